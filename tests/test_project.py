@@ -386,29 +386,6 @@ def test_no_point_is_believed_at_the_edge_of_its_surface():
     }
 
 
-@pytest.mark.parametrize("moves", [True, False])
-def test_a_swinging_limb_ends_where_the_key_sweep_saw_past_it(moves):
-    """Of other sweeps it reaches farther to the right; the wall is seen beside it."""
-    camera = make_camera(120, 90, 300.0)
-    back, back_frame = wall(camera, 20.0, SWEEPS)
-    front, front_frame = wall(camera, 10.0, SWEEPS)
-
-    def column(points):
-        return np.rint(points[:, 0] / points[:, 2] * 300 + camera.K[0, 2])
-
-    front_end, back_begin = (np.where(f == KEY, 60, 80) for f in (front_frame, back_frame))
-    limb = (column(front) >= 40) & (column(front) < front_end)
-    beside = (column(back) < 40) | (column(back) >= back_begin)
-    points = np.vstack([front[limb], back[beside]])
-    frame = np.concatenate([front_frame[limb], back_frame[beside]])
-    moving = np.arange(len(points)) < limb.sum() if moves else False
-    knobs = ProjectSettings(rims="keep")
-    depth = see(camera, points, frame, knobs, (2.0, 2.0), moving=moving)
-    near = (np.abs(depth.depth_m - 10) < 1)[20:70]
-    assert near[:, 42:58].mean() > 0.4  # all the pixels that it was measured in
-    assert near[:, 61:64].any() != moves  # of what stands still every sweep tells
-
-
 def test_every_point_has_one_reason():
     camera = make_camera(60, 40)
     points, frame = wall(camera, 10.0, SWEEPS)

@@ -26,10 +26,11 @@ MOST_CONFIDENCE = 0.2
 _NUM_ROUNDS = 2
 _RIM_WEIGHT = 0.5  # of a boundary pixel's own vote, at most
 _LEAST_SHARE = 0.97  # of the votes for a pixel that is kept
-_LEAST_OF_MOVERS = 0.7  # most of these are right too, since what the key sweep saw past is refused
 _FEW = 100  # boundary pixels, of which nothing can be told
 _SUREST = 2.5  # -log10 of the share against
-_REACH, _DECAY = 6.0, 1.2  # gaps between rays: of a vote, and at which it counts half
+VOTERS_REACH = 6.0
+"""Gaps between rays within which pixels vote."""
+_DECAY = 1.2  # gaps between rays at which a vote counts half
 _SAME_M, _SAME_FRACTION = 0.2, 0.05  # within which a surface agrees with a depth
 _COLOURS = 6.0  # standard deviation of a surface's, in L*a*b*
 _THROUGH = 0.001  # what is left of a vote across an edge of the image
@@ -51,9 +52,8 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
     """Accept boundary pixels (``rim_m``) as the knob ``project.rims`` says.
 
     rims: ``image`` accepts those that the image puts on the measured surface, ``keep`` also all
-    others that are not occluded, ``strict`` none. Accepted are 97 % of the votes, 70 % on moving
-    objects (those below 97 % become ``unsure``), but never a pixel that is ``refused``. Boundary
-    pixels vote too, by half, and in a second round less the less they are believed.
+    others that are not occluded, ``strict`` none. Accepted are 97 % of the votes. Boundary pixels
+    vote too, by half, and in a second round less the less they are believed.
 
     An image that lies up to three steps aside is moved, with a warning. One that does not fit or is
     blurred is not used, with a warning. ``lab`` goes on only if it is used. The ``confidence`` of
@@ -71,17 +71,11 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
             if aligned.right_px or aligned.down_px:
                 warnings = (*warnings, _MOVED.format(place=aligned))
     believed = share >= _LEAST_SHARE
-    if layers.moving is not None:
-        believed |= layers.moving.flat[pixel] & (share >= _LEAST_OF_MOVERS)
     if rims == "strict":
         believed[:] = False
     elif rims == "keep":
         believed |= ~layers.veiled.flat[pixel]
-    believed &= ~layers.refused.flat[pixel]
     kept = pixel[believed]
-    unsure = np.zeros(layers.rim_m.shape, bool)
-    if rims == "image":
-        unsure.flat[kept] = share[believed] < _LEAST_SHARE
     depth_m = layers.depth_m.copy()
     depth_m.flat[kept] = layers.rim_m.flat[kept]
     confidence = layers.confidence.copy()
@@ -94,7 +88,6 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
         confidence=np.where(depth_m > 0, confidence, np.float32(0)),
         lab=lab,
         warnings=warnings,
-        unsure=unsure,
     )
 
 
@@ -109,12 +102,17 @@ def shares(layers: Layers, pixel: Int) -> Float32:
 
 
 def voted_for(
-    layers: Layers, known_m: Float32, pixel: Int, depth_m: Float32, least_share: float
+    layers: Layers,
+    known_m: Float32,
+    pixel: Int,
+    depth_m: Float32,
+    least_share: float,
+    surely: bool = False,
 ) -> Bool:
     """Return (P,) True where ``least_share`` of the votes or more is for ``depth_m`` (P,) of the
-    pixels ``pixel`` (P,); known_m: (H,W) depth of those that vote, 0 none."""
+    pixels ``pixel`` (P,); known_m: (H,W) depth of those that vote, 0 none. surely: see `vote`."""
     weight = np.ones_like(known_m)
-    share = vote(layers, _voters(layers, known_m), pixel, depth_m, weight, surely=False)
+    share = vote(layers, _voters(layers, known_m), pixel, depth_m, weight, surely)
     return share >= _ROUNDED * least_share
 
 
@@ -176,7 +174,7 @@ def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-
         k = _steps_to(voters.steps, d, v, u)
         du, dv = offset(d, k)
         steps[d], agrees[d] = 0, False
-        if k == NONE or max(abs(du), abs(dv)) > _REACH * gap:
+        if k == NONE or max(abs(du), abs(dv)) > VOTERS_REACH * gap:
             continue
         steps[d] = k
         here = extended(voters.inverse, voters.tilt, v + dv, u + du, du, dv)

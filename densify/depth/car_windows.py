@@ -54,7 +54,7 @@ def close_windows(layers: Layers, focal_px: float) -> Layers:
     window if they have its size and shape, if half of them have a frame above too, if a tenth have
     one to both sides that does not lie lower, and if few of them lie in the plane, as in a hedge.
 
-    focal_px: pixels per radian. ``layers.window`` says where windows are, ``layers.glass`` where a
+    focal_px: pixels per radian. ``layers.solid`` says where windows are, ``layers.glass`` where a
     measured pixel was taken out.
     """
     size = max(1, round(focal_px * _CELL_RAD))
@@ -86,7 +86,7 @@ def close_windows(layers: Layers, focal_px: float) -> Layers:
         filled_m=filled_m,
         tilt=tilt,
         confidence=certain,
-        window=window,
+        solid=window,
         glass=glass,
     )
 

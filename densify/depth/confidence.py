@@ -74,8 +74,8 @@ def contradicted(layers: Layers, focal_px: float) -> Float32:
     half_px = max(2, round(float(np.median(layers.gap_px))))
     apart = OUTLIER_PX / (focal_px * KITTI_BASELINE_M)
     _contradicted.over_rows(len(pixel), pixel, inverse, known, layers.tilt, half_px, apart, share)
-    if layers.window is not None:
-        share[layers.window] = 0
+    if layers.solid is not None:
+        share[layers.solid] = 0
     return share
 
 

@@ -167,15 +167,13 @@ def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32], far: Bool) -> Int:
     return ages_ns
 
 
-def distance_behind(
-    points: PointsInImage, camera: Camera, who: Bool | slice = slice(None)
-) -> Float:
+def distance_behind(points: PointsInImage, camera: Camera) -> Float:
     """Return (K,) how far each point lies behind the nearest patch over its pixel, as a share of
-    what is allowed; above 1 it is hidden. who: (K,) the points whose patches hide."""
+    what is allowed; above 1 it is hidden."""
     slack_px = _SLACK_M * points.focal_px / points.depth[:, None]
     half_px = np.clip(_FOOTPRINT * points.spacing_px + slack_px, 0.5, _MAX_HALF_PX)
     nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
-    paint(points.uv[who], points.inverse[who], points.slope[who], half_px[who], nearest)
+    paint(points.uv, points.inverse, points.slope, half_px, nearest)
     column, row = np.rint(points.uv).astype(np.int64).T
     occluder = nearest[row, column].astype(np.float64)
     covered = occluder > 0

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,21 +18,18 @@ class Layers:
 
     depth_m: accepted as measured. rim_m: measured so close to a depth discontinuity that the pixel
     may show what lies beyond; it stays when the pixel is accepted. veiled: this boundary pixel is
-    measured behind the patch of a nearer point. refused: it is never accepted, because the key
-    sweep saw past the moving object there. filled_m: accepted and interpolated pixels. confidence:
-    0 to 1. point: row of the cloud that measured the pixel, -1 none. tilt: (H,W,2) slope of the
-    surface's inverse depth to the right and down, 1/m per px. spacing_px: (H,W,2) between
-    neighbouring rays of one sweep, across and down, everywhere. lab: (H,W,3) the image in L*a*b*,
-    if there is one. warnings: what could not be done as asked. window: inside car windows. glass:
-    where a measured pixel was taken out of one. key_only: only the key sweep has returns of the
-    surface. moving: of a moving object. unsure: an accepted boundary pixel with too few votes to
-    count as measured.
+    measured behind the patch of a nearer point. filled_m: accepted and interpolated pixels.
+    confidence: 0 to 1. point: row of the cloud that measured the pixel, -1 none. tilt: (H,W,2)
+    slope of the surface's inverse depth to the right and down, 1/m per px. spacing_px: (H,W,2)
+    between neighbouring rays of one sweep, across and down, everywhere. lab: (H,W,3) the image in
+    L*a*b*, if there is one. warnings: what could not be done as asked. solid: closed car windows,
+    and moving bodies. glass: where a measured pixel was taken out of a window. key_only: only the
+    key sweep has returns of the surface.
     """
 
     depth_m: Float32
     rim_m: Float32
     veiled: Bool
-    refused: Bool
     filled_m: Float32
     confidence: Float32
     point: NDArray[np.int32]
@@ -39,16 +37,20 @@ class Layers:
     spacing_px: Float32
     lab: Float32 | None = None
     warnings: tuple[str, ...] = ()
-    window: Bool | None = None
+    solid: Bool | None = None
     glass: Bool | None = None
     key_only: Bool | None = None
-    moving: Bool | None = None
-    unsure: Bool | None = None
 
     @property
     def gap_px(self) -> Float32:
         """(H,W) between neighbouring rays, whichever way."""
         return np.sqrt(self.spacing_px[..., 0] * self.spacing_px[..., 1])
+
+    def part(self, box: tuple[slice, slice]) -> Layers:
+        """Return the layers of a box of the image, as views: a change there changes these."""
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        images = {n: v[box] for n, v in values.items() if isinstance(v, np.ndarray)}
+        return Layers(**values | images)
 
     def without(self, dropped: Bool) -> Layers:
         """Take out the pixels ``dropped`` (H,W) of the filled map; what was measured there becomes

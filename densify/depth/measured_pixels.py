@@ -42,8 +42,6 @@ _RIDGE_PX2 = 0.02
 _LEAST_WINDOW_PX, _LEAST_FIT_PX, _MOST_PX = 3, 2.0, 24
 _MOVING_SLACK = 4.0  # motion is known less well than static surfaces
 _MOVING_WITNESS_NS = 120_000_000  # from the key
-_CLEARLY = 0.25  # of the squared distance
-_ALONE = 0.5  # squared spacings; a ray of each sweep falls nearer to every point of a surface
 _GOES_ON = 1.2  # spacings within which a surface shows again
 _ANY_AGE_NS = 1 << 62
 _ALL_ROUND = 3.0  # edges' reaches: no edge near
@@ -56,8 +54,7 @@ class MeasuredPixels(NamedTuple):
     """The H·W pixels of an image, row by row.
 
     winner: int, which of the points in the image gives the depth, -1 none. depth_m, confidence:
-    float32. inside: no depth edge is near. veiled, refused, key_only: as in
-    `densify.depth.layers.Layers`.
+    float32. inside: no depth edge is near. veiled, key_only: as in `densify.depth.layers.Layers`.
     """
 
     winner: Int
@@ -65,7 +62,6 @@ class MeasuredPixels(NamedTuple):
     confidence: Float32
     inside: Bool
     veiled: Bool
-    refused: Bool
     key_only: Bool
 
     @staticmethod
@@ -88,7 +84,7 @@ def nearest_pixels(
     reason[points.index] = Reason.NOT_CHOSEN
     no = np.zeros(len(pixel), bool)
     depth_m, confidence = points.depth[nearest], own[nearest]
-    return MeasuredPixels.at(camera, pixel, nearest, depth_m, confidence, ~no, no, no, no)
+    return MeasuredPixels.at(camera, pixel, nearest, depth_m, confidence, ~no, no, no)
 
 
 def visible_pixels(
@@ -141,10 +137,6 @@ def _settled(
     pixel, winner, found = _found(points, hidden, own, camera, least, taken)
     depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge, num_now = found
     veiled = hidden[winner]
-    refused = veiled & (points.age_ns[winner] > NOW_NS)
-    if refused.any():
-        refused &= distance_behind(points, camera, points.moving)[winner] > 1
-    refused |= edge < 0
     key_only = num_now >= _LEAST_ALONE
     if taken is None:
         supported = num_sweeps >= least
@@ -166,8 +158,7 @@ def _settled(
     )
     confidence = np.maximum(own[winner] * (1 - _DOUBTS @ doubts), MOST_CONFIDENCE)
     inside &= ~veiled
-    confidence, refused = confidence.astype(np.float32), refused & ~inside
-    columns = winner, depth_m, confidence, inside, veiled, refused, key_only
+    columns = winner, depth_m, confidence.astype(np.float32), inside, veiled, key_only
     kept = [column[supported] for column in columns]
     return MeasuredPixels.at(camera, pixel[supported], *kept), reason
 
@@ -270,9 +261,8 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
     witness_ns: how long before or after the key a point behind shows an edge; `_ANY_AGE_NS` for
     static points. Fills the moments m (9,) and how far the surface goes on, reach (8,). Returns a
     bit for each sweep that agrees, the age of the youngest, the number of points in the fit, their
-    weighted squares, True if something lies behind close by, and of a moving point the squared
-    distances in spacings to the key sweep's returns of its surface and behind it, and the number of
-    its returns that agree.
+    weighted squares, True if something lies behind close by, and of a moving point the number of
+    returns of the key sweep around it that agree.
     """
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
@@ -287,28 +277,21 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
     wide_u, wide_v = max(support_u, _window(outer)), max(support_v, _window(on_v))
     fit_u, fit_v = _fit(_PLANE_REACH * across), _fit(_PLANE_REACH * along)
     seen, num, youngest, behind, squares = np.int64(0), 0, age_ns[i], False, 0.0
-    now, now_behind, num_now = np.inf, np.inf, 0
+    num_now = 0
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
         for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
             k = np.uint64(j)  # unsigned, so that no access checks for a negative index
             du, dv = uv[k, 0] - u0, uv[k, 1] - v0
             off = inverse[k] - (centre + su * du + sv * dv)
-            away = np.inf
-            if moving and age_ns[k] <= NOW_NS:
-                away = (du / across) ** 2 + (dv / along) ** 2
             if (hidden[k] and not hidden[i]) or abs(off) > agree:
                 if off >= -far:
                     continue
                 close = abs(du) <= outer and abs(dv) <= outer
                 behind |= close and age_ns[k] <= witness_ns
-                if moving:
-                    now_behind = min(now_behind, away)
                 continue
-            if moving:
-                now = min(now, away)
-                around = abs(du) <= _GOES_ON * across and abs(dv) <= _GOES_ON * along
-                num_now += around and away < np.inf
+            if moving and age_ns[k] <= NOW_NS:
+                num_now += abs(du) <= _GOES_ON * across and abs(dv) <= _GOES_ON * along
             # No branches: half of them would be predicted wrongly.
             vouches = abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v
             seen |= np.int64(vouches) << np.int64(points.sweep[k])
@@ -327,7 +310,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
             m[8] += weight * dv * off
             squares += weight * off * off
             num += abs(du) < fit_u and abs(dv) < fit_v
-    return seen, youngest, num, squares, behind, now, now_behind, num_now
+    return seen, youngest, num, squares, behind, num_now
 
 
 @Kernel
@@ -340,10 +323,6 @@ def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-u
     mean square residual (m), how far the surface goes on to all sides as a share of the reach of
     edges, and number of returns that agree where the key sweep only is asked. Hidden points agree
     with a hidden one only.
-
-    Limbs swing, so the key sweep says more of a moving object's outline than others. Where it saw
-    past the object nearer by than it saw the object, an edge is near (0). At half the distance, or
-    if it should have met the object there and did not, the pixel shows what is behind (-1).
     """
     m, reach = np.zeros(9), np.zeros(8)
     for p in range(first, last):
@@ -360,13 +339,13 @@ def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-u
         m[:], reach[:] = 0.0, 0.0
         # Other sweeps saw the background where the moving object was not yet, or no more.
         witness_ns = _MOVING_WITNESS_NS if points.moving[i] else _ANY_AGE_NS
-        seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
+        seen, youngest, num, squares, behind, num_now = _look_round(
             points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach
         )
         if points.age_ns[i] <= NOW_NS and not points.hidden[i] and _count(seen) < few:
             m[:], reach[:] = 0.0, 0.0
             now_ns = np.int64(NOW_NS)  # of the type of witness_ns, or this is compiled twice
-            seen, youngest, num, squares, behind, now, now_behind, num_now = _look_round(
+            seen, youngest, num, squares, behind, num_now = _look_round(
                 points, shape, i, u0, v0, centre, agree, inner, now_ns, m, reach
             )
             found[6, p] = num_now
@@ -378,8 +357,3 @@ def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-u
         found[5, p] = _ALL_ROUND
         if behind and inner > 0:
             found[5, p] = reach.min() / inner
-        alone = now > _ALONE
-        if now_behind < now:
-            found[5, p] = -1.0 if alone or now_behind < _CLEARLY * now else 0.0
-        elif alone and now_behind < np.inf:
-            found[5, p] = 0.0

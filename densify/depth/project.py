@@ -7,6 +7,7 @@ where depth is the range.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from densify.depth.fill import fill, fill_stars, without_shreds
 from densify.depth.image_points import PointsInImage, points_in_image
 from densify.depth.layers import Layers
 from densify.depth.measured_pixels import MeasuredPixels, nearest_pixels, visible_pixels
+from densify.depth.moving_bodies import MovingBody, close_bodies
 from densify.depth.seen_through import Rays, without_seen_through
 from densify.depth.spots import measure_spots
 from densify.geometry.types import Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
@@ -40,6 +42,7 @@ def project(
     filled: bool = True,
     lab: Float32 | None = None,
     rays: Rays | None = None,
+    bodies: Mapping[int, MovingBody] | None = None,
 ) -> DepthMap:
     """Return the depth map of a cloud as a camera sees it.
 
@@ -64,6 +67,8 @@ def project(
         if visible and settings.glass == "plane":
             layers = close_windows(layers, camera.focal_px)
         layers = without_shreds(fill_stars(layers))
+        if visible and bodies:
+            layers = close_bodies(layers, cloud, exposure, bodies)
     rank = None
     if visible:
         if rays is not None:
@@ -76,8 +81,6 @@ def project(
         far[measured] = cloud.far[layers.point[measured]]
         rank = rank_pixels(layers, far, against)
         layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
-        if layers.unsure is not None:
-            layers = replace(layers, depth_m=np.where(layers.unsure, 0, layers.depth_m))
     _set_reasons(layers, reason)
     if visible and filled:
         layers = measure_spots(layers, points)
@@ -105,7 +108,6 @@ def _layers_of(
         depth_m=depth_m,
         rim_m=np.where(inside, np.float32(0), pixels.depth_m).reshape(shape),
         veiled=pixels.veiled.reshape(shape),
-        refused=pixels.refused.reshape(shape),
         filled_m=depth_m,
         confidence=np.maximum(pixels.confidence, least).reshape(shape),
         point=image(points.index.astype(np.int32), -1),
@@ -113,7 +115,6 @@ def _layers_of(
         spacing_px=_spacing_px(near, shape),
         lab=lab,
         key_only=pixels.key_only.reshape(shape),
-        moving=image(points.moving),
     )
 
 

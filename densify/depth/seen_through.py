@@ -19,17 +19,15 @@ from scipy import ndimage
 from densify.depth.exposure import Exposure, InView
 from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
-from densify.depth.measured_pixels import NOW_NS
 from densify.geometry import poses
 from densify.geometry.types import Bool, Cloud, Float, Float32, Reason, Stretch
 
 _SHARE = 0.25  # of the rays that went through a pixel that is taken out
 _OF_FILLED = 0.5  # of that share, around a filled pixel
-_OF_KEY = 0.35  # share of the key sweep's rays, near moving objects
-_LEAST_RAYS, _LEAST_OF_KEY = 0.9, 0.3  # through a pixel itself, or more of them around it
+_LEAST_RAYS = 0.9  # through a pixel
 _GAPS, _GAPS_AROUND = 0.25, 0.7  # between rays, over which they count: standard deviation
 _LEAST_BLUR_PX = 1.0
-_MOVER_GAPS = 3.6  # between rays, around a moving object: others passed there before and after it
+_KEY_GAPS = 3.6  # between rays, around a surface that only the key sweep measured
 _NUM_STEPS = 6
 _SAME_M, _SAME_FRACTION = 0.05, 0.01  # from one step to the next: the crossing is found
 
@@ -71,15 +69,15 @@ def without_seen_through(
     A ray of a hidden point went through where it crosses the surface of the map, clearly before its
     end. A ray of another point stopped in its pixel. Both are blurred by a quarter of the gap
     between rays; a pixel goes if a quarter of the rays went through. A filled pixel also goes if
-    an eighth did, blurred by 0.7 gaps, and no less in the pixel itself. Near moving objects, and
-    near surfaces of the key sweep only, only the key's own rays count. Closed car windows stay.
+    an eighth did, blurred by 0.7 gaps, and no less in the pixel itself. Closed car windows and
+    moving bodies stay, and what is near surfaces that only the key sweep measured: an object that
+    moves without being noticed was elsewhere at other times.
     """
     counts = np.isin(cloud.frame, rays.stretch.frames)
     counts &= (reason != Reason.OUTSIDE) & (reason != Reason.VETOED)
     stopped = counts & (reason != Reason.HIDDEN)
     passed = counts & ~stopped & ~cloud.moving
     gap_px, shape = float(np.median(layers.gap_px)), layers.filled_m.shape
-    near_mover = _near_movers(layers, cloud, view, stopped, round(_MOVER_GAPS * gap_px))
 
     def through(hits: Bool) -> Float:
         """(K,2) px where rays of these points (M,) went through the map."""
@@ -90,24 +88,15 @@ def without_seen_through(
 
     by_all, ends_px = through(passed), view.uv[stopped[view.rows]]
     here, around = (
-        _Passed.by(by_all, ends_px, (blur_px, blur_px), shape)
+        _Passed.by(by_all, ends_px, blur_px, shape)
         for blur_px in (max(_LEAST_BLUR_PX, wide * gap_px) for wide in (_GAPS, _GAPS_AROUND))
     )
     gaps = around.opens(_OF_FILLED * _SHARE) & (here.share >= around.share)
     dropped = here.opens(_SHARE) | (gaps & (layers.depth_m == 0))
-    dropped &= ~near_mover
-    if near_mover.any():
-        now = counts & (np.abs(cloud.since_key_ns) <= NOW_NS)
-        column, row = np.rint(view.uv).astype(np.int64).T
-        near = np.zeros(len(cloud), bool)
-        near[view.rows] = near_mover[row, column]
-        across_px, down_px = np.median(layers.spacing_px, axis=(0, 1)).tolist()
-        blur_px = (_GAPS_AROUND * down_px, _GAPS_AROUND * across_px)
-        ends_px = view.uv[(stopped & now)[view.rows]]
-        of_key = _Passed.by(through(near & now), ends_px, blur_px, shape)
-        dropped |= of_key.opens(_OF_KEY, _LEAST_OF_KEY) & near_mover
-    if layers.window is not None:
-        dropped &= ~layers.window
+    if layers.key_only is not None:
+        dropped &= ~ndimage.maximum_filter(layers.key_only, 2 * round(_KEY_GAPS * gap_px) + 1)
+    if layers.solid is not None:
+        dropped &= ~layers.solid
     return layers.without(dropped)
 
 
@@ -118,48 +107,27 @@ class _Passed(NamedTuple):
     share: Float32
 
     @staticmethod
-    def by(
-        through: Float, stopped: Float, blur_px: tuple[float, float], shape: tuple[int, ...]
-    ) -> _Passed:
-        """through, stopped: (K,2) px. blur_px: down and across, standard deviation."""
+    def by(through: Float, stopped: Float, blur_px: float, shape: tuple[int, ...]) -> _Passed:
+        """through, stopped: (K,2) px. blur_px: standard deviation."""
         num, num_stopped = (
-            _counts(uv, shape, blur_px) * (2 * np.pi * blur_px[0] * blur_px[1])
-            for uv in (through, stopped)
+            _counts(uv, shape, blur_px) * (2 * np.pi * blur_px**2) for uv in (through, stopped)
         )
         met = num + num_stopped
         return _Passed(num, np.divide(num, met, out=np.zeros_like(met), where=met > 0))
 
-    def opens(self, share: float, least: float = _LEAST_RAYS) -> Bool:
-        """Return (H,W) True where more than ``share`` of the rays went through, and at least
-        ``least``."""
-        opened: Bool = (self.share > share) & (self.num >= least)
+    def opens(self, share: float) -> Bool:
+        """Return (H,W) True where more than ``share`` of the rays went through, and enough."""
+        opened: Bool = (self.share > share) & (self.num >= _LEAST_RAYS)
         return opened
 
 
-def _near_movers(layers: Layers, cloud: Cloud, view: InView, seen: Bool, reach_px: int) -> Bool:
-    """Return (H,W) True within ``reach_px`` of moving points that are not hidden. seen: (M,)."""
-    moving = (seen & cloud.moving)[view.rows]
-    movers = _counts(view.uv[moving], layers.depth_m.shape) > 0
-    if layers.key_only is not None:
-        movers |= layers.key_only
-    near: Bool = ndimage.maximum_filter(movers, 2 * reach_px + 1)
-    return near
-
-
-def _counts(
-    uv: Float, shape: tuple[int, ...], blur_px: tuple[float, float] | None = None
-) -> Float32:
+def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
     """Return (H,W) the number of places (K,2) px in each pixel, blurred out to 2.5 deviations."""
     column, row = np.rint(uv).astype(np.int64).T
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
+    size = 2 * round(2.5 * blur_px) + 1
     pixels = counts.reshape(shape).astype(np.float32)
-    if blur_px is None:
-        return pixels
-    down_px, across_px = blur_px
-    size = (2 * round(2.5 * across_px) + 1, 2 * round(2.5 * down_px) + 1)
-    made = cv2.GaussianBlur(
-        pixels, size, sigmaX=across_px, sigmaY=down_px, borderType=cv2.BORDER_REFLECT
-    )
+    made = cv2.GaussianBlur(pixels, (size, size), blur_px, borderType=cv2.BORDER_REFLECT)
     return made.astype(np.float32, copy=False)
 
 

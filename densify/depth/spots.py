@@ -23,8 +23,7 @@ def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
     """Count filled pixels as measured where the spot of a measured return covers them.
 
     The ``point`` of the nearest return is taken. The fill must lie on the return's surface: what
-    the fill left empty stays empty, and boundary pixels that are unsure stay so. Depth and
-    confidence remain the fill's.
+    the fill left empty stays empty. Depth and confidence remain the fill's.
     """
     shape = layers.depth_m.shape
     measured = np.flatnonzero(layers.depth_m > 0)
@@ -32,10 +31,7 @@ def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
         return layers
     point = points.at(layers.point.flat[measured])
     radius_px = np.minimum(_SPOT * points.spacing_px[point, 0], _MOST_PX)
-    fills = layers.depth_m == 0
-    if layers.unsure is not None:
-        fills &= ~layers.unsure
-    filled_m = np.where(fills, layers.filled_m, np.float32(0))
+    filled_m = np.where(layers.depth_m == 0, layers.filled_m, np.float32(0))
     found = np.full(shape, -1)
     nearest, uv = np.full(shape, np.inf), points.uv[point]
     _cover(measured, uv, radius_px, layers.depth_m, layers.tilt, filled_m, found, nearest)

@@ -16,6 +16,7 @@ from densify.depth.confidence import reliability
 from densify.depth.exposure import Exposure, Shot
 from densify.depth.far import far_cloud
 from densify.depth.image_alignment import lab
+from densify.depth.moving_bodies import MovingBody, moving_bodies, outlines
 from densify.depth.patches import patches, seen_through_by_key
 from densify.depth.project import project
 from densify.depth.seen_through import Rays
@@ -44,16 +45,19 @@ _BEHIND_M, _BEHIND_FRACTION = 0.15, 0.02  # the map's surface; a point farther b
 
 
 class SeenCloud(NamedTuple):
-    """A cloud with its patches."""
+    """A cloud with its patches, and the bodies of what moves, by instance."""
 
     cloud: Cloud
     patches: Patches
+    bodies: Mapping[int, MovingBody] = {}
 
     def joined(self, far: SeenCloud | None) -> SeenCloud:
         """Return it with what sweeps beyond the window measured."""
         if far is None or not len(far.cloud):
             return self
-        return SeenCloud(self.cloud.joined(far.cloud), self.patches.joined(far.patches))
+        return self._replace(
+            cloud=self.cloud.joined(far.cloud), patches=self.patches.joined(far.patches)
+        )
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,10 @@ class Views:
             cloud, patches(cloud, self.key, self.sensors, self.origins, key_image, wanted)
         )
 
+    def bodies(self, cloud: Cloud) -> dict[int, MovingBody]:
+        """Return the bodies of what moves, from all the points of the window."""
+        return moving_bodies(cloud, self.rays)
+
     def far(
         self, found: StandingWorld, T_key_found: Float, stretch: Stretch, standing_only: bool
     ) -> SeenCloud:
@@ -139,6 +147,7 @@ class Views:
                 filled,
                 self.lab.get(name),
                 self.rays,
+                seen.bodies,
             )
             for name, exposure in self.exposures.items()
         }
@@ -211,12 +220,17 @@ class Views:
         return maps
 
     def movers(
-        self, cloud: Cloud, visible: bool, images: Mapping[str, NDArray[np.uint8]]
+        self,
+        cloud: Cloud,
+        visible: bool,
+        bodies: Mapping[int, MovingBody],
+        images: Mapping[str, NDArray[np.uint8]],
     ) -> dict[int, Mover]:
         """Return every moving object by itself, and as -1 all moving points without one."""
         movers = {}
         for instance in np.unique(cloud.instance[cloud.moving]).tolist():
             part = self.see(cloud.select(cloud.moving & (cloud.instance == instance)), visible)
+            part = part._replace(bodies={k: b for k, b in bodies.items() if k == instance})
             depth = self.depth(part, visible)
             movers[instance] = Mover(self.coloured(part, depth, images), depth)
         return movers
@@ -269,11 +283,13 @@ class HeldOut:
     """The key sweep's own returns as the truth for the key densified from its neighbours alone.
 
     key_alone: maps of the key sweep, without boundary pixels. moving: (H,W) its moving returns.
+    gap_rad: usual angle between its rings.
     """
 
     views: Views
     key_alone: Mapping[str, DepthMap]
     moving: Mapping[str, Bool]
+    gap_rad: float
 
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
@@ -282,36 +298,40 @@ class HeldOut:
         settings = replace(views.settings, rims="strict", visibility=True)
         own = cloud.select(cloud.frame == views.key)
 
-        def alone(part: Cloud) -> dict[str, DepthMap]:
+        def alone(part: SeenCloud) -> dict[str, DepthMap]:
             """Maps of returns of the key sweep."""
-            surface = views.see(part).patches
             return {
-                name: project(part, exposure, settings, surface, filled=False)
+                name: project(part.cloud, exposure, settings, part.patches, filled=False)
                 for name, exposure in views.exposures.items()
             }
 
-        key_alone = alone(own)
+        seen = views.see(own)
+        key_alone = alone(seen)
         moving = {
             name: (maps.depth_m > 0) & (maps.depth_m == key_alone[name].depth_m)
-            for name, maps in alone(own.select(own.moving)).items()
+            for name, maps in alone(views.see(own.select(own.moving))).items()
         }
-        return HeldOut(views, key_alone, moving)
+        gap_rad = seen.patches.spacing_m[:, 1] / np.linalg.norm(own.points, axis=1)
+        known = gap_rad[np.isfinite(gap_rad) & (gap_rad > 0)]
+        return HeldOut(views, key_alone, moving, float(np.median(known)) if len(known) else 0.0)
 
-    def depth(self, seen: SeenCloud, visible: bool) -> dict[str, DepthMap]:
-        """Return depth maps without the key sweep; none for a cloud of the key sweep alone."""
+    def without_key(self, seen: SeenCloud) -> SeenCloud:
+        """Return the cloud without the key sweep, and what it told of free space and bodies."""
         others = seen.cloud.frame != self.views.key
-        if not others.any():
-            return {}
         surface = seen.patches.select(others)
         surface = replace(surface, free=np.zeros(len(surface.free), bool))
-        return self.views.depth(SeenCloud(seen.cloud.select(others), surface), visible)
+        cloud = seen.cloud.select(others)
+        bodies = self.views.bodies(cloud) if seen.bodies else {}
+        return SeenCloud(cloud, surface, bodies)
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
-        """Return scores by name, with the ``curve`` of precision over density, and ``reliability``;
-        None for a cloud of the key sweep alone."""
-        made = self.depth(seen, visible)
-        if not made:
+        """Return scores by name, with the ``curve`` of precision over density, ``reliability``, and
+        the share of filled pixels ``unjudged`` for want of a return of the key sweep within a gap
+        between rays; None for a cloud of the key sweep alone."""
+        others = self.without_key(seen)
+        if not len(others.cloud):
             return None
+        made = self.views.depth(others, visible)
         scores: dict[str, Any] = {}
         for name, maps in made.items():
             truth_m, camera = self.key_alone[name].depth_m, self.views.exposures[name].camera
@@ -319,5 +339,17 @@ class HeldOut:
                 **depth_metrics.depth_scores(maps, truth_m, self.moving[name], camera),
                 "curve": depth_metrics.precision_density(maps, truth_m, camera),
                 "reliability": reliability(maps, truth_m, camera),
+                "unjudged": self._unjudged(name, maps, seen.bodies),
             }
         return scores
+
+    def _unjudged(
+        self, name: str, maps: DepthMap, bodies: Mapping[int, MovingBody]
+    ) -> dict[str, float | None]:
+        """Return the share of a map's filled pixels that have no return of the key sweep near."""
+        away_px = ndimage.distance_transform_edt(self.key_alone[name].depth_m == 0)
+        unjudged = away_px > self.gap_rad * self.views.exposures[name].camera.focal_px
+        filled = maps.filled_m > 0
+        moving = outlines(bodies.values(), self.views.exposures[name])
+        parts = {"all": filled, "moving": filled & moving, "static": filled & ~moving}
+        return {n: float(unjudged[p].mean()) if p.any() else None for n, p in parts.items()}

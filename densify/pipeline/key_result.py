@@ -99,12 +99,14 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
     far = _see_far(scene, method)
     with watch.stage("project"):
         seen = views.see(moment.cloud, visible).joined(far)
+        if visible:
+            seen = seen._replace(bodies=views.bodies(moment.cloud))
     with watch.stage("held out"):
         held_out = scene.held_out.scores(seen, visible)
     with watch.stage("project"):
         movers = {}
         if output.movers == "separate":
-            movers = views.movers(moment.cloud, visible, scene.images)
+            movers = views.movers(moment.cloud, visible, seen.bodies, scene.images)
         if output.movers != "keep":
             static = moment.cloud.select(~moment.cloud.moving)
             seen = views.see(static, visible).joined(far)

@@ -1,0 +1,395 @@
+# SPDX-License-Identifier: MIT
+"""Moving objects as closed surfaces: nothing that lies behind one shines through it.
+
+Lidar gets no return from much of a near car: dark paint, panes. Other sweeps measured the
+background there, while the car was elsewhere. So every moving object is a body: the convex hull of
+all its points of the window, at the key's moment. The rays of all sweeps, moved along with the
+object, tell where the body is closed: there they end on it. Between the legs of a walker or under
+a bumper they go through.
+
+In the image, pixels well inside the closed part show the body. The image decides the pixels along
+its outline. The surface is the front of the hull, moved smoothly onto the object's own returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import ConvexHull, KDTree, QhullError
+
+from densify.depth.boundary_pixels import MOST_CONFIDENCE, VOTERS_REACH, voted_for
+from densify.depth.exposure import Exposure
+from densify.depth.fill import FILL_CONFIDENCE
+from densify.depth.layers import Layers
+from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
+from densify.depth.seen_through import Rays
+from densify.geometry import cameras, poses
+from densify.geometry.arrays import Bool, Float, Float32, Int
+from densify.geometry.types import Cloud
+
+_AROUND_M, _LEAST_AROUND = 0.25, 6  # a point of the body has six others of it around
+_LEAST_SEEN = 3  # points of a sweep that tell where the body was
+_MOVED_M = 2.0  # the scanner moves on during a sweep
+_POSE_M = 0.03  # standard deviation of the pose of the body
+_LIMBS_S = 0.1  # from the key, over which limbs keep their places
+_BLUR = 0.35  # gaps between rays over which a ray counts
+_PRIOR = 0.05  # rays that end on the body, assumed everywhere
+_WHOLE = 0.8  # share of its front at which a body is closed as a whole, as a car is
+_LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # rays that end on it: a third do at a pane
+_VOTES_OF_WHOLE, _VOTES_OF_OPEN = 0.75, 0.97  # along the outline
+_DEEP_M = 0.6  # behind the front of the hull lie seats and the far side
+_STIFF, _HELD = 3.0, 0.01  # weights of a smooth and of a small offset, against one return
+_AGREES = 2.0  # times what two static points of a surface may deviate
+_BEFORE_M, _BEFORE_FRACTION = 0.3, 0.02  # nearer by both added: it hides the body
+
+
+class MovingBody(NamedTuple):
+    """A moving object at the key's reference time; key frame, metres.
+
+    corners: (V,3) of its convex hull. velocity_m_s: (3,). entries: (K,3) where rays enter the hull.
+    ends: (K,) True if the ray ends on the object, False if it goes through. weight: (K,) of the
+    ray: less long before or after the key, and where it passes just below the surface of the hull.
+    """
+
+    corners: Float
+    velocity_m_s: Float32
+    entries: Float
+    ends: Bool
+    weight: Float
+
+
+def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
+    """Return the bodies of moving objects by instance.
+
+    cloud: at the key's reference time. rays: of the window. Objects whose points span no volume
+    have no body.
+    """
+    instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)]).tolist()
+    own = {k: cloud.select(cloud.moving & (cloud.instance == k)) for k in instances}
+    corners = {k: _corners(own[k].points) for k in instances}
+    met: dict[int, list[_Met]] = {k: [_NOT_MET] for k in instances if len(corners[k])}
+    for frame in rays.stretch.frames if met else ():
+        sweep = _Sweep.of(cloud, rays, frame)
+        for k in met:
+            seen = own[k].frame == frame
+            if seen.sum() >= _LEAST_SEEN:
+                T_key_there = poses.fit_rigid(own[k].rigid_points[seen], own[k].points[seen])
+                met[k].append(sweep.met(k, corners[k], T_key_there))
+    return {
+        k: MovingBody(
+            corners[k],
+            np.median(own[k].velocity_m_s, axis=0),
+            *(np.concatenate(column) for column in zip(*found, strict=True)),
+        )
+        for k, found in met.items()
+    }
+
+
+def _corners(points: Float) -> Float:
+    """Return (V,3) corners of the convex hull of the points (N,3) that have others around."""
+    away_m, _ = KDTree(points).query(points, [_LEAST_AROUND + 1])  # itself is the first
+    points = points[np.ravel(away_m) <= _AROUND_M]
+    try:
+        return points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):  # too few, or flat
+        return points[:0]
+
+
+def _half_spaces(corners: Float) -> Float:
+    """Return (F,4) normal n and offset d of a hull's sides; n · x + d ≤ 0 inside."""
+    return np.unique(ConvexHull(corners).equations, axis=0)
+
+
+def _crossing(spaces: Float, start: Float, way: Float) -> tuple[Float, Float]:
+    """Return (K,) the t at which lines start + t · way enter and leave a convex body; a line that
+    misses it leaves before it enters. spaces: (F,4). start: (K,3) or (3,). way: (K,3)."""
+    enter, leave = np.full(len(way), -np.inf), np.full(len(way), np.inf)
+    for side in spaces:
+        slope, outside = way @ side[:3], start @ side[:3] + side[3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -outside / slope
+        np.maximum(enter, t, out=enter, where=slope < 0)
+        np.minimum(leave, t, out=leave, where=slope > 0)
+        leave[(slope == 0) & (outside > 0)] = -np.inf
+    return enter, leave
+
+
+def _passes_near(corners: Float, start: Float, way: Float) -> Bool:
+    """Return (K,) True where lines come within the sphere around the corners (V,3)."""
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    radius_m = np.linalg.norm(corners - middle, axis=1).max()
+    off = np.linalg.norm(np.cross(start - middle, way), axis=1)
+    near: Bool = off <= radius_m * np.linalg.norm(way, axis=1)
+    return near
+
+
+class _Met(NamedTuple):
+    """Rays that meet a hull; the columns are those of `MovingBody`."""
+
+    entries: Float
+    ends: Bool
+    weight: Float
+
+
+_NOT_MET = _Met(np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0))
+
+
+class _Sweep(NamedTuple):
+    """The returns of one sweep, key frame.
+
+    origin: (3,) of the scanner at the reference time. azimuth: (N,) radians, seen from there.
+    range_m: (N,) level distance from there.
+    """
+
+    cloud: Cloud
+    rays: Rays
+    origin: Float
+    azimuth: Float
+    range_m: Float
+
+    @staticmethod
+    def of(cloud: Cloud, rays: Rays, frame: int) -> _Sweep:
+        part = cloud.select(cloud.frame == frame)
+        origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
+        x, y = (part.rigid_points - origin)[:, :2].T
+        return _Sweep(part, rays, origin, np.arctan2(y, x), np.hypot(x, y))
+
+    def met(self, instance: int, corners: Float, T_key_there: Float) -> _Met:
+        """Return the rays that meet a hull, entering it where it is at the key.
+
+        corners: (V,3) of the hull at the key. T_key_there: motion of the object from this sweep.
+        """
+        part = self.cloud.select(self._toward(poses.transform(poses.inverse(T_key_there), corners)))
+        start = poses.transform(T_key_there, self.rays.starts(part))
+        way = poses.transform(T_key_there, part.rigid_points) - start
+        near, spaces = _passes_near(corners, start, way), _half_spaces(corners)
+        part, start, way = part.select(near), start[near], way[near]
+        enter, leave = _crossing(spaces, start, way)
+        meets = (enter > 0) & (enter < np.minimum(leave, 1))
+        part, start, way, enter = part.select(meets), start[meets], way[meets], enter[meets]
+        middle = start + (enter + np.minimum(leave[meets], 1))[:, None] / 2 * way
+        below_m = -(middle @ spaces[:, :3].T + spaces[:, 3]).max(axis=1, initial=-np.inf)
+        ends = part.moving & (part.instance == instance)
+        weight = np.exp(-abs(part.since_key_ns) * 1e-9 / _LIMBS_S)
+        weight[~ends] *= 1 - np.exp(-0.5 * (np.maximum(below_m[~ends], 0) / _POSE_M) ** 2)
+        return _Met(start + enter[:, None] * way, ends, weight)
+
+    def _toward(self, corners: Float) -> Bool:
+        """Return (N,) True for all returns whose rays may meet a hull with these corners (V,3)."""
+        x, y = (corners - self.origin)[:, :2].T
+        middle_x, middle_y = x.mean(), y.mean()
+        radius_m = np.hypot(x - middle_x, y - middle_y).max() + _MOVED_M
+        range_m = np.hypot(middle_x, middle_y)
+        aside = self.azimuth - np.arctan2(middle_y, middle_x)
+        aside = abs((aside + np.pi) % (2 * np.pi) - np.pi)
+        half = np.pi if range_m <= radius_m else np.arcsin(radius_m / range_m)
+        toward: Bool = (aside <= half) & (self.range_m > range_m - radius_m)
+        return toward
+
+
+def close_bodies(
+    layers: Layers, cloud: Cloud, exposure: Exposure, bodies: Mapping[int, MovingBody]
+) -> Layers:
+    """Return the layers with the surfaces of moving bodies.
+
+    What lies clearly before a body stays. Elsewhere inside the outline of its hull stays only what
+    is measured of something that moves. Pixels at which one of the body's own returns lies on its
+    surface count as measured. ``solid`` says where bodies are.
+
+    cloud: at the key's reference time.
+    """
+    changed = ("depth_m", "filled_m", "confidence", "tilt", "point")
+    layers = replace(layers, **{name: getattr(layers, name).copy() for name in changed})
+    solid = np.zeros(layers.depth_m.shape, bool)
+    for instance, body in bodies.items():
+        margin_px = round(VOTERS_REACH * float(np.median(layers.gap_px)))
+        front = _Front.of(body, exposure, margin_px)
+        if front is not None:
+            rows = np.flatnonzero(cloud.moving & (cloud.instance == instance))
+            part = layers.part(front.box)
+            solid[front.box] |= _close(part, cloud, exposure, rows, body, front)
+    return replace(layers, solid=solid if layers.solid is None else layers.solid | solid)
+
+
+def outlines(bodies: Iterable[MovingBody], exposure: Exposure) -> Bool:
+    """Return (H,W) the pixels within the outlines of the hulls."""
+    shown = np.zeros((exposure.camera.height_px, exposure.camera.width_px), bool)
+    for body in bodies:
+        front = _Front.of(body, exposure, 0)
+        if front is not None:
+            shown[front.box] |= front.inverse > 0
+    return shown
+
+
+class _Front(NamedTuple):
+    """The front of a hull in the image.
+
+    box: rows and columns (h,w) of the image. inverse: (h,w) of its depth, 1/m, 0 outside.
+    """
+
+    box: tuple[slice, slice]
+    inverse: Float
+
+    @staticmethod
+    def of(body: MovingBody, exposure: Exposure, margin_px: int) -> _Front | None:
+        """Return None if the body is not in view. margin_px: of the box, to all sides."""
+        camera = exposure.camera
+        sight = exposure.see(body.corners, _each(body.velocity_m_s, body.corners))
+        if not sight.inside.any():
+            return None
+        low, high = np.zeros(2, int), np.array([camera.width_px, camera.height_px])
+        if (exposure.depth_m(sight.points_cam) > cameras.NEAREST_M).all():
+            low = np.maximum(low, np.floor(np.nanmin(sight.uv, axis=0)).astype(int) - margin_px)
+            high = np.minimum(
+                high, np.ceil(np.nanmax(sight.uv, axis=0)).astype(int) + 1 + margin_px
+            )
+        row, column = np.mgrid[low[1] : high[1], low[0] : high[0]]
+        uv = np.column_stack([column.ravel(), row.ravel()]).astype(np.float64)
+        ray = cameras.rays(camera, uv)
+        enter, leave = _crossing(_half_spaces(sight.points_cam), np.zeros(3), ray)
+        inside = (enter > 0) & (enter < leave)
+        depth_m = exposure.depth_m(np.where(inside, enter, 1)[:, None] * ray)
+        inside &= depth_m > cameras.NEAREST_M
+        inverse = np.divide(1, depth_m, out=np.zeros(len(ray)), where=inside)
+        box = (slice(low[1], high[1]), slice(low[0], high[0]))
+        return _Front(box, inverse.reshape(row.shape)) if inside.any() else None
+
+    def pixels(self, exposure: Exposure, points: Float, velocity_m_s: Float32) -> _Pixels:
+        """Return where points (N,3), key frame, show within the box."""
+        sight = exposure.see(points, velocity_m_s)
+        column, row = np.rint(np.where(sight.inside, sight.uv.T, -1)).astype(np.int64)
+        row, column = row - self.box[0].start, column - self.box[1].start
+        height, width = self.inverse.shape
+        shown = sight.inside & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        which = np.flatnonzero(shown)
+        depth_m = exposure.depth_m(sight.points_cam[which])
+        return _Pixels(which, (row[which], column[which]), depth_m)
+
+    def closed(self, body: MovingBody, exposure: Exposure, spacing_px: Float32) -> Float:
+        """Return (h,w) the share of the rays that end on the body, of those that enter there."""
+        blur_px = np.maximum(_BLUR * np.median(spacing_px, axis=(0, 1)), 1.0)
+        at = self.pixels(exposure, body.entries, _each(body.velocity_m_s, body.entries))
+        front_m = 1 / np.maximum(self.inverse[at.place], 1e-6)
+        faces = at.depth_m < front_m + _BEFORE_M + _BEFORE_FRACTION * front_m
+        counts = np.zeros((2, *self.inverse.shape))
+        ends = body.ends[at.which].astype(np.int64)
+        np.add.at(counts, (ends, *at.place), np.where(faces, body.weight[at.which], 0))
+        passed, ended = (cv2.GaussianBlur(n, (0, 0), blur_px[0], sigmaY=blur_px[1]) for n in counts)
+        ended = ended + _PRIOR / (2 * np.pi * blur_px.prod())
+        share: Float = np.where(self.inverse > 0, ended / (ended + passed), 0)
+        return share
+
+
+class _Pixels(NamedTuple):
+    """Points in a box of the image: rows of the points, their rows and columns, their depth."""
+
+    which: Int
+    place: tuple[Int, Int]
+    depth_m: Float
+
+
+def _close(
+    layers: Layers, cloud: Cloud, exposure: Exposure, rows: Int, body: MovingBody, front: _Front
+) -> Bool:
+    """Put the surface of one body into ``layers``, the box of its front; return (h,w) where.
+
+    rows: of its points in the cloud.
+    """
+    surface = _surface(layers, rows, front)
+    surface_m = (1 / surface).astype(np.float32)
+    agree_m = _AGREES * (AGREE_M + AGREE_FRACTION * surface_m)
+    share = front.closed(body, exposure, layers.spacing_px)
+    shows, sure = _shown(layers, cloud, surface, agree_m, share)
+    layers.filled_m[shows] = surface_m[shows]
+
+    at = front.pixels(exposure, cloud.points[rows], cloud.velocity_m_s[rows])
+    agrees = sure[at.place] & (abs(at.depth_m - surface_m[at.place]) <= agree_m[at.place])
+    place, rows = tuple(axis[agrees] for axis in at.place), rows[at.which[agrees]]
+    oldest_first = np.argsort(-abs(cloud.since_key_ns[rows]), kind="stable")
+    measured = np.full(surface.shape, -1)
+    measured[tuple(axis[oldest_first] for axis in place)] = rows[oldest_first]
+    hit = measured >= 0
+    away_px = cv2.distanceTransform((~hit).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    confidence = FILL_CONFIDENCE / (1 + away_px / layers.gap_px)
+    confidence[hit] = np.maximum(layers.confidence[hit], MOST_CONFIDENCE)
+    layers.confidence[shows] = confidence[shows]
+    layers.depth_m[shows] = np.where(hit, surface_m, 0)[shows]
+    layers.point[hit] = measured[hit]
+    return shows
+
+
+def _surface(layers: Layers, rows: Int, front: _Front) -> Float:
+    """Return (h,w) the inverse depth of a body's surface, 1/m, in the box of its front.
+
+    rows: of its points in the cloud.
+    """
+    inside = front.inverse > 0
+    known_m = np.maximum(layers.depth_m, layers.rim_m)
+    own = inside & (known_m > 0) & np.isin(layers.point, rows)
+    own &= known_m * front.inverse < 1 + _DEEP_M * front.inverse
+    offset = 1 / np.where(own, known_m, 1) - front.inverse
+    surface: Float = np.maximum(front.inverse + _smooth(offset, own, inside), 1e-3)
+    return surface
+
+
+def _shown(
+    layers: Layers, cloud: Cloud, surface: Float, agree_m: Float32, share: Float
+) -> tuple[Bool, Bool]:
+    """Return (h,w) the pixels that show a body, and those of them at which its returns count.
+
+    Takes out of ``layers`` what else is inside its outline. surface: (h,w) inverse depth of the
+    body, 1/m. agree_m: (h,w) what is farther behind it is something else. share: (h,w) of the rays
+    that end on it, 0 outside its outline.
+    """
+    inside, now_m, surface_m = share > 0, layers.filled_m, (1 / surface).astype(np.float32)
+    whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
+    before = (now_m > 0) & (now_m < surface_m - _BEFORE_M - _BEFORE_FRACTION * surface_m)
+    closed = share >= (_LEAST_OF_WHOLE if whole else _LEAST_OF_OPEN)
+    core = _well_inside(closed, float(np.median(layers.gap_px[inside]))) & ~before
+    moves = (layers.depth_m > 0) & cloud.moving[layers.point]
+    outline = inside & ~before & ~core & ~(moves & (layers.depth_m <= surface_m + agree_m))
+    if not whole:
+        outline &= share >= _LEAST_OF_WHOLE
+    for values in (layers.depth_m, layers.filled_m, layers.confidence):
+        values[outline] = 0
+    layers.filled_m[core] = surface_m[core]
+    layers.tilt[core] = np.stack(list(np.gradient(surface))[::-1], axis=-1)[core]
+    shows, votes = core.copy(), _VOTES_OF_WHOLE if whole else _VOTES_OF_OPEN
+    pixel, depth_m = np.flatnonzero(outline), surface_m[outline]
+    shows[outline] = voted_for(layers, layers.filled_m, pixel, depth_m, votes, surely=not whole)
+    return shows, shows if whole else core
+
+
+def _well_inside(closed: Bool, away_px: float) -> Bool:
+    """Return the pixels farther than this from those that are not closed, or not in the box."""
+    padded = np.pad(closed, 1, mode="edge").astype(np.uint8)
+    distance_px = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    inside: Bool = distance_px > away_px
+    return inside
+
+
+def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
+    """Return (h,w) the smooth offset o that is the least of
+    Σ known (o - offset)² + stiff Σ |∇o|² + held Σ o² over the pixels ``inside``."""
+    number = np.cumsum(inside).reshape(inside.shape) - 1
+    across, down = inside[:, :-1] & inside[:, 1:], inside[:-1] & inside[1:]
+    one = np.concatenate([number[:, :-1][across], number[:-1][down]])
+    other = np.concatenate([number[:, 1:][across], number[1:][down]])
+    num = int(inside.sum())
+    joins = sparse.coo_matrix((np.full(len(one), _STIFF), (one, other)), (num, num)).tocsr()
+    joins = joins + joins.T
+    weight = known[inside].astype(np.float64)
+    diagonal = np.asarray(joins.sum(axis=1)).ravel() + weight + _HELD
+    found = np.zeros(inside.shape)
+    found[inside] = spsolve((sparse.diags(diagonal) - joins).tocsc(), weight * offset[inside])
+    return found
+
+
+def _each(velocity_m_s: Float32, points: Float) -> Float32:
+    return np.broadcast_to(velocity_m_s, points.shape)
