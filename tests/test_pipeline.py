@@ -126,7 +126,7 @@ def test_the_ghost_score_agrees_with_the_truth(moving):
     """What it calls a ghost among rigid points is truly on something that moves."""
     sequence = tiny(MOVERS)
     icp = moving["icp"].cloud
-    found = ghosts(icp, RangeImage.of(sequence.scene.stretch(KEY, 1)[KEY]), KEY)
+    found, _ = ghosts(icp, RangeImage.of(sequence.scene.stretch(KEY, 1)[KEY]), KEY)
     assert found.sum() > 50
     true = np.zeros(len(icp), bool)
     for frame in np.unique(icp.frame):

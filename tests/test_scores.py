@@ -86,7 +86,9 @@ def test_the_key_sweep_itself_and_an_unseen_direction_hold_no_ghosts():
     seen = RangeImage.of(key)
     assert ghost_rate(cloud_of((key.sweep.points, KEY + 1, False)), seen, KEY) == 0
     above = panel(1.0)[:, [1, 2, 0]] * [0.1, 0.1, 5.0]
-    assert ghost_rate(cloud_of((above, KEY + 1, False)), seen, KEY) == 0
+    unseen = cloud_of((above, KEY + 1, False))
+    assert ghost_rate(unseen, seen, KEY) == 0
+    assert ghost_scores(unseen, seen, KEY)["unjudged"]["static"] == 1
     assert ghost_rate(cloud_of((panel(10.0), KEY, False)), seen, KEY) is None
 
 
@@ -107,6 +109,7 @@ def test_ghost_scores_by_kind_and_distance():
         "all": pytest.approx(100 / (n + 200)),
         "moving": 0.5,
         "static": 0.0,
+        "unjudged": {"all": 0.0, "moving": 0.0, "static": 0.0},
         "by_distance": {"1": 0.0, "2": 0.5},
         "by_seconds": {"0.10": 0.0, "0.20": 0.5},
     }

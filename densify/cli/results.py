@@ -64,6 +64,12 @@ def summary(result: Result) -> str:
         for part, where in (("all", ""), ("moving", ", on moving objects")):
             if outliers := _beside_icp(result, "held_out", name, "measured", part, "outliers"):
                 lines.append(f"{name}, key held out: outliers{where}: {outliers}")
+        if unjudged := look_up(result.metrics, "held_out", name, "unjudged"):
+            lines.append(
+                f"{name}, not judged, as the key sweep has no return there: "
+                f"{percent(unjudged['static'])} of static, {percent(unjudged['moving'])} of moving "
+                "pixels"
+            )
     return "\n".join(lines)
 
 

@@ -9,13 +9,15 @@ metrics.json. compare.json holds the fields from ``frames`` on, by method, under
     density     camera -> measured, filled: fraction of the pixels with a depth; with --prior also
                 full, and prior, the fraction that came from it
     ghosts      `densify.scores.cloud_scores.ghost_scores`: num_points, all, moving, static,
-                by_distance
+                unjudged, by_distance
     depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
                 fields of `densify.scores.depth_metrics.DepthErrors`; with --prior also full, prior
     measure     map -> z, depth along the camera's axis, or range, distance from the lens
     held_out    camera -> the same fields as depth: the key densified from its neighbours alone
                 against its own returns; curve, `densify.scores.depth_metrics.precision_density`;
-                reliability, `densify.depth.confidence.reliability`. null for the key sweep alone
+                reliability, `densify.depth.confidence.reliability`; unjudged, the fraction of the
+                filled pixels of all, moving and static surfaces near which the key sweep has no
+                return. null for the key sweep alone
     reliability where there is truth: map -> the same list against it
     expected_outliers  map -> measured, filled: the fraction of outliers that confidence expects
     baselines   the same from ``frames`` on for each simpler method on the same registration

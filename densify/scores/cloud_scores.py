@@ -17,34 +17,40 @@ from densify.geometry.types import Bool, Cloud
 _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
 
 
-def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> Bool:
-    """Return (M,) True for points of other sweeps of the window that the key sweep saw through.
+def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
+    """Return (M,) True for points of other sweeps of the window that the key sweep saw through,
+    and (M,) True for those that it cannot judge.
 
     A ghost lies in front of all that the key sweep measured in its direction and in the eight
-    around, by more than max(0.5 m, 2 % of its range); six of the nine must have a return.
+    around, by more than max(0.5 m, 2 % of its range). Of these nine directions six must have a
+    return: dark paint and panes, which give none, hide ghosts.
     """
-    ghost = np.zeros(len(cloud), bool)
+    ghost, unjudged = np.zeros((2, len(cloud)), bool)
     other = np.flatnonzero(_others(cloud, key))
-    points, velocity_m_s = cloud.points[other], cloud.velocity_m_s[other]
-    ghost[other] = key_image.sees_through(
-        points, _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED, velocity_m_s
+    margins_m = (_GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION)
+    beyond = key_image.num_beyond(
+        cloud.points[other], margins_m, _MIN_FILLED, cloud.velocity_m_s[other]
     )
-    return ghost
+    ghost[other] = (beyond >= _MIN_FILLED).any(axis=0)
+    unjudged[other] = (beyond == 0).all(axis=0)
+    return ghost, unjudged
 
 
 def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
     """Return the fraction of the other sweeps' points in the window that are `ghosts`."""
-    return _mean(ghosts(cloud, key_image, key)[_others(cloud, key)])
+    return _mean(ghosts(cloud, key_image, key)[0][_others(cloud, key)])
 
 
 def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
     """Return the rate of `ghosts` among the ``num_points`` of other sweeps of the window.
 
     It is given for ``all``, for ``moving`` and ``static`` points, by distance from the key in
-    frames (``by_distance["3"]``), and in seconds to 10 ms (``by_seconds["0.30"]``).
+    frames (``by_distance["3"]``), and in seconds to 10 ms (``by_seconds["0.30"]``). ``unjudged``:
+    the share of all, moving and static points for which the key sweep has no returns to compare.
     """
     other = np.flatnonzero(_others(cloud, key))
-    ghost, moving = ghosts(cloud, key_image, key)[other], cloud.moving[other]
+    ghost, unjudged = (found[other] for found in ghosts(cloud, key_image, key))
+    moving = cloud.moving[other]
     distance = np.abs(cloud.frame[other] - key)
     hundredths = np.rint(np.abs(cloud.since_key_ns[other]) / 1e7).astype(np.int64)
     return {
@@ -52,6 +58,11 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
         "all": _mean(ghost),
         "moving": _mean(ghost[moving]),
         "static": _mean(ghost[~moving]),
+        "unjudged": {
+            "all": _mean(unjudged),
+            "moving": _mean(unjudged[moving]),
+            "static": _mean(unjudged[~moving]),
+        },
         "by_distance": {str(steps): rate for steps, rate in _rates(ghost, distance).items()},
         "by_seconds": {f"{h / 100:.2f}": rate for h, rate in _rates(ghost, hundredths).items()},
     }
