@@ -24,9 +24,11 @@ WHEELBASE_M = {"car": 2.6, "truck": 3.4, "trailer": 8.0, "cyclist": 1.05, "walke
 DURATION_S = 16
 SPAN_S = (-1.0, DURATION_S + 1.0)  # in which poses are asked for
 _KINGPIN_M = -1.2
+_EDGE_M = 0.78  # from here up, cars lose rays as about their panes
 _PAINTS: tuple[Tint, ...] = (
     (0.92, 0.92, 0.92), (0.62, 0.64, 0.66), (0.14, 0.14, 0.16), (0.62, 0.10, 0.09),
     (0.12, 0.24, 0.52), (0.30, 0.33, 0.36), (0.20, 0.36, 0.30), (0.78, 0.66, 0.36),
+    (0.06, 0.06, 0.07),
 )  # fmt: skip
 
 
@@ -58,6 +60,11 @@ def _wheels(xs: Sequence[float], y: float, radius: float, width: float) -> list[
     ]  # fmt: skip
 
 
+def _panels(low: Float, high: Float) -> Float:
+    """(K,3) points along a lower and an upper line -> (K-1,4,3) quads between them."""
+    return np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
+
+
 def _both_sides(left: Float, material: Material, tint: Tint = WHITE) -> Mesh:
     """(K,4,3) quads on the left and their mirror images on the right."""
     right = left * [1.0, -1.0, 1.0]
@@ -82,33 +89,42 @@ def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
     top = 0.64  # half width of the roof
     cowl, screen, rear_roof = 1.05, 0.35, rear + (0.45 if estate else 0.95)
     deck = rear + (0.08 if estate else 0.45)
-    # side panels between the sill and the shoulder line
-    line = np.array([(rear, 0.62), (rear + 0.03, belt), (deck, belt), (cowl, belt),
-                     (front - 0.12, 0.74), (front, 0.60)])  # fmt: skip
-    sill = line.copy()
-    sill[:, 1] = [0.30, 0.24, 0.22, 0.22, 0.26, 0.30]
-    side = np.stack([sill[:-1], sill[1:], line[1:], line[:-1]], axis=1)
+    # side panels between the sill, the upper edge of what is painted like doors, and the shoulder
+    shoulder = np.array(
+        [
+            (rear, wide, 0.62),
+            (rear + 0.03, wide, belt),
+            (deck, wide, belt),
+            (cowl, wide, belt),
+            (front - 0.12, wide, 0.74),
+            (front, wide, 0.60),
+        ]
+    )
+    sill = shoulder * (1, 1, 0) + np.outer([0.30, 0.24, 0.22, 0.22, 0.26, 0.30], (0, 0, 1))
+    edge = np.minimum(shoulder, (np.inf, np.inf, _EDGE_M))
     # pillars and glass in turn, between shoulder line and roof
     low, high = (
         np.array([(x, y, z) for x in (a, a + 0.13 * (-0.35 - a), -0.35, -0.25,
                                       b - 0.10 * (b + 0.25), b)])
         for a, b, y, z in ((deck, cowl, wide, belt), (rear_roof, screen, top, roof))
     )  # fmt: skip
-    band = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
-    nose = [(front - 0.02, 0.28, wide), (front, 0.60, wide), (front - 0.12, 0.74, wide),
-            (cowl, belt, wide)]  # fmt: skip
-    tail = [(deck, belt, wide), (rear + 0.03, belt, wide), (rear, 0.62, wide),
-            (rear + 0.02, 0.28, wide)]  # fmt: skip
+    band = _panels(low, high)
+    nose = [(front - 0.02, 0.28, wide), (front, 0.60, wide), (front - 0.12, 0.74, wide)]
+    tail = [(rear, 0.62, wide), (rear + 0.02, 0.28, wide)]
+    boot = [(deck, belt, wide), (rear + 0.03, belt, wide), tail[0]]
     return Mesh.join([
-        _both_sides(np.insert(side, 1, wide, axis=2), Material.BODYWORK, paint),
+        _both_sides(_panels(sill, edge), Material.BODYWORK, paint),
+        _both_sides(_panels(edge, shoulder), Material.FRAME, paint),
         _across(nose, Material.BODYWORK, paint),
+        _across([nose[-1], (cowl, belt, wide)], Material.FRAME, paint),
+        _across(boot, Material.FRAME, paint),
         _across(tail, Material.BODYWORK, paint),
-        _across([(rear_roof, roof, top), (screen, roof + 0.01, top)], Material.BODYWORK, paint),
+        _across([(rear_roof, roof, top), (screen, roof + 0.01, top)], Material.FRAME, paint),
         _across([(front - 0.02, 0.24, wide), (rear, 0.24, wide)], Material.RUBBER),
-        _both_sides(band[::2], Material.BODYWORK, paint),
-        _both_sides(band[1::2], Material.GLASS),
-        _across([(cowl, belt, wide), (screen, roof, top)], Material.GLASS),
-        _across([(rear_roof, roof, top), (deck, belt, wide)], Material.GLASS),
+        _both_sides(band[::2], Material.FRAME, paint),
+        _both_sides(band[1::2], Material.GLASS, paint),
+        _across([(cowl, belt, wide), (screen, roof, top)], Material.GLASS, paint),
+        _across([(rear_roof, roof, top), (deck, belt, wide)], Material.GLASS, paint),
         _inside_and_wheels(),
         *_lights(front, rear, wide),
     ])  # fmt: skip
@@ -167,7 +183,7 @@ def truck(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
         frustum((front - 2.2, -1.22, 2.6), (front - 0.15, 1.22, 3.5), Material.BODYWORK, paint,
                 (0.85, 0.9)),
         box((front - 2.2, -1.22, 1.75), (front - 0.9, 1.22, 2.6), Material.BODYWORK, paint),
-        Mesh.quads(np.array(panes), Material.GLASS),
+        Mesh.quads(np.array(panes), Material.GLASS, paint),
         box((-3.0, -0.5, 0.7), (front - 2.2, 0.5, 1.05), Material.METAL),
         boxes([((front - 0.05, y - 0.25, 0.7), (front + 0.02, y + 0.25, 0.95))
                for y in (-0.9, 0.9)], Material.LAMP),

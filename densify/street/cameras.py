@@ -12,19 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.cameras import rays
 from densify.geometry.poses import inverse
-from densify.geometry.types import Bool, Camera, Float, Float32
+from densify.geometry.types import Camera, Float, Float32
 from densify.street.lidar import T_ego_lidar
 from densify.street.materials import (
     COLOUR,
-    GLASS_PASSES,
     GLOSS,
-    NOTHING_PASSES,
     Material,
     shade_factor,
     smooth_noise,
 )
 from densify.street.motion import Driving, poses_at
-from densify.street.world import Hits, Rays, World
+from densify.street.world import PASSES, STOPS, Hits, Optics, Rays, World
 
 # how KITTI's cameras sit: axes turned, a little off true, below and before the scanner
 _AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -102,8 +100,8 @@ _SUN = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
 @dataclass(frozen=True)
 class Picture:
     """One exposure; (H,W) everywhere. image: (H,W,3) uint8 RGB. depth_m: float32 of the nearest
-    surface as the camera's ``measure`` says, 0 where there is none within 120 m, where it is glass
-    (which has two) or the lens sees nothing. body: int32 index of the body seen, -1 sky."""
+    surface, glass included, as the camera's ``measure`` says, 0 where there is none within 120 m or
+    the lens sees nothing. body: int32 index of the body seen, -1 sky."""
 
     image: NDArray[np.uint8]
     depth_m: Float32
@@ -118,15 +116,16 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
     seen = np.flatnonzero(np.isfinite(ray[:, 0]))
     ray = ray[seen]
     cast = _in_world(ego, camera, ray, time_s, v[seen] - (h - 1) / 2)
-    hits = world.cast(cast, NOTHING_PASSES, np.zeros(len(ray)))
+    hits = world.cast(cast, lambda met: np.full(len(met.ray), STOPS))
     colour = _colours(world, cast, hits)
-    glass = np.flatnonzero(_is_glass(world, hits))
+    is_glass = world.triangles.material[hits.triangle] == Material.GLASS
+    glass = np.flatnonzero((hits.triangle >= 0) & is_glass)
     if len(glass):
         through = Rays(*(column[glass] for column in cast))
-        behind = world.cast(through, GLASS_PASSES, np.zeros(len(glass)))
+        behind = world.cast(through, through_glass(world))
         colour[glass] = 0.07 * _sky(through.direction) + 0.6 * _colours(world, through, behind)
     depth_m = hits.range_m * ray[:, 2] if camera.measure == "z" else hits.range_m
-    solid = np.isfinite(depth_m) & (depth_m <= MAX_DEPTH_M) & ~_is_glass(world, hits)
+    solid = np.isfinite(depth_m) & (depth_m <= MAX_DEPTH_M)
     image, depth = np.zeros((h * w, 3), np.uint8), np.zeros(h * w, np.float32)
     body = np.full(h * w, -1, np.int32)
     image[seen] = np.rint(255 * np.clip(colour, 0, 1) ** (1 / 2.2)).astype(np.uint8)
@@ -143,8 +142,10 @@ def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Floa
     return Rays(origin, poses.turn(ray @ T_ego_cam[:3, :3].T), time)
 
 
-def _is_glass(world: World, hits: Hits) -> Bool:
-    return (hits.triangle >= 0) & (world.triangles.material[hits.triangle] == Material.GLASS)
+def through_glass(world: World) -> Optics:
+    """Light passes the glass of vehicles and nothing else."""
+    is_glass = world.triangles.material == Material.GLASS
+    return lambda met: np.where(is_glass[met.triangle], PASSES, STOPS)
 
 
 def _colours(world: World, rays: Rays, hits: Hits) -> Float:
@@ -167,7 +168,7 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
     point = rays.origin[rows] + direction * range_m + 0.015 * normal
     shadow_rays = Rays(point[sunny], np.tile(_SUN, (len(sunny), 1)), rays.time_s[rows[sunny]])
     lit = np.zeros(len(rows))
-    lit[sunny] = ~np.isfinite(world.cast(shadow_rays, GLASS_PASSES, np.zeros(len(sunny))).range_m)
+    lit[sunny] = ~np.isfinite(world.cast(shadow_rays, through_glass(world)).range_m)
     sun = 1.15 * (lit * towards_sun)[:, None] * np.array([1.0, 0.95, 0.86])
     ambient = (0.34 + 0.16 * normal[:, 2:]) * np.array([0.88, 0.95, 1.08])
     mirrored = direction - 2 * np.einsum("ni,ni->n", direction, normal)[:, None] * normal

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.poses import rotate, transform
 from densify.geometry.types import Bool, Float, Float32, Int
-from densify.street.materials import LASER_PASSES, REFLECTIVITY
+from densify.street.materials import REFLECTIVITY
 from densify.street.mesh import across, lengths
 from densify.street.motion import Driving, poses_at
+from densify.street.returns import laser, share_lost
 from densify.street.sensors import Sensor, firings
 from densify.street.world import Hits, Rays, World
 
@@ -72,14 +73,13 @@ def scan(
     beams = (np.repeat(column, len(_SPOT), axis=0) for column in (origin, times))
     echoes = world.cast(
         Rays(next(beams), spot.reshape(-1, 3), next(beams)),
-        LASER_PASSES, luck.ravel(), len(_SPOT), 2 * _SPOT_RAD,
+        laser(world, luck.ravel()), len(_SPOT), 2 * _SPOT_RAD,
     )  # fmt: skip
     range_m, hit, edge = _echo(echoes, spot, rng)
-    tint = world.triangles.tint[hit.triangle].mean(axis=1)
-    reflectivity = REFLECTIVITY[world.triangles.material[hit.triangle]] * (0.6 + 0.4 * tint)
+    material, tint = world.triangles.material[hit.triangle], world.triangles.tint[hit.triangle]
+    reflectivity = REFLECTIVITY[material] * (0.6 + 0.4 * tint.mean(axis=1))
     grazing = np.abs(np.einsum("ni,ni->n", hit.normal, spot[:, 0]))
-    signal = reflectivity * np.sqrt(grazing) * (60.0 / np.maximum(range_m, 5.0)) ** 2
-    heard = 0.995 * (1 - np.exp(-8.0 * signal)) * np.where(edge, 0.85, 1.0)
+    heard = (1 - share_lost(material, tint, range_m)) * np.where(edge, 0.85, 1.0)
     keep = np.isfinite(range_m) & (rng.random(n) < heard)
     range_m = np.where(keep, range_m, 0.0)
     range_m += sensor.each("range_sigma_m")[fired.lidar] * rng.normal(size=n)

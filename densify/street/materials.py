@@ -13,16 +13,14 @@ from densify.geometry.types import Float, Int
 
 
 class Material(IntEnum):
-    """colour: of the surface. reflectivity: at 905 nm. passes: probability that a laser ray goes
-    through. gloss: share of the sky that it mirrors."""
+    """colour: of the surface. reflectivity: at 905 nm. gloss: share of the sky that it mirrors."""
 
     def __new__(
-        cls, colour: tuple[float, float, float], reflectivity: float, passes: float = 0.0,
-        gloss: float = 0.0,
-    ) -> Material:  # fmt: skip
+        cls, colour: tuple[float, float, float], reflectivity: float, gloss: float = 0.0
+    ) -> Material:
         material = int.__new__(cls, len(cls.__members__))
         material._value_ = len(cls.__members__)
-        material.row = (*colour, reflectivity, passes, gloss)
+        material.row = (*colour, reflectivity, gloss)
         return material
 
     row: tuple[float, ...]
@@ -34,25 +32,24 @@ class Material(IntEnum):
     BRICK = (0.56, 0.27, 0.20), 0.42
     PLASTER = (0.80, 0.76, 0.66), 0.60
     ROOF = (0.42, 0.20, 0.15), 0.30
-    PANE = (0.16, 0.20, 0.25), 0.08, 0.0, 0.25  # of a house: dark, nothing passes
+    PANE = (0.16, 0.20, 0.25), 0.08, 0.25  # of a house: dark, nothing passes
     WOOD = (0.45, 0.33, 0.21), 0.45
     METAL = (0.52, 0.54, 0.56), 0.55
     BARK = (0.30, 0.23, 0.17), 0.35
-    LEAF = (0.22, 0.36, 0.12), 0.45, 0.45
-    BODYWORK = (0.90, 0.90, 0.90), 0.55, 0.0, 0.06
-    GLASS = (0.10, 0.13, 0.15), 0.10, 0.88  # of a vehicle
+    LEAF = (0.22, 0.36, 0.12), 0.45
+    BODYWORK = (0.90, 0.90, 0.90), 0.55, 0.06
+    GLASS = (0.10, 0.13, 0.15), 0.10  # of a vehicle
     RUBBER = (0.06, 0.06, 0.06), 0.08
     CLOTH = (0.90, 0.90, 0.90), 0.40
     SKIN = (0.78, 0.58, 0.46), 0.50
     LAMP = (0.95, 0.93, 0.85), 0.90
     UPHOLSTERY = (0.16, 0.15, 0.15), 0.20
     CONCRETE = (0.62, 0.61, 0.58), 0.45
+    FRAME = (0.90, 0.90, 0.90), 0.55, 0.06  # bodywork around and above panes
 
 
 _ROWS: Float = np.array([m.row for m in Material])
-COLOUR, (REFLECTIVITY, LASER_PASSES, GLOSS) = _ROWS[:, :3], _ROWS[:, 3:].T
-NOTHING_PASSES: Float = np.zeros(len(Material))
-GLASS_PASSES: Float = np.where(np.arange(len(Material)) == Material.GLASS, 1.0, 0.0)
+COLOUR, (REFLECTIVITY, GLOSS) = _ROWS[:, :3], _ROWS[:, 3:].T
 
 
 def noise(i: Int, j: Int) -> Float:

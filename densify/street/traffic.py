@@ -127,7 +127,8 @@ def assemble(scenery: Scenery, parts: Sequence[Mesh], traffic: Traffic) -> Scene
     static = Body(Mesh.join([*parts, *scenery.meshes]), Still())
     bodies = [static, *(body for actor in traffic.actors for body in actor.bodies)]
     footprints = Rectangles.joined(scenery.footprints)
-    return Scene(World(bodies), scenery.ground, traffic.ego, tuple(traffic.actors), footprints)
+    world = World(bodies, int(scenery.rng.integers(2**31)))
+    return Scene(world, scenery.ground, traffic.ego, tuple(traffic.actors), footprints)
 
 
 def jitter(rng: np.random.Generator, share: float = 0.15) -> float:

@@ -8,7 +8,7 @@ imports Embree.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, NamedTuple
@@ -16,12 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.geometry.types import Float, Int
+from densify.geometry.types import Bool, Float, Int
 from densify.street.mesh import Mesh, across, lengths
 from densify.street.motion import Still, Trajectory, poses_at
 
 _STEP_M = 2e-3  # from a surface passed to where the ray goes on
-_GOLDEN = 0.6180339887498949
 _MAX_LAYERS = 8  # of glass and leaves that one ray passes
 
 
@@ -46,12 +45,32 @@ class Rays(NamedTuple):
 class Hits(NamedTuple):
     """The hits of N rays. range_m: (N,), inf where nothing. triangle: (N,) index over all bodies'
     triangles, -1 nothing. barycentric: (N,2) as in ``(1-u-v) a + u b + v c``. normal: (N,3) of
-    that triangle, world axes, either side."""
+    that triangle, world axes, either side. absorbed: (N,) True where the ray ends there and does
+    not come back; its range is inf."""
 
     range_m: Float
     triangle: Int
     barycentric: Float
     normal: Float
+    absorbed: Bool
+
+
+class Meeting(NamedTuple):
+    """K rays that meet a surface. ray: (K,) their numbers. triangle: (K,). place: (K,3) in the
+    body's frame. cosine: (K,) of the angle of incidence. inside: (K,) True where the last surface
+    that the ray passed was of the same object. layer: how many surfaces the rays have passed."""
+
+    ray: Int
+    triangle: Int
+    place: Float
+    cosine: Float
+    inside: Bool
+    layer: int
+
+
+STOPS, PASSES, ABSORBED = range(3)
+Optics = Callable[[Meeting], Int]
+"""Returns for each of K meetings (K,) whether the ray stops there, passes or is absorbed."""
 
 
 class Triangles:
@@ -81,10 +100,10 @@ class Triangles:
 
 
 class World:
-    """All bodies; body 0 stands still."""
+    """All bodies; body 0 stands still. seed: of what is random about their surfaces."""
 
-    def __init__(self, bodies: Sequence[Body]) -> None:
-        self.bodies = tuple(bodies)
+    def __init__(self, bodies: Sequence[Body], seed: int = 0) -> None:
+        self.bodies, self.seed = tuple(bodies), seed
 
     @cached_property
     def triangles(self) -> Triangles:
@@ -92,30 +111,29 @@ class World:
         scene takes."""
         return Triangles(self.bodies)
 
-    def cast(
-        self, rays: Rays, passes: Float, luck: Float, num_together: int = 1, spread: float = 0.0
-    ) -> Hits:
-        """The first surface that stops each ray.
+    def cast(self, rays: Rays, optics: Optics, num_together: int = 1, spread: float = 0.0) -> Hits:
+        """The first surface that each ray does not pass.
 
-        passes: (num materials,) probability that a surface lets the ray through. luck: (N,) in
-        [0, 1), the ray's own random number. num_together: rays in a row that share origin and time
-        and differ from the first of them by at most ``spread`` rad.
+        num_together: rays in a row that share origin and time and differ from the first of them by
+        at most ``spread`` rad.
         """
-        best = self._cast_body(0, rays.origin, rays.direction, passes, luck)
+        every = np.arange(len(rays.time_s))
+        best = self._cast_body(0, rays.origin, rays.direction, every, optics)
         for index, near in self._near(Rays(*(c[::num_together] for c in rays)), spread):
             rows = (near[:, None] * num_together + np.arange(num_together)).ravel()
             trajectory, time_s = self.bodies[index].trajectory, rays.time_s[rows]
             origin, direction = rays.origin[rows], rays.direction[rows]
             if isinstance(trajectory, Still):
-                found = self._cast_body(index, origin, direction, passes, luck[rows])
+                found = self._cast_body(index, origin, direction, rows, optics)
             else:
                 poses = poses_at(trajectory, time_s)
                 ray = poses.undo(origin), poses.unturn(direction)
-                found = self._cast_body(index, *ray, passes, luck[rows])
+                found = self._cast_body(index, *ray, rows, optics)
                 found = found._replace(normal=poses.turn(found.normal))
             nearer = np.flatnonzero(found.range_m < best.range_m[rows])
             for column, new in zip(best, found, strict=True):
                 column[rows[nearer]] = new[nearer]
+        best.range_m[best.absorbed] = np.inf
         return best
 
     def _near(self, rays: Rays, spread: float) -> Iterator[tuple[int, Int]]:
@@ -136,32 +154,38 @@ class World:
                 yield index, rows
 
     def _cast_body(
-        self, index: int, origin: Float, direction: Float, passes: Float, luck: Float
+        self, index: int, origin: Float, direction: Float, number: Int, optics: Optics
     ) -> Hits:
-        """origin, direction: in the body's frame. Distances are to the triangle's plane, in double
-        precision."""
-        surfaces, first = self.triangles, self.triangles.first[index]
-        n = len(origin)
-        hits = Hits(np.full(n, np.inf), np.full(n, -1), np.zeros((n, 2)), np.zeros((n, 3)))
-        rows, begin, luck = np.arange(n), np.zeros(n), luck.copy()
-        for _ in range(_MAX_LAYERS):
+        """origin, direction: in the body's frame. number: (N,) of the rays. Distances are to the
+        triangle's plane, in double precision, also where a ray is absorbed."""
+        surfaces, first, n = self.triangles, self.triangles.first[index], len(origin)
+        hits = Hits(
+            np.full(n, np.inf), np.full(n, -1), np.zeros((n, 2)), np.zeros((n, 3)),
+            np.zeros(n, bool),
+        )  # fmt: skip
+        rows, begin, passed = np.arange(n), np.zeros(n), np.full(n, -1, np.int32)
+        for layer in range(_MAX_LAYERS):
             ray = direction[rows]
             start = origin[rows] + begin[rows, None] * ray
             triangle, barycentric = _first_hit(surfaces.scenes[index], start, ray)
             met = np.flatnonzero(triangle >= 0)
-            rows, triangle = rows[met], triangle[met] + first
+            rows, triangle, ray = rows[met], triangle[met] + first, ray[met]
             if not len(rows):
                 break
-            normal = surfaces.normal[triangle]
+            normal, instance = surfaces.normal[triangle], surfaces.instance[triangle]
             to_plane = np.einsum("ni,ni->n", surfaces.corner[triangle] - origin[rows], normal)
-            distance = to_plane / np.einsum("ni,ni->n", ray[met], normal)
-            stops = luck[rows] >= passes[surfaces.material[triangle]]
-            stopped = distance, triangle, barycentric[met], normal
-            for column, new in zip(hits, stopped, strict=True):
-                column[rows[stops]] = new[stops]
-            rows = rows[~stops]
-            begin[rows] = distance[~stops] + _STEP_M
-            luck[rows] = (luck[rows] + _GOLDEN) % 1.0
+            facing = np.einsum("ni,ni->n", ray, normal)
+            distance = to_plane / facing
+            place = origin[rows] + distance[:, None] * ray
+            inside = (instance >= 0) & (instance == passed[rows])
+            meeting = Meeting(number[rows], triangle, place, np.abs(facing), inside, layer)
+            outcome = optics(meeting)
+            ends, goes_on = outcome != PASSES, outcome == PASSES
+            ended = distance, triangle, barycentric[met], normal, outcome == ABSORBED
+            for column, new in zip(hits, ended, strict=True):
+                column[rows[ends]] = new[ends]
+            rows = rows[goes_on]
+            begin[rows], passed[rows] = distance[goes_on] + _STEP_M, instance[goes_on]
         return hits
 
 
