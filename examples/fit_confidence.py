@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 import densify
-from densify.bench.depth import exact_truth
 from densify.config import resolve
 from densify.depth import confidence as scale
 from densify.scores.depth_metrics import is_outlier_depth
@@ -56,9 +55,8 @@ def evidence(text, window, changes):
     if sequence.truth is None:
         raise SystemExit(f"{spec}: no exact truth; expected a simulated recording")
     result = densify.run(sequence, int(key), window, config=config)
-    truths = exact_truth(sequence, sequence[int(key)], int(key), None, config)
     for camera, maps in result.depth.items():
-        known_m, found = truths[camera].depth_m, maps.ranked
+        known_m, found = result.truth_m[camera], maps.ranked
         shown = maps.filled_m > 0
         compared = shown & (known_m > 0)
         bad = compared.copy()
