@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -20,10 +21,12 @@ from densify.geometry.types import Result
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import densify as densify_key
 from densify.readers import open_sequence
+from densify.scores.depth_metrics import depth_scores
 
 TABLE = Path(__file__).with_name("gate.yaml")
 DRIVE = "kitti/2011_09_26/2011_09_26_drive_0013_sync"
 KEY, WINDOW, CAMERA = 120, 5, "image_02"
+STEREO_BASELINE_M = 0.532725  # of the drives of 2011_09_26
 RECORDINGS = {"street": "street", "street:crossing": "street:crossing", "drive 0013": DRIVE}
 
 TOLERANCE = {
@@ -69,9 +72,9 @@ def flow_figures(recording: Recording) -> dict[str, float]:
     }
 
 
-def densified(spec: str, *methods: str) -> tuple[Recording, dict[str, Result]]:
-    recording = Recording(open_sequence(spec), resolve(None), WINDOW, [KEY], looks_around=True)
-    return recording, densify_key(recording, KEY, methods, [CAMERA])
+def densified(spec: str, *methods: str, key: int = KEY) -> tuple[Recording, dict[str, Result]]:
+    recording = Recording(open_sequence(spec), resolve(None), WINDOW, [key], looks_around=True)
+    return recording, densify_key(recording, key, methods, [CAMERA])
 
 
 def figures(recording: Recording, results: dict[str, Result]) -> dict[str, float]:
@@ -119,6 +122,28 @@ def test_a_real_drive(drive) -> None:
     assert cloud.rigid_points.tobytes() == rigid.tobytes()
     density = {m: r.metrics["density"]["image_02"]["measured"] for m, r in results.items()}
     assert density["flow"] > 2 * density["none"]
+
+
+def test_a_near_dark_car_is_solid(test_data) -> None:
+    """Truth on what moves: disparity of KITTI's stereo benchmark with whole models of its cars."""
+    place = test_data / "kitti_stereo"
+    drive, truth = place / Path(DRIVE).relative_to("kitti"), place / "truth"
+    true_px = cv2.imread(str(truth / "frame10_disparity.png"), cv2.IMREAD_UNCHANGED) / 256
+    moving = cv2.imread(str(truth / "frame10_objects.png"), cv2.IMREAD_UNCHANGED) > 0
+    recording, results = densified(str(drive), "flow", key=10)
+    camera = recording.sequence.cameras[CAMERA]
+    disparity_m_px = camera.focal_px * STEREO_BASELINE_M
+    true_m = np.divide(disparity_m_px, true_px, out=np.zeros_like(true_px), where=true_px > 0)
+    scores = depth_scores(results["flow"].depth[CAMERA], true_m.astype(np.float32), moving, camera)
+    for product, part, most_outliers, least_coverage in (
+        ("filled", "moving", 0.02, 0.95),
+        ("measured", "moving", 0.02, 0.35),
+        ("filled", "all", 0.01, 0.93),
+        ("filled", "static", 0.0045, 0.92),
+        ("measured", "static", 0.002, 0.78),
+    ):
+        score = scores[product][part]
+        assert score["outliers"] < most_outliers and score["coverage"] > least_coverage
 
 
 def main() -> None:
