@@ -120,11 +120,7 @@ _CHECKS: dict[str, Check] = {
     "row_time_s": _NUMBER,
     "clock_offset_s": _NUMBER,
 }
-<<<<<<< HEAD
 """Every key that is no text, with the check of its value."""
-=======
-"""Which value each key that is no text has."""
->>>>>>> 00dae9e (x)
 
 
 @dataclass(frozen=True)
