@@ -151,7 +151,7 @@ def test_what_is_behind_a_closed_window_does_not_contradict_it():
     open_ = gapped(filled_m, depth_m)
     share = scale.contradicted(open_, FOCAL_PX)
     assert share[window].min() > 0.7
-    closed = replace(open_, window=window)
+    closed = replace(open_, solid=window)
     of_closed = scale.contradicted(closed, FOCAL_PX)
     assert not of_closed[window].any()
     assert np.array_equal(of_closed[~window], share[~window])

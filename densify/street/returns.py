@@ -41,9 +41,9 @@ _PASSES = 0.01 * np.array(
 )
 _PATCH_M = 0.7  # in which most rays share their fate: a pane, half a door
 # Share of pulses that are lost elsewhere, by range: gaps in the rings of KITTI's drives 0013 and
-# 0002 (HDL-64E) between returns of one surface; the road beyond 35 m: straight ahead of the car.
+# 0002 (HDL-64E) between returns of one surface. Beyond 35 m the ground loses more than measured.
 _RANGE_M = (5.0, 14.0, 27.0, 45.0, 75.0, 110.0)
-_GROUND_LOST = (0.003, 0.004, 0.009, 0.09, 0.18, 0.33)
+_GROUND_LOST = (0.003, 0.004, 0.009, 0.4, 0.7, 0.9)
 _DARK_LOST = (0.03, 0.10, 0.12, 0.10, 0.13, 0.20)  # reflectance below 0.1, upright
 _OTHER_LOST = (0.001, 0.003, 0.007, 0.012, 0.06, 0.15)
 _DARK = 0.1

@@ -86,7 +86,7 @@ class Bodies:
             )
 
 
-VERSION = 5  # raise it whenever the same frame would come out differently
+VERSION = 6  # raise it whenever the same frame would come out differently
 EPOCH_NS = 1_781_258_400_000_000_000  # 2026-06-12 10:00:00 UTC, frame 0
 _MOVING_M, _MOVING_S = 0.05, 0.5
 
