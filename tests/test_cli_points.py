@@ -43,7 +43,7 @@ def test_flow_between_two_files(tmp_path: Path, capsys: pytest.CaptureFixture[st
         ("nan.npy", np.array([[1, 2, 3], [1, np.nan, 3]]), "1 of 2 points are not finite"),
         ("objects.npy", np.array([[{}, {}, {}]], dtype=object), "Object arrays"),
         ("garbage.npz", b"no zip", "not a readable .npz"),
-        ("cloud.stl", b"solid", "got .stl, expected one of .npy, .npz, .txt, .csv, .bin, .pcd"),
+        ("cloud.stl", b"solid", "got .stl, expected one of .pcd, .bin, .ply"),
     ],
 )
 def test_bad_point_files(name, content, part, tmp_path: Path, capsys) -> None:

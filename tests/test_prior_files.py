@@ -173,7 +173,7 @@ def test_a_prior_changes_nothing_of_what_is_measured_or_filled(runs, tmp_path):
 def test_the_priors_pixels_are_scored_by_themselves(runs):
     full, scores = runs.full.full["front"], runs.full.metrics["depth"]["front"]
     known = runs.true_m > 0
-    assert full.share > 0.1 and full.fit.used
+    assert full.from_prior.mean() > 0.1 and full.fit.used
     assert scores["prior"]["all"]["num_compared"] == (full.from_prior & known).sum()
     assert scores["prior"]["all"]["outliers"] < 0.02
     assert scores["full"]["all"]["coverage"] > scores["filled"]["all"]["coverage"] + 0.1

@@ -28,7 +28,7 @@ from densify.readers.street import Street
 from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
 from tests.test_point_files import write_pcd
 
-FRAMES, CAMERA = (59, 60, 61), "image_02"
+FRAMES, CAMERA = (39, 40, 41), "image_02"
 
 
 @pytest.fixture(scope="module")

@@ -241,7 +241,7 @@ def test_of_two_sweeps_the_pair_alone_tells_what_moves() -> None:
     """A track shows itself in three."""
 
     class Two:
-        frames = (80, 81)
+        frames = (100, 101)
 
         def __getattr__(self, name):
             return getattr(simulated, name)
@@ -251,13 +251,13 @@ def test_of_two_sweeps_the_pair_alone_tells_what_moves() -> None:
 
     simulated = Street("street", 4711, "dual32", cameras=())
     recording = Recording(Two(), Config(), 1)
-    assert recording.is_pair(80)
-    found = recording.step(80)
-    field, row = found.steps[80, 81], found.stretch[80].sweep.row
-    true_m = simulated.truth.displacement(80, 81)[row]
+    assert recording.is_pair(100)
+    found = recording.step(100)
+    field, row = found.steps[100, 101], found.stretch[100].sweep.row
+    true_m = simulated.truth.displacement(100, 101)[row]
     moves = np.linalg.norm(true_m, axis=1) > 0.05
     assert np.mean(field.moving[moves]) > 0.85 and field.moving[~moves].sum() < 10
     off_m = np.linalg.norm(field.displacement - true_m, axis=1)
     assert off_m[moves].mean() < 0.08 and off_m[moves & field.moving].mean() < 0.03
-    told = pipeline.run(Two(), 80, 1, config={"accumulate": {"far_m": 0}}).warnings
+    told = pipeline.run(Two(), 100, 1, config={"accumulate": {"far_m": 0}}).warnings
     assert any("two sweeps" in warning for warning in told)
