@@ -43,7 +43,7 @@ _PRIOR = 0.05  # rays that end on the body, assumed everywhere
 _WHOLE = 0.8  # share of its front at which a body is closed as a whole, as a car is
 _LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # rays that end on it: a third do at a pane
 _VOTES_OF_WHOLE, _VOTES_OF_OPEN = 0.75, 0.97  # along the outline
-_DEEP_M = 0.6  # behind the front of the hull lie seats and the far side
+_DEEP_M = 0.6  # farther behind the front of the hull lie seats, axles and the far side
 _STIFF, _HELD = 3.0, 0.01  # weights of a smooth and of a small offset, against one return
 _AGREES = 2.0  # times what two static points of a surface may deviate
 _BEFORE_M, _BEFORE_FRACTION = 0.3, 0.02  # nearer by both added: it hides the body
@@ -54,7 +54,8 @@ class MovingBody(NamedTuple):
 
     corners: (V,3) of its convex hull. velocity_m_s: (3,). entries: (K,3) where rays enter the hull.
     ends: (K,) True if the ray ends on the object, False if it goes through. weight: (K,) of the
-    ray: less long before or after the key, and where it passes just below the surface of the hull.
+    ray: less long before or after the key, and where it passes just below the surface of the hull;
+    0 where it ends on the object, but far behind the front: at wheels, below a trailer.
     """
 
     corners: Float
@@ -178,6 +179,7 @@ class _Sweep(NamedTuple):
         ends = part.moving & (part.instance == instance)
         weight = np.exp(-abs(part.since_key_ns) * 1e-9 / _LIMBS_S)
         weight[~ends] *= 1 - np.exp(-0.5 * (np.maximum(below_m[~ends], 0) / _POSE_M) ** 2)
+        weight[ends & ((1 - enter) * np.linalg.norm(way, axis=1) > _DEEP_M)] = 0
         return _Met(start + enter[:, None] * way, ends, weight)
 
     def _toward(self, corners: Float) -> Bool:
