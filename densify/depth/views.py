@@ -45,7 +45,7 @@ _BEHIND_M, _BEHIND_FRACTION = 0.15, 0.02  # the map's surface; a point farther b
 
 
 class SeenCloud(NamedTuple):
-    """A cloud with its patches, and the bodies of what moves, by instance."""
+    """A cloud with its patches, and the bodies of its moving objects, by instance."""
 
     cloud: Cloud
     patches: Patches
@@ -116,7 +116,7 @@ class Views:
         )
 
     def bodies(self, cloud: Cloud) -> dict[int, MovingBody]:
-        """Return the bodies of what moves, from all the points of the window."""
+        """Return the bodies of moving objects by instance. cloud: all the points of the window."""
         return moving_bodies(cloud, self.rays)
 
     def far(

@@ -63,7 +63,7 @@ def with_baselines(method: str) -> tuple[str, ...]:
 
 
 def looks_around(methods: Sequence[str]) -> bool:
-    """Return True if one of the methods finds what moves."""
+    """Return True if one of the methods finds moving objects."""
     return any(METHODS[name].engine is not None for name in methods if name in METHODS)
 
 
