@@ -66,12 +66,16 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
 
 
 def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
-    """Remove what killed processes left aside anywhere under a folder, if it is older than that,
-    because other processes may be writing there; 0 where none does."""
-    with suppress(OSError):  # others may finish theirs meanwhile
-        for hidden in [place for place in root.rglob(".*.tmp") if place.is_dir()]:
-            if time.time() - hidden.stat().st_mtime >= age_s:
-                shutil.rmtree(hidden)
+    """Remove the hidden folders that killed processes left anywhere under `root`.
+
+    A folder younger than `age_s` seconds stays, as another process may be writing there.
+    """
+    for folder, names, _ in os.walk(root):  # passes over what others remove meanwhile
+        for name in names:
+            hidden = Path(folder, name)
+            with suppress(OSError):
+                if hidden.match(".*.tmp") and time.time() - hidden.stat().st_mtime >= age_s:
+                    shutil.rmtree(hidden)
 
 
 @contextmanager
