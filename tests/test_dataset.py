@@ -45,11 +45,6 @@ CHEAP = (*OPTIONS, "--method", "none")
 GIVEN = {"register": {"source": "dataset"}}
 
 
-def num_files(folder: Path, suffix: str) -> int:
-    """Count the files with that suffix while another process writes and removes there."""
-    return sum(name.endswith(suffix) for _, _, names in os.walk(folder) for name in names)
-
-
 def times(out: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in out.rglob("*.png")}
 
@@ -93,7 +88,8 @@ def test_shards_workers_and_a_killed_run_make_what_one_makes(
     arguments = ["--data", border_drive, *OPTIONS, "--out", out]
     with command(*arguments, "--shard", "1/2", "--workers", "2") as process:
         end = time.monotonic() + PATIENCE_S
-        while num_files(out, ".png") < 9 and process.poll() is None:
+        while not any('"done"' in p.read_text() for p in out.glob("manifest*.jsonl")):
+            assert process.poll() is None
             assert time.monotonic() < end
             time.sleep(0.002)
         os.killpg(process.pid, signal.SIGKILL)
