@@ -25,6 +25,7 @@ if NUM_PROCESSES > 1:  # libraries read it when imported: the tests' own modules
 
 from tests.command import exit_code  # noqa: E402
 from tests.dataset_scenes import OPTIONS, across_border, write_drive  # noqa: E402
+from tests.recorded import broken, copied, excerpt, recorded, written  # noqa: E402, F401
 
 # No test depends on how busy the machine is.
 hypothesis.settings.register_profile("densify", deadline=None)

@@ -52,13 +52,13 @@ class SmallClips(ClipMaker):
         return clip(number, self.seed)
 
 
-def train_small(out: str, resume: bool = False, **options) -> list[Path]:
-    """`train` on small clips in this process, with a checkpoint after every third step."""
+def train_small(out: str, **options) -> Path:
+    """`train` on small clips in this process."""
     training = densify.learning.training
     before, training.ClipMaker = training.ClipMaker, SmallClips
     try:
-        options = {"teacher": "truth", "checkpoint_steps": 3, **options}
-        settings = training.Training(("streets",), **options)
-        return training.train(settings, Path(out), resume).files
+        settings = training.Training(("streets",), **{"teacher": "truth", **options})
+        training.train(settings, Path(out))
+        return Path(out)
     finally:
         training.ClipMaker = before

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
 
 import numpy as np
 import pytest
@@ -14,12 +13,6 @@ from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.geometry.types import LidarSequence
 from densify.readers import open_sequence
-from densify.readers.street import Street
-from densify.scores.depth_metrics import DepthErrors, depth_errors
-from tests.scenes import by_flow
-
-"""Knobs of the projection for tests that look at what is measured: filling takes most of the time,
-and changes nothing of it."""
 
 
 def check_sweeps(
@@ -108,39 +101,6 @@ def check_truth(sequence: LidarSequence, excerpt: Excerpt) -> None:
         still = ~true.moving[sweep.row]
         flow = truth.displacement(number, 0)[sweep.row]
         assert not flow[still].any() or np.linalg.norm(flow[still], axis=1).max() < 0.06
-
-
-def check_depth(
-    sequence: LidarSequence, excerpt: Excerpt, worse: float = 0.03, name: str | None = None
-) -> None:
-    """The middle sweep, densified with its neighbours and the recorded poses, has the depth that
-    the street itself gives: as many pixels and errors to the share ``worse``. name: what the format
-    calls the street's first camera."""
-    own, middle = excerpt.cameras[0], len(excerpt.frames) // 2
-    read = depth_score(sequence, middle, name or own)
-    true = street_score(excerpt.street.name, excerpt.frames[middle], own)
-    assert true.num_compared > 5_000
-    assert abs(read.num_compared / true.num_compared - 1) < worse, (read, true)
-    assert read.mae_m < (1 + worse) * true.mae_m and read.rmse_m < (1 + 2 * worse) * true.rmse_m
-
-
-def depth_score(recording: LidarSequence, key: int, camera: str) -> DepthErrors:
-    """Of the map of a key that is densified with one neighbour to either side."""
-    # The excerpt ends where the street goes on: nothing from beyond the window.
-    config = {
-        "register": {"source": "dataset"},
-        "accumulate": {"far_m": 0},
-        "project": {"fill_reach": 0.1},
-    }
-    result = by_flow(recording, key, 1, [camera], config)
-    depth_m, true_m = result.depth[camera].depth_m, recording.truth.depth_m(camera, key)
-    return depth_errors(depth_m, true_m, focal_px=recording.cameras[camera].focal_px)
-
-
-@cache
-def street_score(name: str, key: int, camera: str) -> DepthErrors:
-    """The same of the street itself, which several formats are written of."""
-    return depth_score(Street.from_spec(name), key, camera)
 
 
 def check_refused(spec: object, says: str, place: object = "", frame: int = 0) -> None:

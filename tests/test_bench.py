@@ -77,14 +77,13 @@ def test_depth_counts_are_those_of_an_image_of_truth():
     assert found["bare"]["density"]["measured"] != found["usual"]["density"]["measured"]
 
 
-@pytest.mark.parametrize(("off_m", "wrong"), [(0.0, (0, 0.02)), (2.5, (0.7, 1))])
-def test_the_scanner_held_out_is_the_truth_and_not_in_the_maps(off_m, wrong):
+def test_the_scanner_held_out_is_the_truth_and_not_in_the_maps():
     sequence = TwoScanners(one_car().scene, range(7))
-    sequence.off_m = off_m
+    sequence.off_m = 2.5
     found = bench_depth(sequence, [KEY], 2, {"usual": CONFIG}, scanner=1)["variants"]["usual"]
     score = found["scores"]["scanner"]["filled"]["all"]
     assert score["num_pixels"] > 500 and score["coverage"] > 0.5
-    assert wrong[0] <= score["outliers"] <= wrong[1]
+    assert score["outliers"] > 0.7
     assert found["scores"]["truth"]["measured"]["all"]["outliers"] < 0.02
 
 
@@ -115,13 +114,6 @@ def test_methods_of_flow_do_what_they_are_for(measured):
     assert rows["paper"]["step"]["background_m"] > 0  # every point moves
     for n, error_m in ours["window"]["found_movers_m_by_hops"].items():
         assert error_m <= ours["window"]["movers_m_by_hops"][n] + 1e-9
-
-
-def test_without_truth_seconds_and_ghosts_are_left():
-    found = bench_flow(tiny(with_truth=False), 4, 1, CONFIG, ("ours",))["methods"]["ours"]
-    assert set(found["step"]) == {"called_moving"} and found["seconds_per_pair"] > 0
-    assert list(found["window"]) == ["ghost_rate"]
-    assert found["challenge"] is None
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.bench.paper import METHODS, bench_paper
-from densify.bench.paper_pairs import (
+from densify.bench.paper import (
+    METHODS,
+    bench_paper,
     has_truth,
     pair_of_recording,
     pairs_of_files,
@@ -18,8 +19,7 @@ from densify.bench.paper_pairs import (
 )
 from densify.cli import main
 from densify.config.errors import InputError
-from densify.learning.model_file import Model, write_model
-from densify.learning.network import build
+from densify.learning.network import Model, build, write_model
 from densify.readers.street import Street
 from tests.writers import write_street
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from densify.readers.true_flow import CATEGORIES
+from densify.readers.flow_files import CATEGORIES
 from densify.scores.challenge import CLASSES, IGNORED, ChallengeScorer
 
 NAMES = ("NONE", *CATEGORIES)

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import pytest
 
 from densify.outputs import plots
 from densify.outputs.key_outputs import Context
@@ -62,16 +61,3 @@ def test_the_curves_of_a_result_are_of_all_cameras_and_methods(tmp_path) -> None
 def test_without_a_held_out_key_there_is_no_curve(tmp_path) -> None:
     plots.write_curve(result_of("none", held_out=None), Context({}, "street"), tmp_path)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("num_steps", [0, 1, 300])
-def test_losses_with_their_running_median(num_steps: int) -> None:
-    losses = np.geomspace(2, 0.1, num_steps)
-    losses[::7] *= 3
-    (axes,) = plots.draw_losses(losses, "teacher objective").axes
-    assert axes.get_yscale() == "log" and axes.get_title() == "teacher objective"
-    assert len(axes.lines) == (2 if num_steps else 0)
-    if num_steps > 1:
-        dots, median = (np.asarray(line.get_ydata()) for line in axes.lines)
-        np.testing.assert_array_equal(dots, losses)
-        assert (np.diff(median[20:-20]) <= 1e-9).all()  # no outlier of the losses is left

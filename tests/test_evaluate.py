@@ -115,16 +115,6 @@ def test_of_our_output_one_product_and_nothing_beside_it(tmp_path: Path) -> None
     assert both == (DepthPair(filled_map, depth),)
 
 
-def test_the_ground_truth_of_a_whole_kitti_tree(tmp_path: Path) -> None:
-    truth = put(official(tmp_path / "t", 5))
-    put(tmp_path / "t" / DRIVE / "proj_depth" / "velodyne_raw" / "image_02" / "0000000005.png")
-    put(tmp_path / "t" / DRIVE / "image_02" / "data" / "0000000005.png")  # the photograph
-    found = put(own(tmp_path / "out", 5))
-    pairs = pair_depth_files(tmp_path / "out", tmp_path / "t")
-    assert pairs == type(pairs)((DepthPair(found, truth),))
-    assert "velodyne_raw" in refusal(tmp_path / "t", tmp_path / "t")
-
-
 def tree(root: Path, drive: str, product: str, frame: int, camera: str = "front") -> Path:
     return root / drive / "proj_depth" / product / camera / f"{frame:010d}.png"
 
@@ -222,16 +212,6 @@ def test_maps_of_another_size_are_refused(tmp_path: Path) -> None:
     mask = put_mask(tmp_path / "m.png", np.zeros((1, 3), np.uint8))
     with pytest.raises(InputError, match=r"m\.png: got 3 x 1 px, expected 2 x 1"):
         evaluate(pair_depth_files(a, a, mask))
-
-
-def test_kittis_own_truth(test_data) -> None:
-    path = test_data / "kitti/depth_annotated_sample" / "groundtruth_0000000050.png"
-    same = evaluate(pair_depth_files(path, path))["parts"]
-    assert same["all"]["num_pixels"] == np.count_nonzero(cv2.imread(str(path), -1)) > 90_000
-    for name, part in same.items():
-        assert part["coverage"] == part["delta_1"] == 1, name
-        assert part["mae_m"] == part["irmse_per_km"] == part["outliers"] == 0, name
-    assert 0.005 < same["edge"]["num_pixels"] / same["all"]["num_pixels"] < 0.05
 
 
 # --- the verb -------------------------------------------------------------------------------------

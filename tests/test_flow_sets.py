@@ -16,8 +16,8 @@ from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
 from densify.readers import open_sequence
+from densify.readers.flow_files import labelled_flow
 from densify.readers.street import Street
-from densify.readers.true_flow import labelled_flow
 from tests.exact_motion import registered
 
 feather = pytest.importorskip("pyarrow.feather")

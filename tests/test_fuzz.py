@@ -9,7 +9,6 @@ import io
 import json
 import os
 import re
-import shutil
 import struct
 import zipfile
 from collections.abc import Callable
@@ -23,7 +22,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from writers import FORMATS, write_street
+from writers import FORMATS
 
 from densify.cli.verbs.flow import read_points
 from densify.config import resolve
@@ -38,7 +37,7 @@ from densify.readers.describe import describe
 from densify.readers.flow_files import load_flow_file
 from densify.readers.kitti.drive import read_stamps
 from densify.readers.kitti.tracking import read_labels
-from densify.readers.point_files import read_table, read_viewpoint
+from densify.readers.point_files import read_table
 from densify.readers.prior_files import PriorFiles
 from densify.readers.recorded_poses import PoseFile
 from densify.readers.stamp_files import StampFile
@@ -207,8 +206,8 @@ FILES: dict[str, tuple[tuple[Callable[[Path], Any], ...], bytes]] = {
     "a.bin": ((read_table,), POINTS.tobytes()),
     "a.txt": ((read_table,), ROWS.encode()),
     "a.csv": ((read_table,), b"x,y,z,i\n" + ROWS.replace(" ", ",").encode()),
-    "a.pcd": ((read_table, read_viewpoint), f"{PCD}ascii\n{ROWS}".encode()),
-    "b.pcd": ((read_table, read_viewpoint), f"{PCD}binary\n".encode() + POINTS.tobytes()),
+    "a.pcd": ((read_table,), f"{PCD}ascii\n{ROWS}".encode()),
+    "b.pcd": ((read_table,), f"{PCD}binary\n".encode() + POINTS.tobytes()),
     "a.ply": ((read_table,), f"{PLY}end_header\n{ROWS}\n".encode()),
     "a.las": ((read_table,), las(compressed=False)),
     "a.laz": ((read_table, read_cloud), las(compressed=True)),
@@ -256,18 +255,12 @@ def test_files(name: str, tmp_path: Path) -> None:
 
 # --- recordings -----------------------------------------------------------------------------------
 
-SENSORS = {"nuscenes": ("hdl32", 20, (119, 120, 121)), "pandaset": ("pandaset", 10, (59, 60, 61))}
-
 
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.filterwarnings("ignore")
-def test_recordings(format: str, tmp_path: Path) -> None:
+def test_recordings(format: str, copied, tmp_path: Path) -> None:
     """One file of a recording is changed at a time."""
-    sensor, hz, frames = SENSORS.get(format, ("vlp16", 10, (59, 60, 61)))
-    street = Street("street", 0, sensor, hz=hz, cameras=("image_02",))
-    place = write_street(format, street, tmp_path / "out", frames)
-    for truth in [*tmp_path.rglob("truth")]:
-        shutil.rmtree(truth)
+    place = copied(format)
     files = sorted(path for path in tmp_path.rglob("*") if path.is_file())
     for number in range(NUM_TREE_CASES):
         random = Random(f"{format} {number}")

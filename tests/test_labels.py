@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import shutil
 from collections.abc import Callable, Sequence
@@ -14,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 from writers import write_street
 from writers.pandaset import put_frame
 
@@ -22,14 +20,13 @@ from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
 from densify.flow.boxes import BoxMargins, flow_of_boxes
-from densify.geometry.poses import transform
 from densify.geometry.types import Boxes, BoxView, Camera, RegisteredSweep, Sweep
 from densify.learning.labels import label_sweeps
 from densify.readers import open_sequence
 from densify.readers.kitti.drive import Calibration
-from densify.readers.nuscenes_tables import Annotations
+from densify.readers.nuscenes import Annotations
 from densify.readers.street import Street
-from densify.readers.waymo_components import STAMP
+from densify.readers.waymo import STAMP
 
 pyarrow = pytest.importorskip("pyarrow")
 FRAMES = range(60, 63)
@@ -228,26 +225,6 @@ def test_a_recording_without_boxes_is_refused(tmp_path: Path, capsys) -> None:
     assert not (tmp_path / "x").exists()
 
 
-def test_damaged_boxes_are_refused(log: Path, tmp_path: Path) -> None:
-    from pyarrow import feather
-
-    copy = shutil.copytree(log, tmp_path / "log")
-    table = feather.read_table(copy / "annotations.feather")
-    assert open_sequence(str(copy)).boxes(0).size_m.min() > 0.2
-    flat = with_column(table, "width_m", np.zeros(len(table)))
-    feather.write_feather(flat, str(copy / "annotations.feather"))
-    with pytest.raises(InputError, match="sweep 0: a box has no size"):
-        open_sequence(str(copy)).boxes(0)
-    feather.write_feather(table.drop_columns(["qw"]), str(copy / "annotations.feather"))
-    with pytest.raises(InputError, match="no column qw"):
-        open_sequence(str(copy)).boxes(0)
-    (copy / "annotations.feather").write_bytes(b"no feather file")
-    with pytest.raises(InputError, match="not a whole feather file"):
-        open_sequence(str(copy)).boxes(0)
-    (copy / "annotations.feather").unlink()
-    assert open_sequence(str(copy)).boxes(0) is None
-
-
 # Waymo
 
 
@@ -262,10 +239,6 @@ def test_a_waymo_frame_without_boxes_has_no_label(places, tmp_path: Path) -> Non
     parquet.write_table(table.filter(stamps < stamps.max()), path)
     labels = label_sweeps(open_sequence(str(copy)), range(3), GIVEN)
     assert [frame for frame, _ in labels] == [0]
-
-
-def with_column(table, name: str, values: np.ndarray):
-    return table.set_column(table.column_names.index(name), name, pyarrow.array(values))
 
 
 def refused(place: Path, tmp_path: Path, capsys) -> str:
@@ -306,26 +279,6 @@ def test_pandaset_boxes_stand_as_the_devkit_has_them(places, tmp_path: Path) -> 
     assert sequence.boxes(0) is None and sequence.boxes(1) is not None
     with pytest.raises(InputError, match="no sweep of frame 9"):
         sequence.boxes(9)
-
-
-def test_damaged_pandaset_boxes_are_refused(places, tmp_path: Path, capsys) -> None:
-    copy = shutil.copytree(places("pandaset"), tmp_path / "002")
-    path = copy / CUBOIDS
-    whole = path.read_bytes()
-    good = one_cuboid("a", 0.0)
-    for change, said in (
-        ({"dimensions.y": 0.0}, "a box has no size"),
-        ({"yaw": "0.5"}, "column yaw: expected finite numbers"),
-        ({}, "the box a is there twice"),
-    ):
-        write_cuboids(copy, [{**good, **change}, good])
-        error = refused(copy, tmp_path, capsys)
-        assert said in error and CUBOIDS in error
-    write_cuboids(copy, [{name: v for name, v in good.items() if name != "yaw"}])
-    assert "no column yaw" in refused(copy, tmp_path, capsys)
-    for data in (whole[:-40], gzip.compress(b"cos\nsystem\n(S'touch x'\ntR.")):
-        path.write_bytes(data)
-        assert "nothing in it was run" in refused(copy, tmp_path, capsys)
 
 
 CUBOIDS = "annotations/cuboids/00.pkl.gz"
@@ -458,41 +411,3 @@ def test_kitti_boxes_stand_as_the_devkit_has_them(places, tmp_path: Path) -> Non
     np.testing.assert_allclose(T_cam_box[:, :3, 2], 2 * [[0, -1, 0]], atol=1e-9)
     np.testing.assert_array_equal(boxes.view.left_out_px, [[100, 120, 300, 220]])
     assert (boxes.view.camera.width_px, boxes.view.camera.height_px) == (1224, 370)
-
-
-def test_real_boxes_carry_points_onto_the_next_sweep(test_data: Path, tmp_path: Path) -> None:
-    """KITTI's drive 0013 with boxes as KITTI tracking has them: what they move lies on what the
-    next sweep measured, 1.4 m on."""
-    root = tracking_tree(test_data / "kitti", range(103, 105), tmp_path / "training")
-    sequence = open_sequence(str(root))
-    ((_, label),) = label_sweeps(sequence, [103], GIVEN)
-    moving = label.field.moving & label.sure
-    points = label.registered.sweep.points[moving]
-    assert moving.sum() > 50 and 0.1 < label.sure.mean() < 0.2
-    after = cKDTree(sequence[104].points)
-    standing_m, moved_m = (
-        np.median(after.query(transform(label.T_next_here, p))[0])
-        for p in (points, points + label.field.displacement[moving])
-    )
-    assert moved_m < 0.1 * standing_m and standing_m > 0.5
-
-
-def tracking_tree(kitti: Path, frames: range, root: Path) -> Path:
-    """Sweeps of the raw drive 0013 as KITTI tracking, with links to its files."""
-    date, drive = kitti / "2011_09_26", "2011_09_26_drive_0013_sync"
-    for folder in ("velodyne/0000", "calib", "oxts", "label_02"):
-        (root / folder).mkdir(parents=True)
-    for frame in frames:
-        raw = date / drive / "velodyne_points" / "data" / f"{frame:010d}.bin"
-        (root / "velodyne" / "0000" / f"{frame:06d}.bin").symlink_to(raw)
-    cameras = Calibration.read(date / "calib_cam_to_cam.txt")
-    lines = [f"P{i}: {cameras.entries[f'P_rect_0{i}']}" for i in range(4)]
-    lines.append(f"R_rect {cameras.entries['R_rect_00']}")
-    for key, name in (("Tr_velo_cam", "velo_to_cam"), ("Tr_imu_velo", "imu_to_velo")):
-        T = Calibration.read(date / f"calib_{name}.txt").pose()
-        lines.append(f"{key} {' '.join(map(str, T[:3].ravel()))}")
-    (root / "calib" / "0000.txt").write_text("\n".join(lines))
-    oxts = [date / drive / "oxts" / "data" / f"{max(f, 96):010d}.txt" for f in range(frames.stop)]
-    (root / "oxts" / "0000.txt").write_text("".join(path.read_text() for path in oxts))
-    (root / LABELS).symlink_to(kitti / "tracking_boxes" / f"{drive}.txt")
-    return root

@@ -14,8 +14,7 @@ from densify.config.errors import InputError
 from densify.flow.engines import Scene, check_engine, estimate_motion
 from densify.free_space.ground import ground
 from densify.learning import engine
-from densify.learning.model_file import Model, write_model
-from densify.learning.network import build
+from densify.learning.network import Model, build, write_model
 from tests import scenes
 from tests.small_street import KEY, POSES_GIVEN, one_car
 

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from densify.config.errors import InputError, OutputError
 from densify.dataset.manifest import (
@@ -67,32 +65,6 @@ def test_a_line_is_what_the_contract_says() -> None:
     scores = {"a": np.float32(0.5), "b": np.nan, "c": [np.int64(3), np.inf], "d": {"e": (1, None)}}
     back = KeyRecord.from_line(record(1, scores=scores).to_line())
     assert back.scores == {"a": 0.5, "b": None, "c": [3, None], "d": {"e": [1, None]}}
-
-
-json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False),
-    lambda inner: st.dictionaries(st.text(), inner, max_size=3) | st.lists(inner, max_size=3),
-    max_leaves=5,
-)
-
-
-@given(
-    drive=st.text(),
-    key=st.integers(0),
-    status=st.sampled_from(["done", "aside", "failed"]),
-    reason=st.none() | st.text(),
-    frames=st.lists(st.integers(0)).map(tuple),
-    files=st.dictionaries(st.text(), st.binary().map(FileRecord.of), max_size=3),
-    scores=st.dictionaries(st.text(), json_values, max_size=3),
-    seconds=st.integers(0, 10**9).map(lambda ms: ms / 1000),
-    warnings=st.lists(st.text()).map(tuple),
-)
-def test_every_record_comes_back_from_one_line(**fields) -> None:
-    made = KeyRecord(**fields)
-    line = made.to_line()
-    assert line.count(b"\n") == 1 and line.endswith(b"\n")
-    assert KeyRecord.from_line(line) == made
-    assert KeyRecord.from_line(line).to_line() == line
 
 
 BAD_LINES = [b"", b"{}", b"null", b"[1]", b"\0" * 40, b"\xff\xfe{", b"hello", b"[" * 100_000]

@@ -19,11 +19,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from densify.config.errors import InputError
-from densify.geometry.types import FullDepth, PriorFit, Result
 from densify.outputs import (
     check_writable,
     key_outputs,
-    plots,
     read_cloud,
     read_depth_png,
     write_age_png,
@@ -310,52 +308,6 @@ def test_places_that_cannot_be_written_to(put, tmp_path, monkeypatch):
 
 
 # --- pictures -------------------------------------------------------------------------------------
-
-
-def test_the_figure_shows_each_return_at_its_place(tmp_path):
-    image = np.full((400, 800, 3), 200, np.uint8)
-    depth = np.zeros(image.shape[:2], np.float32)
-    depth[100, 200], depth[300, 600], depth[300, 601] = 4, 70, 5
-    plots.write_plot(tmp_path / "f.png", plots.draw_figure(image, {"a": 0 * depth, "b": depth}))
-    picture = cv2.imread(str(tmp_path / "f.png")).astype(int)
-    assert picture.shape[1] == 800 and 880 < picture.shape[0] < 960
-    coloured = (np.ptp(picture, axis=2) > 40)[: 2 * (400 + 36)]
-    rows, columns = np.nonzero(coloured)
-    assert rows.min() == 2 * 36 + 400 + 99 and len(rows) == 9 + 12
-    assert (columns.min(), columns.max()) == (199, 602)
-    blue, _, red = picture[2 * 36 + 400 + 100, 200]
-    assert red > blue  # near is red
-    blue, _, red = picture[2 * 36 + 400 + 300, 599]
-    assert blue > red  # far is blue
-    nearer = picture[2 * 36 + 400 + 300, 600]
-    assert nearer[2] > nearer[0]  # the nearer of two neighbours is drawn
-
-
-def titles(drawn) -> list[str]:
-    return [axes.get_title(loc="left") for axes in drawn.axes if axes.get_title(loc="left")]
-
-
-def test_titles_of_the_figure_say_error_beside_density(tmp_path, monkeypatch):
-    def held(wrong):
-        return {"measured": {"all": {"outliers": wrong}}}
-
-    truth = {"image_02": {**held(0.0123), "full": {"all": {"outliers": 0.0345}}}}
-    scores, ones = {"image_02": held(0.0456)}, np.ones((H, W), np.float32)
-    fit = PriorFit("depth", 1.0, 0.0, 0.0, 0.0, True)
-    full = {"image_02": FullDepth(ones, ones / 20, ones > 0, fit, "prior.npy")}
-    known = replace(result_of("flow", depth=truth, held_out=scores), full=full)
-    icp, none = result_of("icp", held_out=scores), result_of("none", held_out=None)
-    results: dict[str, Result] = {"none": none, "icp": icp, "flow": known}
-    drawn: list = []
-    monkeypatch.setattr(plots, "write_plot", lambda path, made: drawn.append(made))
-    plots.write_figure(tmp_path / "figure.png", results)
-    density = [f"{np.mean(r.depth['image_02'].depth_m > 0):.1%}" for r in results.values()]
-    assert titles(drawn[0]) == [
-        f"sparse: {density[0]} of pixels",
-        f"icp: {density[1]} of pixels, 4.56% outliers (key held out)",
-        f"flow: {density[2]} of pixels, 1.23% outliers (truth)",
-        "flow and prior: 100.0% of pixels, 3.45% outliers (truth)",
-    ]
 
 
 # --- comparison -----------------------------------------------------------------------------------

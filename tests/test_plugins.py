@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Readers, engines and outputs of other packages: one that works, and all that can be wrong."""
+"""Readers and engines of other packages: one that works, and all that can be wrong."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import subprocess
 import sys
 from pathlib import Path
 from textwrap import dedent
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from densify.config import resolve
 from densify.config.errors import InputError
 from densify.config.plugins import READERS, engine
 from densify.flow.engines import check_engine
-from densify.outputs.store import check_writable, write_result
 from densify.readers import Spec
 from tests.tiny_street import MOVERS, tiny
 
@@ -62,19 +60,13 @@ def command(installed: Path, *arguments: object) -> subprocess.CompletedProcess[
     )
 
 
-def test_the_example_reads_estimates_and_writes(
-    installed: Path, sweeps: Path, tmp_path: Path
-) -> None:
-    options = ["--key", 7, "--window", 1, "--flow", "still", "--set", "output.also=txt"]
+def test_the_example_reads_and_estimates(installed: Path, sweeps: Path, tmp_path: Path) -> None:
+    options = ["--key", 7, "--window", 1, "--flow", "still"]
     done = command(installed, "run", "--data", sweeps, *options, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "out" / "000007"
-    assert str(folder / "cloud.txt") in done.stdout.splitlines()
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["num_moving"] == 0 < metrics["num_points"]
-    cloud = np.loadtxt(folder / "cloud.txt")
-    assert cloud.shape == (metrics["num_points"], 3)
-    assert np.linalg.norm(cloud, axis=1).max() > 20
     told = command(installed, "info", "--data", f"npy:{sweeps}")
     assert told.returncode == 0 and "4-8 (5, no gaps)" in told.stdout, told.stdout + told.stderr
 
@@ -172,54 +164,3 @@ def test_a_reader_of_another_package(package, tmp_path: Path) -> None:
     assert densify.open_sequence(f"marked:{data}#night") == (data, "night")
     assert Spec.parse("marked:here").absolute() == f"marked:{Path.cwd()}/here"
     assert [row.name for row in READERS][-2:] == ["marked", "folder"]
-
-
-RESULT = SimpleNamespace(
-    **{name: {} for name in ("depth", "full", "movers", "optical_flow", "rejected", "metrics")},
-    **{"baselines": {}, "flow": None, "key": 3, "method": "flow", "frames": (3,), "costs": ()},
-    **{"far_frames": (), "warnings": (), "stamp_ns": 0, "T_key_lidar": {}},
-    far_left_out=(),
-    images={},
-    cloud=None,
-)
-
-
-def written(out: Path, monkeypatch: pytest.MonkeyPatch, also: str) -> list[str]:
-    monkeypatch.setattr("densify.outputs.key_outputs.write_cloud", lambda *_: None)
-    paths = write_result(RESULT, out, config={}, data="here", also=also)
-    return [path.relative_to(out / "000003").as_posix() for path in paths]
-
-
-def test_an_output_of_another_package(package, tmp_path: Path, monkeypatch) -> None:
-    code = """
-        OWNED = ("notes",)
-        def write_output(result, context, folder):
-            (folder / "notes").mkdir()
-            (folder / "notes" / "about.txt").write_text(f"{context.data} {result.key}")
-    """
-    package("densify.outputs", "notes", code)
-    assert resolve({"output": {"also": "notes"}}).output.also == "notes"
-    out = tmp_path / "out"
-    mine = written(out, monkeypatch, " notes, notes")
-    assert mine == ["metrics.json", "run.yaml", "notes/about.txt"]
-    assert (out / "000003" / "notes" / "about.txt").read_text() == "here 3"
-    with pytest.raises(InputError, match=r"metrics\.json, run\.yaml, notes already there"):
-        check_writable(out, 3, also="notes")
-    assert written(tmp_path / "without", monkeypatch, "") == ["metrics.json", "run.yaml"]
-
-
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [
-        ('OWNED = ("x",)\ndef write_output(r, c, f): (f / "y").touch()', "wrote y, expected noth"),
-        ("def write_output(r, c, f): pass", "stranger_code says no OWNED"),
-        ('OWNED = ("depth",)\ndef write_output(r, c, f): pass', "would write depth of the output"),
-    ],
-)
-def test_an_output_writes_its_own_files_only(
-    package, code: str, words: str, tmp_path: Path, monkeypatch
-) -> None:
-    package("densify.outputs", "strange", code)
-    with pytest.raises(InputError, match=words):
-        written(tmp_path / "out", monkeypatch, "strange")
-    assert not (tmp_path / "out").exists()

@@ -1,53 +1,30 @@
 # SPDX-License-Identifier: MIT
-"""The Argoverse 2 reader on a street written as a log, on broken logs, and on a real one."""
+"""The Argoverse 2 reader on a street written as a log and on a real one."""
 
 from __future__ import annotations
-
-import shutil
 
 import numpy as np
 import pytest
 from writers import write_street
 from writers.argoverse2 import T_EGO_LIDAR
-from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
-from densify.free_space.sensor import Sensors
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.argoverse2 import Argoverse2
 from densify.readers.street import Street
-from densify.readers.timeline import recorded_trajectory
-from densify.registration.deskew import deskew
-from densify.street.sensors import SENSORS
-from tests.reader_checks import check_cameras, check_depth, check_refused, check_sweeps, check_truth
+from tests.reader_checks import check_cameras, check_sweeps, check_truth
+from tests.recorded import CAMERA, FRAMES
 
 feather = pytest.importorskip("pyarrow.feather")
 
-FRAMES, CAMERA = (59, 60, 61), "image_02"
+FORMAT = "argoverse2"
 HALF_NS = 50_000_000
 REAL = "argoverse2/sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 
 
-@pytest.fixture(scope="module")
-def excerpt():
-    return Excerpt.of(Street("street", 0, "vlp16", cameras=(CAMERA,)), FRAMES, None)
-
-
-@pytest.fixture(scope="module")
-def log(excerpt, tmp_path_factory):
-    out = tmp_path_factory.mktemp("argoverse2") / "val"
-    return write_street("argoverse2", excerpt.street, out, FRAMES)
-
-
-@pytest.fixture
-def broken(log, tmp_path):
-    """A copy to be damaged."""
-    return shutil.copytree(log, tmp_path / "log", ignore=shutil.ignore_patterns("truth"))
-
-
-def test_the_street_is_given_back(log, excerpt):
-    sequence = open_sequence(log)
+def test_the_street_is_given_back(written, excerpt):
+    sequence = open_sequence(written)
     assert isinstance(sequence, Argoverse2)
     # half a step of float16 beyond 64 m, in three directions
     check_sweeps(sequence, excerpt, -HALF_NS, inverse(T_EGO_LIDAR), point_m=0.06)
@@ -58,8 +35,8 @@ def test_the_street_is_given_back(log, excerpt):
     assert np.abs(sequence[0].points - away)[near].max() < 0.005
 
 
-def test_a_pose_for_each_image(log, excerpt):
-    sequence = open_sequence(log)
+def test_a_pose_for_each_image(written, excerpt):
+    sequence = open_sequence(written)
     for number, frame in enumerate(FRAMES):
         expected = excerpt.street.T_world_lidar(frame) @ inverse(
             excerpt.street.cameras[CAMERA].T_cam_lidar
@@ -69,11 +46,11 @@ def test_a_pose_for_each_image(log, excerpt):
 
 def test_two_scanners_keep_their_places(tmp_path):
     street = Street("static", 0, "dual32", cameras=())
-    log = write_street("argoverse2", street, tmp_path, [60])
-    sweep, true = Argoverse2(log)[0], street[60]
+    written = write_street("argoverse2", street, tmp_path, [60])
+    sweep, true = Argoverse2(written)[0], street[60]
     np.testing.assert_array_equal(sweep.lidar, true.lidar)
     np.testing.assert_allclose(sweep.scanner_origins, true.scanner_origins + [1.35, 0, 1.64])
-    laser = feather.read_table(next((log / "sensors" / "lidar").iterdir()))["laser_number"]
+    laser = feather.read_table(next((written / "sensors" / "lidar").iterdir()))["laser_number"]
     assert set(laser.to_numpy()) == set(range(64))
     away = true.points - true.scanner_origins[true.lidar]
     elevation_deg = np.degrees(np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1])))
@@ -81,83 +58,17 @@ def test_two_scanners_keep_their_places(tmp_path):
         assert np.ptp(elevation_deg[laser.to_numpy() == ring]) < 0.01
 
 
-def test_depth_is_that_of_the_street(log, excerpt):
-    check_depth(open_sequence(log), excerpt, worse=0.1)
-
-
-def test_logs_are_scenes(log):
-    for place in (log.parent, log.parent.parent):
-        assert open_sequence(place).name == log.name  # the only one
-        assert open_sequence(f"argoverse2:{place}#street").name == log.name
+def test_logs_are_scenes(written):
+    for place in (written.parent, written.parent.parent):
+        assert open_sequence(place).name == written.name  # the only one
+        assert open_sequence(f"argoverse2:{place}#street").name == written.name
         with pytest.raises(InputError, match=r"no recording other.*one of street$"):
             open_sequence(f"argoverse2:{place}#other")
     with pytest.raises(InputError, match="no Argoverse 2 log"):
-        open_sequence(f"argoverse2:{log / 'sensors'}")
-
-
-# Damage
-
-
-def table_of(path):
-    return feather.read_table(path, memory_map=False)
-
-
-def change(path, column, make):
-    """Replace a column by what ``make`` makes of its values; without ``make`` leave it out."""
-    import pyarrow
-
-    table = table_of(path)
-    at = table.column_names.index(column)
-    values = table[column].to_pylist()
-    table = table.remove_column(at)
-    if make:
-        table = table.add_column(at, column, pyarrow.array(make(values)))
-    feather.write_feather(table, path)
-
-
-def first(value):
-    return lambda values: [value, *values[1:]]
-
-
-POSES, SWEEPS = "city_SE3_egovehicle.feather", "sensors/lidar/*.feather"
-LENSES = "calibration/intrinsics.feather"
-DAMAGE = {
-    "poses truncated": (POSES, lambda p: p.write_bytes(p.read_bytes()[:-99]), "not a whole"),
-    "pose column absent": (POSES, lambda p: change(p, "qx", None), "no column qx"),
-    "pose missing": (POSES, lambda p: change(p, "tx_m", first(None)), "1 of them missing"),
-    "poses end before": (
-        POSES,
-        lambda p: change(p, "timestamp_ns", lambda v: [x - 10**9 for x in v]),
-        "no pose at",
-    ),
-    "lasers of another sensor": (
-        SWEEPS,
-        lambda p: change(p, "laser_number", lambda v: [64] * len(v)),
-        "expected 0 to 63",
-    ),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damage_is_refused_in_a_line(broken, damage):
-    pattern, harm, says = DAMAGE[damage]
-    harm(min(broken.glob(pattern)))
-    check_refused(f"argoverse2:{broken}", says, broken)
+        open_sequence(f"argoverse2:{written / 'sensors'}")
 
 
 # A real log
-
-
-def test_both_real_scanners_have_their_rings(test_data):
-    """The lower one hangs upside down; 0.06 degrees off the vehicle's axes tear its rings apart."""
-    sequence = open_sequence(test_data / REAL)
-    sweeps = [sequence[frame] for frame in sequence.frames]
-    trajectory = recorded_trajectory(sequence, sweeps)
-    models = Sensors.of(deskew(sweeps, trajectory).sweeps).models
-    rings_deg = [np.degrees(models[lidar].rings_rad) for lidar in (0, 1)]
-    vlp32_deg = np.sort(SENSORS["dual32"].scanners[0].pattern.elevation_deg)
-    np.testing.assert_allclose(rings_deg[0], vlp32_deg, atol=0.03)
-    np.testing.assert_allclose(rings_deg[1], -vlp32_deg[::-1], atol=0.03)
 
 
 def test_a_real_log(test_data):

@@ -1,42 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""The DGP reader on a street written as a scene, on broken ones, and on a real DDAD scene."""
+"""The DGP reader on a street written as a scene and on a real DDAD scene."""
 
 from __future__ import annotations
 
-import io
-import json
-import pickle
-import shutil
-
 import numpy as np
 import pytest
-from writers import write_street
-from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.readers import open_sequence
 from densify.readers.dgp import Dgp
-from densify.readers.street import Street
-from tests.reader_checks import check_cameras, check_refused, check_truth
+from tests.reader_checks import check_cameras, check_truth
+from tests.recorded import CAMERA, FRAMES
 
-FRAMES, CAMERA = (59, 60, 61), "image_02"
-
-
-@pytest.fixture(scope="module")
-def excerpt():
-    return Excerpt.of(Street("street", 0, "vlp16", cameras=(CAMERA,)), FRAMES, None)
-
-
-@pytest.fixture(scope="module")
-def written(excerpt, tmp_path_factory):
-    return write_street("dgp", excerpt.street, tmp_path_factory.mktemp("dgp"), FRAMES)
-
-
-@pytest.fixture
-def broken(written, tmp_path):
-    """A copy to be damaged."""
-    return shutil.copytree(written, tmp_path / "scene_01", ignore=shutil.ignore_patterns("truth"))
+FORMAT = "dgp"
 
 
 def test_the_street_is_given_back(written, excerpt):
@@ -75,44 +52,6 @@ def test_what_is_not_on_the_disk_leaves_a_gap(broken):
     assert list(sequence.image_stamps_ns(CAMERA)) == [0, 1]
     with pytest.raises(InputError, match="frames that exist: 1-2"):
         sequence[0]
-
-
-# Damage
-
-
-def edit(change):
-    def harm(path):
-        content = json.loads(path.read_text())
-        change(content)
-        path.write_text(json.dumps(content))
-
-    return harm
-
-
-def holds(**arrays):
-    def harm(path):
-        file = io.BytesIO()
-        np.savez(file, **arrays)
-        path.write_bytes(file.getvalue())
-
-    return harm
-
-
-SCENE, CALIBRATION = "scene_*.json", "calibration/*.json"
-SWEEP, IMAGE = "point_cloud/LIDAR/*.npz", f"rgb/{CAMERA}/*.png"
-DAMAGE = {
-    "scene cut": (SCENE, lambda p: p.write_bytes(p.read_bytes()[:-9]), "not a whole JSON"),
-    "no sweeps": (SWEEP, lambda p: shutil.rmtree(p.parent), "none of its sweeps is there"),
-    "calibration of fewer": (CALIBRATION, edit(lambda c: c["extrinsics"].pop()), "names"),
-    "sweep of a pickle": (SWEEP, lambda p: p.write_bytes(pickle.dumps([1])), "not a readable .npz"),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damage_is_refused_in_a_line(broken, damage):
-    pattern, harm, says = DAMAGE[damage]
-    harm(min(broken.glob(pattern)))
-    check_refused(f"dgp:{broken}", says, broken)
 
 
 # A real scene

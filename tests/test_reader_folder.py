@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Folders of no known form: a street written as one, files of every kind beside each other, drafts
-of densify.yaml, and damage."""
+"""Folders of no known form: a street written as one, files of every kind beside each other, and
+damage."""
 
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import yaml
 from scipy.spatial.transform import Rotation
-from writers import write_street
 from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
@@ -22,23 +19,12 @@ from densify.outputs.simulated_street import config_text
 from densify.readers import open_sequence
 from densify.readers.describe import describe
 from densify.readers.folder.config import FolderConfig
-from densify.readers.folder.draft import draft_config
 from densify.readers.folder.reader import Folder
 from densify.readers.street import Street
-from tests.reader_checks import check_cameras, check_depth, check_sweeps, check_truth
+from tests.reader_checks import check_cameras, check_sweeps, check_truth
 from tests.test_point_files import write_pcd
 
-FRAMES, CAMERA = (39, 40, 41), "image_02"
-
-
-@pytest.fixture(scope="module")
-def excerpt():
-    return Excerpt.of(Street("street", 0, "vlp16", cameras=(CAMERA,)), FRAMES, None)
-
-
-@pytest.fixture(scope="module")
-def written(excerpt, tmp_path_factory):
-    return write_street("folder", excerpt.street, tmp_path_factory.mktemp("folder"), FRAMES)
+FORMAT = "folder"
 
 
 def test_the_street_is_given_back(written, excerpt):
@@ -47,7 +33,6 @@ def test_the_street_is_given_back(written, excerpt):
     check_sweeps(sequence, excerpt, offset_ns=4)  # float32 seconds
     check_cameras(sequence, excerpt)
     check_truth(sequence, excerpt)
-    check_depth(sequence, excerpt, worse=0.02)
 
 
 def test_scanners_lenses_and_rolling_shutters_are_kept(tmp_path):
@@ -109,18 +94,12 @@ def test_numbered_files_alone_open(tmp_path):
         sequence.T_world_lidar(3)
 
 
-def test_pcd_files_open_with_times_and_viewpoints(tmp_path):
-    for number in (1, 2):
-        write_pcd(tmp_path / f"scan_{number:03d}.pcd", "binary")
+def test_pcd_files_open_with_times(tmp_path):
+    write_pcd(tmp_path / "scan_001.pcd", "binary")
     sequence = open_sequence(tmp_path)
     # t runs from 0 to 59 x 1.7 ms, in ns: a sweep of about 100 ms
     np.testing.assert_array_equal(sequence[1].offset_ns, np.arange(60) * 1_700_000)
-    T = sequence.T_world_lidar(2)
-    np.testing.assert_allclose(T[:3, 3], [1, 2, 3])
-    np.testing.assert_allclose(T[:3, :3] @ [1, 0, 0], [0, -1, 0], atol=1e-12)
-    found = dict(sequence.findings())
-    assert found["times"] == "t in ns, relative" and found["poses from"].startswith("VIEWPOINT")
-    assert "assumed 10 Hz" in found["stamped by"]
+    assert dict(sequence.findings())["times"] == "t in ns, relative"
 
 
 @pytest.mark.parametrize("form", ["{}.{:09d}", "{}_{:09d}", "cloud_{}{:09d}_lidar"])
@@ -163,7 +142,6 @@ PLACE, ONE = numbers(POSE[:3, 3]), np.eye(4)
 POSE_TEXTS = {
     "KITTI": f"{numbers(ONE[:3])}\n{numbers(POSE[:3])}\n",
     "4x4 rows": f"{numbers(ONE)}\n{numbers(POSE)}\n",
-    "4x4 blocks": "\n".join(numbers(row) for T in (ONE, POSE) for row in T),
     "TUM": f"# time\n0.09 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 0 1\n0.2 {PLACE} {QX} {QY} {QZ} {QW}",
     "table": f"t,qw,qx,qy,qz,x,y,z\n0.1,1,0,0,0,0,0,0\n0.2,{QW},{QX},{QY},{QZ},"
     + PLACE.replace(" ", ","),
@@ -211,7 +189,7 @@ def test_compensation_is_undone_with_stamped_poses(tmp_path):
     assert "left out" in dict(sequence.findings())["times"]
 
 
-# --- cameras, the example, drafts -----------------------------------------------------------------
+# --- cameras, the example -------------------------------------------------------------------------
 
 
 def cameras(folder: Path) -> Path:
@@ -251,93 +229,35 @@ def test_the_documented_example_is_right(tmp_path):
     assert next(iter(read.cameras.values()))[0].K[0, 0] == 1000
 
 
-def test_a_draft_opens_and_says_what_was_found(written, tmp_path):
-    tree = shutil.copytree(written, tmp_path / "tree")
-    whole = open_sequence(tree)
-    (tree / "densify.yaml").unlink()
-    draft = draft_config(tree)
-    drafted = open_sequence(config(tree, draft))
-    assert "columns: [x, y, z, intensity, time, unknown5]" in draft and "time_unit: s" in draft
-    np.testing.assert_array_equal(drafted[1].points, whole[1].points)
-    np.testing.assert_array_equal(drafted[1].offset_ns, whole[1].offset_ns)
-    np.testing.assert_array_equal(drafted.T_world_lidar(1), whole.T_world_lidar(1))
-    assert not drafted.cameras
-    filled = re.sub(r"(?m)^# (cameras:|  .*)$", r"\1", draft[draft.index("# cameras:") :])
-    filled = filled.replace("[fx, fy, cx, cy]", "[721.5, 721.5, 609.5, 172.75]")
-    filled = open_sequence(config(tree, draft[: draft.index("# cameras:")] + filled))
-    assert (filled.cameras["image_02"].width_px, filled.cameras["image_02"].height_px) == (
-        1242,
-        375,
-    )
-    assert filled.image_stamps_ns("image_02") == whole.image_stamps_ns("image_02")
-
-
-def test_a_draft_chooses_among_folders(tmp_path):
-    for name in ("top", "side"):
-        bare(tmp_path / name, ["1.bin"])
-    with pytest.raises(InputError, match="several folders hold sweeps: side, top; name one in"):
-        Folder(tmp_path)
-    draft = draft_config(tmp_path)
-    assert "files: side  # or: top" in draft
-    assert list(Folder(config(tmp_path, draft)).frames) == [1]
-    assert yaml.safe_load(draft)["sweeps"]["rate_hz"] == 10
-
-
 # --- damage ---------------------------------------------------------------------------------------
 
 WRONG_CONFIGS = [
     ("a: [1", r"densify\.yaml: not YAML"),
-    ("- 1", "expected a mapping of keys"),
     ("sweeps: !!python/object/apply:os.getcwd []", "not YAML: could not determine a constructor"),
     ("poses: {}\nposes: {}", "line 2: poses is given twice"),
-    ("pose: {}", "pose: unknown key; did you mean poses"),
-    (
-        "sweeps:\n  time_iss: absolute",
-        r"line 2: sweeps\.time_iss: unknown key; did you mean time_is",
-    ),
-    ("sweeps: {axes: [x, y, x]}", r"axes: got .* expected x, y and z in some order"),
-    ("sweeps: {time_unit: sec}", "got 'sec', expected one of s, ms"),
+    ("sweeps:\n  time_iss: x", r"line 2: sweeps\.time_iss: unknown key; did you mean time_is"),
     ("sweeps: {scale_m: full}", "got 'full', expected a finite number above 0"),
-    ("sweeps: {compensated: 1}", "got 1, expected true or false"),
-    ("sweeps: {columns: [a, y, z, i]}", "no column x: got a, y"),
     ("sweeps: {columns: [x, y, z, i, a, b, c]}", "multiple of 28"),
     ("sweeps: {time: tee}", r"sweeps\.time: got 'tee', expected a column of 0\.bin"),
     ("sweeps: {lidar: intensity}", "expected the number of a scanner, 0 to 255"),
     ("sweeps: {scanner_origins: [[0, 0]]}", r"sweeps\.scanner_origins: .* shape \(N, 3\)"),
-    ("sweeps: {files: swept}", "no such folder, though"),
-    ("sweeps: {stamps: stamps.txt}", r"stamps\.txt: no such file"),
     ("sweeps: {stamps: names}", "its name is no time"),
     ("poses: {file: path.txt}", r"path\.txt: no such file, though"),
     ("cameras: {../cam: {}}", "expected a name of letters"),
-    ("cameras: {a: {files: none}}", "size: got nothing, expected"),
 ]
 CAMERA_EDITS = [
     ("K: [9, 9", "K: [0, 9", "with fx and fy above 0"),
     ("K: [9, 9", "K: [fx, 9", r"front\.K: got .*expected .fx, fy"),
-    (
-        "[[0, -1, 0, 0]",
-        "[[0.5, -1, 0, 0]",
-        r"front\.T_cam_lidar: .*expected three or four rows",
-    ),
-    (
-        "fisheye, distortion: [0, 0, 0, 0]",
-        "pinhole, distortion: [1, 2, 3]",
-        "0, 4, 5, 8, 12, 14 co",
-    ),
-    ("size: [8, 6]", "size: [8.5, 6]", "in whole pixels"),
-    ("model: fisheye", "model: wide", "expected one of pinhole, fisheye, mei"),
+    ("[[0, -1, 0, 0]", "[[0.5, -1, 0, 0]", r"front\.T_cam_lidar: .*three or four rows"),
+    ("fisheye, distortion: [0, 0, 0, 0]", "pinhole, distortion: [1, 2]", "0, 4, 5, 8, 12, 14 co"),
     ("files: a,", "files: nowhere,", "no images, though densify"),
 ]
 WRONG_FILES = [
     ("timestamps.txt", "1317042661.1\n", "got 1 times for 2 files"),
     ("timestamps.txt", "0.1\nnoon\n", "line 2: got 'noon', expected a time in s"),
-    ("timestamps.txt", "0.2\n0.1\n", "not after"),
     ("timestamps.txt", "100\n200\n", "too far apart for seconds.*stamps_unit"),
-    ("poses.txt", "", "holds no lines"),
     ("poses.txt", "0.1 0 0 0 0 0 0 1\n0.2 0", "line 2: got 2 columns, expected 8"),
-    ("poses.txt", "0.1 0 0 nan 0 0 0 1\n", "line 1: got a value that is not finite"),
     ("poses.txt", "0.1 0 0 0 0 0 0 4\n", "line 1: got a quaternion of length"),
-    ("poses.txt", "1 2 3 4 5 6 7\n", "got 7 numbers, expected 12"),
     ("poses.txt", "0.2 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 0 1\n", "stamps that ascend"),
     ("a_1.bin", "", r"has the number 1, as 1\.bin has|1\.bin: has the number 1, as a_1\.bin has"),
 ]
@@ -395,8 +315,3 @@ def test_real_sweeps_without_a_word_beside_them(test_data):
     assert list(plain.frames) == list(known.frames)
     np.testing.assert_array_equal(plain[100].points, known[100].points)
     assert [plain.stamp_ns(f) for f in plain.frames] == [known.stamp_ns(f) for f in known.frames]
-    nuscenes = open_sequence(f"folder:{test_data / 'nuscenes'}")
-    assert nuscenes[0].points.shape == (34_688, 3) and nuscenes[0].intensity.max() <= 1
-    assert "column4 (0 to 31)" in dict(nuscenes.findings())["fields"]
-    height_m = nuscenes[0].points[:, 2]
-    assert -2.5 < np.median(height_m[height_m < -1]) < -1.5  # the ground below the roof

@@ -9,8 +9,6 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from writers import write_street
-from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
 from densify.geometry import cameras
@@ -18,44 +16,14 @@ from densify.geometry.poses import inverse
 from densify.readers import open_sequence
 from densify.readers.kitti.kitti_360 import Kitti360
 from densify.readers.kitti.odometry import KittiOdometry
-from densify.readers.kitti.tracking import KittiTracking
-from densify.readers.street import Street
 from tests.reader_checks import check_cameras, check_sweeps, check_truth
+from tests.recorded import CAMERA, FRAMES
 
-FRAMES, CAMERA = (59, 60, 61), "image_02"
 DRIVE = "2026_06_12_drive_0000_sync"
-FORMATS = {
-    "kitti-odometry": ("image_2", KittiOdometry),
-    "kitti-tracking": ("image_02", KittiTracking),
-    "kitti-360": ("image_00", Kitti360),
-}
 
 
-@pytest.fixture(scope="module")
-def excerpt():
-    return Excerpt.of(Street("street", 0, "vlp16", cameras=(CAMERA,)), FRAMES, None)
-
-
-@pytest.fixture(scope="module")
-def written(excerpt, tmp_path_factory):
-    out = tmp_path_factory.mktemp("kitti")
-    return {name: write_street(name, excerpt.street, out / name, FRAMES) for name in FORMATS}
-
-
-@pytest.fixture
-def copied(written, tmp_path):
-    """Makes a copy to be damaged, of the first sweep and image alone the bytes."""
-
-    def copy(name):
-        whole = written[name].parent.parent if name == "kitti-odometry" else written[name]
-        copy = shutil.copytree(whole, tmp_path / name, ignore=shutil.ignore_patterns("truth"))
-        return copy / written[name].relative_to(whole)
-
-    return copy
-
-
-def test_odometry_is_given_back(written, excerpt):
-    sequence, street = open_sequence(written["kitti-odometry"]), excerpt.street
+def test_odometry_is_given_back(recorded, excerpt):
+    sequence, street = open_sequence(recorded("kitti-odometry")), excerpt.street
     clock_ns = -street.stamp_ns(FRAMES[0])
     check_cameras(sequence, excerpt, names={CAMERA: "image_2"}, clock_ns=clock_ns)
     check_truth(sequence, excerpt)
@@ -86,28 +54,28 @@ def test_odometry_without_poses_is_given_as_it_stands(copied, excerpt):
         np.testing.assert_allclose(sweep.points[still], true.points[still], atol=1e-4)
 
 
-def test_tracking_is_given_back(written, excerpt):
-    sequence = open_sequence(written["kitti-tracking"])
+def test_tracking_is_given_back(recorded, excerpt):
+    sequence = open_sequence(recorded("kitti-tracking"))
     clock_ns = -excerpt.street.stamp_ns(FRAMES[0])
     check_sweeps(sequence, excerpt, offset_ns=20, clock_ns=clock_ns)
     check_cameras(sequence, excerpt, clock_ns=clock_ns)
     check_truth(sequence, excerpt)
 
 
-def test_kitti_360_is_given_back(written, excerpt):
-    sequence = open_sequence(written["kitti-360"])
+def test_kitti_360_is_given_back(recorded, excerpt):
+    sequence = open_sequence(recorded("kitti-360"))
     check_sweeps(sequence, excerpt, offset_ns=20)
     check_cameras(sequence, excerpt, names={CAMERA: "image_00"})
     check_truth(sequence, excerpt)
 
 
-def test_scenes(written):
-    root = written["kitti-odometry"].parent.parent
+def test_scenes(recorded):
+    root = recorded("kitti-odometry").parent.parent
     assert open_sequence(root).name == open_sequence(f"kitti-odometry:{root}#00").name == "00"
     for name, scene in (("kitti-tracking", "0000"), ("kitti-360", DRIVE)):
-        assert scene in open_sequence(f"{name}:{written[name]}#{scene}").name
-    for spec in (root, written["kitti-tracking"], written["kitti-360"]):
-        reader = next(n for n, p in written.items() if p == spec or root == spec)
+        assert scene in open_sequence(f"{name}:{recorded(name)}#{scene}").name
+    for reader in ("kitti-odometry", "kitti-tracking", "kitti-360"):
+        spec = root if reader == "kitti-odometry" else recorded(reader)
         with pytest.raises(InputError, match="no recording 77; choose one"):
             open_sequence(f"{reader}:{spec}#77")
         with pytest.raises(InputError, match=r"no KITTI.* expected"):
@@ -185,88 +153,6 @@ def test_a_fisheye_projects_as_the_data_sets_tools_do(fisheye):
     x, y = x / (z + 2.2), y / (z + 2.2)
     bent = 1 + 0.016 * (x * x + y * y) + 1.65 * (x * x + y * y) ** 2
     np.testing.assert_allclose(uv[0], [1336 * x * bent + 716.9, 1335 * y * bent + 705.7])
-
-
-# --- damage ---------------------------------------------------------------------------------------
-
-
-def swap(old, new):
-    return lambda path: path.write_text(path.read_text().replace(old, new, 1))
-
-
-def write(text):
-    return lambda path: path.write_text(text)
-
-
-def short(length):
-    return lambda path: path.write_bytes(path.read_bytes()[:length])
-
-
-def remove(path):
-    path.unlink()
-
-
-ODOMETRY, TRACKING, DRIVE_360 = FORMATS
-POSES, CALIBRATION, PERSPECTIVE = (
-    "../../poses/00.txt",
-    "calib/0000.txt",
-    "calibration/perspective.txt",
-)
-STAMPS = f"data_3d_raw/{DRIVE}/velodyne_points/timestamps.txt"
-POSES_360 = f"data_poses/{DRIVE}/poses.txt"
-TO_POSE, TO_VELO = "calibration/calib_cam_to_pose.txt", "calibration/calib_cam_to_velo.txt"
-DAMAGE = [
-    (ODOMETRY, "calib.txt", remove, "missing"),
-    (ODOMETRY, "calib.txt", swap("Tr: ", "Rt: "), "no key Tr"),
-    (ODOMETRY, "calib.txt", swap("Tr: -0.0", "Tr: -9.0"), "rotation"),
-    (
-        ODOMETRY,
-        "times.txt",
-        write("1e999999999\n"),
-        "line 1: got .* 2261",
-    ),
-    (ODOMETRY, "times.txt", swap("2.0", "1.0"), "line 3: got"),
-    (ODOMETRY, POSES, swap(" ", " nan "), "line 1: got 13 values"),
-    (ODOMETRY, POSES, write(""), "no pose of frame 0"),
-    (ODOMETRY, "velodyne/000000.bin", short(-5), "truncated"),
-    (ODOMETRY, "image_2/000000.png", write("x"), "not a complete image"),
-    (TRACKING, CALIBRATION, swap("R_rect", "R"), "no key R_rect"),
-    (TRACKING, "oxts/0000.txt", short(70), "line 1: got"),
-    (DRIVE_360, STAMPS, remove, "cannot be read"),
-    (DRIVE_360, PERSPECTIVE, swap("1242.0", "1240"), "expected 1240 x 375"),
-    (DRIVE_360, POSES_360, write("0 1 0\n"), "got 3 values"),
-    (DRIVE_360, POSES_360, lambda p: p.write_text(p.read_text().split("\n")[0]), "two"),
-    (DRIVE_360, TO_POSE, swap("image_00", "image_04"), "no key image_00"),
-]
-
-
-@pytest.mark.parametrize(("name", "file", "harm", "says"), DAMAGE, ids=range(len(DAMAGE)))
-def test_damage_is_refused_in_a_line(copied, name, file, harm, says):
-    place = copied(name)
-    harm(place / file)
-    with pytest.raises(InputError, match=says) as error:
-        sequence = open_sequence(f"{name}:{place}")
-        sequence[0]
-        sequence.T_world_lidar(0)
-        sequence.image(FORMATS[name][0], 0)
-    assert "\n" not in str(error.value) and str(place.parents[1]) in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "says"),
-    [
-        ("   xi: 2.2\n", "", "expected image_width"),
-        ("1336.0", "-3", "positive focal"),
-        ("k1: 0.016", "k1: abc", "abc"),
-        ("model_type: MEI", "model_type: [", "not YAML"),
-        ("1400", "140", "expected 140 x 1400"),
-    ],
-)
-def test_a_broken_fisheye_is_refused_in_a_line(fisheye, old, new, says):
-    swap(old, new)(fisheye / "calibration/image_02.yaml")
-    with pytest.raises(InputError, match=says) as error:
-        Kitti360(fisheye, DRIVE).image("image_02", 1)
-    assert "\n" not in str(error.value) and "image_02" in str(error.value)
 
 
 # A real sequence

@@ -1,44 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""The nuScenes reader on a street written as a tree, on broken trees, and on a real key frame."""
+"""The nuScenes reader on a street written as a tree and on a real key frame."""
 
 from __future__ import annotations
 
-import json
-import shutil
 import tracemalloc
 
 import numpy as np
 import pytest
-from writers import write_street
-from writers.excerpt import Excerpt
 from writers.nuscenes import T_LIDAR_POINTS, last_column_ns
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.readers import open_sequence
-from densify.readers.nuscenes import NuScenes
-from densify.readers.nuscenes_tables import find_records
-from densify.readers.street import Street
-from tests.reader_checks import check_cameras, check_refused, check_truth
+from densify.readers.nuscenes import NuScenes, find_records
+from tests.reader_checks import check_cameras, check_truth
+from tests.recorded import CAMERA
 
-FRAMES, CAMERA = (119, 120, 121), "image_02"
+FORMAT = "nuscenes"
 VERSION = "v1.0-mini"
-
-
-@pytest.fixture(scope="module")
-def excerpt():
-    return Excerpt.of(Street("street", 0, "hdl32", hz=20, cameras=(CAMERA,)), FRAMES, None)
-
-
-@pytest.fixture(scope="module")
-def tree(excerpt, tmp_path_factory):
-    return write_street("nuscenes", excerpt.street, tmp_path_factory.mktemp("nuscenes"), FRAMES)
-
-
-@pytest.fixture
-def broken(tree, tmp_path):
-    """A copy to be damaged."""
-    return shutil.copytree(tree, tmp_path / "tree", ignore=shutil.ignore_patterns("truth"))
 
 
 def file_order(excerpt, frame):
@@ -49,11 +28,12 @@ def file_order(excerpt, frame):
     return np.lexsort((excerpt.rings(frame), column))
 
 
-def test_the_street_is_given_back(tree, excerpt):
-    sequence = open_sequence(tree)
+def test_the_street_is_given_back(written, excerpt):
+    sequence = open_sequence(written)
     assert isinstance(sequence, NuScenes) and sequence.name == "scene-0001"
-    late_ns = last_column_ns(excerpt, FRAMES[0]) - excerpt.street.stamp_ns(FRAMES[0])
-    for number, frame in enumerate(FRAMES):  # all in the file's order
+    first = excerpt.frames[0]
+    late_ns = last_column_ns(excerpt, first) - excerpt.street.stamp_ns(first)
+    for number, frame in enumerate(excerpt.frames):  # all in the file's order
         order = file_order(excerpt, frame)
         read, true = sequence[number], excerpt.street[frame]
         points = true.points[order] @ T_LIDAR_POINTS[:3, :3]
@@ -67,13 +47,13 @@ def test_the_street_is_given_back(tree, excerpt):
     check_truth(sequence, excerpt)
     steps = [
         inverse(s.T_world_lidar(a)) @ s.T_world_lidar(b)
-        for s, a, b in ((sequence, 0, 2), (excerpt.street, FRAMES[0], FRAMES[2]))
+        for s, a, b in ((sequence, 0, 2), (excerpt.street, excerpt.frames[0], excerpt.frames[2]))
     ]
     assert abs(np.linalg.norm(steps[0][:3, 3]) - np.linalg.norm(steps[1][:3, 3])) < 0.01
 
 
-def test_a_pose_for_each_image(tree, excerpt):
-    sequence = open_sequence(tree)
+def test_a_pose_for_each_image(written, excerpt):
+    sequence = open_sequence(written)
     exposed_ns = excerpt.street.image_stamps_ns(CAMERA)
     for number, image in enumerate(excerpt.image_numbers(CAMERA)):
         T_world_lidar = excerpt.street.simulator.T_world_lidar_at(exposed_ns[image])
@@ -81,11 +61,11 @@ def test_a_pose_for_each_image(tree, excerpt):
         np.testing.assert_allclose(sequence.T_world_cam(CAMERA, number), expected, atol=1e-6)
 
 
-def test_scenes_are_named(tree):
-    assert open_sequence(f"nuscenes:{tree}#scene-0001").name == "scene-0001"
-    assert open_sequence(tree / VERSION).name == "scene-0001"
+def test_scenes_are_named(written):
+    assert open_sequence(f"nuscenes:{written}#scene-0001").name == "scene-0001"
+    assert open_sequence(written / VERSION).name == "scene-0001"
     with pytest.raises(InputError, match=r"no recording scene-0002; .* one of scene-0001"):
-        open_sequence(f"nuscenes:{tree}#scene-0002")
+        open_sequence(f"nuscenes:{written}#scene-0002")
 
 
 def test_what_is_not_on_the_disk_leaves_a_gap(broken):
@@ -109,57 +89,6 @@ def test_of_millions_of_records_few_are_parsed(tmp_path):
     tracemalloc.stop()
     assert list(found) == [str(i) for i in (*range(70, 80), *range(49_990, 50_000))]
     assert peak < 1_000_000
-
-
-# Damage
-
-
-def edit(root, table, change):
-    path = root / VERSION / f"{table}.json"
-    records = json.loads(path.read_text())
-    for record in records:
-        change(record)
-    path.write_text(json.dumps(records))
-
-
-def sets(table, **values):
-    return lambda root: edit(root, table, lambda r: r.update(values))
-
-
-def cut(table, size=-40):
-    def harm(root):
-        path = root / VERSION / f"{table}.json"
-        path.write_bytes(path.read_bytes()[:size])
-
-    return harm
-
-
-def without(table):
-    return lambda root: (root / VERSION / f"{table}.json").unlink()
-
-
-def on_file(pattern, change):
-    def harm(root):
-        path = sorted(root.glob(pattern), key=lambda p: p.name)[0]
-        path.write_bytes(change(path.read_bytes()))
-
-    return harm
-
-
-DAMAGE = {
-    "no tables": (lambda root: shutil.rmtree(root / VERSION), "no nuScenes tables"),
-    "poses missing": (without("ego_pose"), "ego_pose.json: no such table"),
-    "table cut off": (cut("sample_data"), "not a whole JSON table"),
-    "quaternion not of unit length": (sets("ego_pose", rotation=[1, 1, 0, 0]), "length 1.414"),
-    "sweep truncated": (on_file("s*/LIDAR_TOP/*", lambda d: d[:-7]), "a multiple of 20"),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damage_is_refused_in_a_line(broken, damage):
-    harm, says = DAMAGE[damage]
-    harm(broken)
-    check_refused(f"nuscenes:{broken}", says, broken)
 
 
 # A real key frame

@@ -8,36 +8,21 @@ import numpy as np
 import pytest
 from ros_bags import PERIOD_NS, STAMP_NS, Maker, scan
 from scipy.spatial.transform import Rotation
-from writers import write_street
-from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.ros import RosBag
-from densify.readers.street import Street
 from tests.reader_checks import check_cameras, check_refused, check_sweeps, check_truth
 
 pytest.importorskip("rosbags")
 
-FRAMES, CAMERA = (59, 60, 61), "image_02"
 HALF_NS = 50_000_000
 
 
-@pytest.fixture(scope="module")
-def excerpt():
-    return Excerpt.of(Street("street", 0, "vlp16", cameras=(CAMERA,)), FRAMES, None)
-
-
-@pytest.fixture(scope="module")
-def written(excerpt, tmp_path_factory):
-    out = tmp_path_factory.mktemp("bags")
-    return {f: write_street(f, excerpt.street, out, FRAMES) for f in ("ros1", "ros2")}
-
-
 @pytest.mark.parametrize("format", ["ros1", "ros2"])
-def test_the_street_is_given_back(format, written, excerpt):
-    sequence = open_sequence(written[format])
+def test_the_street_is_given_back(format, recorded, excerpt):
+    sequence = open_sequence(recorded(format))
     assert isinstance(sequence, RosBag)
     check_sweeps(sequence, excerpt, -HALF_NS)
     check_cameras(sequence, excerpt)
@@ -103,18 +88,6 @@ def test_definitions_in_a_bag_are_not_made_code_of(tmp_path, monkeypatch):
     text = "float32 no_such_field\nimport os"
     monkeypatch.setattr(maker.types, "generate_msgdef", lambda _: (text, "0" * 32))
     assert len(open_sequence(maker.write(tmp_path))[1]) == 60
-
-
-def test_padded_points_are_dropped_and_rows_are_the_messages(tmp_path):
-    columns = scan()
-    for axis, value in zip("xyz", (np.nan, np.nan, np.nan), strict=True):
-        columns[axis][3] = value
-    for axis in "xyz":
-        columns[axis][7] = 0
-    maker = Maker()
-    maker.cloud(columns)
-    sweep = open_sequence(maker.write(tmp_path))[0]
-    assert len(sweep) == 58 and {3, 7}.isdisjoint(sweep.row) and sweep.row[-1] == 59
 
 
 def test_a_livox_message(tmp_path):

@@ -1,46 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""The Waymo reader on a street written as a segment, against the published formulas, and on broken
-segments."""
+"""The Waymo readeron a street written as a segment and against the published formulas."""
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from writers import write_street
-from writers.excerpt import Excerpt
 from writers.waymo import T_EGO_LIDAR, pixels
 
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.describe import describe
-from densify.readers.street import Street
 from densify.readers.waymo import Waymo
-from tests.reader_checks import check_refused, check_truth
+from tests.reader_checks import check_truth
+from tests.recorded import FRAMES
 
 parquet = pytest.importorskip("pyarrow.parquet")
 
-FRAMES, CAMERAS = (59, 60, 61), ("image_02", "rolling")
+FORMAT = "waymo"
 LIDAR, POSE = "[LiDARComponent].range_image_return", "[LiDARPoseComponent].range_image_return1"
 CALIBRATION = "[LiDARCalibrationComponent]"
-
-
-@pytest.fixture(scope="module")
-def excerpt():
-    return Excerpt.of(Street("street", 0, "vlp16", cameras=CAMERAS), FRAMES, None)
-
-
-@pytest.fixture(scope="module")
-def root(excerpt, tmp_path_factory):
-    return write_street("waymo", excerpt.street, tmp_path_factory.mktemp("waymo"), FRAMES)
-
-
-@pytest.fixture
-def copy(root, tmp_path):
-    """A segment to be changed."""
-    return shutil.copytree(root, tmp_path / "copy", ignore=shutil.ignore_patterns("truth"))
 
 
 def table_of(root, component):
@@ -62,8 +42,8 @@ def put(root, component, rows, schema=None):
 # The street
 
 
-def test_the_street_is_given_back(root, excerpt):
-    sequence = open_sequence(root)
+def test_the_street_is_given_back(written, excerpt):
+    sequence = open_sequence(written)
     assert isinstance(sequence, Waymo) and list(sequence.frames) == [0, 1, 2]
     for number, frame in enumerate(FRAMES):
         read, true = sequence[number], excerpt.street[frame]
@@ -89,9 +69,9 @@ def test_the_street_is_given_back(root, excerpt):
     np.testing.assert_allclose(step, inverse(T[0]) @ T[2], atol=1e-9)
 
 
-def test_cameras_are_given_back(root, excerpt):
-    sequence = open_sequence(root)
-    for name, ours in zip(("FRONT", "FRONT_LEFT"), CAMERAS, strict=True):
+def test_cameras_are_given_back(written, excerpt):
+    sequence = open_sequence(written)
+    for name, ours in zip(("FRONT", "FRONT_LEFT"), excerpt.cameras, strict=True):
         read, true = sequence.cameras[name], excerpt.street.cameras[ours]
         np.testing.assert_allclose(read.K, true.K, atol=1e-9)
         np.testing.assert_allclose(
@@ -146,11 +126,11 @@ def thinned(root, component, name):
     return np.reshape(row[f"{name}.values"], row[f"{name}.shape"])
 
 
-def test_compensated_they_are_the_points_of_the_published_conversion(root):
-    sequence = open_sequence(root)
-    image, pose = thinned(root, "lidar", f"{LIDAR}1"), thinned(root, "lidar_pose", POSE)
+def test_compensated_they_are_the_points_of_the_published_conversion(written):
+    sequence = open_sequence(written)
+    image, pose = thinned(written, "lidar", f"{LIDAR}1"), thinned(written, "lidar_pose", POSE)
     image[:, np.arange(image.shape[1]) % 60 > 0, 0] = 0
-    laser = rows_of(root, "lidar_calibration")[0]
+    laser = rows_of(written, "lidar_calibration")[0]
     extrinsic = np.reshape(laser[f"{CALIBRATION}.extrinsic.transform"], (4, 4))
     beams = np.array(laser[f"{CALIBRATION}.beam_inclination.values"])
     expected = official_points(image, beams, extrinsic, pose, sequence.T_world_lidar(1))
@@ -161,10 +141,10 @@ def test_compensated_they_are_the_points_of_the_published_conversion(root):
     np.testing.assert_allclose(found, expected, atol=0.01)
 
 
-def test_five_lidars_and_both_returns(copy):
+def test_five_lidars_and_both_returns(broken):
     """A small side lidar with even beams, turned, that hits something twice."""
-    schema = table_of(copy, "lidar").schema
-    rows = rows_of(copy, "lidar")
+    schema = table_of(broken, "lidar").schema
+    rows = rows_of(broken, "lidar")
     rng = np.random.default_rng(0)
     side = {1: rng.uniform(3, 20, (5, 8, 4)), 2: rng.uniform(20, 30, (5, 8, 4))}
     side[1][0, 0, 0] = side[2][0, :, 0] = -1
@@ -174,8 +154,8 @@ def test_five_lidars_and_both_returns(copy):
             new[f"{LIDAR}{number}.values"] = image.ravel()
             new[f"{LIDAR}{number}.shape"] = image.shape
         rows.insert(0, new)
-    put(copy, "lidar", rows, schema)
-    lasers = rows_of(copy, "lidar_calibration")
+    put(broken, "lidar", rows, schema)
+    lasers = rows_of(broken, "lidar_calibration")
     T = np.array([[0, 1.0, 0, 0.5], [-1, 0, 0, -1], [0, 0, 1, 1], [0, 0, 0, 1]])
     lasers.append(
         dict(
@@ -189,8 +169,8 @@ def test_five_lidars_and_both_returns(copy):
             },
         )
     )
-    put(copy, "lidar_calibration", lasers)
-    sweep = open_sequence(copy)[1]
+    put(broken, "lidar_calibration", lasers)
+    sweep = open_sequence(broken)[1]
     mine = sweep.select(sweep.lidar == 3)
     beams = -1.5 + 2.0 * (np.arange(5) + 0.5) / 5
     expected = np.concatenate(
@@ -200,41 +180,3 @@ def test_five_lidars_and_both_returns(copy):
     assert len(mine) == 39 + 32 and not mine.offset_ns.any()
     np.testing.assert_allclose(sweep.scanner_origins[3], T[:3, 3])
     np.testing.assert_allclose(sweep.R_scanner_lidar[3], T[:3, :3].T)
-
-
-# Damage
-
-
-def cut(component, size=-3000):
-    def harm(root):
-        path = root / component / "street.parquet"
-        path.write_bytes(path.read_bytes()[:size])
-
-    return harm
-
-
-def sets(component, column, value, row=slice(None)):
-    def harm(root):
-        rows, schema = rows_of(root, component), table_of(root, component).schema
-        for one in rows[row]:
-            one[column] = value(one[column]) if callable(value) else value
-        put(root, component, rows, schema)
-
-    return harm
-
-
-VEHICLE = "[VehiclePoseComponent].world_from_vehicle.transform"
-IMAGE, LENS = "[CameraImageComponent]", "[CameraCalibrationComponent]"
-DAMAGE = {
-    "no calibration": (lambda r: shutil.rmtree(r / "lidar_calibration"), "no such file"),
-    "lidar truncated": (cut("lidar"), "not a whole parquet file"),
-    "ranges of another shape": (sets("lidar", f"{LIDAR}1.shape", [1, 2, 4]), "expected .H, W, 4"),
-    "pose not a number": (sets("vehicle_pose", VEHICLE, np.full(16, np.nan)), "finite numbers"),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damaged_segments_are_refused_in_a_line(copy, damage):
-    harm, says = DAMAGE[damage]
-    harm(copy)
-    check_refused(f"waymo:{copy}", says, copy)

@@ -51,18 +51,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_run(tmp_path_factory.mktemp("run"))
 
 
-class TestPacking:
-    @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32])
-    @pytest.mark.parametrize("shape", [(0,), (7,), (5, 11)])
-    @pytest.mark.parametrize("smooth", [True, False])
-    def test_arrays_come_back(self, kind, shape, smooth) -> None:
-        rng = np.random.default_rng(3)
-        array = rng.integers(0, np.iinfo(kind).max, shape, kind, endpoint=True)
-        if smooth:
-            array = np.cumsum(array // 64, axis=-1, dtype=kind)  # wraps around
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32])
+def test_arrays_come_back(kind) -> None:
+    array = np.random.default_rng(3).integers(0, np.iinfo(kind).max, (5, 11), kind, endpoint=True)
+    for values in (array, np.cumsum(array // 64, axis=-1, dtype=kind)):  # smooth; wraps around
         blobs = Blobs()
-        entry = blobs.add(array)
-        assert np.array_equal(unpacked(blobs, entry), array)
+        assert np.array_equal(unpacked(blobs, blobs.add(values)), values)
 
 
 def test_thinning_keeps_moving_and_distant_points() -> None:

@@ -166,20 +166,6 @@ def test_the_cloud_is_drawn_and_its_controls_change_it(opened: Opened) -> None:
     assert 0 < drawn(opened) < 0.2 * everything
 
 
-def test_the_trail_collapses(opened: Opened) -> None:
-    """From above the car is longer where registration alone puts its points: it moves 0.4 s at
-    8 m/s."""
-    for name in ("show-paths", "show-cameras", "only-moving"):
-        opened.value(f"document.getElementById('{name}').click()")
-    opened.value("cloudPane.look({ yaw: Math.PI, pitch: 1.5, distance: 30, target: [9, 1.8, 0] })")
-    lengths = []
-    for value in (0, 1):
-        opened.set("morph", value)
-        opened.page.wait_for_timeout(400)
-        lengths.append(np.ptp(np.flatnonzero(foreground(opened).any(axis=1))))
-    assert lengths[0] > 1.4 * lengths[1] > 0
-
-
 def test_a_damaged_run_says_what_is_damaged(browser: Any, run: Path, tmp_path: Path) -> None:
     folder = write_run(tmp_path, report=False)
     for name in ("confidence/front.png", "cloud.laz", "scene/image/front.jpg"):

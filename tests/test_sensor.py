@@ -15,7 +15,7 @@ from densify.free_space.range_image import RangeImage
 from densify.free_space.rings import Aimed, aimed, find_rings, fires_by_azimuth
 from densify.free_space.sensor import SensorModel, Sensors
 from densify.geometry.types import RegisteredSweep
-from densify.readers.file_sequence import scanner_axes
+from densify.readers import checks
 from densify.street.sensors import SENSORS, Spinning
 from tests.fired import fired
 from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere
@@ -90,7 +90,7 @@ def test_a_scanner_that_hangs_upside_down_has_axes_with_z_upwards():
     tilt = Rotation.from_euler("y", 3.0, degrees=True).as_matrix()
     T[0, :3, :3] = tilt
     T[1, :3, :3] = tilt @ np.diag([1.0, -1.0, -1.0])
-    axes = scanner_axes(T)
+    axes = checks.scanner_axes(T)
     np.testing.assert_allclose(axes[0] @ tilt, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(axes[1], axes[0], atol=1e-12)
 

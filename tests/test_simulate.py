@@ -125,18 +125,6 @@ def _bodies() -> Bodies:
     return Bodies(T_world_lidar, T_world_body, np.array([[False, True]] * 3))
 
 
-def test_displacement_is_written_in_the_frames_own_axes(tmp_path):
-    write_bodies(tmp_path, _bodies())
-    body, point = np.array([0, 1], np.int32), np.array([[5.0, 0, 0], [5.0, 0, 0]])
-    write_points(tmp_path, 1, body, np.array([-1, 0], np.int32), point)
-    truth = FileTruth(tmp_path)
-    assert truth is not None
-    # the lidar of frame 1 looks along +y of the world, where +x is its right
-    np.testing.assert_array_equal(truth.displacement(1, 2), [[0, 0, 0], [0, -1.5, 0]])
-    np.testing.assert_array_equal(truth.sweep(1).points, [[0, -5, 0], [0, -6, 0]])
-    assert truth.sweep(1).moving.tolist() == [False, True]
-
-
 def test_missing_or_malformed_truth_files_are_named(tmp_path):
     with pytest.raises(InputError, match=r"bodies\.npz: no such truth file"):
         FileTruth(tmp_path)

@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from writers import write_street
 
 from densify.geometry.poses import inverse, transform
 from densify.readers.describe import describe
-from densify.readers.kitti.raw import KittiRaw
 from densify.readers.street import Street
 from densify.street.materials import Material
 from densify.street.mesh import box
@@ -224,24 +222,3 @@ def test_a_tilted_mount_turns_the_lidar_and_leaves_the_cameras(level):
     picture = tilted.simulator.picture("image_02", 120)  # anew: the cache shares them
     np.testing.assert_array_equal(picture.depth_m, level.truth.depth_m("image_02", 120))
     np.testing.assert_array_equal(picture.image, level.image("image_02", 120))
-
-
-def test_a_tree_of_another_rate_and_mount_opens_as_what_it_was(level, tmp_path):
-    street = same_scene(level, 20, 10.0)
-    drive = write_street("kitti", street, tmp_path, [116, 120], [])
-    (drive / "image_02").mkdir()  # cameras are those that have a folder
-    kitti = KittiRaw(drive)
-    for frame in (116, 120):
-        ours, read = street[frame], kitti[frame]
-        np.testing.assert_array_equal(read.points, ours.points)
-        assert read.stamp_ns == ours.stamp_ns == kitti.stamp_ns(frame)
-        assert np.abs(read.offset_ns - ours.offset_ns).max() <= 20
-    assert kitti[120].stamp_ns - kitti[116].stamp_ns == 200_000_000
-    steps = [inverse(s.T_world_lidar(116)) @ s.T_world_lidar(120) for s in (street, kitti)]
-    np.testing.assert_allclose(*steps, atol=1e-6)
-    cameras = street.cameras["image_02"], kitti.cameras["image_02"]
-    np.testing.assert_allclose(*(camera.T_cam_lidar for camera in cameras), atol=1e-12)
-    assert kitti.truth is not None
-    np.testing.assert_array_equal(
-        kitti.truth.displacement(116, 118), street.truth.displacement(116, 118)
-    )

@@ -63,14 +63,11 @@ def bench_depth(
 ) -> dict[str, Any]:
     """Make the keys with each variant and score the pixels of all keys and cameras together.
 
-    variants: configurations by name.
-    scanner: number of the scanner whose returns are the truth.
-    The other parameters are those of `densify.pipeline.run.run`.
-
-    Returns plain numbers: by variant ``density`` (mean share of the image) of each product,
-    ``seconds`` a key of the stages after the cloud, and ``scores`` by truth, product and part
-    (``all``, ``moving``): num_pixels, coverage, outliers.
-    Raises InputError for what cannot be used, ComputationError where registration went wrong.
+    variants: configurations by name. scanner: number of the scanner whose returns are the truth.
+    The other parameters are those of `densify.pipeline.run.run`. Returns plain numbers: by variant
+    ``density`` (mean share of the image) of each product, ``seconds`` a key of the stages after the
+    cloud, and ``scores`` by truth, product and part: num_pixels, coverage, outliers. Raises
+    InputError for what cannot be used, ComputationError where registration went wrong.
     """
     choose_cameras(sequence, cameras)
     if method not in METHODS:

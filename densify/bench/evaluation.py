@@ -37,16 +37,12 @@ def evaluate(
     """Score pairs of depth maps: the mean over images of each image's value, as in KITTI's kit.
 
     focal_px, baseline_m: turn depth into the disparity that defines outliers and depth edges.
-
     Returns plain numbers ready for JSON, None where undefined::
 
-        schema_version, focal_px, baseline_m
-        num_images   pairs
+        schema_version, focal_px, baseline_m, num_images
         density      predicted, truth: mean share of all the pixels that have a depth
-        parts        `errors_by_part` name -> num_images (with any pixel of the part compared) and
-                     the `DepthErrors` of `mean_errors`; moving and static over pairs with a mask
-        images       of each pair: predicted, truth, mask (paths or None), density, and the
-                     `DepthErrors` of all its pixels
+        parts        of `errors_by_part`: num_images and `mean_errors`
+        images       of each pair: predicted, truth, mask (paths or None), density, `DepthErrors`
         without_truth, without_prediction, without_mask   paths
 
     Raises InputError if a file is no depth map or mask, or the sizes of a pair differ.

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from densify.cli.answer import Answer
+from densify.cli.screen import Answer
 from densify.config import Config, presets, resolve
 from densify.config.errors import InputError
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from densify.cli.answer import aligned, look_up, percent, written
+from densify.cli.screen import aligned, look_up, percent, written
 from densify.geometry.types import Result
 from densify.outputs import Export
-from densify.outputs.plain import plain
+from densify.outputs.atomic import plain
 from densify.readers.timeline import format_frames
 
 FIRST_OF_RUN = {

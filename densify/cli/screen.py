@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Answers on stdout, log lines and the one error on stderr."""
+"""Answers on stdout, with tables of text; log lines, the one error, and where that is a terminal a
+progress bar on stderr."""
 
 from __future__ import annotations
 
@@ -8,13 +9,110 @@ import json
 import logging
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from typing import Any
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from densify.cli.answer import Answer
 from densify.config.errors import brief
 
+if TYPE_CHECKING:
+    from densify.geometry.types import Progress
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer of a verb.
+
+    text: for people.
+    facts: for programs (``--json``); lists of several answers are joined.
+    files: the files written.
+    first: the files to open first, each with what it shows.
+    """
+
+    text: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    files: Sequence[Path] = ()
+    first: Mapping[Path, str] = field(default_factory=dict)
+
+    def lines(self) -> list[str]:
+        """Return the text, every file, and the files to open first."""
+        lines = [self.text] if self.text else []
+        lines += map(str, self.files)
+        if self.first:
+            rows = [[f"  {path}", what] for path, what in self.first.items()]
+            lines += ["open first:", aligned(rows, "<")]
+        return lines
+
+
+def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> dict[Path, str]:
+    """Return the files to open first, at most one of each kind.
+
+    kinds: pattern of the end of a path -> what the file shows; the first kinds come first.
+    """
+    first: dict[Path, str] = {}
+    for pattern, what in kinds.items():
+        found = next((f for f in files if f.match(pattern) and f not in first), None)
+        if found is not None and len(first) < most:
+            first[found] = what
+    return first
+
+
+def numbers_table(columns: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a table with a column for each mapping and a row for each number in any of them, named
+    by its path."""
+    flat = {title: dict(_numbers(numbers, "")) for title, numbers in columns.items()}
+    names = dict.fromkeys(name for numbers in flat.values() for name in numbers)
+    body = [[name, *(_cell(column.get(name)) for column in flat.values())] for name in names]
+    return aligned([["", *columns], *body])
+
+
+def _cell(value: float | None) -> str:
+    return written(value, ",d" if isinstance(value, int) else ".4g")
+
+
+def _numbers(values: Mapping[str, Any], path: str) -> Iterator[tuple[str, float]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _numbers(value, f"{path}{name} ")
+        elif isinstance(value, float | int):
+            yield f"{path}{name}", value
+
+
+def aligned(rows: Sequence[Sequence[str]], side: str = ">") -> str:
+    """Return the rows as text, the first column to the left, the others to the right or left."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    sides = ["<", *(side * (len(widths) - 1))]
+    lines = (
+        "  ".join(f"{cell:{s}{w}}" for cell, s, w in zip(row, sides, widths, strict=True))
+        for row in rows
+    )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def written(value: float | None, form: str) -> str:
+    """Return the number as text, "-" for None. form: a format, and after a blank a unit."""
+    if value is None:
+        return "-"
+    number, _, unit = form.partition(" ")
+    return f"{value:{number}}".replace("%", " %") + (f" {unit}" if unit else "")
+
+
+def percent(value: float | None, digits: int = 2) -> str:
+    """Return a share as a percentage."""
+    return written(value, f".{digits}%")
+
+
+def look_up(metrics: Mapping[str, Any], *path: str) -> Any:
+    """Return ``metrics[a][b]...``, None where a step of the path is missing."""
+    value: Any = metrics
+    for step in path:
+        value = value.get(step) if isinstance(value, Mapping) else None
+    return value
+
+
+_LAYOUT = "{desc:<10} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 _SCHEMA = 1
 """Version of what ``--json`` prints; grows when a key changes its meaning or goes."""
 
@@ -52,7 +150,7 @@ class Screen(logging.Handler):
         if error is not None:
             logging.getLogger("densify").error("%s", error)
         if self._json:
-            from densify.outputs.plain import plain
+            from densify.outputs.atomic import plain
 
             outcome = {"exit_code": exit_code, "error": error, "warnings": self._warnings}
             facts = plain({**self._facts, **outcome})
@@ -89,6 +187,24 @@ def screen() -> Iterator[Screen]:
         log.setLevel(before[0])
         log.propagate = before[1]
         progress.setLevel(before[2])
+
+
+@contextmanager
+def progress_on_stderr() -> Iterator[Progress]:
+    """Yield a function that shows that ``done`` of ``total`` parts of a stage are done."""
+    from tqdm import tqdm
+
+    hidden = not sys.stderr.isatty()
+    with tqdm(total=1, file=sys.stderr, leave=False, bar_format=_LAYOUT, disable=hidden) as bar:
+
+        def show(stage: str, done: int, total: int) -> None:
+            if done < bar.n or total != bar.total:  # another stage
+                bar.reset(total)
+                bar.initial = done
+            bar.n = done
+            bar.set_description(stage)
+
+        yield show
 
 
 def _above_bars() -> AbstractContextManager[None]:

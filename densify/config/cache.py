@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The cache on disk: results of pipeline steps, found again by all that they were made from. An
-entry is an ``.npz`` file without pickles: the arrays, and the rest as JSON. Its folder belongs to
-the user alone (`densify.config.user_folder`). A damaged entry is made again."""
+entry is an ``.npz`` file without pickles: the arrays, and the rest as JSON. A damaged entry is made
+again. Its folder belongs to the user alone: nobody else can put anything there."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import hashlib
 import json
 import logging
 import os
+import stat
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
@@ -18,9 +19,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import platformdirs
 
 from densify import __version__
-from densify.config.user_folder import own_folder
+from densify.config.errors import InputError
 
 T = TypeVar("T")
 _log = logging.getLogger("densify")
@@ -143,3 +145,32 @@ def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     value = object.__new__(made)
     value.__dict__.update(zip((f.name for f in fields(made)), parts, strict=True))
     return value
+
+
+def own_folder(name: str) -> Path:
+    """Return that folder of the user's cache directory, or of the one that the environment variable
+    DENSIFY_CACHE_DIR names. It is made with mode 0700 where that is possible.
+
+    Raises InputError if others can write to it.
+    """
+    named = os.environ.get("DENSIFY_CACHE_DIR")
+    root = Path(named or platformdirs.user_cache_dir("densify"))
+    for folder in (root, root / name):
+        with suppress(OSError):  # whoever writes to it reports that
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if others_can_write(folder):
+            raise InputError(
+                f"cache {folder}: others can write to it, expected a folder of yours alone; "
+                f"chmod 700 {folder}, or name another by DENSIFY_CACHE_DIR"
+            )
+    return root / name
+
+
+def others_can_write(folder: Path) -> bool:
+    """Return True if anybody but this user and root can write to an existing folder."""
+    try:
+        found = folder.stat()
+    except OSError:
+        return False
+    mine = found.st_uid in (0, os.getuid())
+    return not mine or bool(found.st_mode & (stat.S_IWGRP | stat.S_IWOTH))

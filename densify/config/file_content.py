@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Bounded reading of files: bytes, text, JSON and YAML."""
+"""Bounded reading of files: bytes, text, JSON and YAML; optional packages, imported where they are
+used; and one error for whatever a malformed description raises."""
 
 from __future__ import annotations
 
@@ -7,6 +8,9 @@ import json
 import os
 import stat
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +20,7 @@ MOST_BYTES = 1 << 30
 """Largest content that is read into memory, unpacked. A sweep has 2 to 10 MB."""
 _MOST_YAML_BYTES = 1 << 22
 _MOST_ALIASES = 30  # nested aliases multiply: 30 of them make at most 60,000 values of one
+_MALFORMED = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 def open_file(path: Path) -> BinaryIO:
@@ -129,3 +134,36 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
             raise ValueError(f"line {line}: {full} is given twice; keep one")
         lines[full] = line
         _note_lines(value, full, lines)
+
+
+def needed(module: str, extra: str, what: str) -> Any:
+    """Return the imported module. Raises InputError, with what mends it, if that fails.
+
+    extra: of densify, that brings it. what: needs it, such as "Argoverse 2 recordings".
+    """
+    package = module.partition(".")[0]
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{what} need the package {package} ({error}); install it with "
+            f"pip install 'densify[{extra}]'"
+        ) from None
+    except ImportError as error:
+        raise InputError(
+            f"{what} need the package {package}, which is installed and cannot be loaded here "
+            f"({error}); install the system's library that it names"
+        ) from None
+
+
+@contextmanager
+def described_in(where: Path | str, expected: str) -> Iterator[None]:
+    """Raise InputError, which begins with ``where``, for a key that is absent or a value of another
+    kind in what is read meanwhile."""
+    try:
+        yield
+    except InputError:
+        raise
+    except _MALFORMED as error:
+        got = f"no {error}" if isinstance(error, KeyError) else reason(error)
+        raise InputError(f"{where}: {got:.200}; expected {expected}; fetch it again") from None

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Plug-ins: the built-in readers and engines, and those that other packages add by entry points.
-The outputs and exports are in `densify.config.written`. Rows name modules and import none.
+Rows name modules and import none.
 
 The entry point's name is the plug-in's, its value a module::
 
@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from densify.config.errors import InputError, did_you_mean
 
@@ -25,16 +25,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Plugin:
-    """One plug-in. Another package's module has the other fields as attributes: ``owned`` as OWNED,
+    """One plug-in. Another package's module has the other fields as attributes: ``holds`` as HOLDS,
     ``recognises`` as it is.
 
     name: as users write it. module: import path. Of readers, ``recognises`` returns True if a
     place, which exists, holds such recordings, judged by names alone; ``holds`` says what is there,
     and ``boxes`` where tracked boxes are, for messages; ``scenes``: a place may hold several, named
-    by ``#SCENE``. Of outputs and exports, ``function`` does the work and alone writes the files and
-    folders ``owned``; ``of_drive``: it takes several keys of a drive. Of engines, ``argument`` is
-    what follows the name after a colon; ``shared``: the motion of a long stretch serves every key
-    in it (`densify.flow.engines.SharedMotion`).
+    by ``#SCENE``. Of engines, ``argument`` is what follows the name after a colon; ``shared``: the
+    motion of a long stretch serves every key in it (`densify.flow.engines.SharedMotion`).
     """
 
     name: str
@@ -43,9 +41,6 @@ class Plugin:
     holds: str = "a recording of another package's reader"
     boxes: str = ""
     scenes: bool = False
-    function: str = ""
-    owned: tuple[str, ...] = ()
-    of_drive: bool = False
     argument: str = ""
     shared: bool = False
 
@@ -62,7 +57,7 @@ class Plugin:
 @dataclass(frozen=True)
 class Table:
     """kind: for messages. group: of the entry points. members: functions that the module of another
-    package has, the first one does the work."""
+    package has."""
 
     kind: str
     group: str
@@ -122,8 +117,7 @@ class Table:
             )
         own = {f.name: f.name.upper() for f in fields(Plugin)} | {"recognises": "recognises"}
         said = {name: getattr(module, told) for name, told in own.items() if hasattr(module, told)}
-        known = {"name": point.name, "module": module.__name__, "function": self.members[0]}
-        return Plugin(**{**said, **known})
+        return Plugin(**{**said, "name": point.name, "module": module.__name__})
 
 
 ENGINES = Table(
@@ -236,3 +230,27 @@ READERS = Table(
     ),
 )  # fmt: skip
 """The module of each has the function of `densify.readers.ReaderModule`."""
+
+
+class Form(NamedTuple):
+    """module: in `densify.outputs.export`, with the function ``write_NAME``. owned: the files and
+    folders that it writes. of_drive: it takes several keys of a drive."""
+
+    module: str
+    owned: tuple[str, ...]
+    of_drive: bool = False
+
+
+EXPORTS = {
+    "npy": Form("maps_and_clouds", ("depth", "depth_filled", "confidence")),
+    "exr": Form("maps_and_clouds", ("depth", "depth_filled", "confidence")),
+    "ply": Form("maps_and_clouds", ("cloud.ply",)),
+    "pcd": Form("maps_and_clouds", ("cloud.pcd",)),
+    "nerfstudio": Form("camera_files", ("transforms.json", "images", "depth", "cloud.ply")),
+    "colmap": Form("camera_files", ("images", "sparse")),
+    "splats": Form("camera_files", ("images", "sparse", "movers", "tracks.json")),
+    "kitti": Form("maps_and_clouds", ("train", "val"), of_drive=True),
+    "rrd": Form("rrd", ("recording.rrd",), of_drive=True),
+    "mcap": Form("mcap", ("recording.mcap",), of_drive=True),
+}
+"""The forms of ``densify export``, by name."""

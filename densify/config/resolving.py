@@ -20,13 +20,10 @@ def resolve(
 ) -> Config:
     """Return the configuration that `config` and the overrides name.
 
-    config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a YAML
-        file of that form; or a str, the name of a preset (`presets`) or else a file. Only
-        differences from the defaults need to be named.
-    overrides: ``section.key=value`` each, values written as in YAML; later ones win.
-
-    Raises InputError for anything unknown (suggesting the right name), of the wrong type or out of
-    range, naming the file or ``--set`` that it comes from.
+    config: None for the defaults; a Config; a mapping ``{section: {key: value}}`` of differences
+    from them; a Path to a YAML file of that form; or a str, a preset's name or else a file's.
+    overrides: ``section.key=value`` each, values as in YAML; later ones win. Raises InputError for
+    anything unknown, of the wrong type or out of range, naming where it comes from.
     """
     values = as_mapping(config if isinstance(config, Config) else Config())
     if isinstance(config, Mapping):

@@ -159,19 +159,11 @@ class PriorSettings(Section):
 class OutputSettings(Section):
     """Files beside those that every run writes."""
 
-    flow: str = one_of("none", "npz", "opensceneflow")
+    flow: str = one_of("none", "npz")
     optical_flow: bool = False
     rejected: bool = False
     report: bool = False
-    also: str = ""
     movers: str = one_of("keep", "drop", "separate")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.also:
-            from densify.config.written import check_also
-
-            check_also(self.also)
 
 
 @dataclass(frozen=True)

@@ -50,16 +50,15 @@ def call_all(
 ) -> Iterator[tuple[Item, Any]]:
     """Call ``call(item)`` for every item and yield each with its outcome as soon as it is over.
 
-    call: a function of a module.
-    groups: none empty. The first item of a group is over before the others of the group begin; what
-        these have in common is then in the cache. Items are hashable and picklable.
+    call: a function of a module. groups: none empty, of hashable and picklable items; the first of
+    a group is over before the others begin, which then find what they share in the cache.
     num_workers: processes; 1 is this one. log: the file to which other processes append their log.
     scheduler: address of a Dask scheduler whose workers are used instead.
 
-    An item whose process dies is tried once more, alone. Its outcome is a ComputationError if that
-    process dies too. InputError and ComputationError of ``call`` are raised; any other error is the
-    item's outcome as a ComputationError. Raises ComputationError if the workers cannot begin or the
-    scheduler is lost, InputError if it is not reached.
+    An item whose process dies is tried once more, alone; then its outcome is a ComputationError.
+    InputError and ComputationError of ``call`` are raised, any other error is the item's outcome as
+    a ComputationError. Raises ComputationError if the workers cannot begin or the scheduler is
+    lost, InputError if it is not reached.
     """
     if num_workers == 1 and scheduler is None:
         for group in groups:

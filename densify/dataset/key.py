@@ -122,7 +122,6 @@ def _write(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
         config=as_mapping(job.recipe.config),
         data=job.data,
         overwrite=True,
-        also=job.recipe.config.output.also,
     )
     return {p.relative_to(job.out).as_posix(): FileRecord.of(p.read_bytes()) for p in paths}
 

@@ -89,24 +89,18 @@ def make_dataset(
 ) -> Summary:
     """Make every key of whole recordings, as a training set in the folder ``out``.
 
-    data: recordings, as `densify.open_sequence` takes them.
-    keys: the frames ``start`` to ``stop`` - 1 by ``step`` that exist; all if None.
-    recipe: window, method, cameras and the like; the usual ones if None.
-    num_workers: processes; 1 works in this one, None takes as many as cores, free memory and keys
-        suffice for. A script that starts several needs ``if __name__ == "__main__"``.
-    scheduler: address of a Dask scheduler whose workers are used instead; they need the same files
-        at the same paths. ``tcp://`` trusts everybody on that network, ``tls://`` takes
-        certificates.
-    shard: (i, n), the i-th of n parts of the work, from 1. Parts may run at the same time on
-        machines that share ``out``.
-    verify: compare finished files with their recorded hashes, and make damaged ones again.
-    report: called before the first key and after every one.
+    data: as `densify.open_sequence` takes them. keys: the frames ``start`` to ``stop`` - 1 by
+    ``step`` that exist; all if None. recipe: the usual one if None. num_workers: processes; 1 works
+    in this one, None takes as many as cores, free memory and keys suffice for (a script that starts
+    several needs ``if __name__ == "__main__"``). scheduler: address of a Dask scheduler whose
+    workers are used instead, with the same files at the same paths; ``tcp://`` trusts everybody on
+    that network, ``tls://`` takes certificates. shard: (i, n), the i-th of n parts, from 1, which
+    may run at once on machines that share ``out``. verify: compare finished files with their
+    hashes, and make damaged ones again. report: called before the first key and after every one.
 
-    Run again, it goes on where it was stopped: finished keys are kept, keys that failed are tried
-    again. The files do not depend on the number of processes, on shards or on interruptions. The
-    manifest says what became of every key (`densify.dataset.manifest`).
-
-    Raises InputError for what cannot be used, and where another run is at work on the same part;
+    Run again, it goes on where it was stopped; failed keys are tried again. The files do not depend
+    on processes, shards or interruptions; the manifest says what became of every key. Raises
+    InputError for what cannot be used, and where another run is at work on the same part;
     ComputationError where the disk is full or the workers are lost: what is finished is kept.
     """
     if isinstance(data, str) or not data:

@@ -2,17 +2,16 @@
 """The record of what was made: ``OUT/manifest.jsonl``, or ``OUT/manifest-2of4.jsonl`` of the second
 of four shards, one JSON line per key::
 
-    drive, key   the recording's name and the frame number
-    status       done, aside (made, but not good enough to be in the set) or failed
-    reason       why it is not done, or null
-    frames       of the sweeps it was made of
-    files        path relative to OUT, with slashes -> bytes, sha256
-    scores       numbers; null where nothing can be said
-    seconds      of computing
-    warnings     sentences about what was assumed or looks wrong
+    drive, key       the recording's name and the frame number
+    status, reason   done, aside (made, but not good enough to be in the set) or failed, and why
+    frames           of the sweeps it was made of
+    files            path relative to OUT, with slashes -> bytes, sha256
+    scores           numbers; null where nothing can be said
+    seconds          of computing
+    warnings         sentences about what was assumed or looks wrong
 
-A line is on the disk before the next one is begun. A killed writer damages at most the last line.
-The key of a damaged line is made again. A later line of a key replaces an earlier one.
+A line is on the disk before the next is begun: a killed writer damages at most the last, whose key
+is made again. A later line of a key replaces an earlier one.
 """
 
 from __future__ import annotations
@@ -29,9 +28,8 @@ from typing import Any, Literal
 
 from densify.config.errors import InputError, OutputError
 from densify.config.file_content import parse_json, read_bytes
-from densify.outputs.atomic import write_file
+from densify.outputs.atomic import plain, write_file
 from densify.outputs.kitti_tree import FileRecord
-from densify.outputs.plain import plain
 
 Status = Literal["done", "aside", "failed"]
 Key = tuple[str, int]
@@ -139,13 +137,9 @@ class Manifest:
     """The manifest of one run, or of one shard, while it is written; a context manager.
 
     root: the folder of the set, made if it is not there. shard: (k, n) for the k-th of n, from 1.
-
-    Only one process at a time can have it open. Its hidden lock file stays: to remove it would take
-    the lock from another process that has just opened it. On opening and on closing, the lines are
-    put in order: one per key, by drive and key.
-
-    Raises InputError if another process has it open or it cannot be read, OutputError if it cannot
-    be written.
+    One process at a time has it open, by a hidden lock file that stays. On opening and closing the
+    lines are put in order: one per key, by drive and key. Raises InputError if another process has
+    it open or it cannot be read, OutputError if it cannot be written.
     """
 
     def __init__(self, root: Path, shard: tuple[int, int] | None = None) -> None:

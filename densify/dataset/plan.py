@@ -25,10 +25,10 @@ from densify import __version__
 from densify.config import Config, as_mapping
 from densify.config.errors import InputError
 from densify.config.file_content import read_json
+from densify.config.sections import Section, one_of, within
 from densify.geometry.types import Camera, LidarSequence
-from densify.outputs.atomic import write_file
+from densify.outputs.atomic import plain, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
-from densify.outputs.plain import plain
 from densify.pipeline.sweeps import Cut
 from densify.readers import Spec, open_sequence
 from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, runs
@@ -37,7 +37,6 @@ SCHEMA_VERSION = 1
 _KNOWN = {
     "method": ("flow", "icp", "none"),
     "layout": ("kitti-depth", "densify"),
-    "split": ("train", "val", None),
 }
 _FILE = "dataset.json"
 _MOST_FRAMES = 10_000_000
@@ -47,8 +46,9 @@ _CAMERA = [f.name for f in fields(Camera) if f.name != "name"]
 
 
 @dataclass(frozen=True)
-class Gate:
-    """Limits beyond which a key is put aside, by scores that need no truth; None is no limit.
+class Gate(Section):
+    """``--set dataset.NAME=VALUE``: limits beyond which a key is put aside, by scores that need no
+    truth, None is no limit; and the split of the tree, kitti for KITTI's official one.
 
     max_ghost: share of the accumulated points that the key sweep saw through.
     min_density: share of the image's pixels with a measured depth, in every camera.
@@ -57,10 +57,11 @@ class Gate:
     min_sweeps: number of sweeps in the window, which ends and gaps of the recording cut.
     """
 
-    max_ghost: float | None = None
-    min_density: float | None = None
-    max_outliers: float | None = None
-    min_sweeps: int | None = None
+    max_ghost: float | None = within(None, 0, 1)
+    min_density: float | None = within(None, 0, 1)
+    max_outliers: float | None = within(None, 0, 1)
+    min_sweeps: int | None = within(None, 1, 101)
+    split: str = one_of("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
         """Return why a key with these `scores` is put aside; None if it is not."""
@@ -84,15 +85,14 @@ class Recipe:
 
     window: sweeps on each side of a key. method: flow, icp or none.
     layout: ``kitti-depth``, KITTI's depth tree, or ``densify``, what ``densify run`` writes.
-    cameras: names, None for all. split: train or val, None for KITTI's official one.
-    gate: limits of the scores. config: what `densify.config.resolve` returns.
+    cameras: names, None for all. gate: limits of the scores, and the split of the tree.
+    config: what `densify.config.resolve` returns.
     """
 
     window: int = 5
     method: str = "flow"
     layout: str = "kitti-depth"
     cameras: tuple[str, ...] | None = None
-    split: str | None = None
     gate: Gate = field(default_factory=Gate)
     config: Config = field(default_factory=Config)
 
@@ -133,10 +133,8 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]
     """Open every recording and choose its keys.
 
     data: what ``--data`` takes. keys: all if None, else of the frames ``start`` to ``stop`` - 1 by
-    ``step`` those that exist, of every recording.
-
-    Raises InputError for recordings that cannot be opened, have equal names, no such camera, or
-    none of the keys.
+    ``step`` those that exist, of every recording. Raises InputError for recordings that cannot be
+    opened, have equal names, no such camera, or none of the keys.
     """
     drives: dict[str, Drive] = {}
     for spec in data:
@@ -150,7 +148,8 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]
         cameras = {camera.name: camera for camera in choose_cameras(sequence, recipe.cameras)}
         if not cameras:
             raise InputError(f"--data {spec}: has no camera; expected one to make depth maps for")
-        folder = f"{recipe.split or split_of(sequence.name)}/{name}"
+        split = recipe.gate.split
+        folder = f"{split_of(sequence.name) if split == 'kitti' else split}/{name}"
         if recipe.layout == "densify":
             folder = name if len(data) > 1 else "."
         cut = Cut.whole(Timeline.of(sequence), recipe.window)

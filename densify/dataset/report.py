@@ -13,9 +13,7 @@ from typing import Any
 from densify.config.errors import InputError
 from densify.dataset.manifest import KeyRecord, read_manifests
 from densify.dataset.plan import planned_keys, read_plan
-from densify.geometry.types import Result
 from densify.outputs.atomic import write_file
-from densify.outputs.key_outputs import Context
 from densify.outputs.report.key_page import KeyFiles, key_page
 
 _STATUSES = ("failed", "aside", "done")
@@ -36,13 +34,6 @@ tr:nth-child(even) {{background: #eee}}</style>
 """
 
 
-def write_output(result: Result, context: Context, folder: Path) -> None:
-    """Write ``report.html`` of the files of the other outputs, where ``output.report`` asks."""
-    if context.config.get("output", {}).get("report"):
-        page = key_page(KeyFiles.of_run(folder), f"{result.key:06d}")
-        write_file(folder / "report.html", page)
-
-
 def write_comparison_page(folder: Path) -> Path:
     """Write ``compare.html`` of a key's folder."""
     page = folder / "compare.html"
@@ -54,12 +45,9 @@ def write_report(place: Path, overwrite: bool = False) -> list[Path]:
     """Make the page or pages of what lies in a folder; return them: ``report.html`` of a run or a
     set, ``compare.html`` of a comparison, beside their files.
 
-    place: a key's folder of ``run`` or ``compare``, such as densify-out/000120, the folder above
-        it if it holds no other, or a training set. overwrite: replace an earlier page.
-
-    The page tells what is damaged or missing. Raises InputError for a folder that is none of these,
-    one whose main files are damaged, and a page that is there already, OutputError if it cannot be
-    written.
+    place: a key's folder, the folder above it if it holds no other, or a training set. Raises
+    InputError for a folder that is none of these, one whose main files are damaged, and a page that
+    is there already, OutputError if it cannot be written.
     """
     pages = _pages(place)
     for path in pages:

@@ -17,7 +17,7 @@ from densify.config.errors import ComputationError, InputError
 from densify.flow.engines import Scene, estimate_motion
 from densify.free_space.ground import ground
 from densify.geometry.types import Bool, Float32, LidarSequence
-from densify.learning.clouds import AboveGround
+from densify.learning.network import AboveGround
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
 from densify.readers.street import Street

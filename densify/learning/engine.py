@@ -16,9 +16,7 @@ from densify.flow.engines import Scene
 from densify.flow.tracking.candidates import Candidates, closer_rings, cluster_around
 from densify.flow.tracking.groups import GroupMotion, motion_of
 from densify.geometry.types import Float
-from densify.learning.clouds import AboveGround, order_for
-from densify.learning.model_file import Model, read_model
-from densify.learning.network import NUM_SWEEPS
+from densify.learning.network import NUM_SWEEPS, AboveGround, Model, order_for, read_model
 
 MOVES_M_S = 0.5
 """Points that the network sees move more slowly start no track (Chodosh et al., WACV 2024)."""

@@ -6,17 +6,35 @@ It follows FastFlow3D (Jund et al., "Scalable Scene Flow from Point Clouds in th
 are encoded one by one and averaged over the cells of a grid of 0.4 m. The grids of all sweeps go
 through one U-Net, which can compare them. Each source point reads the result at its position,
 joined to its own code, and two more layers give its flow.
+
+A model file is numpy's archive of arrays, read without running any code: ``header`` holds JSON
+(format, version, network, how it was trained), ``weights/NAME`` the network's arrays.
 """
 
 from __future__ import annotations
 
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from densify.learning.clouds import NetworkCloud, Sweeps
+from densify.config.errors import InputError
+from densify.config.file_content import parse_json
+from densify.flow.objective.energy import on_one_thread
+from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
+from densify.geometry import poses
+from densify.geometry.types import Float, Float32, Int, RegisteredSweep
+from densify.outputs.atomic import write_file
+from densify.readers.decoded_files import read_arrays
 
 CELL_M = 0.4
 NUM_CELLS = 256
@@ -27,6 +45,59 @@ _NUM_POINT_FEATURES = 6
 _WIDTH = 16
 _WIDTHS = (32, 48, 64, 96)
 _LARGEST_HEIGHT_M = 4.0
+
+
+# Its input, the same in training and inference: points above the ground, the ego motion undone
+
+
+class NetworkCloud(NamedTuple):
+    """One sweep of n points.
+
+    points: (n,3) float32 metres, world axes (z up) about the scanner at the time of the *source*
+    sweep. height_m: (n,) float32 above the ground.
+    """
+
+    points: Tensor
+    height_m: Tensor
+
+
+class AboveGround(NamedTuple):
+    """The points of a sweep above the ground.
+
+    row: (n,) in the sweep. points: (n,3) metres, world. height_m: (n,) above the ground.
+    """
+
+    row: Int
+    points: Float
+    height_m: Float32
+
+    @staticmethod
+    def of(registered: RegisteredSweep, ground: HeightMap, row: Int | None = None) -> AboveGround:
+        """Select the points above the ground, or those of the rows (n,)."""
+        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+        height_m = ground.above(points)
+        row = np.flatnonzero(height_m >= ABOVE_GROUND_M) if row is None else row
+        return AboveGround(row, points[row], height_m[row])
+
+    def cloud(self, origin: Float) -> NetworkCloud:
+        """Return the input of a network, about the origin (3,)."""
+        points = torch.from_numpy((self.points - origin).astype(np.float32))
+        return NetworkCloud(points, torch.from_numpy(np.ascontiguousarray(self.height_m)))
+
+
+def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> list[int | None]:
+    """Return the numbers of the sweeps that a network gets for the flow from source to target.
+
+    Source and target come first, then the sweeps before the source in that direction of time; None
+    beyond the first and the last sweep.
+    """
+    step = source - target
+    wanted = [source, target, *(source + step * n for n in range(1, num_wanted - 1))]
+    return [n if 0 <= n < num_sweeps else None for n in wanted]
+
+
+Sweeps = Sequence[NetworkCloud | None]
+"""Source, target, and any number of sweeps before the source; None where there is none."""
 
 
 class Voxels(nn.Module):
@@ -159,3 +230,64 @@ def _at(image: Tensor, pillars: _Pillars) -> Tensor:
         image, at[None, None], padding_mode="border", align_corners=False
     )
     return found[0, :, 0].T
+
+
+FORMAT, VERSION = "densify model", 1
+NETWORK = "voxels"
+_HEADER, _WEIGHTS = "header", "weights/"
+
+
+@dataclass(frozen=True)
+class Model:
+    """A network with its weights. made: how it was trained, plain values for JSON."""
+
+    network: Voxels
+    made: Mapping[str, Any] = field(default_factory=dict)
+
+    def flow(self, sweeps: Sweeps) -> Float:
+        """Return the (n,3) flow of the first sweep to the second, metres; the same bytes on any
+        number of cores."""
+        with on_one_thread(), torch.inference_mode():
+            found: Float = self.network(sweeps).double().numpy()
+        return found
+
+
+def write_model(path: Path, model: Model) -> None:
+    """Write a model file: the same bytes for the same model.
+
+    The file appears when it is complete. Raises OutputError where it cannot be written.
+    """
+    header = {"format": FORMAT, "version": VERSION, "network": NETWORK, "made": model.made}
+    text = json.dumps(header, sort_keys=True).encode()
+    arrays: dict[str, NDArray[Any]] = {_HEADER: np.frombuffer(text, np.uint8)}
+    for name, tensor in model.network.state_dict().items():
+        arrays[_WEIGHTS + name] = tensor.detach().cpu().numpy()
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
+    write_file(path, buffer.getvalue())
+
+
+def read_model(path: Path) -> Model:
+    """Read a model file. Raises InputError for another file, a damaged one, or another version."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a model that densify train flow wrote")
+    arrays = read_arrays(path)
+    try:
+        header = dict(parse_json(bytes(arrays.pop(_HEADER).astype(np.uint8)), path))
+        found = header["format"], header["version"], header["network"]
+        made = dict(header["made"])
+    except (KeyError, ValueError, TypeError, InputError):
+        raise InputError(f"{path}: no model that densify train flow wrote") from None
+    if found != (FORMAT, VERSION, NETWORK):
+        raise InputError(
+            f"{path}: got {found}, expected {(FORMAT, VERSION, NETWORK)}; train it again"
+        )
+    network = build()
+    weights = {name.removeprefix(_WEIGHTS): array for name, array in arrays.items()}
+    if not all(np.isfinite(array).all() for array in weights.values()):
+        raise InputError(f"{path}: weights that are not finite; train it again")
+    try:
+        network.load_state_dict({name: torch.from_numpy(a) for name, a in weights.items()})
+    except (RuntimeError, TypeError) as error:
+        raise InputError(f"{path}: damaged: {error}; train it again") from error
+    return Model(network.train(False), made)

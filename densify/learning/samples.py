@@ -1,23 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""Pairs of sweeps to train on, in an order that follows from a seed alone.
+"""Pairs of sweeps to train on, in an order that follows from a seed alone, and the losses of the
+teachers.
 
 The pairs of several clips come mixed, in both directions of time, and several times. Each time they
 are turned about the vertical, mirrored and scaled at random.
+
+The teacher ``objective`` is the published objective in m² per point (Pontes, Hays, Lucey, 3DV 2020,
+sections 3 and 4), with alpha = 4 (10 without learning) and a graph of 50 neighbours; it needs no
+labels. ``engine`` and ``truth`` compare with a known flow. Nearly all points are static, and a
+plain mean teaches a network to be static: the loss, in metres, is a sum of means over static
+points, points slower than 1 m/s, and faster ones (DeFlow, Zhang et al., ICRA 2024, eq. 5).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from densify.flow.objective.energy import energy
+from densify.flow.objective.graph import knn_graph, laplacian
 from densify.geometry.types import Float32
 from densify.learning.clips import Clip, ClipMaker
-from densify.learning.clouds import NetworkCloud, Sweeps, order_for
-from densify.learning.network import REACH_M
+from densify.learning.network import REACH_M, NetworkCloud, Sweeps, order_for
 
 NUM_DRAWN = 4096
 """Points of source and target that the objective is computed for."""
@@ -53,27 +62,22 @@ def on_device(value: Any, device: torch.device) -> Any:
     return value
 
 
-def samples(make: ClipMaker, num_wanted: int, first: int = 0) -> Iterator[Sample]:
-    """Yield samples from number ``first`` on, without end.
-
-    num_wanted: sweeps that the network takes.
-    """
-    group, skip = divmod(first, _NUM_MIXED * _PAIRS_OF_CLIP)
-    while True:
+def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
+    """Yield samples without end. num_wanted: sweeps that the network takes."""
+    for group in count():
         mixed = [make(group * _NUM_MIXED + n) for n in range(_NUM_MIXED)]
         rng = np.random.default_rng([make.seed, group, 1])
         pairs = [pair for c, clip in enumerate(mixed) for pair in _pairs(c, clip, rng)]
-        for place in rng.permutation(len(pairs))[skip:]:
+        for place in rng.permutation(len(pairs)):
             own = np.random.default_rng([make.seed, group, 2, int(place)])
             c, source, target = pairs[place]
             yield sample_of(mixed[c], source, target, num_wanted, own)
-        group, skip = group + 1, 0
 
 
 def _pairs(c: int, clip: Clip, rng: np.random.Generator) -> list[tuple[int, int, int]]:
     """Return as many (clip, source, target) of every clip, in rounds of all its pairs."""
-    count = len(clip)
-    found = [(c, i, j) for i in range(count) for j in (i - 1, i + 1) if 0 <= j < count]
+    number = range(len(clip))
+    found = [(c, i, j) for i in number for j in (i - 1, i + 1) if j in number]
     num_rounds = -(-_PAIRS_OF_CLIP // len(found))
     order = [place for _ in range(num_rounds) for place in rng.permutation(len(found))]
     return [found[place] for place in order[:_PAIRS_OF_CLIP]]
@@ -129,3 +133,40 @@ def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
         every = np.arange(NUM_DRAWN) * len(rows) // NUM_DRAWN
         rows = rows[every] if rng is None else np.sort(rng.choice(rows, NUM_DRAWN, replace=False))
     return torch.from_numpy(rows)
+
+
+# Losses
+
+Predict = Callable[[Sweeps], Tensor]
+ALPHA, NUM_NEIGHBORS = 4.0, 50
+FAST_M_S = 1.0
+
+
+def objective_loss(predict: Predict, sample: Sample) -> Tensor:
+    """Return the published objective of a sample's drawn points, m² per point."""
+    source: Tensor = sample.sweeps[0].points[sample.drawn]  # type: ignore[union-attr]
+    graph = knn_graph(source.detach().cpu().double().numpy(), NUM_NEIGHBORS)
+    flow = predict(sample.sweeps)[sample.drawn]
+    found = energy(flow, source, sample.drawn_target, laplacian(graph), ALPHA)
+    return found.total / len(source)
+
+
+def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
+    """Return the sum of the mean errors over static, slow and fast points of a sample with labels,
+    metres."""
+    flow, true, moving, counted = (
+        predict(sample.sweeps),
+        sample.flow,
+        sample.moving,
+        sample.in_reach,
+    )
+    fast = true.norm(dim=1) >= FAST_M_S * sample.duration_s
+    # The gradient of the norm itself is not a number at 0.
+    error_m = ((flow - true) ** 2).sum(dim=1).add(1e-8).sqrt()
+    sets = (~moving, moving & ~fast, moving & fast)
+    means = [error_m[counted & each].mean() for each in sets if bool((counted & each).any())]
+    return torch.stack(means).sum() if means else (flow * 0).sum()
+
+
+TEACHERS = {"objective": objective_loss, "engine": supervised_loss, "truth": supervised_loss}
+"""The loss of a network and a sample, a 0-d tensor."""

@@ -1,16 +1,22 @@
 # SPDX-License-Identifier: MIT
 """Files and folders that appear when they are complete: written in a hidden folder, renamed. The
-folders above them are made. What cannot be written is an OutputError that names the place."""
+folders above them are made. What cannot be written is an OutputError that names the place. And
+values as JSON and YAML can say them."""
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import shutil
 import tempfile
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from densify.config.errors import OutputError
 
@@ -89,3 +95,22 @@ def _hidden_folder(path: Path) -> Iterator[Path]:
             yield Path(place)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write `plain` of a mapping, indented."""
+    write_file(path, (json.dumps(plain(value), indent=2, allow_nan=False) + "\n").encode())
+
+
+def plain(value: Any) -> Any:
+    """Numpy's numbers as Python's, tuples as lists, and None for what JSON cannot say (not finite
+    numbers); for the files that people and other programs read."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

@@ -88,12 +88,10 @@ class StoredCloud:
 def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     """Write a cloud with the extra dimensions of `_EXTRA_DIMENSIONS`.
 
-    stamp_ns: the key's reference time; the header's date is its day. ``gps_time`` is the reference
-        time of the sweep that measured the point, as LAS 1.4 has it: seconds since 1980-01-06 less
-        10^9, by the recording's clock taken as UNIX time, without leap seconds.
-
-    Coordinates are rounded to 1 mm, intensity and colour are widened to 16 bits. The same cloud
-    gives the same bytes. Raises ValueError for coordinates that are not finite or beyond 2,147 km.
+    stamp_ns: the key's reference time; the header's date is its day. ``gps_time`` is that of the
+    sweep that measured the point, as LAS 1.4 has it: seconds since 1980-01-06 less 10^9, without
+    leap seconds. Coordinates are rounded to 1 mm, intensity and colour widened to 16 bits. The same
+    cloud gives the same bytes. Raises ValueError for coordinates not finite or beyond 2,147 km.
     """
     import laspy
 

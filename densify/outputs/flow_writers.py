@@ -6,15 +6,13 @@ NAME is the recording's::
     npz            OUT/000119_000120.npz: flow files, see `densify.readers.flow_files`
     av2            OUT/NAME/STAMP.feather, of the Argoverse 2 scene flow challenge of 2024: is_valid
                    bool, flow_tx_m flow_ty_m flow_tz_m float16, to the next sweep without the
-                   ego-motion, in the frame of the sweep's file; a row for each of the file's
-    opensceneflow  OUT/NAME.h5, a group for each sweep, named by its stamp in ns
-                   (https://github.com/KTH-RPL/OpenSceneFlow): lidar (N,4) deskewed to the stamp,
-                   pose (4,4), lidar_id, ground_mask (all False), row (N,) in the sweep's file;
-                   where flow to the next sweep is known, with the ego-motion: flow (N,3),
-                   flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
+                   ego-motion; a row for each of the sweep's file, in its frame
+    opensceneflow  OUT/NAME.h5 (https://github.com/KTH-RPL/OpenSceneFlow), a group for each sweep,
+                   its stamp in ns: lidar (N,4) deskewed to the stamp, pose (4,4), lidar_id,
+                   ground_mask (all False), row (N,) in the sweep's file; with the ego-motion, where
+                   known: flow (N,3), flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
 
-The challenge takes every fifth sweep, zipped as NAME/0000000000.feather, NAME/0000000005.feather
-and so on. The masks that it publishes say which points count.
+The challenge takes every fifth sweep, zipped as NAME/0000000000.feather, NAME/0000000005.feather…
 """
 
 from __future__ import annotations
@@ -28,11 +26,11 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
+from densify.config.file_content import needed
 from densify.geometry import poses
 from densify.geometry.types import FlowField, LidarSequence, Result, StretchFlow
 from densify.outputs.atomic import file_aside, write_file
 from densify.outputs.key_outputs import Context
-from densify.readers.extras import needed
 
 FlowWriter = Callable[[int, StretchFlow], Path]
 """Writes a sweep and its flow to the next, the only step it is given (none: the last sweep), and
@@ -40,12 +38,8 @@ returns the folder of its file."""
 
 
 def write_flow(result: Result, context: Context, folder: Path) -> None:
-    """Write ``flow/`` in the form of ``output.flow``: npz or opensceneflow."""
-    if result.flow is None:
-        return
-    if context.config["output"]["flow"] == "opensceneflow":
-        write_flow_h5(folder / "flow" / f"{result.key:06d}.h5", result.flow)
-    else:
+    """Write ``flow/`` if ``output.flow`` asks for it."""
+    if result.flow is not None:
         write_flow_npz(folder / "flow", result.flow)
 
 
@@ -81,20 +75,6 @@ def flow_npz(field: FlowField, **beside: Any) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     return buffer.getvalue()
-
-
-def write_flow_h5(path: Path, flow: StretchFlow) -> None:
-    """Write all sweeps of a window in OpenSceneFlow's form. Raises InputError without h5py."""
-    with _h5_aside(path) as file:
-        for frame in flow.stretch.frames:
-            _add_sweep(file, frame, flow)
-
-
-@contextmanager
-def _h5_aside(path: Path) -> Iterator[Any]:
-    h5py = needed("h5py", "opensceneflow", "OpenSceneFlow's files")
-    with file_aside(path) as aside, h5py.File(aside, "w") as file:
-        yield file
 
 
 def _add_sweep(file: Any, frame: int, flow: StretchFlow) -> None:
@@ -148,7 +128,9 @@ def flow_writer(
         )
     with ExitStack() as stack:
         if form == "opensceneflow":
-            file = stack.enter_context(_h5_aside(out / f"{name}.h5"))
+            h5py = needed("h5py", "opensceneflow", "OpenSceneFlow's files")
+            aside = stack.enter_context(file_aside(out / f"{name}.h5"))
+            file = stack.enter_context(h5py.File(aside, "w"))
 
         def write(frame: int, flow: StretchFlow) -> Path:
             if form == "opensceneflow":

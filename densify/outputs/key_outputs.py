@@ -1,48 +1,37 @@
 # SPDX-License-Identifier: MIT
 """The outputs of a key: depth maps, moving objects, metrics.json, movers.json, run.yaml, scene/.
 
-metrics.json. compare.json holds the fields from ``frames`` on, by method, under ``methods``::
+metrics.json; compare.json has the fields from ``frames`` on, by method, under ``methods``. A score
+is null where nothing is known::
 
     schema_version, key, method
     frames      of the window, absolute numbers
     num_points  of the cloud; num_moving of those
-    density     camera -> measured, filled: fraction of the pixels with a depth; with --prior also
-                full, and prior, the fraction that came from it
-    ghosts      `densify.scores.cloud_scores.ghost_scores`: num_points, all, moving, static,
-                unjudged, by_distance
-    depth       where there is truth: camera -> measured, filled -> all, moving, static -> the
-                fields of `densify.scores.depth_metrics.DepthErrors`; with --prior also full, prior
+    density     camera -> measured, filled: share of the pixels with a depth; with --prior also
+                full, and prior, the share that came from it
+    ghosts      `densify.scores.cloud_scores.ghost_scores`
+    depth       with truth: camera -> measured, filled (full, prior) -> all, moving, static ->
+                `densify.scores.depth_metrics.DepthErrors`
     measure     map -> z, depth along the camera's axis, or range, distance from the lens
-    held_out    camera -> the same fields as depth: the key densified from its neighbours alone
-                against its own returns; curve, `densify.scores.depth_metrics.precision_density`;
-                reliability, `densify.depth.confidence.reliability`; unjudged, the fraction of the
-                filled pixels of all, moving and static surfaces near which the key sweep has no
-                return. null for the key sweep alone
-    reliability where there is truth: map -> the same list against it
-    expected_outliers  map -> measured, filled: the fraction of outliers that confidence expects
-    baselines   the same from ``frames`` on for each simpler method on the same registration
+    held_out    camera -> as depth: the key densified from its neighbours alone against its own
+                returns; curve, `precision_density`; reliability, `densify.depth.confidence`;
+                unjudged, share of the filled pixels near which the key sweep has no return
+    reliability with truth: map -> the same list against it
+    expected_outliers  map -> measured, filled: the share of outliers that confidence expects
+    baselines   as from ``frames`` on for each simpler method on the same registration
 
-A score is null where nothing is known.
-
-movers.json, by `ObjectTrack`::
-
-    schema_version, key
-    objects     instance, as in cloud.laz
-                size_m, length, width, height
-                poses: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,) in key
-                coordinates without the ego-motion; at each sweep that observed it, and at the key
+movers.json, by `ObjectTrack`: schema_version, key, objects (instance as in cloud.laz; size_m:
+length, width, height; poses: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,) in
+key coordinates without the ego-motion, at each sweep that observed it and at the key).
 
 scene/, for pages, viewers and other tools::
 
     image/CAMERA.jpg   the image that the map shows
-    none/CAMERA.png, icp/…   measured depth of the simpler methods, as in ``depth``
-    truth/CAMERA.png   true depth where there is some, as in ``depth``
+    none/CAMERA.png, icp/…, truth/…   depth of the simpler methods and the true one, as in ``depth``
     sweep/CAMERA.png   uint16, measured pixels: 1 + row of the source sweep in ``sweeps``; 0 none
     reason/CAMERA.png  uint8 `Reason` that the nearest point of a pixel was rejected
-    scene.json         schema_version, key
-      sweeps           of the window and beyond it: frame, since_key_s, far, T_key_lidar (4,4)
-      views            map -> camera (width_px, height_px, K, model, distortion, ...), T_cam_key
-                       (4,4), late_s after the key, number of its image
+    scene.json         schema_version, key; sweeps: frame, since_key_s, far, T_key_lidar (4,4);
+                       views: map -> camera, T_cam_key (4,4), late_s after the key, image number
 """
 
 from __future__ import annotations
@@ -60,7 +49,7 @@ import yaml
 
 from densify import __version__
 from densify.geometry.types import Result
-from densify.outputs.atomic import write_file
+from densify.outputs.atomic import plain, write_file, write_json
 from densify.outputs.cloud_laz import write_cloud
 from densify.outputs.depth_png import (
     encode_jpeg,
@@ -71,7 +60,6 @@ from densify.outputs.depth_png import (
     write_depth_png,
     write_flow_png,
 )
-from densify.outputs.plain import plain, write_json
 
 SCHEMA_VERSION = 1
 """Version of each JSON file; grows when a field changes its meaning or goes."""

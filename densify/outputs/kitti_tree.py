@@ -21,9 +21,8 @@ import yaml
 
 from densify import __version__
 from densify.geometry.types import DepthMap
-from densify.outputs.atomic import write_file
+from densify.outputs.atomic import plain, write_file
 from densify.outputs.depth_png import write_confidence_png, write_depth_png
-from densify.outputs.plain import plain
 
 Split = Literal["train", "val"]
 
@@ -83,13 +82,9 @@ def write_key(
 ) -> dict[str, FileRecord]:
     """Write the maps of one key, each file whole or not there.
 
-    root: of the tree.
-    folder: of the drive, relative to root: ``val/2011_09_26_drive_0013_sync``.
-    frame: the key's number.
-    sparse, dense: camera -> map, of the key sweep alone and of all sweeps.
-
-    Returns path relative to root -> what the file holds. The same maps give the same bytes. Raises
-    OutputError if the files cannot be written.
+    folder: of the drive, relative to the tree's root: ``val/2011_09_26_drive_0013_sync``. sparse,
+    dense: camera -> map, of the key sweep alone and of all sweeps. Returns path relative to root ->
+    what the file holds, the same bytes for the same maps. Raises OutputError.
     """
     paths = []
     for camera, maps in dense.items():

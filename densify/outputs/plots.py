@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from densify.geometry.types import Float, Float32, Result
+from densify.geometry.types import Float32, Result
 from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import Picture
 from densify.outputs.key_outputs import Context
@@ -158,22 +158,4 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
-    return figure
-
-
-def draw_losses(losses: Float, title: str) -> Figure:
-    """Draw the loss of each step of a training, and its running median.
-
-    losses: (S,) positive.
-    """
-    from matplotlib.figure import Figure
-    from scipy.ndimage import median_filter
-
-    figure = Figure(figsize=(8.6, 4.2), dpi=_DPI, layout="constrained")
-    axes = figure.add_subplot(title=title, xlabel="step", ylabel="loss", yscale="log")
-    if len(losses):
-        size = len(losses) // _MEDIAN_SHARE | 1
-        axes.plot(losses, ".", markersize=2, color="C0", alpha=0.4)
-        axes.plot(median_filter(losses, size, mode="nearest"), color="C0", linewidth=2)
-    axes.grid(alpha=0.3)
     return figure

@@ -14,7 +14,7 @@ import numpy as np
 from densify.config.errors import InputError, brief
 from densify.config.file_content import read_json
 from densify.geometry.types import Camera, CameraView, Float, ObjectTrack
-from densify.readers.file_sequence import rigid
+from densify.readers import checks
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def read_scene(path: Path) -> SceneFile:
         return SceneFile(
             table,
             {name: _view(view) for name, view in table["views"].items()},
-            {frame: rigid(T, "T_key_lidar") for frame, T in poses.items() if T is not None},
+            {frame: checks.rigid(T, "T_key_lidar") for frame, T in poses.items() if T is not None},
         )
 
 
@@ -66,12 +66,15 @@ def damage_named(path: Path) -> Iterator[None]:
 
 def _view(view: Mapping[str, Any]) -> CameraView:
     own = {f.name: view[f.name] for f in fields(Camera)}
-    own |= {"K": _array(view["K"], 3, 3), "T_cam_lidar": rigid(view["T_cam_lidar"], "T_cam_lidar")}
+    own |= {
+        "K": _array(view["K"], 3, 3),
+        "T_cam_lidar": checks.rigid(view["T_cam_lidar"], "T_cam_lidar"),
+    }
     camera = Camera(**{**own, "distortion": tuple(map(float, view["distortion"]))})
     is_known = camera.model in ("pinhole", "fisheye", "mei")
     if not is_known or not min(camera.width_px, camera.height_px, camera.K[0, 0]) > 0:
         raise ValueError(f"camera {camera.name}: size, model or K")
-    T_cam_key = rigid(view["T_cam_key"], "T_cam_key")
+    T_cam_key = checks.rigid(view["T_cam_key"], "T_cam_key")
     return CameraView(camera, T_cam_key, float(view["late_s"]), view["number"])
 
 
@@ -82,7 +85,9 @@ def _track(entry: Mapping[str, Any]) -> ObjectTrack:
         size_m=_array(entry["size_m"], 3),
         frames=tuple(int(pose["frame"]) for pose in poses),
         stamp_ns=np.array([pose["stamp_ns"] for pose in poses], np.int64),
-        T_key_object=np.stack([rigid(pose["T_key_object"], "T_key_object") for pose in poses]),
+        T_key_object=np.stack(
+            [checks.rigid(pose["T_key_object"], "T_key_object") for pose in poses]
+        ),
         velocity_m_s=_array([pose["velocity_m_s"] for pose in poses], len(poses), 3),
         num_points=np.array([pose["num_points"] for pose in poses], np.int64),
     )

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write frames of the built-in street, with exact truth, as a KITTI raw drive or a plain folder.
-
-``truth/`` is described in `densify.readers.truth_files`. KITTI's form, for
-`densify.readers.kitti.raw`; a timestamps file has a line per frame of the street::
+"""Write frames of the built-in street, with exact truth, as a KITTI raw drive or a plain folder::
 
     OUT/2026_06_12/calib_cam_to_cam.txt calib_velo_to_cam.txt calib_imu_to_velo.txt
     OUT/2026_06_12/2026_06_12_drive_0001_sync/
@@ -10,15 +7,12 @@
         image_02/{data/0000000120.png, timestamps.txt}  image_03/...
         oxts/{data/0000000120.txt, timestamps.txt}  truth/
 
-The plain folder, for `densify.readers.folder`::
-
-    OUT/street/densify.yaml
-    OUT/street/sweeps/000000.bin, ...  float32 x y z intensity time lidar, time in s since
-                                       the stamp
-    OUT/street/timestamps.txt          one time per sweep, s since 1970
-    OUT/street/poses.txt               the lidar's path (TUM): time x y z qx qy qz qw
+    OUT/street/densify.yaml timestamps.txt (s since 1970) poses.txt (TUM, the lidar's) truth/
+    OUT/street/sweeps/000000.bin, ...  float32 x y z intensity time lidar, s since the stamp
     OUT/street/images/CAMERA/1781258406000000000.png, ...  named by their times in ns
-    OUT/street/truth/                  sweeps and images are numbered from 0
+
+A timestamps file of KITTI's has a line per frame of the street; the folder's truth is numbered from
+0. ``truth/`` is described in `densify.readers.truth_files`.
 """
 
 from __future__ import annotations
@@ -36,7 +30,7 @@ from densify.geometry import poses
 from densify.geometry.types import Float, Float32, Int, Progress
 from densify.outputs.atomic import staged_folder
 from densify.outputs.depth_png import encode_png
-from densify.readers.file_sequence import camera_named
+from densify.readers import checks
 from densify.readers.folder.config import NAME
 from densify.readers.kitti.raw import KITTI_TRIGGER_LATENCY_NS
 from densify.readers.recorded_poses import PoseTrack
@@ -71,9 +65,8 @@ def write_street(
 ) -> Path:
     """Write frames of a street and return the place that ``--data`` opens, complete or not there.
 
-    format: one of `FORMATS`. frames: absolute numbers. cameras: names, None for all of the street.
-    Raises InputError for a format, frame or camera that does not exist or does not fit, and for a
-    place that exists, unless ``overwrite`` is set.
+    format: of `FORMATS`. cameras: None for all of the street. Raises InputError for a format, frame
+    or camera that does not exist or fit, and for a place that exists, unless ``overwrite`` is set.
     """
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
@@ -85,7 +78,7 @@ def write_street(
             f"scanner; choose a single scanner that spins: {', '.join(fit)}"
         )
     for name in excerpt.cameras if is_kitti else ():
-        camera_named({usual: CAMERAS[usual] for usual in USUAL}, name, out)
+        checks.camera_named({usual: CAMERAS[usual] for usual in USUAL}, name, out)
     place, owned = (_DATE, (_DRIVE, *_CALIBRATION)) if is_kitti else ("street", _FOLDER)
     for name in owned:
         if (out / place / name).exists() and not overwrite:
@@ -111,7 +104,7 @@ class Excerpt:
         """cameras: None for all of the street. Raises InputError for what does not exist."""
         names = tuple(street.cameras if cameras is None else cameras)
         for name in names:
-            camera_named(street.cameras, name, Path(street.name))
+            checks.camera_named(street.cameras, name, Path(street.name))
         unknown = [frame for frame in frames if frame not in street.frames]
         if unknown or not frames:
             raise InputError(

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """The files of one key, ``OUT/000120/...``: results of ``run`` and tables of ``compare``, whole or
-not at all. The table of what ``run`` writes is `config.written`."""
+not at all."""
 
 from __future__ import annotations
 
@@ -11,19 +11,31 @@ from pathlib import Path
 from typing import Any, Literal
 
 from densify.config.errors import InputError
-from densify.config.plugins import Plugin
-from densify.config.written import chosen_outputs
 from densify.geometry.types import Result
-from densify.outputs import key_outputs
-from densify.outputs.atomic import staged_folder
+from densify.outputs import flow_writers, key_outputs, plots
+from densify.outputs.atomic import staged_folder, write_json
 from densify.outputs.key_outputs import Context
-from densify.outputs.plain import write_json
-from densify.outputs.plots import write_figure
+from densify.outputs.report.key_page import write_report
 
-WriteOutput = Callable[[Result, Context, Path], None]
-"""Writes the files that an output owns into the key's folder, where the result has something for
-them. The folder appears when every output is done. Same result and context, same bytes."""
+_OUTPUTS: Mapping[tuple[str, ...], Callable[[Result, Context, Path], None]] = {
+    ("depth", "depth_filled", "confidence", "age"): key_outputs.write_depth,
+    ("depth_full", "confidence_full"): key_outputs.write_full,
+    ("flow",): flow_writers.write_flow,
+    ("movers",): key_outputs.write_movers,
+    ("movers.json",): key_outputs.write_tracks,
+    ("optical_flow",): key_outputs.write_optical_flow,
+    ("cloud.laz",): key_outputs.write_cloud_laz,
+    ("scene",): key_outputs.write_scene,
+    ("metrics.json",): key_outputs.write_metrics,
+    ("figure.png",): plots.write_key_figure,
+    ("curve.png",): plots.write_curve,
+    ("run.yaml",): key_outputs.write_run_yaml,
+    ("report.html",): write_report,  # last, because it reads what the others wrote
+}
+"""The entries of a key's folder, and what writes them where the result has something for them. The
+same result and context give the same bytes."""
 
+_RUN = tuple(name for names in _OUTPUTS for name in names)
 _COMPARISON = ("compare.json", "compare.png", "compare", "compare.html")
 
 
@@ -32,14 +44,13 @@ def check_writable(
     key: int,
     overwrite: bool = False,
     verb: Literal["run", "compare"] = "run",
-    also: str = "",
 ) -> None:
     """Raise InputError if a result could not be written. Nothing is touched.
 
-    out: the folder of ``--out``, which need not exist. also: as ``output.also``. Causes are files
-    of ``verb`` that are there and not to be overwritten, and a place without permission.
+    out: the folder of ``--out``, which need not exist. Causes are files of ``verb`` that are there
+    and not to be overwritten, and a place without permission.
     """
-    owned = _owned(chosen_outputs(also)) if verb == "run" else _COMPARISON
+    owned = _RUN if verb == "run" else _COMPARISON
     _check_place(_key_folder(out, key), owned, out, overwrite)
 
 
@@ -83,28 +94,18 @@ def write_result(
     config: Mapping[str, Any],
     data: str,
     overwrite: bool = False,
-    also: str = "",
 ) -> list[Path]:
     """Write one densified key as ``out/KEY/``, and return the files written.
 
-    config: the merged configuration, as plain mappings.
-    data: the recording, as the user named it.
-    overwrite: replace an earlier result. Whatever else lies in the folder is kept.
-    also: outputs of other packages, as ``output.also``.
-
-    Raises InputError if the place cannot be written to, or holds a result already.
+    config: the merged configuration, as plain mappings. data: the recording, as the user named it.
+    overwrite: replace an earlier result. Whatever else lies in the folder is kept. Raises
+    InputError if the place cannot be written to, or holds a result already.
     """
-    rows = chosen_outputs(also)
-    owned, context = _owned(rows), Context(config, data)
-    with writing(_key_folder(out, result.key), owned, out, overwrite) as folder:
-        for row in rows:
-            getattr(row.work(), row.function)(result, context, folder)
-            if strays := sorted({entry.name for entry in folder.iterdir()} - {*owned}):
-                raise InputError(
-                    f"output {row.name}: wrote {', '.join(strays)}, expected nothing but "
-                    f"{', '.join(row.owned)}; mend {row.module}"
-                )
-    return _written(out, result.key, owned)
+    context = Context(config, data)
+    with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:
+        for write in _OUTPUTS.values():
+            write(result, context, folder)
+    return _written(out, result.key, _RUN)
 
 
 def write_comparison(
@@ -130,7 +131,7 @@ def write_comparison(
     }
     with writing(_key_folder(out, key), _COMPARISON, out, overwrite) as folder:
         write_json(folder / "compare.json", table)
-        write_figure(folder / "compare.png", results)
+        plots.write_figure(folder / "compare.png", results)
         for name in ("write_depth", "write_cloud_laz", "write_tracks", "write_scene"):
             getattr(key_outputs, name)(last, context, folder / "compare")
     return _written(out, key, _COMPARISON)
@@ -138,10 +139,6 @@ def write_comparison(
 
 def _key_folder(out: Path, key: int) -> Path:
     return out / f"{key:06d}"
-
-
-def _owned(rows: Sequence[Plugin]) -> tuple[str, ...]:
-    return tuple(name for row in rows for name in row.owned)
 
 
 def _written(out: Path, key: int, owned: Sequence[str]) -> list[Path]:

@@ -7,15 +7,11 @@
     LOG/calibration/egovehicle_SE3_sensor.feather, intrinsics.feather
     LOG/annotations.feather                                  optional: tracked boxes
 
-Points are in the vehicle's frame (x forward, y left, z up, origin on the rear axle). They are
-compensated to the file's stamp, the *start* of the sweep; ``offset_ns`` is the firing time. The
-poses undo that here: on a real log the elevations of a ring then spread by 0.003 degrees instead
-of 0.06. Coordinates are float16, so they are 3 cm apart beyond 32 m.
-
-Two scanners turn half a revolution apart, the lower one upside down. Lasers 0 to 31 are
-``up_lidar``, 32 to 63 ``down_lidar`` (https://github.com/argoverse/av2-api/issues/77). Images are
-undistorted already, so k1 to k3 of the intrinsics do not apply. Their stamps are taken as exposure
-times. The world is the city's frame. Frames and images are numbered from 0 in the order of time.
+Points are in the vehicle's frame (x forward, y left, z up), float16, compensated to the file's
+stamp, the *start* of the sweep; the poses undo that by ``offset_ns``, the firing time. Two scanners
+turn half a revolution apart, the lower one upside down: lasers 0 to 31 are ``up_lidar``, 32 to 63
+``down_lidar`` (issue 77 of av2-api). Images are undistorted, so k1 to k3 do not apply, and stamped
+at their exposure. Frames and images are numbered from 0 in the order of time.
 """
 
 from __future__ import annotations
@@ -30,18 +26,9 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.geometry.types import Boxes, Camera, Float
+from densify.readers import checks
 from densify.readers.arrow_columns import read_feather
-from densify.readers.file_sequence import (
-    FileSequence,
-    Returns,
-    checked_boxes,
-    chosen_scene,
-    numbered_files,
-    pinhole,
-    quaternion_pose,
-    scanner_axes,
-    truth_beside,
-)
+from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.recorded_poses import PoseTrack
 
 BOX_SIZE = ("length_m", "width_m", "height_m")
@@ -65,16 +52,17 @@ def open_recording(path: Path, scene: str | None) -> Argoverse2:
             f"{path}: no Argoverse 2 log; expected {_POSES} and sensors/lidar in it, or in folders "
             f"within it"
         )
-    return Argoverse2(logs[chosen_scene("argoverse2", path, scene, sorted(logs))])
+    return Argoverse2(logs[checks.chosen_scene("argoverse2", path, scene, sorted(logs))])
 
 
 class Argoverse2(FileSequence):
-    """A log as a `LidarSequence`; the lidar frame is the vehicle's."""
+    """A log as a `LidarSequence`; the lidar frame is the vehicle's. A sweep's reference time is its
+    start."""
 
     def __init__(self, log: Path) -> None:
         """Read poses and calibration. Raises InputError if there are no sweeps, or a table is
         missing or malformed."""
-        sweeps = numbered_files(log / "sensors" / "lidar", ".feather")
+        sweeps = checks.numbered_files(log / "sensors" / "lidar", ".feather")
         if not sweeps:
             raise InputError(
                 f"{log / 'sensors' / 'lidar'}: no sweeps; expected files such as "
@@ -96,41 +84,30 @@ class Argoverse2(FileSequence):
         self._T_ego_scanner = np.stack([self._T_ego_sensor[name] for name in SCANNERS])
         cameras = _cameras(log, self._T_ego_sensor)
         folder = log / "sensors" / "cameras"
-        images = {name: numbered_files(folder / name, ".jpg", ".png") for name in cameras}
+        images = {name: checks.numbered_files(folder / name, ".jpg", ".png") for name in cameras}
         super().__init__(
             log.resolve().name,
             log,
             range(len(sweeps)),
             cameras,
             {name: dict(enumerate(files)) for name, files in images.items()},
-            truth_beside(log),
+            checks.truth_beside(log),
             dict(enumerate(sweeps.values())),
             {name: dict(enumerate(files.values())) for name, files in images.items()},
         )
 
-    def stamp_ns(self, frame: int) -> int:
-        """Return the start of the sweep."""
-        self.check_frame(frame)
-        return self._stamps_ns[frame]
-
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
-        path = self._files[frame]
+    def _returns(self, frame: int) -> Returns:
         kinds = {"x": "m", "y": "m", "z": "m", "intensity": "n"}
-        columns = _read(path, {**kinds, "laser_number": "i", "offset_ns": "i"})
-        laser, most = columns["laser_number"], len(SCANNERS) * LASERS_PER_SCANNER - 1
-        if len(laser) and not 0 <= laser.min() <= laser.max() <= most:
-            raise InputError(
-                f"{path}: laser_number: got {laser.min()} to {laser.max()}, expected 0 to {most}"
-            )
+        columns = _read(self._files[frame], {**kinds, "laser_number": "i", "offset_ns": "i"})
         offset_ns = columns["offset_ns"].astype(np.int64)
         points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
-        return path, Returns(
+        return Returns(
             self._track.as_fired(points, self._stamps_ns[frame], offset_ns),
             (columns["intensity"] / 255.0).astype(np.float32),
             offset_ns,
-            (laser // LASERS_PER_SCANNER).astype(np.uint8),
+            columns["laser_number"].astype(np.int64) // LASERS_PER_SCANNER,
             self._T_ego_scanner[:, :3, 3],
-            scanner_axes(self._T_ego_scanner),
+            checks.scanner_axes(self._T_ego_scanner),
         )
 
     def _pose(self, frame: int) -> Float:
@@ -146,7 +123,7 @@ class Argoverse2(FileSequence):
             return None  # no boxes and not annotated look the same
         size_m = np.stack([columns[name][rows] for name in BOX_SIZE], axis=1)
         T = _poses(columns, path, rows)
-        return checked_boxes(columns["track_uuid"][rows], T, size_m, f"{path}: sweep {frame}")
+        return checks.boxes(columns["track_uuid"][rows], T, size_m, f"{path}: sweep {frame}")
 
     @cached_property
     def _annotations(self) -> dict[str, NDArray[Any]] | None:
@@ -173,7 +150,9 @@ def _poses(
     """Return the (n,4,4) poses in the table's rows, in all if None."""
     table = np.stack([columns[name] for name in _POSE], axis=1)
     rows = np.arange(len(table)) if rows is None else rows
-    T = [quaternion_pose(table[row, :4], table[row, 4:], f"{path}: row {row}") for row in rows]
+    T = [
+        checks.quaternion_pose(table[row, :4], table[row, 4:], f"{path}: row {row}") for row in rows
+    ]
     return np.reshape(T, (-1, 4, 4))
 
 
@@ -197,5 +176,7 @@ def _cameras(log: Path, T_ego_sensor: dict[str, Float]) -> dict[str, Camera]:
         fx, fy, cx, cy = (float(columns[c][row[0]]) for c in numbers)
         size_px = int(columns["width_px"][row[0]]), int(columns["height_px"][row[0]])
         T_cam_ego = inverse(T_ego_sensor[name])
-        cameras[name] = pinhole(name, size_px, (fx, fy, cx, cy), T_cam_ego, f"{path}: {name}")
+        cameras[name] = checks.pinhole(
+            name, size_px, (fx, fy, cx, cy), T_cam_ego, f"{path}: {name}"
+        )
     return cameras

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import reason
-from densify.readers.extras import needed
+from densify.config.file_content import needed, reason
 
 _EXPECTED = {
     "n": "finite numbers",
@@ -30,11 +29,10 @@ _TYPES = {"s": ("string", "large_string"), "b": ("binary", "large_binary")}
 def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str, NDArray[Any]]:
     """Return columns of a feather file, (N,) each.
 
-    columns: name -> kind: "n" finite numbers, "m" numbers that may be NaN, "i" whole numbers,
-        "s" texts, "b" bytes, "t" truth values, "l" lists of numbers or None, as arrays of objects.
-    what: needs the file, such as "Argoverse 2 recordings" (extra ``argoverse``).
-    Raises InputError if the file is missing or damaged, or a column is absent, has gaps or holds
-    something else.
+    columns: name -> kind: "n" finite numbers, "m" numbers that may be NaN, "i" whole numbers, "s"
+    texts, "b" bytes, "t" truth values, "l" lists of numbers or None, as arrays of objects. what:
+    needs the file, such as "Argoverse 2 recordings" (extra ``argoverse``). Raises InputError if it
+    is missing or damaged, or a column is absent, has gaps or holds something else.
     """
     needed("pyarrow", "argoverse", what)
     feather = needed("pyarrow.feather", "argoverse", what)

@@ -71,11 +71,10 @@ def pair_depth_files(
     """Pair the PNG files of two places, and masks with them.
 
     predicted, truth, mask: a file or a folder with everything under it; two files are a pair
-    whatever their names. The drive or camera is compared only if both sides' names say it. Files
+    whatever their names. The drive or camera is compared only if both sides' names say it; files
     outside a known layout are passed over. Of densify's own maps the measured ones are taken, or
-    the filled ones if ``filled``; of a truth with KITTI's ``groundtruth`` nothing else.
-
-    Raises InputError if a place is missing, names are ambiguous, or nothing pairs.
+    the filled ones if ``filled``; of a truth with KITTI's ``groundtruth`` nothing else. Raises
+    InputError if a place is missing, names are ambiguous, or nothing pairs.
     """
     found = _product(_found(predicted, "PREDICTED"), predicted, filled)
     true = _found(truth, "TRUTH")

@@ -6,17 +6,13 @@ and its relatives::
     ROOT/scene_02/calibration/<hash>.json  extrinsics (on the vehicle) and intrinsics, by name
     ROOT/scene_02/point_cloud/LIDAR/<stamp>.npz    ROOT/scene_02/rgb/CAMERA_01/<stamp>.jpg
 
-- A scene is its folder, or its name behind ``#``. Sweeps are numbered from 0 in the order of time,
-  and so are each camera's images. A file that is not there leaves a gap.
-- Stamps are ISO dates. DDAD's are tenths of microseconds taken for microseconds, of the year 2464:
-  dates beyond 2200 are divided by ten. DDAD's images are stamped 9 ms before the sweep, and their
-  poses are those of 5 to 6 ms later.
-- Points have no times, so ``offset_ns`` is None. They are in the frame of the sweep's sensor. Each
-  sweep and image has a pose of its sensor.
-- DDAD's sweeps are put together from several solid-state scanners, in the vehicle's frame with its
-  origin on the ground: its lidar has no extrinsics. The origins of the rays are not published. Scan
-  lines of three sides are smoothest from 1.54 to 1.56 m above the ground, as high as the cameras
-  are. The rays are therefore taken to start at the mean position of the cameras.
+- A scene is its folder, or its name behind ``#``. Sweeps and each camera's images are numbered from
+  0 in the order of time; a missing file leaves a gap. Each has a pose of its sensor.
+- Stamps are ISO dates. DDAD's are tenths of microseconds taken for microseconds: dates beyond 2200
+  are divided by ten.
+- Points have no times; they are in the frame of the sweep's sensor. DDAD's are put together from
+  several solid-state scanners, in the vehicle's frame on the ground. Where their rays start is not
+  published; scan lines are smoothest from 1.55 m up, so the cameras' mean position is taken.
 - Images are pinholes without distortion.
 """
 
@@ -31,19 +27,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_json
+from densify.config.file_content import described_in, read_json
 from densify.geometry import poses
 from densify.geometry.types import Float
+from densify.readers import checks
 from densify.readers.decoded_files import read_arrays
-from densify.readers.extras import described_in
-from densify.readers.file_sequence import (
-    FileSequence,
-    Returns,
-    chosen_scene,
-    pinhole,
-    quaternion_pose,
-    truth_beside,
-)
+from densify.readers.file_sequence import FileSequence, Returns
 
 _BOGUS_YEAR = 2200
 
@@ -55,7 +44,7 @@ def open_recording(path: Path, scene: str | None) -> Dgp:
     names = sorted(folder.name for folder in path.glob("*/") if find_scene(folder))
     if not names:
         raise InputError(f"{path}: no DGP scene; expected a folder with scene_<hash>.json")
-    return Dgp(path / chosen_scene("dgp", path, scene, names))
+    return Dgp(path / checks.chosen_scene("dgp", path, scene, names))
 
 
 def find_scene(folder: Path) -> Path | None:
@@ -86,6 +75,7 @@ class Dgp(FileSequence):
         sweeps, self._images, calibration = _read_scene(file)
         lidar = min(sweeps)
         self._sweeps = sweeps[lidar]
+        self._stamps_ns = {number: sweep.stamp_ns for number, sweep in self._sweeps.items()}
         mounts = _read_calibration(calibration)
         missing = [name for name in (lidar, *self._images) if name not in mounts]
         if missing:
@@ -96,7 +86,9 @@ class Dgp(FileSequence):
         for name, data in self._images.items():
             (T_ego_cam, lens), size_px = mounts[name], next(iter(data.values())).size_px
             T_cam_lidar = poses.inverse(T_ego_cam) @ T_ego_lidar
-            cameras[name] = pinhole(name, size_px, lens, T_cam_lidar, f"{calibration}: {name}")
+            cameras[name] = checks.pinhole(
+                name, size_px, lens, T_cam_lidar, f"{calibration}: {name}"
+            )
         self._origins_m = None
         if np.array_equal(T_ego_lidar, np.eye(4)) and cameras:
             places = [poses.inverse(camera.T_cam_lidar)[:3, 3] for camera in cameras.values()]
@@ -107,36 +99,23 @@ class Dgp(FileSequence):
             tuple(self._sweeps),
             cameras,
             {n: {i: d.stamp_ns for i, d in data.items()} for n, data in self._images.items()},
-            truth_beside(path),
-            images={n: {i: d.path for i, d in data.items()} for n, data in self._images.items()},
+            checks.truth_beside(path),
+            {number: sweep.path for number, sweep in self._sweeps.items()},
+            {n: {i: d.path for i, d in data.items()} for n, data in self._images.items()},
         )
-
-    def stamp_ns(self, frame: int) -> int:
-        """Return the data set's own stamp."""
-        self.check_frame(frame)
-        return self._sweeps[frame].stamp_ns
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """Return the data set's own (4,4) pose of an image."""
         self.check_image(camera, number)
         return self._images[camera][number].T_world_sensor
 
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
-        path, names = self._sweeps[frame].path, self._sweeps[frame].columns
-        rows = read_arrays(path, ("data",)).get("data")
-        if rows is None:
-            raise InputError(f"{path}: holds no array data, expected its points there")
-        fits = rows.ndim == 2 and rows.shape[1] == len(names) and rows.dtype.kind in "fiu"
-        if not fits or not {"X", "Y", "Z"} <= set(names):
-            raise InputError(
-                f"{path}: got an array {rows.shape} of {rows.dtype}, expected numbers, a column "
-                f"for each of {' '.join(names) or 'X Y Z INTENSITY'}, X Y Z among them"
-            )
-        columns = dict(zip(names, rows.T, strict=True))
+    def _returns(self, frame: int) -> Returns:
+        rows = read_arrays(self._files[frame], ("data",))["data"]
+        columns = dict(zip(self._sweeps[frame].columns, rows.T, strict=True))
         points = np.column_stack([columns[name] for name in "XYZ"]).astype(np.float64)
         brightness = columns.get("INTENSITY")
         intensity = None if brightness is None else np.clip(brightness, 0, 1).astype(np.float32)
-        return path, Returns(points, intensity, scanner_origins=self._origins_m)
+        return Returns(points, intensity, scanner_origins=self._origins_m)
 
     def _pose(self, frame: int) -> Float:
         return self._sweeps[frame].T_world_sensor
@@ -189,7 +168,7 @@ def _stamp_ns(text: str) -> int:
 def _read_pose(given: Mapping[str, Any], where: str) -> Float:
     turn, place = given["rotation"], given["translation"]
     quaternion = [turn[key] for key in ("qw", "qx", "qy", "qz")]
-    return quaternion_pose(quaternion, [place[key] for key in "xyz"], where)
+    return checks.quaternion_pose(quaternion, [place[key] for key in "xyz"], where)
 
 
 def _read_calibration(file: Path) -> dict[str, tuple[Float, list[float]]]:

@@ -12,38 +12,31 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.geometry.types import Boxes, Camera, Float, Float32, Int, Sweep, Truth
-from densify.readers.decoded_files import decode_image
-from densify.readers.timeline import format_frames
-
-T = TypeVar("T")
-
-_ORTHONORMAL_TOLERANCE = 1e-3  # text files carry seven digits, float32 files as many
+from densify.config.file_content import described_in, read_bytes
+from densify.geometry.types import Camera, Float, Float32, Int, Sweep, Truth
+from densify.readers import checks
 
 
 @dataclass(frozen=True)
 class Returns:
     """The N rows of a sweep's file, each as it was measured, none left out.
 
-    points: (N,3) metres, lidar frame, each at its own firing time. intensity: (N,) 0 to 1, None if
-    there is none. offset_ns: (N,) int64 since the sweep's reference time, None if unknown. lidar:
-    (N,) uint8, which of several scanners fired, None if there is one. scanner_origins: (S,3)
-    metres, lidar frame, None where all rays start at the frame's origin. R_scanner_lidar: (S,3,3)
-    from the lidar frame's axes to each scanner's, z along the axis it spins about, None where they
-    are the frame's.
+    points: (N,3) metres, lidar frame, each at its own firing time. intensity: (N,) 0 to 1.
+    offset_ns: (N,) int64 since the sweep's reference time, None if unknown. lidar: (N,) which of
+    several scanners fired. scanner_origins: (S,3) metres, R_scanner_lidar: (S,3,3) to each
+    scanner's axes, z along the one it spins about; None where they are the frame's.
     """
 
     points: Float
     intensity: Float32 | None = None
     offset_ns: Int | None = None
-    lidar: NDArray[np.uint8] | None = None
+    lidar: NDArray[np.integer[Any]] | None = None
     scanner_origins: Float | None = None
     R_scanner_lidar: Float | None = None
 
@@ -55,8 +48,11 @@ class FileSequence(ABC):
     sweeps that exist, ascending. cameras: by name. exposed_ns: of each camera, when its images that
     exist were exposed, by image number. truth: exact truth where there is some. files: of the
     sweeps, where each has one of its own. images: PNG or JPEG files by camera and image number;
-    a reader without them overrides `_encoded_image`.
+    a reader without them overrides `_encoded_image`. A reader sets ``_stamps_ns``, the reference
+    times by frame, or overrides `stamp_ns`.
     """
+
+    _stamps_ns: Mapping[int, int] | Sequence[int] | Int
 
     def __init__(
         self,
@@ -79,13 +75,22 @@ class FileSequence(ABC):
         self._files = files or {}
         self._image_files = images or {}
 
-    @abstractmethod
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep without reading its points."""
+        self.check_frame(frame)
+        return int(self._stamps_ns[frame])
 
     @abstractmethod
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
-        """Return the rows of an existing sweep, and the file for messages."""
+    def _returns(self, frame: int) -> Returns:
+        """Return the rows of an existing sweep. Whatever a malformed file makes it raise becomes an
+        InputError that names the file."""
+
+    def _checked_returns(self, frame: int) -> tuple[Path, Returns]:
+        """Return the file of a sweep, for messages, and its rows."""
+        self.check_frame(frame)
+        path = self._files.get(frame, self.where)
+        with described_in(path, f"sweep {frame} in the data set's own form"):
+            return path, self._returns(frame)
 
     def sweep_bytes(self) -> dict[int, int]:
         """See `LidarSequence`; empty where sweeps share files."""
@@ -94,7 +99,7 @@ class FileSequence(ABC):
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         """Return the (H,W,3) RGB of an existing image."""
         path, data = self._encoded_image(camera.name, number)
-        return decoded_image(data, camera, path)
+        return checks.decoded_image(data, camera, path)
 
     def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
         """Return the file of an existing image, for messages, and its bytes."""
@@ -114,8 +119,7 @@ class FileSequence(ABC):
 
         Raises InputError if the frame does not exist, or its file is damaged or holds no returns.
         """
-        self.check_frame(frame)
-        path, returns = self._returns(frame)
+        path, returns = self._checked_returns(frame)
         x, y, z = returns.points.T  # by columns: sums over rows of three take several times as long
         valid = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
         row = np.flatnonzero(valid)
@@ -125,6 +129,12 @@ class FileSequence(ABC):
                 f"choose a key or window without this frame"
             )
         intensity, lidar = _rows(returns.intensity, row), _rows(returns.lidar, row)
+        num = 256 if returns.scanner_origins is None else len(returns.scanner_origins)
+        if lidar is not None and not 0 <= lidar.min() <= lidar.max() < num:
+            raise InputError(
+                f"{path}: got points of scanner {lidar.min()} to {lidar.max()}, expected 0 to "
+                f"{num - 1}"
+            )
         return Sweep(
             frame=int(frame),
             stamp_ns=self.stamp_ns(frame),
@@ -139,12 +149,11 @@ class FileSequence(ABC):
 
     def num_rows(self, frame: int) -> int:
         """See `LidarSequence`."""
-        self.check_frame(frame)
-        return len(self._returns(frame)[1].points)
+        return len(self._checked_returns(frame)[1].points)
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
         """Return when each image that exists was exposed, by its number."""
-        camera_named(self.cameras, camera, self.where)
+        checks.camera_named(self.cameras, camera, self.where)
         return self._exposed_ns.get(camera, {})
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
@@ -156,225 +165,20 @@ class FileSequence(ABC):
         """Return the data set's own (4,4) pose at the sweep's reference time. Raises InputError if
         there is none, or it is no rigid motion."""
         self.check_frame(frame)
-        return rigid(self._pose(frame), f"{self.where}: pose of frame {frame}")
+        return checks.rigid(self._pose(frame), f"{self.where}: pose of frame {frame}")
 
     def check_frame(self, frame: int) -> None:
         """Raise InputError, which names the frames that exist, for one that does not."""
         if frame not in self._frames:
-            of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
+            checks.of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
 
     def check_image(self, camera: str, number: int) -> Camera:
         """Return the camera. Raises InputError, which names those that exist, for a camera or an
         image that does not."""
-        calibrated = camera_named(self.cameras, camera, self.where)
-        of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
+        calibrated = checks.camera_named(self.cameras, camera, self.where)
+        checks.of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
         return calibrated
 
 
 def _rows(column: NDArray[Any] | None, row: Int) -> NDArray[Any] | None:
     return None if column is None else column[row]
-
-
-def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
-    """Return the files of a folder that are named by a frame number, by ascending frame. Empty if
-    there is no such folder.
-
-    suffixes: those accepted, with the dot and in lower case.
-    """
-    if not folder.is_dir():
-        return {}
-    found = {
-        int(path.stem): path
-        for path in folder.iterdir()
-        if path.stem.isdecimal() and path.suffix.lower() in suffixes
-    }
-    return dict(sorted(found.items()))
-
-
-def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
-    """Return the entry of a frame, or raise InputError that names the frames that exist.
-
-    what, where: for the message, such as ``"sweep"`` and the recording's folder.
-    """
-    if frame not in entries:
-        raise InputError(
-            f"{where}: no {what} of frame {frame}; frames that exist: {format_frames(entries)}"
-        )
-    return entries[frame]
-
-
-def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camera:
-    """Return the camera, or raise InputError that names those that exist."""
-    if name not in cameras:
-        raise InputError(
-            f"{where}: no camera {name!r}; cameras that exist: {', '.join(cameras) or 'none'}"
-        )
-    return cameras[name]
-
-
-def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
-    """Return (H,W,3) uint8 RGB of an image file's bytes, gray in three equal channels.
-
-    Raises InputError, which names the place, if it is no whole image or not of the camera's size.
-    """
-    bgr = decode_image(data, where)
-    check_image_size(bgr.shape, camera, where)
-    return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
-
-
-def check_image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> None:
-    """Raise InputError if an image (H,W,...) is not of the camera's size."""
-    if shape[:2] != (camera.height_px, camera.width_px):
-        raise InputError(
-            f"{where}: got an image of {shape[1]} x {shape[0]} px; expected {camera.width_px} x "
-            f"{camera.height_px}, as the calibration of {camera.name} says"
-        )
-
-
-def pinhole(
-    name: str,
-    size_px: tuple[int, int],
-    fx_fy_cx_cy: Sequence[float],
-    T_cam_lidar: Float,
-    where: str,
-    **lens: Any,
-) -> Camera:
-    """Return a camera without skew. Raises InputError, which starts with ``where``, unless the
-    numbers are finite and the focal lengths and the size (width, height) are positive.
-
-    lens: further arguments of `Camera`, such as its distortion.
-    """
-    fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
-    if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
-        raise InputError(
-            f"{where}: got fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} and {size_px[0]} x "
-            f"{size_px[1]} px, expected finite numbers, positive focal lengths and sizes"
-        )
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return Camera(name, *size_px, K, T_cam_lidar, **lens)
-
-
-def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str]) -> str:
-    """Return which recording of a place is meant: the one named, or the only one.
-
-    Raises InputError, which lists them, if that does not tell.
-    """
-    if scene in names or (scene is None and len(names) == 1):
-        return scene or names[0]
-    shown = ", ".join(names[:4]) + f", ... {names[-1]} ({len(names)} in all)" * (len(names) > 4)
-    got = f"holds {len(names)} recordings" if scene is None else f"no recording {scene}"
-    raise InputError(f"{path}: {got}; choose one by {reader}:{path}#NAME, NAME one of {shown}")
-
-
-def truth_beside(recording: Path) -> Truth | None:
-    """Return the exact truth in the folder ``truth`` of a simulated recording."""
-    if not (recording / "truth").is_dir():
-        return None
-    from densify.readers.truth_files import FileTruth
-
-    return FileTruth(recording / "truth")
-
-
-def parse_numbers(text: str, where: str, count: int) -> Float:
-    """Return the (count,) finite numbers of a line or file. Raises InputError that starts with
-    ``where``."""
-    try:
-        values = np.array(text.split(), np.float64)
-    except ValueError as error:
-        raise InputError(f"{where}: {error}; expected {count} numbers") from None
-    if len(values) != count:
-        raise InputError(f"{where}: got {len(values)} values, expected {count} numbers")
-    if not np.isfinite(values).all():
-        raise InputError(f"{where}: got a value that is not finite, expected {count} numbers")
-    return values
-
-
-def rigid(T: Float, where: str) -> Float:
-    """(4,4) or (3,4) -> (4,4) float64. Raises InputError, which starts with ``where``, if it is not
-    finite or its upper left is no rotation."""
-    T = np.asarray(T, np.float64)
-    if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
-        got = "NaN or infinity" if T.shape in ((4, 4), (3, 4)) else f"shape {T.shape}"
-        raise InputError(f"{where}: got {got}, expected a (4,4) pose of finite numbers")
-    check_rotation(T[:3, :3], where)
-    return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
-
-
-def check_rotation(R: Float, where: str) -> Float:
-    """Return the (3,3) matrix. Raises InputError, which starts with ``where``, if it is no
-    rotation."""
-    error = np.abs(R @ R.T - np.eye(3)).max()
-    if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(R) < 0:
-        raise InputError(
-            f"{where}: got a matrix that is not a rotation (R Rᵀ is off by {error:.2g}, "
-            f"determinant {np.linalg.det(R):.3f}), expected an orthonormal one"
-        )
-    return R
-
-
-def scanner_axes(T_lidar_scanner: Float) -> Float:
-    """(S,4,4) mounting poses of scanners -> (S,3,3) `Returns.R_scanner_lidar`. A scanner that hangs
-    upside down is turned about its x axis, so that z points upwards."""
-    R = T_lidar_scanner[:, :3, :3]
-    upright = np.where(R[:, 2:, 2:] < 0, R * [1.0, -1.0, -1.0], R)
-    return np.ascontiguousarray(upright.transpose(0, 2, 1))
-
-
-def quaternion_pose(
-    w_x_y_z: Sequence[float] | Float, translation_m: Sequence[float] | Float, where: str
-) -> Float:
-    """Return the (4,4) pose of a unit quaternion and a translation. Raises InputError, which starts
-    with ``where``, unless there are four and three finite numbers and the quaternion's length is 1
-    to 0.01 (it is made 1 exactly)."""
-    from scipy.spatial.transform import Rotation
-
-    try:
-        numbers = np.array([*w_x_y_z, *translation_m], np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{where}: {error}; expected numbers") from None
-    with np.errstate(over="ignore"):
-        length = float(np.linalg.norm(numbers[:4]))
-    if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(length - 1) > 0.01:
-        raise InputError(
-            f"{where}: got a quaternion of length {length:.4g} and the translation "
-            f"{numbers[4:].tolist()}, expected a unit quaternion w x y z and metres x y z"
-        )
-    quaternion, translation = numbers[:4], numbers[4:]
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
-    T[:3, 3] = translation
-    return T
-
-
-def upright_poses(centre_m: Float, heading_rad: Float) -> Float:
-    """Return the (K,4,4) poses of boxes whose z axis is the frame's.
-
-    centre_m: (K,3). heading_rad: (K,) of the boxes' fronts, from x towards y.
-    """
-    T = np.tile(np.eye(4), (len(centre_m), 1, 1))
-    c, s = np.cos(heading_rad), np.sin(heading_rad)
-    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c
-    T[:, :3, 3] = centre_m
-    return T
-
-
-def checked_boxes(
-    track: Sequence[str] | NDArray[Any],
-    T_lidar_box: Float | Sequence[Float],
-    size_m: Float,
-    where: str,
-    lidar: Int | None = None,
-) -> Boxes:
-    """Return boxes as they were read. Raises InputError, which starts with ``where``, for a box
-    that has no size, or is there twice."""
-    bad = np.flatnonzero(~((size_m > 0) & (size_m < np.inf)).all(axis=1))
-    if len(bad):
-        raise InputError(
-            f"{where}: a box has no size: got {size_m[bad[0]].tolist()}, expected length, width "
-            f"and height in metres above 0"
-        )
-    names = np.array(track, np.str_)
-    found, times = np.unique(names[names != ""], return_counts=True)
-    if (times > 1).any():
-        raise InputError(f"{where}: the box {found[times > 1][0]} is there twice, expected once")
-    return Boxes(names, np.reshape(T_lidar_box, (-1, 4, 4)), size_m.reshape(-1, 3), lidar=lidar)

@@ -3,60 +3,178 @@
 
     ROOT/v1.0-trainval/{scene,sample,sample_data,ego_pose,calibrated_sensor,sensor}.json
     ROOT/v1.0-trainval/sample_annotation.json    optional: tracked boxes
-    ROOT/samples/LIDAR_TOP/*.pcd.bin, ROOT/sweeps/LIDAR_TOP/*.pcd.bin    key frames, and the others
-    ROOT/samples/CAM_FRONT/*.jpg ...
+    ROOT/{samples,sweeps}/LIDAR_TOP/*.pcd.bin    ROOT/samples/CAM_FRONT/*.jpg ...
 
-A scene is named by ``#scene-0061``. Its sweeps, key frames or not, are numbered from 0 in the order
-of time, and so are each camera's images. A file that is not there leaves a gap. Images are
-undistorted, with the stamps of the exposure. Poses are the vehicle's in the map's frame, one for
-each record; all poses of a scene give the vehicle's path.
+A scene is named by ``#scene-0061``. Its sweeps, key frames or not, and each camera's images are
+numbered from 0 in the order of time; a missing file leaves a gap. Images are undistorted, stamped
+at their exposure. All the vehicle's poses of a scene, one a record, give its path.
 
-nuScenes: one HDL-32E at 20 Hz. Points are in the scanner's frame (x right, y forward, z up),
-compensated to the stamp, which is that of the *last* packet. There are no point times. Rows are
-columns of 32 rings in the order of firing, 46.08 µs apart (HDL-32E manual, 2018, section 9.3), so
-column c of n fired (c + 1 - n) · 46.08 µs after the stamp. The compensation is undone with that: on
-a real sweep at 9 m/s the elevations of a ring then spread by 0.0016 degrees instead of 0.073. Rows
-without a return then lie at the scanner's origin and are left out.
+One HDL-32E at 20 Hz. Points are in the scanner's frame (x right, y forward, z up), compensated to
+the stamp, that of the *last* packet, without times. Rows are columns of 32 rings in the order of
+firing, 46.08 µs apart (HDL-32E manual, 9.3): column c of n fired (c + 1 - n) · 46.08 µs after the
+stamp, by which the compensation is undone. Rows without a return then lie at the origin and are
+left out. The tables have millions of records: only those asked for are parsed.
 """
 
 from __future__ import annotations
 
+import mmap
+import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os.path import isfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
-from densify.geometry.poses import inverse
+from densify.config.file_content import (
+    described_in,
+    open_file,
+    parse_json,
+    read_bytes,
+    read_json,
+    reason,
+)
+from densify.geometry.poses import interpolate, inverse
 from densify.geometry.types import Boxes, Camera, Float, Int
-from densify.readers.extras import described_in
-from densify.readers.file_sequence import (
-    FileSequence,
-    Returns,
-    chosen_scene,
-    pinhole,
-    truth_beside,
-)
-from densify.readers.nuscenes_tables import (
-    EXPECTED,
-    Annotations,
-    Record,
-    find_records,
-    pose_of,
-    read_table,
-    stamp_ns,
-)
+from densify.readers import checks
+from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.recorded_poses import PoseTrack
 
-_NUM_RINGS = 32
 _COLUMN_NS = 46_080  # from column to column of an HDL-32E
 _NO_RETURN_M = 0.05
+_RECORD = re.compile(rb"\{[^{}]*\}")
+_LENGTH_WIDTH_HEIGHT = [1, 0, 2]  # of the table's width, length, height
+_EXPECTED = "a table of nuScenes: records of tokens, stamps and poses"
+
+Record = dict[str, Any]
+
+
+def stamp_ns(record: Record) -> int:
+    """Return the time of a record; the tables have microseconds."""
+    return int(np.int64(int(record["timestamp"]) * 1000))
+
+
+def pose_of(record: Record, where: str) -> Float:
+    """Return the (4,4) of its rotation and translation."""
+    return checks.quaternion_pose(record["rotation"], record["translation"], where)
+
+
+def read_table(path: Path) -> dict[str, Record]:
+    """Return all records by token. Raises InputError if the file is missing or no such table."""
+    with described_in(path, _EXPECTED):
+        return {str(record["token"]): record for record in read_json(_existing(path))}
+
+
+def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Record]:
+    """Return the records, by token, whose ``key`` is one of ``wanted``; others are not parsed.
+
+    Raises InputError if the file is missing or cut off, or one of the records is malformed.
+    """
+    pattern = re.compile(rb'"%s"\s*:\s*"([^"]*)"' % key.encode())
+    names = frozenset(name.encode() for name in wanted)
+    found = []
+    try:
+        with (
+            open_file(_existing(path)) as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+        ):
+            if data[:4096].lstrip()[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
+                raise ValueError("it does not begin with [ or end with ]")
+            for match in _RECORD.finditer(data):
+                of = pattern.search(match[0])
+                if of and of[1] in names:
+                    found.append(parse_json(match[0], path))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: not a whole JSON table: {reason(error)}; fetch it again"
+        ) from error
+    with described_in(path, _EXPECTED):
+        return {str(record["token"]): record for record in found}
+
+
+def _existing(path: Path) -> Path:
+    if not path.exists():
+        raise InputError(f"{path}: no such table; fetch the data set's metadata")
+    return path
+
+
+class KeyBox(NamedTuple):
+    """T_world_box: (4,4). size_m: (3,) length, width, height."""
+
+    T_world_box: Float
+    size_m: Float
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """Boxes of a scene's key frames (2 Hz), from ``sample_annotation.json``.
+
+    key_ns: (n,) ascending stamps of the key frames. boxes: per key frame, by the object's token.
+    Between two key frames an object moves straight and turns evenly, as in the devkit. One that
+    only one of them has goes on at its speed without a track: nobody drew where it really is.
+    """
+
+    where: str
+    key_ns: Int
+    boxes: tuple[Mapping[str, KeyBox], ...]
+
+    @staticmethod
+    def read(tables: Path, scene: str) -> Annotations | None:
+        """scene: its token. None without the table, or without a box in the scene. Raises
+        InputError if a record is malformed, or an object is twice in a key frame."""
+        path = tables / "sample_annotation.json"
+        if not path.is_file():
+            return None
+        samples = find_records(tables / "sample.json", "scene_token", {scene})
+        found: dict[str, dict[str, KeyBox]] = defaultdict(dict)
+        with described_in(path, _EXPECTED):
+            stamps_ns = {token: stamp_ns(record) for token, record in samples.items()}
+            for token, record in find_records(path, "sample_token", samples).items():
+                where, boxes = f"{path}: record {token}", found[record["sample_token"]]
+                if record["instance_token"] in boxes:
+                    raise InputError(
+                        f"{where}: a second box of the instance {record['instance_token']} in the "
+                        f"sample {record['sample_token']}, expected one"
+                    )
+                size_m = np.array(record["size"], np.float64)[_LENGTH_WIDTH_HEIGHT]
+                boxes[record["instance_token"]] = KeyBox(pose_of(record, where), size_m)
+        order = sorted(stamps_ns, key=stamps_ns.__getitem__)
+        key_ns = np.array([stamps_ns[token] for token in order], np.int64)
+        return Annotations(str(path), key_ns, tuple(found[t] for t in order)) if found else None
+
+    def at(self, stamp_ns: int, T_lidar_world: Float) -> Boxes | None:
+        """Return the boxes of that time in a lidar frame, None outside the key frames."""
+        if not self.key_ns[0] <= stamp_ns <= self.key_ns[-1]:
+            return None
+        after = int(np.searchsorted(self.key_ns, stamp_ns))
+        before = after if self.key_ns[after] == stamp_ns else after - 1
+        here, there = self.boxes[before], self.boxes[after]
+        track = [name if name in here and name in there else "" for name in {**here, **there}]
+        found = [self._box(name, before, after, stamp_ns) for name in {**here, **there}]
+        return checks.boxes(
+            track,
+            T_lidar_world @ np.reshape([box.T_world_box for box in found], (-1, 4, 4)),
+            np.reshape([box.size_m for box in found], (-1, 3)),
+            f"{self.where}: at {stamp_ns} ns",
+        )
+
+    def _box(self, instance: str, before: int, after: int, stamp_ns: int) -> KeyBox:
+        """Interpolate, or extrapolate from the two nearest key frames that have the object."""
+        boxes = self.boxes
+        for first, last in ((before, after), (after, after + 1), (before - 1, before)):
+            inside = 0 <= first < last < len(boxes)
+            if inside and instance in boxes[first] and instance in boxes[last]:
+                here, there = boxes[first][instance], boxes[last][instance]
+                span_ns = self.key_ns[last] - self.key_ns[first]
+                share = float((stamp_ns - self.key_ns[first]) / span_ns)
+                T = interpolate(here.T_world_box, there.T_world_box, share)
+                return KeyBox(T, (there if share > 0.5 else here).size_m)
+        return {**boxes[before], **boxes[after]}[instance]
 
 
 def open_recording(path: Path, scene: str | None) -> NuScenes:
@@ -73,7 +191,7 @@ def open_recording(path: Path, scene: str | None) -> NuScenes:
     for folder in folders:
         for token, record in read_table(folder / "scene.json").items():
             scenes.setdefault(str(record.get("name")), (folder, token))
-    name = chosen_scene("nuscenes", path, scene, list(scenes))
+    name = checks.chosen_scene("nuscenes", path, scene, list(scenes))
     found = Scene.read(*scenes[name], name)
     if len(found.lidars) > 1:
         raise InputError(f"{path}: {name} has the lidars {', '.join(found.lidars)}, expected one")
@@ -112,7 +230,7 @@ class Scene:
     def read(tables: Path, token: str, name: str) -> Scene:
         """Raises InputError if a table is missing or malformed, or the scene has no sweeps."""
         file, poses_file = tables / "sample_data.json", tables / "ego_pose.json"
-        with described_in(file, EXPECTED):
+        with described_in(file, _EXPECTED):
             samples = find_records(tables / "sample.json", "scene_token", {token})
             data = find_records(file, "sample_token", set(samples))
             records = sorted(data.values(), key=stamp_ns)
@@ -166,6 +284,7 @@ class NuScenes(FileSequence):
         """Raises InputError if no sweep is on the disk, or a camera is malformed."""
         self._scene, self._lidar = scene, next(iter(scene.lidars.values()))
         self._T_ego_lidar, track = self._lidar.T_ego_sensor[0], scene.track
+        self._stamps_ns = self._lidar.stamps_ns
         self._track = PoseTrack(track.where, track.stamp_ns, track.T_world_ego @ self._T_ego_lidar)
         root, there = scene.tables.parent, self._lidar.on_disk()
         if not there:
@@ -180,14 +299,10 @@ class NuScenes(FileSequence):
             list(there),
             {name: self._camera(name, channel) for name, channel in scene.cameras.items()},
             {n: {i: scene.cameras[n].stamps_ns[i] for i in files} for n, files in images.items()},
-            truth_beside(root),
-            images=images,
+            checks.truth_beside(root),
+            there,
+            images,
         )
-
-    def stamp_ns(self, frame: int) -> int:
-        """Return the stamp in the table."""
-        self.check_frame(frame)
-        return self._lidar.stamps_ns[frame]
 
     def _camera(self, name: str, channel: Channel) -> Camera:
         where = f"{self._scene.tables / 'calibrated_sensor.json'}: {name}"
@@ -195,17 +310,17 @@ class NuScenes(FileSequence):
             K = np.array(channel.intrinsics, np.float64).reshape(3, 3)
         T_cam_lidar = inverse(channel.T_ego_sensor[0]) @ self._T_ego_lidar
         fx_fy_cx_cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-        return pinhole(name, channel.size_px, fx_fy_cx_cy, T_cam_lidar, where)
+        return checks.pinhole(name, channel.size_px, fx_fy_cx_cy, T_cam_lidar, where)
 
     def _pose(self, frame: int) -> Float:
-        return self._track.at(self._lidar.stamps_ns[frame])
+        return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
         """See `LidarSequence`; the test split has none. Raises InputError for a malformed table."""
         self.check_frame(frame)
         if self._annotations is None:
             return None
-        return self._annotations.at(self._lidar.stamps_ns[frame], inverse(self._pose(frame)))
+        return self._annotations.at(self._stamps_ns[frame], inverse(self._pose(frame)))
 
     @cached_property
     def _annotations(self) -> Annotations | None:
@@ -216,23 +331,11 @@ class NuScenes(FileSequence):
         T_world_ego = self._scene.track.at(self.image_stamps_ns(camera)[number])
         return T_world_ego @ self._scene.cameras[camera].T_ego_sensor[number]
 
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
-        path = self._lidar.files[frame]
-        data = read_bytes(path)
-        if len(data) % 20:
-            raise InputError(
-                f"{path}: truncated: got {len(data)} bytes, expected a multiple of 20 (x y z "
-                f"intensity ring as float32); fetch the file again"
-            )
-        rows = np.frombuffer(data, "<f4").reshape(-1, 5).astype(np.float64)
-        ring = rows[:, 4]
-        if not np.isin(ring, np.arange(_NUM_RINGS)).all():
-            raise InputError(
-                f"{path}: got rings from {ring.min():g} to {ring.max():g}, expected whole numbers "
-                f"from 0 to {_NUM_RINGS - 1} in the fifth column"
-            )
-        column: Int = np.cumsum(np.diff(ring, prepend=0.0) < 0, dtype=np.int64)
+    def _returns(self, frame: int) -> Returns:
+        data = read_bytes(self._files[frame])
+        rows = np.frombuffer(data, "<f4").reshape(-1, 5).astype(np.float64)  # x y z intensity ring
+        column: Int = np.cumsum(np.diff(rows[:, 4], prepend=0.0) < 0, dtype=np.int64)
         offset_ns: Int = (column - column[-1:]) * _COLUMN_NS
-        points = self._track.as_fired(rows[:, :3], self._lidar.stamps_ns[frame], offset_ns)
+        points = self._track.as_fired(rows[:, :3], self._stamps_ns[frame], offset_ns)
         points[np.linalg.norm(points, axis=1) < _NO_RETURN_M] = 0.0
-        return path, Returns(points, (rows[:, 3] / 255).astype(np.float32), offset_ns)
+        return Returns(points, (rows[:, 3] / 255).astype(np.float32), offset_ns)

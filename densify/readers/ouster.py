@@ -2,17 +2,12 @@
 """Packets of an Ouster scanner: a ``.pcap`` file and the metadata ``.json`` that the sensor gives,
 decoded by the maker's ouster-sdk (densify[ouster]).
 
-The metadata is the ``.json`` whose name the capture's begins with, or the only one beside it, or
-the one named behind ``#``. A sweep is a frame of the sensor, numbered from 0. Opening finds the
-frames; their packets are read when a sweep is asked for.
-
-- The stamp is the computer's: when the first packet of the frame was captured. The sensor's own
-  clock may count from when it was switched on; it gives the time of each column since the first
-  (``offset_ns``).
-- Points are the sensor's, as measured, in its frame (x forward, y left, z up, origin on its base).
-  Rays start on the spinning axis (they leave it 1 to 2 cm ahead, in their own direction).
-- Rows count over the image of returns, ring by ring. Of two returns the first is taken.
-- There are neither cameras nor poses.
+The metadata is the ``.json`` whose name the capture's begins with, the only one beside it, or the
+one named behind ``#``. A sweep is a frame of the sensor, numbered from 0, read when asked for. Its
+stamp is the computer's, of its first packet; the sensor's clock gives the columns' times since
+then. Points are as measured, in the sensor's frame (x forward, y left, z up, origin on its base);
+rays start on the spinning axis. Rows count over the image of returns; of two returns the first is
+taken. There are neither cameras nor poses.
 """
 
 from __future__ import annotations
@@ -23,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_json, reason
-from densify.readers.extras import needed
+from densify.config.file_content import needed, read_json, reason
 from densify.readers.file_sequence import FileSequence, Returns
 
 
@@ -52,7 +46,7 @@ def find_metadata(path: Path) -> Path | None:
 
 
 class Ouster(FileSequence):
-    """A capture as a `LidarSequence`."""
+    """A capture as a `LidarSequence`. A sweep's stamp is when its first packet was captured."""
 
     def __init__(self, path: Path, metadata: Path) -> None:
         """Raises InputError if the file is no capture, the metadata no Ouster's, or they do not
@@ -74,19 +68,14 @@ class Ouster(FileSequence):
                 f"{path}: no sweeps of the sensor that {metadata.name} describes; name its own "
                 f"metadata by ouster:{path}#NAME.json"
             )
-        self._captured_us = index[:, 0].astype(np.int64)
+        self._stamps_ns = index[:, 0].astype(np.int64) * 1000
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # deprecated names
             T = np.asarray(self._source.sensor_info[0].lidar_to_sensor_transform, np.float64)
         self._origins_m = T[None, :3, 3] * 1e-3
         super().__init__(path.stem, path, range(len(index)))
 
-    def stamp_ns(self, frame: int) -> int:
-        """Return when the sweep's first packet was captured."""
-        self.check_frame(frame)
-        return int(self._captured_us[frame]) * 1000
-
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
+    def _returns(self, frame: int) -> Returns:
         try:
             scan = self._source[frame][0]
             points = np.asarray(self._table(scan), np.float64)
@@ -104,7 +93,7 @@ class Ouster(FileSequence):
         intensity = np.zeros((scan.h, scan.w))
         if scan.has_field("REFLECTIVITY"):
             intensity = np.clip(scan.field("REFLECTIVITY") / 255, 0, 1)
-        return self.where, Returns(
+        return Returns(
             points.reshape(-1, 3),
             intensity.astype(np.float32).reshape(-1),
             np.broadcast_to(since_ns, (scan.h, scan.w)).reshape(-1),

@@ -5,25 +5,18 @@
     002/camera/front_camera/{00.jpg, ..., poses.json, timestamps.json, intrinsics.json}
     002/annotations/cuboids/{00.pkl.gz, ...}    optional: tracked boxes
 
-- A frame's number is that of its files. Its stamp is the end of the sweep; each point has a time of
-  its own, 0.14 s before the stamp to 0.015 s after it. The first scanner (``d`` 0, Pandar64) turns
-  once in a sweep; the second (``d`` 1, PandarGT, forward, solid state) runs free of it.
-- Points are in the world, compensated: each was placed with the vehicle's pose at its own time.
-  Poses are the vehicle's, x right, y forward, z up, 10 Hz. That their clock is the points' own is
-  known to 20 ms only: the sequence measured (002) goes 0.4 m/s at most.
-- The positions of the scanners are not published. The Pandar64's position and axis below are those
-  that make its rings sharpest: the entropy of the elevations, minimised over position and tilt,
-  gives all 64 rings, and the same position to 1 cm in different sweeps. The PandarGT's position
-  makes the points of each of its mirror swings lie on the smoothest curve. The same vehicle drove
-  all sequences.
-- The lidar frame is the Pandar64's: x forward, y left, z along its axis.
-- Boxes are in the world. A moving object that both scanners see has two boxes with names of their
-  own, each around the points of one scanner (``cuboids.sensor_id``). ``dimensions`` are width,
-  length, height, and ``yaw`` turns the front from the world's y (the devkit's documentation; not
-  tried on real boxes).
-- Cameras are pinholes without distortion; their size is that of the images. Each image has a pose
-  and a stamp of its own, 19 to 100 ms before the sweep's. A camera's mounting is taken from the
-  image at which the vehicle moved least.
+- A frame's number is that of its files; its stamp is the end of the sweep. The first scanner (``d``
+  0, Pandar64) turns once in a sweep, the second (``d`` 1, PandarGT, forward) runs free of it.
+- Points are in the world, each placed with the vehicle's pose at its own time. Poses are the
+  vehicle's, x right, y forward, z up, 10 Hz; their clock is the points' own to 20 ms.
+- The scanners' places are not published. The Pandar64's is where its rings are sharpest, the
+  PandarGT's where its mirror's swings are smoothest; the same vehicle drove all sequences. The
+  lidar frame is the Pandar64's: x forward, y left, z along its axis.
+- Boxes are in the world. What both scanners see has two, each of one scanner
+  (``cuboids.sensor_id``). ``dimensions`` are width, length, height; ``yaw`` turns the front from
+  the world's y (devkit; not tried on real boxes).
+- Cameras are pinholes without distortion, as large as their images. Each image has a pose and a
+  stamp. A camera's mounting is taken from the image at which the vehicle moved least.
 """
 
 from __future__ import annotations
@@ -33,21 +26,12 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_json
+from densify.config.file_content import described_in, read_json
 from densify.geometry import poses
 from densify.geometry.types import Boxes, Camera, Float, Int
+from densify.readers import checks
 from densify.readers.decoded_files import image_size_px
-from densify.readers.extras import described_in
-from densify.readers.file_sequence import (
-    FileSequence,
-    Returns,
-    checked_boxes,
-    numbered_files,
-    pinhole,
-    quaternion_pose,
-    truth_beside,
-    upright_poses,
-)
+from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.pickled_frame import read_columns
 from densify.readers.recorded_poses import PoseTrack
 
@@ -58,7 +42,7 @@ PANDAR_GT_M = np.array([0.580, 0.027, -0.294])
 
 _LATEST_S = 4e9  # of stamps: the year 2096
 _CENTRE = tuple(f"position.{axis}" for axis in "xyz")
-_WIDTH_LENGTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "xyz")
+_LENGTH_WIDTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "yxz")
 
 
 def _T_pose_lidar() -> Float:
@@ -82,7 +66,8 @@ def open_recording(path: Path, scene: str | None) -> PandaSet:
 
 
 class PandaSet(FileSequence):
-    """A sequence as a `LidarSequence` with poses of its images."""
+    """A sequence as a `LidarSequence` with poses of its images. A sweep's stamp is the end of the
+    Pandar64's turn."""
 
     def __init__(self, path: Path) -> None:
         """path: the sequence's folder. Raises InputError if it holds no sweeps, or poses, stamps or
@@ -95,17 +80,18 @@ class PandaSet(FileSequence):
                 f"{path}: no sweeps; expected a PandaSet sequence with files such as "
                 f"lidar/00.pkl.gz"
             )
-        stamps_ns, T_world_pose = _stamped_poses(lidar, max(sweeps))
-        self._track = PoseTrack(str(lidar / "poses.json"), stamps_ns, T_world_pose @ T_POSE_LIDAR)
+        self._stamps_ns, T_world_pose = _stamped_poses(lidar, max(sweeps))
+        T_world_lidar = T_world_pose @ T_POSE_LIDAR
+        self._track = PoseTrack(str(lidar / "poses.json"), self._stamps_ns, T_world_lidar)
         images, self._T_world_cam, cameras, exposed_ns = {}, dict[str, Float](), {}, {}
         for folder in sorted(path.glob("camera/*")):
-            files, name = numbered_files(folder, ".jpg", ".png"), folder.name
+            files, name = checks.numbered_files(folder, ".jpg", ".png"), folder.name
             if files:
                 images_ns, self._T_world_cam[name] = _stamped_poses(folder, max(files))
                 exposed_ns[name] = {n: int(images_ns[n]) for n in files}
                 calm = min(files, key=lambda n: self._step_m(exposed_ns[name][n]))
-                T_world_lidar = self._track.at(exposed_ns[name][calm])
-                T_cam_lidar = poses.inverse(self._T_world_cam[name][calm]) @ T_world_lidar
+                T_cam_world = poses.inverse(self._T_world_cam[name][calm])
+                T_cam_lidar = T_cam_world @ self._track.at(exposed_ns[name][calm])
                 cameras[name], images[name] = _camera(folder, files[min(files)], T_cam_lidar), files
         super().__init__(
             path.resolve().name,
@@ -113,15 +99,10 @@ class PandaSet(FileSequence):
             tuple(sorted(sweeps)),
             cameras,
             exposed_ns,
-            truth_beside(path),
+            checks.truth_beside(path),
             sweeps,
             images,
         )
-
-    def stamp_ns(self, frame: int) -> int:
-        """Return the end of the Pandar64's turn."""
-        self.check_frame(frame)
-        return int(self._track.stamp_ns[frame])
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """Return the data set's own (4,4) pose of an image."""
@@ -137,9 +118,12 @@ class PandaSet(FileSequence):
         here, there = self._track.T_world_ego[after - 1 : after + 1, :3, 3]
         return float(np.linalg.norm(there - here))
 
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
+    def _returns(self, frame: int) -> Returns:
         path, stamp_ns = self._files[frame], self.stamp_ns(frame)
-        x, y, z, brightness, time_s, scanner = _numbers(path, ("x", "y", "z", "i", "t", "d"))[0]
+        columns = read_columns(path)
+        x, y, z, brightness, time_s, scanner = (
+            np.asarray(columns[name], np.float64) for name in ("x", "y", "z", "i", "t", "d")
+        )
         since_s = time_s - stamp_ns * 1e-9
         if not (np.abs(since_s) < 1.0).all():
             raise InputError(
@@ -148,8 +132,8 @@ class PandaSet(FileSequence):
             )
         offset_ns = np.rint(since_s * 1e9).astype(np.int64)
         T_lidar_world = poses.inverse(self._track.at(stamp_ns))
-        points = poses.transform(T_lidar_world, np.column_stack([x, y, z]).astype(np.float64))
-        return path, Returns(
+        points = poses.transform(T_lidar_world, np.column_stack([x, y, z]))
+        return Returns(
             self._track.as_fired(points, stamp_ns, offset_ns),
             (brightness / 255).astype(np.float32),
             offset_ns,
@@ -167,43 +151,15 @@ class PandaSet(FileSequence):
         path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"
         if not path.is_file():
             return None
-        names = (*_CENTRE, *_WIDTH_LENGTH_HEIGHT, "yaw", "cuboids.sensor_id")
-        (x, y, z, width, length, height, yaw, scanner), (uuid,) = _numbers(path, names, ("uuid",))
-        wrong = scanner[~np.isin(scanner, (-1, 0, 1))]
-        if len(wrong):
-            raise InputError(
-                f"{path}: column cuboids.sensor_id: got {wrong[0]}, expected -1, 0 or 1"
-            )
-        T_world_box = upright_poses(np.stack([x, y, z], axis=1).astype(float), yaw + np.pi / 2)
-        return checked_boxes(
-            uuid,
-            poses.inverse(self._pose(frame)) @ T_world_box,
-            np.stack([length, width, height], axis=1).astype(np.float64),
-            str(path),
-            lidar=scanner.astype(np.int64),
-        )
-
-
-def _numbers(
-    path: Path, numbers: tuple[str, ...], texts: tuple[str, ...] = ()
-) -> tuple[list[Float], list[list[str]]]:
-    """Return columns of numbers, finite but for x y z, and columns of texts. Raises InputError if
-    one is absent or holds something else."""
-    columns = read_columns(path)
-    missing = [name for name in (*numbers, *texts) if name not in columns]
-    if missing:
-        raise InputError(
-            f"{path}: no column {missing[0]}: got {' '.join(columns) or 'none'}; use the data "
-            f"set's own files"
-        )
-    for name in numbers:
-        column = columns[name]
-        if column.dtype.kind not in "fiu" or not (name in "xyz" or np.isfinite(column).all()):
-            raise InputError(f"{path}: column {name}: expected finite numbers")
-    found = [columns[name].tolist() for name in texts]
-    if not all(isinstance(text, str) and text for column in found for text in column):
-        raise InputError(f"{path}: column {', '.join(texts)}: expected a text in each row")
-    return [columns[name] for name in numbers], found
+        columns = read_columns(path)
+        with described_in(path, "the cuboids of PandaSet"):
+            texts = [str(text) for text in columns["uuid"]]
+            numbers = (*_CENTRE, *_LENGTH_WIDTH_HEIGHT, "yaw", "cuboids.sensor_id")
+            table = np.column_stack([np.asarray(columns[name], np.float64) for name in numbers])
+        T_world_box = checks.upright_poses(table[:, :3], table[:, 6] + np.pi / 2)
+        T_lidar_box = poses.inverse(self._pose(frame)) @ T_world_box
+        lidar = table[:, 7].astype(np.int64)
+        return checks.boxes(texts, T_lidar_box, table[:, 3:6], str(path), lidar=lidar)
 
 
 def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
@@ -219,7 +175,7 @@ def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
         for number, entry in enumerate(read_json(path)):
             turn, place = entry["heading"], entry["position"]
             values = [turn[k] for k in "wxyz"], [place[k] for k in "xyz"]
-            T.append(quaternion_pose(*values, f"{path}: entry {number}"))
+            T.append(checks.quaternion_pose(*values, f"{path}: entry {number}"))
     num = min(len(stamps_ns), len(T))
     if last >= num:
         raise InputError(
@@ -234,4 +190,4 @@ def _camera(folder: Path, image: Path, T_cam_lidar: Float) -> Camera:
     given = read_json(path)
     with described_in(path, "fx fy cx cy in pixels"):
         fx_fy_cx_cy = [float(given[name]) for name in ("fx", "fy", "cx", "cy")]
-    return pinhole(folder.name, image_size_px(image), fx_fy_cx_cy, T_cam_lidar, str(path))
+    return checks.pinhole(folder.name, image_size_px(image), fx_fy_cx_cy, T_cam_lidar, str(path))

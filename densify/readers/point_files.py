@@ -15,18 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import check_size, open_file, read_bytes, reason
+from densify.config.file_content import check_size, needed, read_bytes, reason
 from densify.readers.decoded_files import read_array, read_arrays, read_las
-from densify.readers.extras import needed
-from densify.readers.file_sequence import parse_numbers
 
 Columns = dict[str, NDArray[Any]]
 
 _UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most others follow
-_BIN_COLUMNS = range(3, 8)
-_TRIED_COLUMNS = range(1, 33)
-_LEAST_ROWS = 20  # that tell of other numbers of columns
-_ALIKE, _UNLIKE = 0.5, 0.8  # steps from row to row, as a share of the sizes
+_ALIKE = 0.5  # steps from row to row, as a share of the sizes
+_FEWEST_ROWS = 20  # that tell
 _MOST_COLUMNS = 100  # more are rows
 _ROWS_LOOKED_AT = 4000
 
@@ -59,9 +55,8 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     .las, .laz                dimensions
     ========================= ==================================================================
 
-    names: of the columns, where the file has none; a .bin file without them has 3 to 7, the first
-    of them x y z intensity. Raises InputError if the file is missing, damaged, of another form, or
-    has no rows.
+    names: of the columns, where the file has none; a .bin file without them has x y z intensity.
+    Raises InputError if the file is missing, damaged, of another form, or has no rows.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -78,21 +73,6 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     if not len(table):
         raise InputError(f"{path}: holds no points, expected at least one")
     return table
-
-
-def read_viewpoint(path: Path) -> tuple[float, ...] | None:
-    """Return tx ty tz qw qx qy qz of a .pcd file's header, None of other files. Raises InputError
-    if the header is damaged."""
-    if path.suffix.lower() != ".pcd":
-        return None
-    try:
-        with open_file(path) as file:
-            lines = _pcd_header(file)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a readable .pcd point file: {error}") from error
-    found = next((line.split()[1:] for line in lines if line.startswith("VIEWPOINT")), None)
-    where = f"{path}: VIEWPOINT, tx ty tz qw qx qy qz"
-    return None if found is None else tuple(parse_numbers(" ".join(found), where, 7).tolist())
 
 
 def unnamed(num_columns: int) -> tuple[str, ...]:
@@ -121,48 +101,29 @@ def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Col
 
 
 def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
-    data = read_bytes(path)
-    num_columns = len(names) if names is not None else _num_columns(data)
+    data, num_columns = read_bytes(path), len(_UNNAMED) if names is None else len(names)
     if len(data) % (4 * num_columns):
         raise ValueError(
             f"got {len(data)} bytes, expected a multiple of {4 * num_columns} "
             f"({num_columns} float32 columns); it is cut off, or has another number of columns"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, num_columns)
+    if names is None and not _are_scanned(rows[:_ROWS_LOOKED_AT, :3]):
+        raise ValueError(
+            "read as rows of 4 little-endian float32 columns, neighbouring points are not alike; "
+            "in a plain folder name the columns in densify.yaml: sweeps.columns"
+        )
     return PointTable(_matrix(rows, names, path))
 
 
-def _num_columns(data: bytes) -> int:
-    """Return the number of float32 columns, 3 to 7: the least with which neighbouring points are
-    alike, or else the one with which they are most alike; a wrong number mixes x with y.
-
-    Raises ValueError if they are not alike, far more alike with more columns, all the same, or if
-    neighbouring numbers are alike: all x then come before all y.
-    """
+def _are_scanned(points: NDArray[Any]) -> bool:
+    """Return True if (N,3) points lie near those of the rows before, by the median of the steps as
+    a share of the sizes: another number of columns mixes x with y."""
     with np.errstate(invalid="ignore"):  # other bytes may be any sort of NaN
-        values = np.frombuffer(data[: len(data) // 4 * 4], "<f4").astype(np.float64)
-    values = np.nan_to_num(values, posinf=0, neginf=0)
-    steps = {}
-    for k in _TRIED_COLUMNS:
-        least_rows = 1 if k in _BIN_COLUMNS else _LEAST_ROWS
-        if len(data) % (4 * k) == 0 and len(values) > k * least_rows:
-            places = values.reshape(-1, k)[:_ROWS_LOOKED_AT, :3]
-            size = np.abs(places[1:]).sum(axis=1) + np.abs(places[:-1]).sum(axis=1) + 1e-9
-            steps[k] = float(np.mean(np.abs(np.diff(places, axis=0)).sum(axis=1) / size))
-    usual = [k for k in _BIN_COLUMNS if k in steps]
-    if not usual:
-        return 4
-    alike = [k for k in usual if steps[k] < _ALIKE]
-    k = alike[0] if alike else min(usual, key=lambda k: steps[k])
-    neighbours = min(steps.get(1, 1), steps.get(2, 1))
-    more = not alike and (steps[k] > _UNLIKE or steps[k] > 2 * min(steps.values()))
-    same = steps[k] == 0 and values.any()
-    if more or same or neighbours < min(1.2 * _ALIKE, 2 * steps[k]):
-        raise ValueError(
-            "read as rows of 3 to 7 little-endian float32 columns, neighbouring points are not "
-            "alike; in a plain folder name the columns in densify.yaml: sweeps.columns"
-        )
-    return k
+        near = np.nan_to_num(points.astype(np.float64), posinf=0, neginf=0)
+    step, size = np.abs(np.diff(near, axis=0)).sum(axis=1), np.abs(near).sum(axis=1)
+    share = step / (size[1:] + size[:-1] + 1e-9)
+    return len(near) < _FEWEST_ROWS or 0 < np.median(share) < _ALIKE
 
 
 def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:
@@ -184,8 +145,6 @@ def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
     lines = read_bytes(path).decode("utf-8-sig").splitlines()
     skip, words, delimiter = _header(lines)
     rows = lines[skip:]
-    if delimiter and delimiter != ",":  # a comma is then a decimal point
-        rows = [line.replace(",", ".") for line in rows]
     if delimiter:
         blank = re.compile(f"(^|{delimiter}) *(?={delimiter}|$)")
         rows = [blank.sub(r"\1nan", line) if line.strip() else "" for line in rows]
@@ -212,7 +171,7 @@ def _header(lines: Sequence[str]) -> tuple[int, list[str], str | None]:
             continue
         delimiter = next((d for d in (";", "\t", ",") if d in text), None)
         words = [word.strip().strip('"') for word in text.split(delimiter)]
-        if _are_numbers([word.replace(",", ".") for word in words]):
+        if _are_numbers(words):
             return number - 1, [], delimiter
         if not line.strip().startswith("#") or _names_axes(words):
             return number, words, delimiter

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Depth images that the user brings, such as a monocular network's, in a folder::
 
-    DIR/CAMERA/FRAME.npy, .exr or .png   (or DIR/CAMERA/data/..., as KITTI has its images)
-    DIR/FRAME.npy, .exr or .png          of a single camera
-    FRAME.npy, .exr or .png              a file alone: of one camera and one image
-    DIR/sky/CAMERA/FRAME.png, DIR/sky/FRAME.png    optional masks, not 0 where there is sky
+    DIR/[CAMERA/[data/]]FRAME.npy, .exr or .png    without CAMERA of a single one; or a file alone
+    DIR/sky/[CAMERA/]FRAME.png    optional masks, not 0 where there is sky
 
 FRAME is the image's number: 120, 000120, 0000000120, 0000000120_depth or _disp. Arrays are (H,W) of
 any number type, with further axes of length 1; EXR files have one channel, or one called Z, Y or
@@ -23,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import open_file, reason
+from densify.config.file_content import needed, open_file, reason
 from densify.geometry.types import Bool, Camera, Float32, Prior
 from densify.readers.decoded_files import check_pixels, read_array, read_image
-from densify.readers.extras import needed
 from densify.readers.timeline import format_frames
 
 _SUFFIXES = (".png", ".exr", ".npy")  # the finest last

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import Float, Int
-from densify.readers.file_sequence import parse_numbers, quaternion_pose, rigid
+from densify.readers import checks
 from densify.readers.stamp_files import TIME_COLUMNS, TextTable
 
 _MAX_BEYOND_NS = 200_000_000  # a pose is extrapolated at constant velocity for so long
@@ -115,23 +115,19 @@ class PoseFile:
             time = table.column(TIME_COLUMNS)
         elif width == 8:
             form, columns, time = "TUM", [7, 4, 5, 6, 1, 2, 3], 0
-        elif width == 4 and len(table.rows) % 4 == 0:
-            T = _numbers(table).reshape(-1, 4, 4)
-            return PoseFile(path, "4x4 blocks", _rigid(path, T, table.lines[::4]))
         elif width in (12, 16):
-            T = _numbers(table).reshape(len(table.rows), -1, 4)
-            return PoseFile(
-                path, "KITTI 3x4" if width == 12 else "4x4 rows", _rigid(path, T, table.lines)
-            )
+            lines = zip(_numbers(table), table.lines, strict=True)
+            T = np.stack([checks.rigid(one, f"{path}: line {n}") for one, n in lines])
+            return PoseFile(path, "KITTI 3x4" if width == 12 else "4x4 rows", T)
         else:
             raise InputError(
                 f"{path}: line {table.lines[0]}: got {width} numbers, expected 12 (KITTI), 16 "
-                f"(4x4), 8 (TUM: time x y z qx qy qz qw), 4 in blocks of four lines, or a first "
-                f"line that names x y z qw qx qy qz"
+                f"(4x4), 8 (TUM: time x y z qx qy qz qw), or a first line that names x y z qw qx "
+                f"qy qz"
             )
         values = _numbers(table, columns)
         lines = zip(values, table.lines, strict=True)
-        T = np.stack([quaternion_pose(v[:4], v[4:], f"{path}: line {n}") for v, n in lines])
+        T = np.stack([checks.quaternion_pose(v[:4], v[4:], f"{path}: line {n}") for v, n in lines])
         stamps_ns = None if time is None else table.times_ns(time, unit)[0]
         return PoseFile(path, form, T, stamps_ns)
 
@@ -141,9 +137,5 @@ def _numbers(table: TextTable, columns: Sequence[int] | None = None) -> Float:
     for line, words in zip(table.lines, table.rows, strict=True):
         chosen = words if columns is None else [words[i] for i in columns]
         width = len(table.rows[0] if columns is None else columns)
-        rows.append(parse_numbers(" ".join(chosen), f"{table.path}: line {line}", width))
+        rows.append(checks.parse_numbers(" ".join(chosen), f"{table.path}: line {line}", width))
     return np.array(rows)
-
-
-def _rigid(path: Path, T: Float, lines: Sequence[int]) -> Float:
-    return np.stack([rigid(one, f"{path}: line {n}") for one, n in zip(T, lines, strict=True)])

@@ -4,22 +4,16 @@
 ``ros:PATH[#points=/topic,/topic&images=/topic,/topic&poses=/topic]``: topics are guessed where one
 fits, and must be named where several do; ``images=none`` and ``poses=none`` leave them out.
 
-points
-    PointCloud2 of any layout, or Livox's CustomMsg, in the frame that their header names, taken as
-    fired. Rays start at that frame's origin. Points of several lidars make one sweep in the frame
-    of the first one named: each of its messages takes the nearest in time of the others, and
-    /tf_static gives where each lidar's rays start.
-stamps
-    of the header (when it was recorded, if that is 0): the reference time. Times of points count
-    from it, or are absolute; field, unit and clock are found out (`densify.readers.point_fields`).
-    Sweeps and images are numbered from 0 in the order of their stamps.
-images
-    Image or CompressedImage with the CameraInfo beside them: raw ones with K and D, ``image_rect``
-    with P and R. Their frame is that of the image's header, fixed to the lidar's by /tf_static (or
-    by a /tf that never moves). A P that moves the camera sideways (stereo) is taken to agree.
-poses
-    Odometry, PoseStamped, or /tf: of the lidar's frame by fixed frames, interpolated to the sweeps'
-    stamps.
+points: PointCloud2 of any layout, or Livox's CustomMsg, in their header's frame, as fired from its
+    origin. Several lidars make one sweep in the frame of the first named: each of its messages
+    takes the others' nearest in time; /tf_static tells where their rays start.
+stamps: of the header (of the recording where that is 0): the reference time. Times of points count
+    from it, or are absolute (`densify.readers.point_fields`). Sweeps and images are numbered from 0
+    in the order of their stamps.
+images: Image or CompressedImage with the CameraInfo beside them: raw ones with K and D,
+    ``image_rect`` with P and R, in the frame of their header, fixed to the lidar's by /tf_static or
+    a /tf that never moves. A P that moves the camera sideways (stereo) is taken to agree.
+poses: Odometry, PoseStamped, or /tf: of the lidar by fixed frames, interpolated to the stamps.
 """
 
 from __future__ import annotations
@@ -36,7 +30,8 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float, Float32
-from densify.readers.file_sequence import FileSequence, Returns, check_image_size, truth_beside
+from densify.readers import checks
+from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.point_fields import PointLayout
 from densify.readers.recorded_poses import PoseTrack
 from densify.readers.ros_bag import POSES, Bag, Entry, Topics, place_of
@@ -100,14 +95,10 @@ class RosBag(FileSequence):
             for name, topic in self._image_topics.items()
         }
         self._sweeps = self._lidars[0].entries
-        truth = truth_beside(path if path.is_dir() else path.parent)
+        self._stamps_ns = [entry.stamp_ns for entry in self._sweeps]
+        truth = checks.truth_beside(path if path.is_dir() else path.parent)
         frames = range(len(self._sweeps))
         super().__init__(path.resolve().name, path, frames, cameras, stamps, truth)
-
-    def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep."""
-        self.check_frame(frame)
-        return self._sweeps[frame].stamp_ns
 
     def findings(self) -> Sequence[tuple[str, str]]:
         """See `LidarSequence`."""
@@ -122,7 +113,7 @@ class RosBag(FileSequence):
         lines += [("no camera", text) for text in self._left_out]
         return [*lines, ("poses from", self._track_and_words[1])]
 
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
+    def _returns(self, frame: int) -> Returns:
         at, found = self._sweeps[frame], list[tuple[int, Returns]]()
         for number, lidar in enumerate(self._lidars):
             near = min(lidar.entries, key=lambda e: abs(e.stamp_ns - at.stamp_ns))
@@ -132,7 +123,7 @@ class RosBag(FileSequence):
         parts = [part for _, part in found]
         timed = all(part.offset_ns is not None for part in parts)
         origins = np.stack([lidar.T_first_lidar[:3, 3] for lidar in self._lidars])
-        return self.where, Returns(
+        return Returns(
             np.concatenate([part.points for part in parts]),
             np.concatenate([_intensity(part) for part in parts]),
             np.concatenate([part.offset_ns for part in parts]) if timed else None,  # type: ignore
@@ -156,7 +147,7 @@ class RosBag(FileSequence):
         topic = self._image_topics[camera.name]
         where = f"{self._bag.path}: {topic}: image {number}"
         rgb = image_rgb(self._bag.message(topic, self._index[topic][number]), where)
-        check_image_size(rgb.shape, camera, where)
+        checks.image_size(rgb.shape, camera, where)
         return rgb
 
     def _pose(self, frame: int) -> Float:

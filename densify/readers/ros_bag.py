@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
 from densify.config.errors import InputError
-from densify.config.file_content import reason
-from densify.readers.extras import needed
+from densify.config.file_content import needed, reason
 
 _MEND = "a bag that was cut off can be mended: rosbag reindex, ros2 bag reindex, mcap recover"
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.geometry.types import Camera, Float
+from densify.readers import checks
 from densify.readers.decoded_files import decode_image
-from densify.readers.file_sequence import quaternion_pose, rigid
 from densify.readers.recorded_poses import PoseTrack
 from densify.readers.ros_bag import Bag
 
@@ -136,7 +136,7 @@ def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, whe
     if not rectified:
         model, distortion = _lens(info.distortion_model, tuple(matrix["d"].tolist()), where)
     elif matrix["r"].any():  # drivers leave zeros where they do not say
-        T = rigid(np.column_stack([matrix["r"].reshape(3, 3), np.zeros(3)]), where) @ T
+        T = checks.rigid(np.column_stack([matrix["r"].reshape(3, 3), np.zeros(3)]), where) @ T
     camera = Camera(name, int(info.width), int(info.height), K, T, distortion, model)
     return _binned(camera, info)
 
@@ -271,4 +271,4 @@ def stamp_of(header: Any) -> int:
 
 def _pose(place: Any, turn: Any, where: str) -> Float:
     quaternion = (turn.w, turn.x, turn.y, turn.z)
-    return quaternion_pose(quaternion, (place.x, place.y, place.z), where)
+    return checks.quaternion_pose(quaternion, (place.x, place.y, place.z), where)

@@ -20,9 +20,8 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.config.cache import Cache, kept
+from densify.config.cache import Cache, kept, own_folder
 from densify.config.errors import InputError
-from densify.config.user_folder import own_folder
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
 from densify.street.cameras import CAMERAS, USUAL, Picture, cameras_beside
@@ -41,12 +40,9 @@ class Street:
     """The built-in street; members as in `LidarSequence`.
 
     preset: street, static (nothing else moves), crossing (the ego vehicle stands) or highway.
-    seed: another number is another scene of that kind. sensor: a row of
-    `densify.street.sensors.SENSORS`. hz: sweeps per second, 5, 10 or 20; frame 120 at 10 Hz is
-    frame 240 at 20 Hz. tilt_deg: pitch of the sensor's mount, nose down; the cameras stay. cameras:
-    names of `densify.street.cameras.CAMERAS`.
-
-    Raises InputError for a value that does not exist.
+    seed: another scene of that kind. sensor: of `densify.street.sensors.SENSORS`. hz: 5, 10 or 20
+    sweeps per second. tilt_deg: pitch of the sensor's mount, nose down; the cameras stay. cameras:
+    of `densify.street.cameras.CAMERAS`. Raises InputError for a value that does not exist.
     """
 
     def __init__(

@@ -2,14 +2,11 @@
 """Packets of a Velodyne scanner: a ``.pcap`` file, decoded by velodyne-decoder (densify[velodyne]).
 The packets do not tell the model reliably, so it is named: ``velodyne:FILE.pcap#HDL-32E``.
 
-- A sweep is a turn that begins and ends straight behind (azimuth 180 degrees), to a packet. Turns
-  cut off at the ends of the file are left out. Sweeps are numbered from 0. Opening finds the
-  packets; they are decoded when a sweep is asked for.
-- The stamp is the computer's: when the last packet of the sweep was captured. ``offset_ns`` is from
-  the packets' own clock and the model's firing order.
-- Points are as measured, in the scanner's frame: x forward (azimuth 0), y left, z up. Rays start at
-  the frame's origin, or a few centimetres ahead in their own direction (HDL-32E: 2.9 cm).
-- There are neither cameras nor poses; packets of a GPS are not used.
+A sweep is a turn that begins and ends straight behind, to a packet, numbered from 0, decoded when
+asked for; turns cut off at the file's ends are left out. Its stamp is the computer's, of its last
+packet; ``offset_ns`` is from the packets' clock and the model's firing order. Points are as
+measured, in the scanner's frame: x forward (azimuth 0), y left, z up. There are neither cameras nor
+poses.
 """
 
 from __future__ import annotations
@@ -22,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import open_file
+from densify.config.file_content import needed, open_file
 from densify.geometry.types import Int
-from densify.readers.extras import needed
 from densify.readers.file_sequence import FileSequence, Returns
 
 MODELS = {
@@ -63,7 +59,7 @@ def open_recording(path: Path, scene: str | None) -> Velodyne:
 
 
 class Velodyne(FileSequence):
-    """A capture as a `LidarSequence`."""
+    """A capture as a `LidarSequence`. A sweep's stamp is when its last packet was captured."""
 
     def __init__(self, path: Path, model: str) -> None:
         """model: a row of `MODELS`. Raises InputError if the file is no capture, or holds less than
@@ -77,14 +73,10 @@ class Velodyne(FileSequence):
                 f"{path}: no whole turn: got {len(azimuth)} packets of returns, expected those of "
                 f"a tenth of a second or more"
             )
+        self._stamps_ns = [int(self._captured_ns[turn.stop - 1]) for turn in self._turns]
         super().__init__(path.stem, path, range(len(self._turns)))
 
-    def stamp_ns(self, frame: int) -> int:
-        """Return when the sweep's last packet was captured."""
-        self.check_frame(frame)
-        return int(self._captured_ns[self._turns[frame].stop - 1])
-
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
+    def _returns(self, frame: int) -> Returns:
         library, packets = self._library, []
         with open_file(self.where) as file:
             for row in self._turns[frame]:
@@ -99,7 +91,7 @@ class Velodyne(FileSequence):
                 f"{self.where}: frame {frame} cannot be decoded: {error}; is it another model?"
             ) from error
         x, y, z, intensity, time_s = columns[:, :5].T
-        return self.where, Returns(
+        return Returns(
             np.column_stack([x, y, z]).astype(np.float64),
             (intensity / 255).astype(np.float32),
             np.rint(time_s.astype(np.float64) * 1e9).astype(np.int64),

@@ -2,67 +2,204 @@
 """Waymo Open Dataset, perception, version 2 (Sun et al., CVPR 2020), read without TensorFlow::
 
     ROOT/{lidar,lidar_calibration,vehicle_pose}/CONTEXT.parquet
-    ROOT/{camera_image,camera_calibration}/CONTEXT.parquet    optional
-    ROOT/lidar_box/CONTEXT.parquet    optional: tracked boxes, in the vehicle's frame
+    ROOT/{camera_image,camera_calibration,lidar_box}/CONTEXT.parquet    optional
 
-ROOT is ``training``, ``validation`` or ``testing``. A segment is named by ``#CONTEXT``. Frames are
-numbered from 0 in the order of time, images by the number of their frame.
+ROOT is ``training``, ``validation`` or ``testing``; a segment is named by ``#CONTEXT``. Frames are
+numbered from 0 in the order of time, images by their frame.
 
-Five lidars, lidar 0 to 4: TOP, FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. A return is a pixel of a range
-image, with the azimuth by its column and the inclination by its row
-(waymo_open_dataset/utils/range_image_utils.py); first and second returns follow each other. The
-point is in the vehicle's frame (x forward, y left, z up) *when it was fired*: not compensated. The
-columns of TOP are spread over the frame's period, from ``frame_timestamp_micros``, when the spin
-begins. The other four lidars are taken as measured at the frame's pose, as in the data set's
-conversion.
+Lidars 0 to 4: TOP, FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. A return is a pixel of a range image, with
+the azimuth by its column and the inclination by its row (range_image_utils.py of the data set);
+first and second returns follow each other. Points are in the vehicle's frame (x forward, y left, z
+up) *when fired*: not compensated. TOP's columns are spread over the frame's period from
+``frame_timestamp_micros``; the others are taken as measured at the frame's pose. Intensity has no
+bound, so its tanh is used.
 
-``vehicle_pose`` belongs to the middle of the spin: it is the pose of the FRONT camera's image
-(https://github.com/waymo-research/waymo-open-dataset/issues/464). The sweep's stamp is therefore
-that image's ``pose_timestamp``, or half a period after the frame's stamp where there are no images.
-Intensity has no bound, so its tanh is used.
-
-Cameras have lenses (k1 k2 p1 p2 k3, as OpenCV) and shutters that usually run sideways. The middle
-of an image is exposed half-way between trigger and end of readout; its own pose, of a time close
-to that, is carried there. Pixel 0 of the calibration is the left edge of the first pixel.
-
-Built on the published formulas and documentation; not tried on real files.
+``vehicle_pose`` belongs to the middle of the spin: it is that of the FRONT image (issue 464 of
+waymo-open-dataset), so the stamp is that image's ``pose_timestamp``, or half a period after the
+frame's stamp without images. Cameras have lenses (k1 k2 p1 p2 k3) and shutters that usually run
+sideways; an image's pose is carried to the middle of its exposure. Pixel 0 of the calibration is
+the left edge of the first pixel. Built on published formulas; not tried on real files.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.config.errors import InputError
+from densify.config.file_content import described_in
 from densify.geometry.poses import inverse, transform
-from densify.geometry.types import Boxes, Float, Int
-from densify.readers.file_sequence import (
-    FileSequence,
-    Returns,
-    chosen_scene,
-    of_frame,
-    scanner_axes,
-    truth_beside,
-)
+from densify.geometry.types import Boxes, Camera, Float, Int
+from densify.readers import checks
+from densify.readers.arrow_columns import read_parquet
+from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.recorded_poses import PoseTrack
-from densify.readers.waymo_components import (
-    CAMERA,
-    CAMERAS,
-    LASER,
-    LASERS,
-    STAMP,
-    Components,
-    image_of,
-    read_boxes,
-    read_cameras,
-    read_images,
-    read_lasers,
-    transform_of,
-)
 
 _NOMINAL_PERIOD_NS = 100_000_000
+OBJECT = "key.laser_object_id"
+BOX_CENTRE = tuple(f"[LiDARBoxComponent].box.center.{axis}" for axis in "xyz")
+BOX_SIZE = tuple(f"[LiDARBoxComponent].box.size.{axis}" for axis in "xyz")  # length, width, height
+BOX_HEADING = "[LiDARBoxComponent].box.heading"
+LASERS = ("TOP", "FRONT", "SIDE_LEFT", "SIDE_RIGHT", "REAR")
+CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
+STAMP, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.camera_name"
+T_OPTICAL_WAYMO = np.array(  # Waymo's camera frame is x forward, y left, z up
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+DOWN, RIGHT, UP, LEFT = 1, 2, 3, 4
+"""Directions of a rolling shutter."""
+
+_LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+
+
+@dataclass(frozen=True)
+class Components:
+    """The tables of one segment. root: folder of the split."""
+
+    root: Path
+    context: str
+
+    def file(self, component: str) -> Path:
+        return self.root / component / f"{self.context}.parquet"
+
+    def read(
+        self, component: str, columns: Mapping[str, str], where: Mapping[str, int] | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """See `densify.readers.arrow_columns.read_parquet`."""
+        return read_parquet(self.file(component), columns, "Waymo recordings", where)
+
+
+class Laser(NamedTuple):
+    """T_vehicle_laser: (4,4). inclinations_rad: from the lowest beam up, or None for beams spread
+    evenly between ``bounds_rad``."""
+
+    T_vehicle_laser: Float
+    inclinations_rad: Float | None
+    bounds_rad: tuple[float, float]
+
+    def directions(self, size: tuple[int, ...]) -> Float:
+        """Return (H,W,3) unit vectors in the laser's frame of the pixels of a range image."""
+        (height, width), beams = size, self.inclinations_rad
+        if beams is None:
+            low, high = self.bounds_rad
+            beams = (np.arange(height) + 0.5) / height * (high - low) + low
+        T = self.T_vehicle_laser
+        turned_rad = np.arctan2(T[1, 0], T[0, 0])
+        azimuth = ((np.arange(width, 0, -1) - 0.5) / width * 2 - 1) * np.pi - turned_rad
+        rise = beams[::-1, None]
+        x, y = np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise)
+        return np.stack([x, y, np.broadcast_to(np.sin(rise), x.shape)], axis=2)
+
+
+class Image(NamedTuple):
+    """pose_ns: time of T_world_vehicle (4,4). exposed_ns: of its middle. readout_s: from the first
+    row or column to the last."""
+
+    pose_ns: int
+    exposed_ns: int
+    readout_s: float
+    T_world_vehicle: Float
+
+
+def read_lasers(parts: Components) -> dict[int, Laser]:
+    """Return the lidars by number, from 1."""
+    head = "[LiDARCalibrationComponent]"
+    extrinsic, beams = f"{head}.extrinsic.transform", f"{head}.beam_inclination"
+    columns = {LASER: "i", extrinsic: "l", f"{beams}.values": "l"}
+    rows = parts.read("lidar_calibration", {**columns, f"{beams}.min": "m", f"{beams}.max": "m"})
+    lasers = {}
+    for row, laser in enumerate(rows[LASER].tolist()):
+        where = f"{parts.file('lidar_calibration')}: lidar {laser}"
+        values = rows[f"{beams}.values"][row]
+        low, high = float(rows[f"{beams}.min"][row]), float(rows[f"{beams}.max"][row])
+        beams_rad = None if values is None or not len(values) else values.astype(np.float64)
+        if not np.isfinite((low, high) if beams_rad is None else beams_rad).all():
+            raise InputError(f"{where}: got beams that are not finite, expected rad")
+        lasers[laser] = Laser(checks.rigid(rows[extrinsic][row], where), beams_rad, (low, high))
+    return lasers
+
+
+def read_boxes(parts: Components) -> dict[int, Boxes]:
+    """Return the boxes by the frame's stamp in µs, in the vehicle's frame at its pose. Frames
+    without boxes are not there. Raises InputError if the component is malformed."""
+    numbers = (*BOX_CENTRE, *BOX_SIZE, BOX_HEADING)
+    rows = parts.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
+    centre_m, size_m = (
+        np.stack([rows[name].astype(np.float64) for name in names], axis=1)
+        for names in (BOX_CENTRE, BOX_SIZE)
+    )
+    T_vehicle_box = checks.upright_poses(centre_m, rows[BOX_HEADING].astype(np.float64))
+    path, found = parts.file("lidar_box"), {}
+    for us in np.unique(rows[STAMP]).tolist():
+        mine = rows[STAMP] == us
+        where = f"{path}: frame_timestamp_micros {us}"
+        found[us] = checks.boxes(rows[OBJECT][mine], T_vehicle_box[mine], size_m[mine], where)
+    return found
+
+
+def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]]:
+    """Return times and poses of the images, without pixels, by camera and frame number.
+
+    starts_us: (n,) stamps of the frames.
+    """
+    head = "[CameraImageComponent]"
+    pose, shutter = f"{head}.pose.transform", f"{head}.rolling_shutter_params"
+    times = [f"{shutter}.{name}" for name in ("camera_trigger_time", "camera_readout_done_time")]
+    numbers = [f"{head}.pose_timestamp", *times, f"{shutter}.shutter"]
+    columns = {STAMP: "i", CAMERA: "i", pose: "l", **dict.fromkeys(numbers, "n")}
+    rows, found = parts.read("camera_image", columns), dict[str, dict[int, Image]]()
+    frame_of = {int(us): number for number, us in enumerate(starts_us)}
+    name_of = dict(enumerate(CAMERAS, 1))
+    for row in np.argsort(rows[STAMP], kind="stable").tolist():
+        name, frame = name_of[int(rows[CAMERA][row])], frame_of.get(int(rows[STAMP][row]))
+        if frame is None:
+            continue
+        pose_s, trigger_s, done_s, shutter_s = (float(rows[name][row]) for name in numbers)
+        T = checks.rigid(rows[pose][row], f"{parts.file('camera_image')}: {name}, frame {frame}")
+        exposed_ns = _whole_us((trigger_s + done_s) / 2)
+        image = Image(_whole_us(pose_s), exposed_ns, max(done_s - trigger_s - shutter_s, 0.0), T)
+        found.setdefault(name, {})[frame] = image
+    return {name: found[name] for name in CAMERAS if name in found}
+
+
+def read_cameras(parts: Components, images: Mapping[str, Mapping[int, Image]]) -> dict[str, Camera]:
+    """Return the cameras that have images."""
+    head = "[CameraCalibrationComponent]"
+    lens = [f"{head}.intrinsic.{n}" for n in _LENS]
+    size = [f"{head}.{n}" for n in ("width", "height", "rolling_shutter_direction")]
+    extrinsic = f"{head}.extrinsic.transform"
+    columns = {CAMERA: "i", extrinsic: "l", **dict.fromkeys(lens, "n")}
+    rows = parts.read("camera_calibration", {**columns, **dict.fromkeys(size, "i")})
+    cameras = {}
+    for name, taken in images.items():
+        where = f"{parts.file('camera_calibration')}: {name}"
+        row = rows[CAMERA].tolist().index(CAMERAS.index(name) + 1)
+        f_u, f_v, c_u, c_v, *distortion = (float(rows[n][row]) for n in lens)
+        width, height, direction = (int(rows[n][row]) for n in size)
+        readout_s = float(np.median([image.readout_s for image in taken.values()]))
+        T_cam_vehicle = T_OPTICAL_WAYMO @ inverse(checks.rigid(rows[extrinsic][row], where))
+        cameras[name] = checks.pinhole(
+            name,
+            (width, height),
+            (f_u, f_v, c_u - 0.5, c_v - 0.5),
+            T_cam_vehicle,
+            where,
+            distortion=tuple(distortion) if any(distortion) else (),
+            row_time_s={DOWN: 1.0, UP: -1.0}.get(direction, 0.0) * readout_s / max(height, 1),
+            column_time_s={RIGHT: 1.0, LEFT: -1.0}.get(direction, 0.0) * readout_s / max(width, 1),
+        )
+    return cameras
+
+
+def _whole_us(seconds: float) -> int:
+    """Return nanoseconds; seconds since 1970 as float64 are good to 0.25 µs."""
+    return round(seconds * 1e6) * 1000
 
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
@@ -73,11 +210,12 @@ def open_recording(path: Path, scene: str | None) -> Waymo:
             f"{path / 'lidar'}: no segments; expected files such as "
             f"10017090168044687777_6380_000_6400_000.parquet"
         )
-    return Waymo(path, chosen_scene("waymo", path, scene, [file.stem for file in files]))
+    return Waymo(path, checks.chosen_scene("waymo", path, scene, [file.stem for file in files]))
 
 
 class Waymo(FileSequence):
-    """A segment as a `LidarSequence`; the lidar frame is the vehicle's."""
+    """A segment as a `LidarSequence`; the lidar frame is the vehicle's. A sweep's stamp is about
+    the middle of the spin, the time of the recorded pose."""
 
     def __init__(self, root: Path, context: str) -> None:
         """Read stamps, poses and calibration. Raises InputError if a component is missing or
@@ -89,9 +227,11 @@ class Waymo(FileSequence):
         starts_ns = self._starts_us * 1000
         steps = np.diff(starts_ns)
         self._period_ns = int(np.median(steps)) if len(steps) else _NOMINAL_PERIOD_NS
-        self._lasers = read_lasers(parts)
         has_images = parts.file("camera_image").is_file()
-        self._images = read_images(parts, self._starts_us) if has_images else {}
+        with described_in(root, f"calibration and images of {context} in the data set's own form"):
+            self._lasers = read_lasers(parts)
+            self._images = read_images(parts, self._starts_us) if has_images else {}
+            cameras = read_cameras(parts, self._images) if has_images else {}
         front = self._images.get(CAMERAS[0], {})
         self._stamps_ns = [
             front[number].pose_ns if number in front else int(ns) + self._period_ns // 2
@@ -101,15 +241,10 @@ class Waymo(FileSequence):
             context,
             root,
             range(len(starts_ns)),
-            read_cameras(parts, self._images) if has_images else {},
+            cameras,
             {name: {n: i.exposed_ns for n, i in of.items()} for name, of in self._images.items()},
-            truth_beside(root),
+            checks.truth_beside(root),
         )
-
-    def stamp_ns(self, frame: int) -> int:
-        """Return about the middle of the spin, the time of the recorded pose."""
-        self.check_frame(frame)
-        return self._stamps_ns[frame]
 
     def _pose(self, frame: int) -> Float:
         return self._T_world_vehicle[frame]
@@ -132,19 +267,11 @@ class Waymo(FileSequence):
             T_world_vehicle = T_world_vehicle @ inverse(before) @ after
         return T_world_vehicle @ inverse(self.cameras[camera].T_cam_lidar)
 
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
-        path, images = self._parts.file("lidar"), self._range_images(frame)
-        if not images:
-            raise InputError(f"{path}: no range image of frame {frame}; fetch it again")
+    def _returns(self, frame: int) -> Returns:
         points, intensity, offset_ns, lidar = [], [], [], []
-        for (number, _), image in images.items():
-            if number not in self._lasers:
-                raise InputError(
-                    f"{self._parts.file('lidar_calibration')}: no lidar {number}; got "
-                    f"{', '.join(map(str, self._lasers))}"
-                )
-            laser, where = self._lasers[number], f"{path}: frame {frame}, lidar {number}"
-            away = laser.directions(image.shape[:2], where) * image[..., :1]
+        for (number, _), image in self._range_images(frame).items():
+            laser = self._lasers[number]
+            away = laser.directions(image.shape[:2]) * image[..., :1]
             met = transform(laser.T_vehicle_laser, away.reshape(-1, 3))
             points.append(np.where(image[..., 0].ravel()[:, None] > 0, met, np.nan))
             intensity.append(np.tanh(image[..., 1].ravel()))
@@ -153,13 +280,13 @@ class Waymo(FileSequence):
         T = np.tile(np.eye(4), (len(LASERS), 1, 1))
         for number, laser in self._lasers.items():
             T[number - 1] = laser.T_vehicle_laser
-        return path, Returns(
+        return Returns(
             np.concatenate(points),
             np.concatenate(intensity).astype(np.float32),
             np.concatenate(offset_ns),
             np.concatenate(lidar),
             T[:, :3, 3],
-            scanner_axes(T),
+            checks.scanner_axes(T),
         )
 
     def _range_images(self, frame: int) -> dict[tuple[int, int], Float]:
@@ -170,16 +297,12 @@ class Waymo(FileSequence):
         rows = self._parts.read("lidar", {LASER: "i", **columns}, {STAMP: start_us})
         found = {}
         for row in np.argsort(rows[LASER], kind="stable"):
-            laser = int(rows[LASER][row])
-            where = f"{self._parts.file('lidar')}: frame {frame}, lidar {laser}"
-            if laser not in range(1, len(LASERS) + 1) or (laser, 1) in found:
-                raise InputError(f"{where}: expected lidars 1 to {len(LASERS)}, each once")
             for number, name in names.items():
                 values, shape = rows[f"{name}.values"][row], rows[f"{name}.shape"][row]
                 if values is not None and len(values):
-                    found[laser, number] = image_of(values, shape, where)
-            if (laser, 1) not in found:
-                raise InputError(f"{where}: no first returns; fetch the file again")
+                    height, width, num = shape.tolist()
+                    image = values.reshape(height, width, num).astype(np.float64)
+                    found[int(rows[LASER][row]), number] = image
         return found
 
     def _offset_ns(self, frame: int, laser: int, size: tuple[int, ...]) -> Int:
@@ -200,11 +323,11 @@ class Waymo(FileSequence):
             self._parts.file("vehicle_pose"),
         )
         poses = {
-            int(us): transform_of(values, f"{where}: frame_timestamp_micros {us}")
+            int(us): checks.rigid(values, f"{where}: frame_timestamp_micros {us}")
             for us, values in zip(rows[STAMP], rows[name], strict=True)
         }
         of = {number: poses[int(us)] for number, us in enumerate(self._starts_us) if us in poses}
-        return {frame: of_frame(of, frame, "vehicle pose", where) for frame in self.frames}
+        return {frame: checks.of_frame(of, frame, "vehicle pose", where) for frame in self.frames}
 
     @cached_property
     def _track(self) -> PoseTrack:

@@ -82,9 +82,8 @@ class Driving:
     """Follows a curve on the ground with both axles, as a car does.
 
     curve, speed: the way, and how fast along it. station_m: arc length at time ``at_s``.
-    wheelbase_m: distance of the two points that touch the curve; the body's origin is the middle
-    between them, x forward, z up. lift_m: stations (N,) -> heights (N,) above the bare ground, none
-    if None. upright: stands vertical whatever the slope, as walkers do.
+    wheelbase_m: of the two points that touch the curve; the origin is midway, x forward, z up.
+    lift_m: stations (N,) -> heights (N,) above the ground. upright: vertical whatever the slope.
     """
 
     curve: Curve

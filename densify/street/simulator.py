@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from importlib import import_module
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +19,13 @@ from densify.geometry.types import Bool, Float, SweepTruth
 from densify.street.actors import DURATION_S
 from densify.street.cameras import CAMERAS, SHUTTERS, Picture, expose
 from densify.street.lidar import Returns, T_ego_lidar, at_offsets, scan
+from densify.street.presets import crossing, highway, static_street, street
 from densify.street.sensors import Sensor
 from densify.street.traffic import Scene
 from densify.street.world import Body
 
-PRESETS = {
-    "street": ("densify.street.town", "street"),
-    "static": ("densify.street.town", "static_street"),
-    "crossing": ("densify.street.crossing", "crossing"),
-    "highway": ("densify.street.highway", "highway"),
-}
-"""Module and function that builds the scene from a random generator."""
+PRESETS = {"street": street, "static": static_street, "crossing": crossing, "highway": highway}
+"""The function that builds the scene from a random generator."""
 
 
 @lru_cache(maxsize=2)
@@ -39,9 +34,7 @@ def build_scene(preset: str, seed: int) -> Scene:
 
     Building takes 1 to 2 s; the last two scenes are shared by all sensors and rates.
     """
-    module, function = PRESETS[preset]
-    scene: Scene = getattr(import_module(module), function)(np.random.default_rng([seed, 0]))
-    return scene
+    return PRESETS[preset](np.random.default_rng([seed, 0]))
 
 
 @dataclass(frozen=True)

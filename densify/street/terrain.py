@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The ground: a smooth hilly surface, the roads on it, and their mesh with real kerbs.
 
-Ground height is one analytic function of the position, so that roads, pavements, houses and
-everything that drives agree on it. The carriageway is the union of the roads' strips with rounded
-corners, given as a signed distance; the ground's triangles are cut along its zero line, where the
-kerb stands upright.
+Its height is one function of the position, so that everything agrees on it. The carriageway is the
+union of the roads' strips with rounded corners, given as a signed distance; the ground's triangles
+are cut along its zero line, where the kerb stands upright.
 """
 
 from __future__ import annotations

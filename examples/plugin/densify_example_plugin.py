@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Sweeps as .npy files, an engine by which nothing moves, and the cloud as text."""
+"""Sweeps as .npy files, and an engine by which nothing moves."""
 
 import numpy as np
 
 from densify import FlowField, InputError, Sweep
 
-HOLDS, OWNED = "sweeps as 000000.npy, (N,4) x y z intensity, ten a second", ("cloud.txt",)
+HOLDS = "sweeps as 000000.npy, (N,4) x y z intensity, ten a second"
 
 
 def recognises(path):
@@ -46,7 +46,3 @@ class NothingMoves:
 
 def estimate_motion(scene, settings, argument):
     return NothingMoves(scene.stretch)
-
-
-def write_output(result, context, folder):
-    np.savetxt(folder / "cloud.txt", result.cloud.points, "%.3f")

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.poses import inverse
 from densify.geometry.types import Camera, Float, Float32, Int
-from densify.readers.waymo_components import (
+from densify.readers.waymo import (
     BOX_CENTRE,
     BOX_HEADING,
     BOX_SIZE,

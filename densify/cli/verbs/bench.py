@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from densify.cli.answer import Answer, numbers_table
 from densify.cli.options import (
     add_common,
     add_recording,
@@ -20,12 +19,12 @@ from densify.cli.options import (
     recordings_of,
     words,
 )
-from densify.cli.progress import progress_on_stderr
+from densify.cli.screen import Answer, numbers_table, progress_on_stderr
 from densify.config import as_mapping, resolve
 from densify.config.errors import InputError
 
 if TYPE_CHECKING:
-    from densify.bench.paper_pairs import PaperPair
+    from densify.bench.paper import PaperPair
 
 _UNSEEN = (
     "street?seed=41@70",
@@ -179,21 +178,21 @@ def _answer_paper(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[PaperPair]]:
-    from densify.bench import paper_pairs
+    from densify.bench import paper
 
     sets: dict[str, Iterable[PaperPair]] = {}
     for name in ("flyingthings", "kitti"):
         if (folder := getattr(options, name)) is not None:
-            sets[name] = paper_pairs.pairs_of_files(folder, options.pairs)
+            sets[name] = paper.pairs_of_files(folder, options.pairs)
     chosen: dict[str, list[tuple[str, int]]] = {}
     for text in options.data or (() if sets else _UNSEEN):
         spec, _, keys = text.rpartition("@")
         if not spec or not all(key.isdecimal() for key in keys.split(",")):
             raise InputError(f"--data {text}: expected a recording and frames, as street@60,80")
-        kind = "streets" if paper_pairs.has_truth(spec) else "against this package's engine"
+        kind = "streets" if paper.has_truth(spec) else "against this package's engine"
         chosen.setdefault(kind, []).extend((spec, int(key)) for key in keys.split(","))
     for kind, places in chosen.items():
-        sets[kind] = map(paper_pairs.pair_of_recording, *zip(*places, strict=True))
+        sets[kind] = map(paper.pair_of_recording, *zip(*places, strict=True))
     return sets
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from densify.cli.answer import Answer, first_of, percent
 from densify.cli.options import (
     add_common,
     add_recording,
@@ -20,12 +19,10 @@ from densify.cli.options import (
     recordings_of,
     shard,
 )
-from densify.cli.progress import progress_on_stderr
-from densify.cli.screen import tell_doubts
+from densify.cli.screen import Answer, first_of, percent, progress_on_stderr, tell_doubts
 from densify.config import presets, resolve
 from densify.config.errors import ComputationError, InputError
 from densify.config.resolving import apply_changes, parse_override
-from densify.config.sections import Section, one_of, within
 
 if TYPE_CHECKING:
     from densify.dataset.make import Summary
@@ -37,17 +34,6 @@ _FIRST = {
 }
 _SCORES = {"density": "density", "ghost": "ghosts", "outliers": "held-out outliers"}
 _MOST_SHOWN = 20
-
-
-@dataclass(frozen=True)
-class DatasetSettings(Section):
-    """The settings of ``--set dataset.NAME=VALUE``."""
-
-    max_ghost: float | None = within(None, 0, 1)
-    min_density: float | None = within(None, 0, 1)
-    max_outliers: float | None = within(None, 0, 1)
-    min_sweeps: int | None = within(None, 1, 101)
-    split: str = one_of("kitti", "train", "val")
 
 
 def add(commands: Any) -> None:
@@ -113,21 +99,18 @@ def _made(options: argparse.Namespace) -> Iterator[Answer]:
         raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
     own = [text for text in options.overrides if text.strip().startswith("dataset.")]
     config = resolve(options.config, [text for text in options.overrides if text not in own])
-    values = {"dataset": asdict(DatasetSettings())}
-    for text in own:
-        apply_changes(values, parse_override(text), f"--set {text}", {"dataset": DatasetSettings})
-    limits = values["dataset"]
-    split = limits.pop("split")
     from densify.dataset.make import make_dataset
     from densify.dataset.plan import Gate, Recipe
 
+    limits = {"dataset": asdict(Gate())}
+    for text in own:
+        apply_changes(limits, parse_override(text), f"--set {text}", {"dataset": Gate})
     recipe = Recipe(
         window=options.window,
         method=options.method,
         layout=options.layout,
         cameras=None if options.cameras is None else tuple(options.cameras),
-        split=None if split == "kitti" else split,
-        gate=Gate(**limits),
+        gate=Gate(**limits["dataset"]),
         config=config,
     )
     with progress_on_stderr() as show:

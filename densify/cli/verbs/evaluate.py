@@ -8,9 +8,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from densify.cli.answer import Answer, numbers_table, percent
 from densify.cli.options import add_verb, option, positive
-from densify.cli.progress import progress_on_stderr
+from densify.cli.screen import Answer, numbers_table, percent, progress_on_stderr
 
 _MISSING = {
     "without_truth": "predicted without truth",

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Verbs of finished runs: ``densify export`` for other tools, ``densify report`` for a page to look
-at, ``densify view`` live in a viewer."""
+"""Verbs of finished runs: ``densify export`` for other tools, ``densify report`` for a page."""
 
 from __future__ import annotations
 
@@ -9,9 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from densify.cli.answer import Answer
-from densify.cli.options import add_common, add_verb, natural, option
-from densify.config.written import EXPORTS
+from densify.cli.options import add_common, add_verb, option
+from densify.cli.screen import Answer
+from densify.config.plugins import EXPORTS
 
 _ONE = "folder of one key, such as densify-out/000120"
 
@@ -27,8 +26,8 @@ def add_export(commands: Any) -> None:
         "measured pixel nearest to it.",
     )
     parser.add_argument("run", metavar="RUN", type=Path, help=_ONE)
-    forms = ", ".join(form.name for form in EXPORTS.built_in)
-    option(parser, "--to FORMAT", f"{forms}; see docs/formats.md", required=True)
+    about = f"{', '.join(EXPORTS)}; see docs/formats.md"
+    option(parser, "--to FORMAT", about, required=True)
     about = "drop pixels and points less certain, 0 to 1 (default: 0, keep all)"
     option(parser, "--min-confidence C", about, type=float, default=0.0)
     about = "drop pixels and points measured longer before or after (default: keep all)"
@@ -77,31 +76,3 @@ def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.dataset.report import write_report
 
     yield Answer(files=write_report(options.place, options.overwrite))
-
-
-def add_view(commands: Any) -> None:
-    """Add the options of ``view``."""
-    parser = add_verb(
-        commands,
-        "view",
-        answer_view,
-        "a run, or keys of a drive, live: cloud, sweeps, images, depth and objects over time",
-        "Needs a screen, and pip install 'densify[rerun]'. densify export --to rrd writes the same "
-        "as a file; densify report needs nothing but a browser.",
-    )
-    about = f"{_ONE}, or of several of a drive"
-    parser.add_argument("place", metavar="DIR", type=Path, help=about)
-    about = "of a rerun viewer that is open already; else a new one is opened (default: 9876)"
-    option(parser, "--port N", about, type=natural, default=9876)
-    add_common(parser, "camera")
-
-
-def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
-    """Show it. rerun's viewer stays open."""
-    from densify.outputs.export import rrd
-    from densify.outputs.export.finished_run import finished_runs
-
-    runs = finished_runs(options.place, cameras=options.cameras)
-    rrd.show(runs, options.port)
-    keys = [run.key for run in runs]
-    yield Answer(f"shown: key {', '.join(map(str, keys))}", {"keys": keys})

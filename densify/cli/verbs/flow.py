@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import densify
-from densify.cli.answer import Answer
 from densify.cli.options import (
     add_common,
     add_recording,
@@ -22,7 +21,7 @@ from densify.cli.options import (
     recording_of,
     sliced,
 )
-from densify.cli.progress import progress_on_stderr
+from densify.cli.screen import Answer, progress_on_stderr
 from densify.config import Config, resolve
 from densify.config.errors import ComputationError, InputError
 

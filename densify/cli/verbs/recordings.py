@@ -11,18 +11,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from densify.cli.answer import Answer
 from densify.cli.options import (
     add_common,
     add_recording,
     add_verb,
-    check_new_file,
     config_of,
     key_range,
     option,
     recording_of,
 )
-from densify.cli.progress import progress_on_stderr
+from densify.cli.screen import Answer, progress_on_stderr
 from densify.config.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,26 +57,16 @@ def add_doctor(commands: Any) -> None:
         "line that mends it. Exit code 2 if something is wrong.",
     )
     add_recording(parser)
-    about = "instead: draft the densify.yaml of a folder of sweeps from what is found in it"
-    option(parser, "--write-config", about)
-    add_common(parser, "config", "overwrite")
+    add_common(parser, "config")
 
 
 def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
     """Say what may be wrong with a recording."""
     config, spec = config_of(options), recording_of(options)
     from densify.doctor import Verdict, examine
-    from densify.outputs.atomic import write_file
     from densify.readers import open_sequence
     from densify.readers.describe import describe
-    from densify.readers.folder.draft import draft_config
 
-    if options.write_config:
-        path = Path(spec) / "densify.yaml"
-        check_new_file(path, options.overwrite)
-        write_file(path, draft_config(path.parent).encode())
-        yield Answer(files=[path])
-        return
     sequence = open_sequence(spec)
     diagnosis = examine(sequence, config)
     yield Answer(f"{describe(sequence)}\n\n{_describe(diagnosis)}", _facts(diagnosis))

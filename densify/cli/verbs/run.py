@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from densify.cli.answer import Answer, first_of
 from densify.cli.options import (
     add_common,
     add_recording,
@@ -21,8 +20,7 @@ from densify.cli.options import (
     sliced,
     words,
 )
-from densify.cli.progress import progress_on_stderr
-from densify.cli.screen import tell_doubts
+from densify.cli.screen import Answer, first_of, progress_on_stderr, tell_doubts
 from densify.config import as_mapping, presets
 from densify.config.errors import ComputationError, InputError
 from densify.config.plugins import ENGINES
@@ -93,7 +91,7 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     sequence = open_sequence(recording_of(options))
     keys = _keys_of(sequence, options)
     for key in keys:
-        check_writable(options.out, key, options.overwrite, "run", config.output.also)
+        check_writable(options.out, key, options.overwrite)
     failed: dict[int, Exception] = {}
     doubts: list[tuple[str, str, int]] = []
     window, method, cameras = options.window, options.method, options.cameras
@@ -112,7 +110,6 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
                 config=as_mapping(config),
                 data=recording_of(options),
                 overwrite=options.overwrite,
-                also=config.output.also,
             )
             first = first_of(paths, FIRST_OF_RUN)
             yield Answer(summary(result), {"keys": [key_facts(result)]}, paths, first)

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from densify.cli.answer import Answer
 from densify.cli.options import (
     add_common,
     add_recording,
@@ -18,7 +17,7 @@ from densify.cli.options import (
     option,
     recordings_of,
 )
-from densify.cli.progress import progress_on_stderr
+from densify.cli.screen import Answer, progress_on_stderr
 
 
 def add(commands: Any) -> None:
@@ -32,18 +31,16 @@ def add(commands: Any) -> None:
         "train a network for scene flow, with labels or without",
         "SPEC may also be streets[?sensor=NAME], the default: a new street for every clip of 7 "
         "sweeps. Teachers: objective (the published one, without labels), engine (this package's "
-        "engine makes the labels), truth (where the recording has some: streets). Ctrl-C or a kill "
-        "loses at most 50 steps: go on with --resume.",
+        "engine makes the labels), truth (where the recording has some: streets).",
     )
     add_recording(flow, several=True)
-    option(flow, "--out MODEL", "the model; MODEL.png: its loss", type=Path, required=True)
+    option(flow, "--out MODEL", "the model", type=Path, required=True)
     add_common(flow, "overwrite")
     teachers, devices = ("objective", "engine", "truth"), ("auto", "cpu", "cuda")
     flow.add_argument("--teacher", choices=teachers, default="objective", help="(objective)")
     option(flow, "--steps N", "train on N pairs of sweeps", type=natural, required=True)
     seed = "of the first weights and the choice of sweeps (default: 0)"
     option(flow, "--seed N", seed, type=natural, default=0)
-    option(flow, "--resume", "go on from MODEL.checkpoint of a stopped training")
     flow.add_argument("--device", choices=devices, default="auto", help="(default: auto)")
 
 
@@ -60,7 +57,7 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
         device=options.device,
     )
     with progress_on_stderr() as show:
-        trained = train(training, options.out, options.resume, show)
-    text = f"{training.steps:,} steps, loss {trained.loss:.4g}"
-    facts = {"num_steps": training.steps, "loss": trained.loss}
-    yield Answer(text, facts, trained.files)
+        loss = train(training, options.out, show)
+    text = f"{training.steps:,} steps, loss {loss:.4g}"
+    facts = {"num_steps": training.steps, "loss": loss}
+    yield Answer(text, facts, [options.out])

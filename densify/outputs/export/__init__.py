@@ -1,22 +1,16 @@
 # SPDX-License-Identifier: MIT
 """A finished run in other tools' formats, optionally with only the certain and recent pixels.
 
-`config.written` is the table of forms. Beside the files of the form lies export.yaml::
-
-    run             the folder of the run, as the user named it
-    to              the form
-    min_confidence  0 to 1
-    max_age_ms      null for any age
-    density         of forms with maps: camera -> measured, filled -> before, after: fraction of
-                    the pixels
-    num_points      of forms with the cloud: before, after
-    version         of densify
+`config.plugins.EXPORTS` has the forms. export.yaml lies beside the files: run, to, min_confidence,
+max_age_ms (null for any age), density (camera -> measured, filled -> before, after: shares of the
+pixels), num_points (before, after), version.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +18,13 @@ import numpy as np
 import yaml
 
 from densify import __version__
-from densify.config.errors import InputError
-from densify.config.written import EXPORTS
+from densify.config.errors import InputError, did_you_mean
+from densify.config.plugins import EXPORTS
+from densify.outputs.atomic import plain
 from densify.outputs.export.finished_run import FinishedRun, Kept, finished_runs
-from densify.outputs.plain import plain
 from densify.outputs.store import writing
 
 _RECORD = "export.yaml"
-
-WriteExport = Callable[[FinishedRun, Path], None]
-"""Writes the files of a form into a folder that appears when all are there. Raises InputError where
-the run lacks what the form needs. A form of drives takes a list of runs, ascending by key."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +52,11 @@ def export_run(
 ) -> Export:
     """Write a finished run in another form. Nothing is computed again.
 
-    run: the folder of one key, such as ``densify-out/000120``, or of several keys for forms of
-        drives.
-    to: a name of `densify.config.written.EXPORTS`.
-    out: the folder to make; ``RUN/export/FORM`` if None.
-    min_confidence: 0 to 1. Pixels and points with less are left out.
-    max_age_ms: greatest time between the exposure, or the key, and the sweep that measured the
-        pixel or point; None for any. A filled pixel has the age of the nearest measured pixel.
-    cameras: only these; all if None. overwrite: replace an earlier export.
+    run: the folder of one key, or of several for forms of drives. to: of
+    `densify.config.plugins.EXPORTS`. out: ``RUN/export/FORM`` if None. min_confidence: 0 to 1;
+    max_age_ms: from the exposure, or the key, to the sweep that measured a pixel or point (a filled
+    one has the age of the nearest measured), None for any: what is beyond is left out. cameras: all
+    if None. overwrite: replace an earlier export.
 
     Raises InputError for thresholds out of range, files that are missing, damaged or inconsistent,
     a form that cannot hold the run, and an ``out`` that holds an export or a run.
@@ -78,13 +65,16 @@ def export_run(
         raise InputError(f"--min-confidence {min_confidence}: expected a number from 0 to 1")
     if max_age_ms is not None and not 0 <= max_age_ms < np.inf:
         raise InputError(f"--max-age-ms {max_age_ms}: expected a number from 0 up")
-    form = EXPORTS.row(to, "--to")
+    if to not in EXPORTS:
+        hint = did_you_mean(to, EXPORTS)
+        raise InputError(f"--to: got {to!r}, {hint}expected one of {', '.join(EXPORTS)}")
+    form = EXPORTS[to]
     read = finished_runs if form.of_drive else lambda *arguments: [FinishedRun(*arguments)]
     runs = read(run, min_confidence, max_age_ms, cameras)
     folder = out or run / "export" / to
     if (folder / "run.yaml").exists():
         raise InputError(f"--out {folder}: holds a run and is kept; choose another folder")
-    write = getattr(form.work(), form.function)
+    write = getattr(import_module(f"densify.outputs.export.{form.module}"), f"write_{to}")
     owned = (*form.owned, _RECORD)
     with writing(folder, owned, folder, overwrite) as staging:
         write(runs if form.of_drive else runs[0], staging)

@@ -21,12 +21,11 @@ from densify.config.errors import InputError
 from densify.config.file_content import read_bytes
 from densify.geometry import poses
 from densify.geometry.types import Camera, CameraView, Float
-from densify.outputs.atomic import write_file
+from densify.outputs.atomic import write_file, write_json
 from densify.outputs.cloud_laz import StoredCloud
 from densify.outputs.depth_png import map_path, metres
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.export.maps_and_clouds import save_ply
-from densify.outputs.plain import write_json
 
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_LENS = ("k1", "k2", "k3", "k4")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
+from densify.config.file_content import needed
 from densify.geometry.arrays import table
 from densify.geometry.types import Float32
 from densify.outputs.atomic import write_file
@@ -18,7 +19,6 @@ from densify.outputs.depth_png import encode_png, map_path, metres
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.readers.decoded_files import decode_image
-from densify.readers.extras import needed
 
 _TREE = {"groundtruth": "depth", "groundtruth_filled": "depth_filled", "confidence": "confidence"}
 _PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}

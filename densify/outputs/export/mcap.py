@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from densify.config.file_content import needed
 from densify.geometry import poses
 from densify.geometry.arrays import table
 from densify.geometry.types import Camera, Float, ObjectTrack
-from densify.outputs.export.finished_run import FinishedRun
-from densify.outputs.export.timeline import Shot, Timeline, colours, timelines
-from densify.readers.extras import needed
+from densify.outputs.export.finished_run import FinishedRun, Shot, Timeline, colours, timelines
 
 _BOX = {"r": 0.84, "g": 0.37, "b": 0.0, "a": 0.4}
 _NS = 10**9

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""One key or a drive for rerun's viewer (https://rerun.io, ``densify[rerun]``), in a file or live.
+"""One key or a drive for rerun's viewer (https://rerun.io, ``densify[rerun]``).
 
-Two time lines, ``time`` (the recording's clock as UNIX time) and ``frame``, have in ``world/key``::
+By ``time`` (the recording's clock as UNIX time) and ``frame`` there are in ``world/key``::
 
-    cloud/static, cloud/moving  the accumulated cloud, at the key's time
-    sweep, vehicle              each sweep as it was measured, and the pose of the sensor
+    cloud/static, cloud/moving, sweep, vehicle    the cloud, each sweep as measured, the sensor
     movers/box, movers/path     moving objects; labels give object and speed
-    CAMERA/image, CAMERA/depth, CAMERA/depth_filled
-                                image and metres; with a pinhole for rectified cameras
+    CAMERA/{image,depth,depth_filled}    image and metres; with a pinhole for rectified cameras
 """
 
 from __future__ import annotations
@@ -19,12 +17,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from densify.config.file_content import needed
 from densify.geometry import poses
 from densify.geometry.types import Float, ObjectTrack
 from densify.outputs.cloud_laz import StoredCloud
-from densify.outputs.export.finished_run import FinishedRun
-from densify.outputs.export.timeline import Shot, Timeline, colours, timelines
-from densify.readers.extras import needed
+from densify.outputs.export.finished_run import FinishedRun, Shot, Timeline, colours, timelines
 
 _KEY = "world/key"
 _POINT, _SWEEP_POINT = -1.5, -2.5  # radii in points of the screen, as rerun writes them
@@ -33,38 +30,18 @@ _POINT, _SWEEP_POINT = -1.5, -2.5  # radii in points of the screen, as rerun wri
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``recording.rrd``. rerun numbers its chunks by the clock, so bytes differ. Raises
     InputError without rerun, and as `timelines`."""
-    with _stream(runs) as stream:
-        stream.save(folder / "recording.rrd")
-        _log(stream, runs)
-
-
-def show(runs: Sequence[FinishedRun], port: int = 9876) -> None:
-    """Show the same in the viewer that listens on the port, else in a new one, which stays open.
-    Raises InputError as `write_rrd`."""
-    with _stream(runs) as stream:
-        stream.spawn(port=port)
-        _log(stream, runs)
-        stream.flush()
-
-
-def _stream(runs: Sequence[FinishedRun]) -> Any:
     rr = needed("rerun", "rerun", "Recordings for rerun")
     name = f"key-{runs[0].key}-{runs[-1].key}"
-    stream = rr.RecordingStream("densify", recording_id=name, send_properties=False)
-    stream.set_log_time_enabled(False)
-    stream.set_log_tick_enabled(False)
-    return stream
-
-
-def _log(stream: Any, runs: Sequence[FinishedRun]) -> None:
-    import rerun as rr
-
-    stream.log("world", rr.ViewCoordinates.FLU, static=True, strict=True)
-    entities = (entity for timeline in timelines(runs) for entity in _entities(timeline))
-    for frame, stamp_ns, name, shown in entities:
-        stream.set_time("time", timestamp=np.datetime64(stamp_ns, "ns"))
-        stream.set_time("frame", sequence=frame)
-        stream.log(f"{_KEY}/{name}".rstrip("/"), shown, strict=True)
+    with rr.RecordingStream("densify", recording_id=name, send_properties=False) as stream:
+        stream.set_log_time_enabled(False)
+        stream.set_log_tick_enabled(False)
+        stream.save(folder / "recording.rrd")
+        stream.log("world", rr.ViewCoordinates.FLU, static=True, strict=True)
+        entities = (entity for timeline in timelines(runs) for entity in _entities(timeline))
+        for frame, stamp_ns, name, shown in entities:
+            stream.set_time("time", timestamp=np.datetime64(stamp_ns, "ns"))
+            stream.set_time("frame", sequence=frame)
+            stream.log(f"{_KEY}/{name}".rstrip("/"), shown, strict=True)
 
 
 def _entities(timeline: Timeline) -> Iterator[tuple[int, int, str, Any]]:

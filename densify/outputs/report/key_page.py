@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from densify import __version__
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_json, read_yaml
-from densify.geometry.types import ObjectTrack
+from densify.geometry.types import ObjectTrack, Result
+from densify.outputs.atomic import write_file
 from densify.outputs.cloud_laz import read_cloud
 from densify.outputs.depth_png import read_stored
 from densify.outputs.export.finished_run import map_names
+from densify.outputs.key_outputs import Context
 from densify.outputs.report.page_file import Blobs, packed_camera, packed_cloud, page_file
 from densify.outputs.scene_file import read_scene, read_tracks
 from densify.readers.decoded_files import decode_image
@@ -109,6 +111,13 @@ class KeyFiles:
 def _mapping(value: Any) -> Mapping[str, Any]:
     """Return a mapping from a file, an empty one for anything else."""
     return value if isinstance(value, dict) else {}
+
+
+def write_report(result: Result, context: Context, folder: Path) -> None:
+    """Write ``report.html`` of the files of the other outputs, where ``output.report`` asks."""
+    if context.config.get("output", {}).get("report"):
+        page = key_page(KeyFiles.of_run(folder), f"{result.key:06d}")
+        write_file(folder / "report.html", page)
 
 
 def key_page(files: KeyFiles, folder: str) -> bytes:

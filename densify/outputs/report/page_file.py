@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.geometry.types import Bool, Float, Int
+from densify.outputs.atomic import plain
 from densify.outputs.cloud_laz import StoredCloud
-from densify.outputs.plain import plain
 
 _SCRIPTS = (
     *("unpack.js", "dom.js", "colours.js", "maps.js", "matrices.js", "gl.js", "cloud.js"),
@@ -96,9 +96,7 @@ def packed_camera(
 ) -> dict[str, Any]:
     """Return a camera's entry of the page.
 
-    maps: kind -> (H,W) as stored, see `outputs.report.key_page.KeyFiles.camera`.
-    jpeg: its image.
-
+    maps: kind -> (H,W) as stored, see `outputs.report.key_page.KeyFiles.camera`. jpeg: its image.
     Measured, source sweep and age are one map: ``source`` numbers the rows of ``sources``, which
     are [row of the sweep + 1, age in ms + 1, measured 0 or 1], 0 where unknown.
     """

@@ -17,7 +17,7 @@ import numpy as np
 from densify.config.errors import InputError, did_you_mean
 from densify.config.file_content import read_yaml
 from densify.geometry.types import Camera, Float
-from densify.readers.file_sequence import rigid
+from densify.readers import checks
 from densify.readers.point_fields import REFERENCES, UNIT_NS
 
 NAME = "densify.yaml"
@@ -94,7 +94,7 @@ _FLAG: Check = (lambda value: _only(bool, value), "true or false")
 _NUMBER: Check = (_number, "a finite number")
 _ABOVE_0: Check = (_above_0, "a finite number above 0")
 _MOTION: Check = (
-    lambda value: rigid(_array(value, -1, 4), ""),
+    lambda value: checks.rigid(_array(value, -1, 4), ""),
     "three or four rows of a rotation and translation",
 )
 _CHECKS: dict[str, Check] = {

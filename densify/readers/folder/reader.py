@@ -1,46 +1,35 @@
 # SPDX-License-Identifier: MIT
 """Any folder of sweeps: numbered files of points, and beside them whatever there is of stamps,
-poses and images. A small ``densify.yaml`` in the folder (`densify.readers.folder.config`) says what
-the files cannot; a folder without one opens as far as can be told.
+poses and images. `densify.readers.folder.config` says what they cannot: a small ``densify.yaml``.
 
-points
-    in the lidar's frame, as fired. ``compensated`` says that they were carried to the stamp by the
-    vehicle's motion; it is undone where points have times and poses have stamps, else the times are
-    left out.
-numbers and stamps
-    files are numbered as their names say, or from 0 in the order of time where the names are times
-    (``1317042651.468569638.pcd``). Times come from names, from a file beside the sweeps such as
-    ``timestamps.txt``, or else from the rate. The stamp is the reference time; points' times are
-    since it (or absolute, on its clock) unless ``reference`` says otherwise. Their unit is the one
-    in which a sweep takes about a period.
-poses
-    KITTI's 3x4, 4x4, TUM, tables with quaternions, or the VIEWPOINT of .pcd files. With stamps they
-    are interpolated to the sweeps' stamps; without, there is one for each sweep or each number.
-images
-    need a calibration. Their stamps come from names, a file, or the sweeps of the same numbers.
+points: in the lidar's frame, as fired. With ``compensated`` they were carried to the stamp; that is
+    undone where points have times and poses have stamps, else the times are left out.
+numbers and stamps: as the names say, or from 0 in the order of time where names are times
+    (``1317042651.468569638.pcd``). Times come from names, a file such as ``timestamps.txt``, or the
+    rate. The stamp is the reference time; points' times are since it, or absolute on its clock, in
+    the unit in which a sweep takes about a period.
+poses: KITTI's 3x4, 4x4, TUM, or tables with quaternions: interpolated by their stamps, or without
+    stamps one for each sweep or number.
+images: need a calibration; stamped by names, a file, or the sweeps of the same numbers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.types import Float
-from densify.readers.file_sequence import (
-    FileSequence,
-    Returns,
-    of_frame,
-    quaternion_pose,
-    truth_beside,
-)
-from densify.readers.folder.columns import SweepColumns
-from densify.readers.folder.config import CameraFiles, FolderConfig
+from densify.geometry.types import Bool, Float
+from densify.readers import checks
+from densify.readers.file_sequence import FileSequence, Returns
+from densify.readers.folder.config import CameraFiles, FolderConfig, SweepFiles
 from densify.readers.folder.series import (
     Series,
     find_images,
@@ -49,11 +38,106 @@ from densify.readers.folder.series import (
     images_in,
     in_time,
 )
-from densify.readers.point_files import read_viewpoint
+from densify.readers.point_fields import PointLayout
+from densify.readers.point_files import read_table
 from densify.readers.recorded_poses import PoseFile, PoseTrack
 from densify.readers.timeline import format_frames
 
-_NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+Columns = Mapping[str, NDArray[Any]]
+
+_ASSUMED_HZ = 10.0
+_NUM_TRIED = 5  # sweeps, until one can be read
+
+
+@dataclass(frozen=True)
+class SweepColumns:
+    """series: the files. settings: what densify.yaml says; config: its path."""
+
+    series: Series
+    settings: SweepFiles
+    config: Path | None
+
+    def returns(self, frame: int, stamp_ns: int) -> Returns:
+        """Return the rows of a sweep. Raises InputError if the file is damaged or lacks
+        columns of the first."""
+        path = self.series.paths[frame]
+        columns = self._columns(path)
+        found, valid = self.layout.returns(columns, path, stamp_ns)
+        points = self.settings.scale_m * found.points
+        if self.settings.axes is not None:
+            points = points @ self.settings.axes.T
+        lidar = self._lidar(path, columns, valid)
+        origins = self.settings.scanner_origins
+        return replace(found, points=points, lidar=lidar, scanner_origins=origins)
+
+    @cached_property
+    def layout(self) -> PointLayout:
+        """Find the meaning of the columns in the first sweep that can be read."""
+        frame, columns = self._sample
+        path, known = self.series.paths[frame], self.settings
+        named = {
+            part: name for part in ("intensity", "time", "lidar") if (name := getattr(known, part))
+        }
+        for part, name in named.items():
+            if name not in columns:
+                raise InputError(
+                    f"{self.config}: sweeps.{part}: got {name!r}, expected a column of "
+                    f"{path.name}: {', '.join(columns)}"
+                )
+        return PointLayout.find(
+            columns,
+            path,
+            self.period_ns,
+            (self.series.stamps_ns or {}).get(frame),
+            named,
+            known.intensity_scale,
+            unit=known.time_unit,
+            absolute=known.time_is == "absolute" if known.time_is else None,
+            reference=known.reference,
+        )
+
+    @cached_property
+    def period_ns(self) -> int:
+        """Return the time from sweep to sweep: by their stamps, or else their rate."""
+        stamps_ns = list((self.series.stamps_ns or {}).values())
+        if len(stamps_ns) > 1:
+            return max(1, int(np.median(np.diff(stamps_ns))))
+        return round(1e9 / (self.settings.rate_hz or _ASSUMED_HZ))
+
+    def unused(self) -> list[str]:
+        """Return the columns that play no part, with their ranges, for people."""
+        return [
+            f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
+            for name, column in self._sample[1].items()
+            if name not in vars(self.layout.fields).values()
+        ]
+
+    @cached_property
+    def _sample(self) -> tuple[int, Columns]:
+        """Read the first sweep that can be read: its number and columns."""
+        errors = []
+        for number, path in list(self.series.paths.items())[:_NUM_TRIED]:
+            try:
+                return number, self._columns(path)
+            except InputError as error:
+                errors.append(error)
+        raise errors[0]
+
+    def _columns(self, path: Path) -> Columns:
+        """Read all columns of numbers, (N,) each, also those beside the points of an .npz file."""
+        table = read_table(path, self.settings.columns)
+        beside = {n: a for n, a in table.beside.items() if a.shape == (len(table),)}
+        columns = {**table.columns, **beside}
+        return {name: c for name, c in columns.items() if c.dtype.kind in "fiu"}
+
+    def _lidar(self, path: Path, columns: Columns, valid: Bool) -> NDArray[np.uint8] | None:
+        name = self.layout.fields.lidar
+        if not name:
+            return None
+        numbers = np.where(valid, columns[name], 0)
+        if not np.isin(numbers, np.arange(256)).all():
+            raise InputError(f"{path}: {name}: expected the number of a scanner, 0 to 255")
+        return numbers.astype(np.uint8)
 
 
 def open_recording(path: Path, scene: str | None) -> Folder:
@@ -79,7 +163,7 @@ class Folder(FileSequence):
             folder,
             tuple(self._sweeps.paths),
             {name: camera for name, (camera, _) in cameras.items()},
-            truth=truth_beside(folder),
+            truth=checks.truth_beside(folder),
             files=self._sweeps.paths,
             images={name: series.paths for name, series in images.items()},
         )
@@ -119,8 +203,6 @@ class Folder(FileSequence):
         ]
         if self._poses is not None:
             lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
-        elif self._has_viewpoints:
-            lines.append(("poses from", "VIEWPOINT of the sweeps"))
         used = {str(Path(given.files)) for _, given in self._config.cameras.values()}
         for name, images in find_images(self.where).items():
             if name not in used:
@@ -128,26 +210,22 @@ class Folder(FileSequence):
                 lines.append(("no camera", text))
         return lines
 
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
+    def _returns(self, frame: int) -> Returns:
         stamp_ns = self.stamp_ns(frame)
-        path, found = self._columns.returns(frame, stamp_ns)
+        found = self._columns.returns(frame, stamp_ns)
         if not self._config.sweeps.compensated or found.offset_ns is None:
-            return path, found
+            return found
         if self._track is None:
-            return path, replace(found, offset_ns=None)
+            return replace(found, offset_ns=None)
         points = self._track.as_fired(found.points, stamp_ns, found.offset_ns)
-        return path, replace(found, points=points)
+        return replace(found, points=points)
 
     def _pose(self, frame: int) -> Float:
         if self._track is not None:
             return self._track.at(self.stamp_ns(frame))
         if self._poses is not None:
-            return of_frame(self._T_world_lidar, frame, "pose", self._poses.path)
-        if not self._has_viewpoints:
-            return super()._pose(frame)
-        path = self._sweeps.paths[frame]
-        x, y, z, *quaternion = read_viewpoint(path) or _NO_VIEWPOINT
-        return quaternion_pose(quaternion, (x, y, z), f"{path}: VIEWPOINT")
+            return checks.of_frame(self._T_world_lidar, frame, "pose", self._poses.path)
+        return super()._pose(frame)
 
     def _read_poses(self) -> None:
         """Read the lidar's path where the poses have stamps, else its pose by frame."""
@@ -170,13 +248,6 @@ class Folder(FileSequence):
             )
         numbers = frames if len(T) == len(frames) else range(len(T))
         self._T_world_lidar = dict(zip(numbers, T, strict=True))
-
-    @cached_property
-    def _has_viewpoints(self) -> bool:
-        """Return True if VIEWPOINT holds poses; many drives begin with sweeps at the origin."""
-        tried = {self.frames[0], self.frames[len(self.frames) // 2], self.frames[-1]}
-        found = [read_viewpoint(self._sweeps.paths[frame]) for frame in sorted(tried)]
-        return any(one not in (None, _NO_VIEWPOINT) for one in found)
 
 
 def _images(folder: Path, name: str, given: CameraFiles) -> Series:

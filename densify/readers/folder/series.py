@@ -35,11 +35,11 @@ class Series:
     told_by: str
 
 
-def sweep_folders(folder: Path, files: str = "") -> dict[str, list[Path]]:
-    """Return the folders with numbered files of points, and those files of the surest suffix.
+def find_sweeps(folder: Path, files: str) -> list[Path]:
+    """Return the numbered files of points, of the surest suffix.
 
     files: the folder they are in, "" to look in this one and two folders down. Raises InputError if
-    there are none.
+    there are none, or several folders of them.
     """
     if files:
         existing(folder, files, "sweeps: {files: ...}", is_folder=True)
@@ -54,13 +54,7 @@ def sweep_folders(folder: Path, files: str = "") -> dict[str, list[Path]]:
             f"{folder / files}: no sweeps; expected numbered files such as 000120.bin "
             f"({', '.join(SUFFIXES)}) in the folder or below it"
         )
-    return found[min(found)]
-
-
-def find_sweeps(folder: Path, files: str) -> list[Path]:
-    """Return the files of the sweeps. Raises InputError if there are none, or several folders of
-    them."""
-    groups = sweep_folders(folder, files)
+    groups = found[min(found)]
     if len(groups) > 1:
         raise InputError(
             f"{folder}: several folders hold sweeps: {', '.join(groups)}; name one in "

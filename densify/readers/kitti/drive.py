@@ -15,16 +15,8 @@ from scipy.spatial.transform import Rotation
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_text
 from densify.geometry.types import Camera, Float, Int
-from densify.readers.file_sequence import (
-    FileSequence,
-    Returns,
-    check_rotation,
-    numbered_files,
-    parse_numbers,
-    pinhole,
-    rigid,
-    truth_beside,
-)
+from densify.readers import checks
+from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.stamp_files import date_ns
 
 NOMINAL_PERIOD_NS = 100_000_000
@@ -45,23 +37,22 @@ class Drive(FileSequence):
     ) -> None:
         """sweeps: folder of the .bin files. truth: folder that may hold exact truth. images:
         folders by camera. Raises InputError if there are no sweeps."""
-        files = numbered_files(sweeps, ".bin")
+        files = checks.numbered_files(sweeps, ".bin")
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
-        found = {n: numbered_files(p, ".png", ".jpg", ".jpeg") for n, p in images.items()}
+        found = {n: checks.numbered_files(p, ".png", ".jpg", ".jpeg") for n, p in images.items()}
         super().__init__(
             name,
             where,
             tuple(files),
-            truth=truth_beside(truth),
+            truth=checks.truth_beside(truth),
             files=files,
             images={name: numbers for name, numbers in found.items() if numbers},
         )
 
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
-        path = self._files[frame]
-        points, intensity = read_points(path)
-        return path, Returns(points, intensity, turned_ns(points, self.revolution_ns))
+    def _returns(self, frame: int) -> Returns:
+        points, intensity = read_points(self._files[frame])
+        return Returns(points, intensity, turned_ns(points, self.revolution_ns))
 
 
 def read_points(path: Path) -> tuple[Float, np.ndarray]:
@@ -113,7 +104,7 @@ def usual_period_ns(stamps_ns: Iterable[int]) -> int:
 def parse_oxts(text: str, where: str) -> Float:
     """Return the (30,) numbers of an oxts record: latitude and longitude (deg), altitude (m), roll,
     pitch, yaw (rad), ... Raises InputError, which starts with ``where``."""
-    values = parse_numbers(text, where, 30)
+    values = checks.parse_numbers(text, where, 30)
     if abs(values[0]) >= 90:
         raise InputError(f"{where}: got a latitude of {values[0]:g} deg, expected -90 to 90")
     return values
@@ -156,17 +147,17 @@ class Calibration:
         if key not in self.entries:
             raise InputError(f"{self.path}: no key {key}; got {', '.join(self.entries)}")
         where = f"{self.path}: {key}"
-        return parse_numbers(self.entries[key], where, int(np.prod(shape))).reshape(shape)
+        return checks.parse_numbers(self.entries[key], where, int(np.prod(shape))).reshape(shape)
 
     def rotation(self, key: str) -> Float:
         """Return (4,4) of the key's (3,3) rotation."""
         T = np.eye(4)
-        T[:3, :3] = check_rotation(self.numbers(key, 3, 3), f"{self.path}: {key}")
+        T[:3, :3] = checks.rotation(self.numbers(key, 3, 3), f"{self.path}: {key}")
         return T
 
     def motion(self, key: str) -> Float:
         """Return (4,4) of the twelve numbers of a key, the upper rows."""
-        return rigid(self.numbers(key, 3, 4), f"{self.path}: {key}")
+        return checks.rigid(self.numbers(key, 3, 4), f"{self.path}: {key}")
 
     def pose(self) -> Float:
         """Return (4,4) of the keys R and T."""
@@ -188,6 +179,6 @@ class Calibration:
         """
         P = self.numbers(key, 3, 4)
         onto, T_cam_rect = P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), np.eye(4)
-        camera = pinhole(name, size_px, onto, T_rect_lidar, f"{self.path}: {key}")
+        camera = checks.pinhole(name, size_px, onto, T_rect_lidar, f"{self.path}: {key}")
         T_cam_rect[:3, 3] = np.linalg.solve(camera.K, P[:, 3])
         return replace(camera, T_cam_lidar=T_cam_rect @ T_rect_lidar)

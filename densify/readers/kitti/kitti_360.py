@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""KITTI-360 (Liao, Xie, Geiger, "KITTI-360: A Novel Dataset and Benchmarks for Urban Scene
-Understanding in 2D and 3D", PAMI 2022), as downloaded; its drives are scenes::
+"""KITTI-360 (Liao, Xie, Geiger, PAMI 2022), as downloaded; its drives are scenes::
 
     data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/{data/0000000000.bin, timestamps.txt}
     data_2d_raw/2013_05_28_drive_0000_sync/image_00/{data_rect/0000000000.png, timestamps.txt}
@@ -8,14 +7,12 @@ Understanding in 2D and 3D", PAMI 2022), as downloaded; its drives are scenes::
     data_poses/2013_05_28_drive_0000_sync/poses.txt
     calibration/{calib_cam_to_pose.txt, calib_cam_to_velo.txt, perspective.txt, image_02.yaml, ...}
 
-- Frames are file numbers and files may be missing; line ``frame`` (from 0) of a timestamp file
-  belongs to ``frame``. A sweep's stamp is the middle of the turn, when the scanner faces forward.
-- Points are the HDL-64E's, in its frame, as measured (the data set's own tools uncurl them). A
-  point's time follows from its azimuth; a turn lasts as long as it usually is from stamp to stamp.
-- image_00 and image_01 are rectified pinholes; image_02 and image_03 are fisheyes to the sides, as
-  they were taken: the model of Mei, of which at most 90 degrees off the axis are used.
-- Poses are the vehicle's (the inertial unit's) in a world with metric, level axes. Frames at which
-  it stood have none: the path is interpolated between those before and after.
+- Frames are file numbers, with gaps; line ``frame`` (from 0) of a timestamp file is its stamp, the
+  middle of the turn.
+- Points are the HDL-64E's, as measured; their times follow from the azimuth and the usual period.
+- image_00 and image_01 are rectified; image_02 and image_03 are fisheyes to the sides by Mei's
+  model, used up to 90 degrees off the axis.
+- Poses are the vehicle's (inertial unit's); where it stood there are none: they are interpolated.
 """
 
 from __future__ import annotations
@@ -26,11 +23,10 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import parse_yaml, read_text
+from densify.config.file_content import described_in, parse_yaml, read_text
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
-from densify.readers.extras import described_in
-from densify.readers.file_sequence import chosen_scene, of_frame, parse_numbers, pinhole, rigid
+from densify.readers import checks
 from densify.readers.kitti.drive import Calibration, Drive, read_stamps, usual_period_ns
 from densify.readers.recorded_poses import PoseTrack
 
@@ -51,7 +47,7 @@ def open_recording(path: Path, scene: str | None) -> Kitti360:
         raise InputError(
             f"{path}: no KITTI-360; expected data_3d_raw/ with drives that hold velodyne_points/"
         )
-    return Kitti360(path, chosen_scene("kitti-360", path, scene, names))
+    return Kitti360(path, checks.chosen_scene("kitti-360", path, scene, names))
 
 
 class Kitti360(Drive):
@@ -65,8 +61,8 @@ class Kitti360(Drive):
         images = {name: around / name / folder for name, folder in _FOLDERS.items()}
         super().__init__(drive, path, velodyne / "data", velodyne.parent, images)
         self._stamp_file = velodyne / "timestamps.txt"
-        self._stamps_ns = read_stamps(self._stamp_file)
-        self.revolution_ns = usual_period_ns(self._stamps_ns.values())
+        self._recorded_ns = read_stamps(self._stamp_file)
+        self.revolution_ns = usual_period_ns(self._recorded_ns.values())
         self._pose_file = path / "data_poses" / drive / "poses.txt"
         self.cameras = {name: _camera(path / "calibration", name) for name in self._image_files}
         stamps_ns = {n: read_stamps(around / n / "timestamps.txt") for n in self._image_files}
@@ -78,7 +74,7 @@ class Kitti360(Drive):
     def stamp_ns(self, frame: int) -> int:
         """When the scanner faced forward."""
         self.check_frame(frame)
-        return of_frame(self._stamps_ns, frame, "stamp", self._stamp_file)
+        return checks.of_frame(self._recorded_ns, frame, "stamp", self._stamp_file)
 
     def _pose(self, frame: int) -> Float:
         if not self._pose_file.exists():
@@ -91,10 +87,10 @@ class Kitti360(Drive):
         T_world_pose = {}
         for number, line in enumerate(read_text(self._pose_file).splitlines(), 1):
             where = f"{self._pose_file}: line {number}"
-            frame, *numbers = parse_numbers(line, where, 13).tolist()
-            if frame in self._stamps_ns:
-                stamp_ns = self._stamps_ns[int(frame)]
-                T_world_pose[stamp_ns] = rigid(np.reshape(numbers, (3, 4)), where)
+            frame, *numbers = checks.parse_numbers(line, where, 13).tolist()
+            if frame in self._recorded_ns:
+                stamp_ns = self._recorded_ns[int(frame)]
+                T_world_pose[stamp_ns] = checks.rigid(np.reshape(numbers, (3, 4)), where)
         return PoseTrack(
             str(self._pose_file),
             np.array(list(T_world_pose), np.int64),
@@ -106,7 +102,7 @@ def _T_pose_lidar(folder: Path) -> Float:
     """(4,4); the scanner is known from camera 0, which is known from the vehicle."""
     path = folder / "calib_cam_to_velo.txt"
     where = f"{path}: the transform from camera 0 to the scanner"
-    T_lidar_cam = rigid(parse_numbers(read_text(path), where, 12).reshape(3, 4), where)
+    T_lidar_cam = checks.rigid(checks.parse_numbers(read_text(path), where, 12), where)
     to_pose = Calibration.read(folder / "calib_cam_to_pose.txt")
     return to_pose.motion("image_00") @ poses.inverse(T_lidar_cam)
 
@@ -131,8 +127,9 @@ def _fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
         words = [given["image_width"], given["image_height"]]
         words += [onto[key] for key in ("gamma1", "gamma2", "u0", "v0")]
         words += [given["mirror_parameters"]["xi"], *(lens[k] for k in ("k1", "k2", "p1", "p2"))]
-    width, height, *numbers = parse_numbers(" ".join(map(str, words)), str(path), 11).tolist()
-    return pinhole(
+    text = " ".join(map(str, words))
+    width, height, *numbers = checks.parse_numbers(text, str(path), 11).tolist()
+    return checks.pinhole(
         name,
         (int(width), int(height)),
         numbers[:4],

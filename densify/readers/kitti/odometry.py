@@ -1,19 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""KITTI odometry (Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012) and
-SemanticKITTI (Behley et al., ICCV 2019), which has the same sequences::
+"""KITTI odometry (Geiger, Lenz, Urtasun, CVPR 2012) and SemanticKITTI (Behley et al., ICCV 2019),
+which has the same sequences::
 
     dataset/sequences/00/velodyne/000000.bin   image_2/000000.png   calib.txt   times.txt
     dataset/poses/00.txt   or SemanticKITTI's  dataset/sequences/00/poses.txt
 
-- Frames are file numbers. ``times.txt`` has seconds since the first frame, a line for each: when
-  the camera exposed and the scanner faced forward. Without it frame k is at k times 100 ms.
-- Points are the HDL-64E's, in its frame, ego-motion compensated to that time, without times. Where
-  there are poses the compensation is undone in a few rounds: a point's time follows from the
-  azimuth at which it was fired, and that azimuth from its time. (On three real sweeps at 0.7 m a
-  sweep the entropy of elevations falls from 6.68 to 6.50.) Without poses ``offset_ns`` is None.
-- Images are rectified; their size is that of the first. ``calib.txt`` has their projections and
-  ``Tr``, the rectified camera 0 from the scanner. Poses are camera 0's, T_first_now: the scanner's
-  are Tr⁻¹ P Tr, and the world is its frame at frame 0.
+- Frames are file numbers. ``times.txt`` has seconds since the first, when camera and scanner faced
+  forward; without it frame k is at k times 100 ms.
+- Points are the HDL-64E's, compensated to that time, without times. With poses the compensation is
+  undone in a few rounds: a point's time follows from the azimuth at which it was fired, and that
+  from its time. Without poses ``offset_ns`` is None.
+- Images are rectified, as large as the first. ``calib.txt`` has their projections and ``Tr``,
+  camera 0 from the scanner. Poses are camera 0's, T_first_now: the scanner's are Tr⁻¹ P Tr.
 """
 
 from __future__ import annotations
@@ -28,8 +26,9 @@ from densify.config.errors import InputError
 from densify.config.file_content import read_text
 from densify.geometry import poses
 from densify.geometry.types import Float
+from densify.readers import checks
 from densify.readers.decoded_files import image_size_px
-from densify.readers.file_sequence import Returns, chosen_scene, of_frame, parse_numbers, rigid
+from densify.readers.file_sequence import Returns
 from densify.readers.kitti.drive import (
     NOMINAL_PERIOD_NS,
     Calibration,
@@ -56,7 +55,7 @@ def open_recording(path: Path, scene: str | None) -> KittiOdometry:
             f"{path}: no KITTI odometry; expected a folder with velodyne/, or sequences/ with such "
             f"folders"
         )
-    return KittiOdometry(folder / chosen_scene("kitti-odometry", path, scene, names))
+    return KittiOdometry(folder / checks.chosen_scene("kitti-odometry", path, scene, names))
 
 
 class KittiOdometry(Drive):
@@ -92,19 +91,18 @@ class KittiOdometry(Drive):
     def _time_ns(self, frame: int) -> int:
         if not self._times_ns:
             return frame * NOMINAL_PERIOD_NS
-        return of_frame(self._times_ns, frame, "time", self._times)
+        return checks.of_frame(self._times_ns, frame, "time", self._times)
 
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
-        path = self._files[frame]
-        stored, intensity = read_points(path)
+    def _returns(self, frame: int) -> Returns:
+        stored, intensity = read_points(self._files[frame])
         track = self._track_around(frame)
         if track is None:
-            return path, Returns(stored, intensity)
+            return Returns(stored, intensity)
         points = stored
         for _ in range(_NUM_ROUNDS):
             offset_ns = turned_ns(points, self.revolution_ns)
             points = track.as_fired(stored, self.stamp_ns(frame), offset_ns)
-        return path, Returns(points, intensity, offset_ns)
+        return Returns(points, intensity, offset_ns)
 
     def _track_around(self, frame: int) -> PoseTrack | None:
         """The scanner's, from the poses of the frame and of those beside it; None without two."""
@@ -114,14 +112,16 @@ class KittiOdometry(Drive):
             return None
         where = f"{path}: line {frame + 1} and those beside it"
         stamps_ns = np.array([self._time_ns(f) for f in near], np.int64)
-        return PoseTrack(where, stamps_ns, np.stack([rigid(self._pose(f), where) for f in near]))
+        return PoseTrack(
+            where, stamps_ns, np.stack([checks.rigid(self._pose(f), where) for f in near])
+        )
 
     def _pose(self, frame: int) -> Float:
         path, lines = self._pose_lines
         if path is None:
             return super()._pose(frame)
-        line = of_frame(lines, frame, "pose", path)
-        P = parse_numbers(line, f"{path}: line {frame + 1}", 12).reshape(3, 4)
+        line = checks.of_frame(lines, frame, "pose", path)
+        P = checks.parse_numbers(line, f"{path}: line {frame + 1}", 12).reshape(3, 4)
         T_cam_lidar = self._calibration.motion("Tr")
         T_first_cam = np.vstack([P, [0.0, 0.0, 0.0, 1.0]])
         return poses.inverse(T_cam_lidar) @ T_first_cam @ T_cam_lidar

@@ -16,7 +16,8 @@ from densify.config.errors import InputError
 from densify.config.file_content import read_text
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
-from densify.readers.file_sequence import Returns, numbered_files, of_frame
+from densify.readers import checks
+from densify.readers.file_sequence import Returns
 from densify.readers.kitti.drive import (
     NOMINAL_PERIOD_NS,
     Calibration,
@@ -42,12 +43,10 @@ def open_recording(path: Path, scene: str | None) -> KittiRaw:
 class KittiRaw(Drive):
     """A KITTI raw drive as a `LidarSequence`.
 
-    Reference time of a sweep: ``velodyne_points/timestamps.txt``, the middle of the revolution,
-    when the scanner faces forward. A point's time follows from its azimuth and from
-    ``timestamps_start.txt`` and ``timestamps_end.txt``; without these ``offset_ns`` is None.
-    Without ``timestamps.txt`` frame k is stamped k times 100 ms.
-
-    Poses come from ``oxts/``; the world is the inertial unit's frame at the first oxts file.
+    A sweep's stamp is the middle of the revolution (``velodyne_points/timestamps.txt``, or k times
+    100 ms); a point's time follows from its azimuth and ``timestamps_start.txt``, ``..._end.txt``,
+    without which ``offset_ns`` is None. Poses come from ``oxts/``; the world is the inertial unit's
+    frame at the first oxts file.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -64,16 +63,16 @@ class KittiRaw(Drive):
         self._stamp_files = {
             name: velodyne / f"timestamps{name}.txt" for name in ("", "_start", "_end")
         }
-        self._stamps_ns = {n: read_stamps(p) for n, p in self._stamp_files.items() if p.exists()}
-        self._oxts = numbered_files(drive / "oxts" / "data", ".txt")
+        self._recorded = {n: read_stamps(p) for n, p in self._stamp_files.items() if p.exists()}
+        self._oxts = checks.numbered_files(drive / "oxts" / "data", ".txt")
         self.cameras = cameras
         self._exposed_ns = {name: self._exposures_ns(name) for name in self._image_files}
 
     def gaps(self) -> list[str]:
         """See `LidarSequence`."""
-        missing = [p.name for n, p in self._stamp_files.items() if n not in self._stamps_ns]
+        missing = [p.name for n, p in self._stamp_files.items() if n not in self._recorded]
         told = [f"{self.where / 'velodyne_points'} has no {', '.join(missing)}"] * bool(missing)
-        if "" not in self._stamps_ns:
+        if "" not in self._recorded:
             told.append(f"{self.where}: sweeps are taken for 100 ms apart")
         left_out = [name for name in _camera_folders(self.where) if name not in self.cameras]
         return told + [
@@ -83,15 +82,15 @@ class KittiRaw(Drive):
 
     def stamp_ns(self, frame: int) -> int:
         """Return a sweep's reference time. Raises InputError for a frame without a stamp."""
-        return self._recorded_ns("", frame) if self._stamps_ns else frame * NOMINAL_PERIOD_NS
+        return self._recorded_ns("", frame) if self._recorded else frame * NOMINAL_PERIOD_NS
 
     def _recorded_ns(self, kind: str, frame: int) -> int:
-        return of_frame(self._stamps_ns[kind], frame, "stamp", self._stamp_files[kind])
+        return checks.of_frame(self._recorded[kind], frame, "stamp", self._stamp_files[kind])
 
-    def _returns(self, frame: int) -> tuple[Path, Returns]:
+    def _returns(self, frame: int) -> Returns:
         points, intensity = read_points(self._files[frame])
-        if len(self._stamps_ns) < len(self._stamp_files):
-            return self._files[frame], Returns(points, intensity)
+        if len(self._recorded) < len(self._stamp_files):
+            return Returns(points, intensity)
         start, end = self._recorded_ns("_start", frame), self._recorded_ns("_end", frame)
         if end <= start:
             raise InputError(
@@ -100,13 +99,13 @@ class KittiRaw(Drive):
             )
         centre_ns = (start + end) // 2 - self.stamp_ns(frame)
         offset_ns = turned_ns(points, end - start) + centre_ns
-        return self._files[frame], Returns(points, intensity, offset_ns)
+        return Returns(points, intensity, offset_ns)
 
     def _exposures_ns(self, camera: str) -> dict[int, int]:
         """Return when the images that exist were exposed: the recorded stamp less
         `KITTI_TRIGGER_LATENCY_NS`, or the sweep's reference time where none is recorded."""
         path, numbers = self.where / camera / "timestamps.txt", self._image_files[camera]
-        exposed_ns = self._stamps_ns.get("", {f: f * NOMINAL_PERIOD_NS for f in numbers})
+        exposed_ns = self._recorded.get("", {f: f * NOMINAL_PERIOD_NS for f in numbers})
         if path.exists():
             recorded = read_stamps(path).items()
             exposed_ns = exposed_ns | {f: ns - KITTI_TRIGGER_LATENCY_NS for f, ns in recorded}
@@ -118,10 +117,10 @@ class KittiRaw(Drive):
         the sweep."""
         if not self._oxts:
             return super()._pose(frame)
-        of_frame(self._oxts, frame, "oxts record", self.where)
+        checks.of_frame(self._oxts, frame, "oxts record", self.where)
         near = [at for at in (frame - 1, frame, frame + 1) if at in self._oxts_stamps_ns]
         stamps_ns = np.array([self._oxts_stamps_ns[at] for at in near], np.int64)
-        if len(near) < 2 or (np.diff(stamps_ns) <= 0).any() or "" not in self._stamps_ns:
+        if len(near) < 2 or (np.diff(stamps_ns) <= 0).any() or "" not in self._recorded:
             return self._T_world_imu(frame) @ poses.inverse(self._T_lidar_imu)
         T_world_imu = np.stack([self._T_world_imu(at) for at in near])
         track = PoseTrack(str(self.where / "oxts"), stamps_ns, T_world_imu)

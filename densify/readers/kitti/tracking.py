@@ -5,18 +5,14 @@ sequences are scenes::
     velodyne/0000/000000.bin   image_02/0000/000000.png   calib/0000.txt   oxts/0000.txt
     label_02/0000.txt    optional: tracked boxes, a line for each object and frame
 
-- Frames are file numbers; a sweep's file can be absent. There are no stamps: frame k is at k times
-  100 ms, its images too.
-- Points are the HDL-64E's, in its frame, as measured. A point's time follows from its azimuth, the
-  turn taken to last 100 ms.
-- Images are rectified; their size is that of the first. ``calib`` has their projections, R_rect,
-  Tr_velo_cam and Tr_imu_velo. Poses come from oxts (a line for each frame); the world is the
-  inertial unit's frame at frame 0.
+- Frames are file numbers; sweeps can be absent. Frame k and its images are at k times 100 ms.
+- Points are the HDL-64E's, as measured; their times follow from the azimuth, a turn lasting 100 ms.
+- Images are rectified, as large as the first. ``calib`` has their projections, R_rect, Tr_velo_cam
+  and Tr_imu_velo. Poses come from oxts; the world is the inertial unit's frame at frame 0.
 - A label line is ``frame track type truncated occluded alpha left top right bottom height width
-  length x y z rotation_y [score]``. x y z is the middle of the box's bottom in the rectified camera
-  0 (x right, y down, z forward), rotation_y its turn about y, 0 where the front is along x. A box
-  belongs to the time at which the scanner faced it. Only what image_02 shows is labelled;
-  ``DontCare`` lines are rectangles in which there may be objects without a box (devkit_tracking).
+  length x y z rotation_y [score]``: x y z of the middle of the box's bottom in the rectified camera
+  0, rotation_y about y, 0 where the front is along x, at the time at which the scanner faced it.
+  Only what image_02 shows is labelled; in ``DontCare`` rectangles there may be more.
 """
 
 from __future__ import annotations
@@ -30,14 +26,8 @@ from densify.config.errors import InputError
 from densify.config.file_content import read_text
 from densify.geometry import poses
 from densify.geometry.types import Bool, Boxes, BoxView, Camera, Float
+from densify.readers import checks
 from densify.readers.decoded_files import image_size_px
-from densify.readers.file_sequence import (
-    checked_boxes,
-    chosen_scene,
-    of_frame,
-    parse_numbers,
-    upright_poses,
-)
 from densify.readers.kitti.drive import (
     NOMINAL_PERIOD_NS,
     Calibration,
@@ -59,11 +49,12 @@ def open_recording(path: Path, scene: str | None) -> KittiTracking:
     names = sorted(p.name for p in (path / "velodyne").glob("*") if p.is_dir())
     if not names:
         raise InputError(f"{path}: no KITTI tracking; expected folders such as velodyne/0000 in it")
-    return KittiTracking(path, chosen_scene("kitti-tracking", path, scene, names))
+    return KittiTracking(path, checks.chosen_scene("kitti-tracking", path, scene, names))
 
 
 class KittiTracking(Drive):
-    """A sequence as a `LidarSequence`."""
+    """A sequence as a `LidarSequence`, stamped as the scanner faced forward, at the nominal
+    rate."""
 
     def __init__(self, path: Path, scene: str) -> None:
         """path: the folder that holds velodyne/. scene: the sequence. Raises InputError if it holds
@@ -72,6 +63,7 @@ class KittiTracking(Drive):
         name = f"{path.resolve().name}/{scene}"
         super().__init__(name, path, path / "velodyne" / scene, path, images)
         self._scene_file = f"{scene}.txt"
+        self._stamps_ns = {frame: frame * NOMINAL_PERIOD_NS for frame in self.frames}
         for name, files in self._image_files.items():
             size_px = image_size_px(next(iter(files.values())))
             self.cameras = {**self.cameras, name: self._camera(name, size_px)}
@@ -80,18 +72,13 @@ class KittiTracking(Drive):
             for name, files in self._image_files.items()
         }
 
-    def stamp_ns(self, frame: int) -> int:
-        """Return when the scanner faced forward, at the nominal rate."""
-        self.check_frame(frame)
-        return frame * NOMINAL_PERIOD_NS
-
     def _pose(self, frame: int) -> Float:
         path = self.where / "oxts" / self._scene_file
         if not path.exists():
             return super()._pose(frame)
         lines = dict(enumerate(read_text(path).splitlines()))
         first, record = (
-            parse_oxts(of_frame(lines, f, "oxts record", path), f"{path}: line {f + 1}")
+            parse_oxts(checks.of_frame(lines, f, "oxts record", path), f"{path}: line {f + 1}")
             for f in (0, frame)
         )
         T_lidar_imu = self._calibration.motion("Tr_imu_velo")
@@ -110,11 +97,11 @@ class KittiTracking(Drive):
         boxes, areas_px = numbers[here & ~is_area], numbers[here & is_area, 5:9]
         height_m, width_m, length_m, right, down, forward, turn = boxes[:, 9:16].T
         centre_m = np.column_stack([right, forward, height_m / 2 - down])
-        T_cam_box = _T_CAM_UPRIGHT @ upright_poses(centre_m, -turn)
+        T_cam_box = _T_CAM_UPRIGHT @ checks.upright_poses(centre_m, -turn)
         T_lidar_box = poses.inverse(self._T_rect_lidar) @ T_cam_box
         size_m = np.column_stack([length_m, width_m, height_m])
         tracks = [f"{track:.0f}" for track in boxes[:, 1]]
-        found = checked_boxes(tracks, T_lidar_box, size_m, f"{path}: frame {frame}")
+        found = checks.boxes(tracks, T_lidar_box, size_m, f"{path}: frame {frame}")
         camera = self.cameras.get("image_02") or self._camera("image_02", _SMALLEST_IMAGE_PX)
         offset_ns = turned_ns(T_lidar_box[:, :3, 3], NOMINAL_PERIOD_NS)
         view = BoxView(camera, areas_px)
@@ -141,6 +128,6 @@ def read_labels(path: Path) -> tuple[Float, Bool]:
         words = line.split()
         if words:
             row = " ".join([*words[:2], *words[3:17]])  # a score may follow
-            rows.append(parse_numbers(row, f"{path}: line {number}", 16))
+            rows.append(checks.parse_numbers(row, f"{path}: line {number}", 16))
             is_area.append(words[2] == "DontCare")
     return np.reshape(rows, (-1, 16)), np.array(is_area, bool)
