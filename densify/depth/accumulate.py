@@ -14,10 +14,8 @@ from densify.geometry.types import Cloud, Float, FlowField, ObjectTrack, Stretch
 
 _CONFIDENCE_PER_S = 0.7
 _CONFIDENCE_MOVED = 0.8
-_LEAST_POINTS = 10  # of an object in all sweeps
-_LEAST_SEEN = 3  # of it in one sweep: fewer do not tell how it is turned
-_PERCENTILES = (1.0, 99.0)
-_LEAST_SPEED_M_S = 0.3  # below, an object points to where it went over the window
+_LEAST_SEEN = 3  # points of an object in one sweep: fewer do not tell how it is turned
+_BEYOND_PERCENT = 1.0  # of its points that lie outside its box on each side
 
 
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
@@ -78,10 +76,12 @@ class _Sighting(NamedTuple):
 def object_tracks(
     stretch: Stretch, fields: Sequence[FlowField], key: int
 ) -> tuple[ObjectTrack, ...]:
-    """Return the tracks of objects with ten points or more, by instance.
+    """Return the tracks of objects by instance.
 
     fields: of each sweep to the key. The pose at a sweep is the rigid motion nearest in least
-    squares to the flow of its points to the key; sweeps with fewer than three points are left out.
+    squares to the flow of its points to the key. Sweeps with fewer than three points of an object
+    are left out, and so are objects that all sweeps show so. An object points to where it goes, by
+    its velocity or by its way over the window, whichever is longer.
     """
     seen: dict[int, dict[int, _Sighting]] = {}
     for registered, flow in zip(stretch.sweeps, fields, strict=True):
@@ -108,7 +108,7 @@ def object_tracks(
     return tuple(
         _track(k, seen[k], key, stamps_ns)
         for k in sorted(seen)
-        if sum(len(s.there) for s in seen[k].values()) >= _LEAST_POINTS
+        if max(len(s.there) for s in seen[k].values()) >= _LEAST_SEEN
     )
 
 
@@ -124,15 +124,15 @@ def _track(
     T_there_key[key] = np.eye(4)
     frames = sorted(T_there_key)
     velocity_m_s = np.median([s.velocity_m_s for s in seen.values()], axis=0)
-    way = velocity_m_s
-    if np.hypot(*way[:2]) < _LEAST_SPEED_M_S:
-        middle = np.median(at_key, axis=0)
-        ends = [poses.transform(T_there_key[f], middle[None])[0] for f in (frames[0], frames[-1])]
-        way = ends[1] - ends[0]
+    middle = np.median(at_key, axis=0)
+    ends = [poses.transform(T_there_key[f], middle[None])[0] for f in (frames[0], frames[-1])]
+    duration_s = (stamps_ns[frames[-1]] - stamps_ns[frames[0]]) * 1e-9
+    way = velocity_m_s * duration_s if duration_s else velocity_m_s
+    way = max(way, ends[1] - ends[0], key=lambda way: float(np.hypot(*way[:2])))
     heading = np.arctan2(way[1], way[0])
     T_key_object = poses.exp(np.array([0, 0, heading, 0, 0, 0]))
     body = poses.rotate(poses.inverse(T_key_object), at_key)
-    low, high = np.percentile(body, _PERCENTILES, axis=0)
+    low, high = np.percentile(body, [_BEYOND_PERCENT, 100 - _BEYOND_PERCENT], axis=0)
     T_key_object[:3, 3] = T_key_object[:3, :3] @ ((low + high) / 2)
     T = np.stack([T_there_key[frame] @ T_key_object for frame in frames])
     stamp_ns = np.array([stamps_ns[frame] for frame in frames], np.int64)

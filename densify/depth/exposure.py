@@ -31,8 +31,7 @@ from densify.geometry.types import (
 
 _log = logging.getLogger("densify")
 _USUAL = ProjectSettings()
-_NUM_NEIGHBOURS = 5  # sweeps on each side of a key that give the usual period
-_JITTER = 1.5  # half a period is at most this much longer
+_JITTER = 1.5  # half a period is at most this much longer than half the shorter one beside it
 _NUM_ROW_STEPS = 4  # of the search for the row that sees a point
 
 
@@ -100,9 +99,8 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
     """Return begin and end of the time that is nearer to the key's sweep than to another."""
     frames = list(sequence.frames)
     at = frames.index(key)
-    around = frames[max(0, at - _NUM_NEIGHBOURS) : at + _NUM_NEIGHBOURS + 1]
     stamps_ns = {}
-    for frame in around:
+    for frame in frames[max(0, at - 1) : at + 2]:
         try:
             stamps_ns[frame] = sequence.stamp_ns(frame)
         except InputError:  # not this key's matter
@@ -111,7 +109,7 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
     if len(stamps_ns) < 2:
         return np.iinfo(np.int64).min, np.iinfo(np.int64).max
     every_ns, middle_ns = [*stamps_ns.values()], stamps_ns[key]
-    most_ns = int(_JITTER * np.median(np.diff(every_ns)))
+    most_ns = int(_JITTER * np.diff(every_ns).min())
     before_ns = max([middle_ns - most_ns, *(s for s in every_ns if s < middle_ns)])
     after_ns = min([middle_ns + most_ns, *(s for s in every_ns if s > middle_ns)])
     return (before_ns + middle_ns) // 2, (middle_ns + after_ns) // 2

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from densify.depth.exposure import Exposure
-from densify.depth.patches import tangents
+from densify.depth.patches import FREE, tangents
 from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
@@ -38,8 +38,7 @@ _CONFIDENCE = 0.5
 _SLACK_M = 0.5
 _SAME_DEPTH = 0.05  # of the depth: a pixel needs one point of each such step
 _PRIME = 2_654_435_761  # its multiples go through any smaller number of points in a mixed order
-_FREE_M, _FREE_FRACTION = 0.3, 0.015  # before what a sweep saw; the larger counts
-_MIN_FILLED, _FEW_FILLED = 6, 3  # of nine cells: of the window's sweeps, of a sweep beyond it
+_FEW_FILLED = 3  # of nine cells of a sweep beyond the window
 # Of travel, between witnesses, and from the sweep that asks: most of a car, or its rear half.
 _WITNESSES_M, _WITNESS_M, _LEAST_WITNESS_M = 5.0, 3.5, 2.0
 
@@ -75,7 +74,7 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
         for number, witness in enumerate(witnesses):
             rows = np.flatnonzero(whose == number)
             there = poses.transform(T[number], points.take(rows, axis=0))
-            free[rows] = images[witness].sees_through(there, _FREE_M, _FREE_FRACTION, _FEW_FILLED)
+            free[rows] = images[witness].sees_through(there, *FREE, _FEW_FILLED)
         return free
 
     with ThreadPoolExecutor(num_threads()) as pool:
@@ -235,5 +234,5 @@ def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -
     for frame in witnesses:
         there = poses.transform(stretch.T_target_source(frame, key), points)
         image = RangeImage.of(stretch[frame])
-        free |= image.sees_through(there, _FREE_M, _FREE_FRACTION, _MIN_FILLED)
+        free |= image.sees_through(there, *FREE)
     return free

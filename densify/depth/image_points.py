@@ -22,7 +22,7 @@ _SLACK_M = 0.05  # added to it, for errors of registration and flow
 _MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
 _MAX_TILT = 0.25  # of the inverse depth per pixel; a plane seen edge-on has no slope
 _SAME_AGE_NS = 10_000_000
-_MOST_SWEEPS = 63  # that are told apart when they are counted
+_MOST_SWEEPS = np.iinfo(np.int64).bits - 1  # that are told apart when they are counted
 
 
 @dataclass(frozen=True)

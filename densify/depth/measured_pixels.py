@@ -26,8 +26,6 @@ from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Camera, Reason
 
-NOW_NS = 60_000_000
-"""Older is not the key sweep."""
 AGREE_M, AGREE_FRACTION = 0.1, 0.01
 """Points on one surface deviate less than this, both added."""
 _SUPPORT_REACH, _PLANE_REACH = 0.8, 0.5  # of sweeps that agree, of the plane; in spacings of rays
@@ -43,11 +41,9 @@ _LEAST_WINDOW_PX, _LEAST_FIT_PX, _MOST_PX = 3, 2.0, 24
 _MOVING_SLACK = 4.0  # motion is known less well than static surfaces
 _MOVING_WITNESS_NS = 120_000_000  # from the key
 _GOES_ON = 1.2  # spacings within which a surface shows again
-_ANY_AGE_NS = 1 << 62
 _ALL_ROUND = 3.0  # edges' reaches: no edge near
-_DIAGONAL = np.sqrt(0.5)
 _LEAST_ALONE = 5  # returns of the key sweep that agree around one, itself among them, of nine
-_NEVER_NS = np.iinfo(np.int64).max
+_NEVER_NS = int(np.iinfo(np.int64).max)
 
 
 class MeasuredPixels(NamedTuple):
@@ -194,7 +190,7 @@ def _found(
     """Return the pixels (P,) with points, the first point of each (P,), and (7,P) what `_settle`
     finds around it; with pixels ``taken`` neither these nor those with hidden points alone."""
     last = int(points.age_ns.max(initial=0)) + 1
-    late = points.age_ns > NOW_NS
+    late = points.age_ns > 0
     rank = np.where(hidden, last + late, points.age_ns)
     start, order = sorted_by_pixel(points, rank, own, camera)
     found = np.zeros((7, len(start) - 1), np.float32)
@@ -239,7 +235,7 @@ def _extend(reach, u, v):  # type: ignore[no-untyped-def]
     """Raise how far points lie in eight directions."""
     reach[0], reach[1] = max(reach[0], u), max(reach[1], -u)
     reach[2], reach[3] = max(reach[2], v), max(reach[3], -v)
-    a, b = _DIAGONAL * (u + v), _DIAGONAL * (u - v)
+    a, b = np.sqrt(0.5) * (u + v), np.sqrt(0.5) * (u - v)
     reach[4], reach[5] = max(reach[4], a), max(reach[5], -a)
     reach[6], reach[7] = max(reach[6], b), max(reach[7], -b)
 
@@ -258,7 +254,7 @@ def _count(seen):  # type: ignore[no-untyped-def]
 def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach):  # type: ignore[no-untyped-def]
     """Compare the points around a pixel with point i's tangent plane, ``centre`` in the pixel.
 
-    witness_ns: how long before or after the key a point behind shows an edge; `_ANY_AGE_NS` for
+    witness_ns: how long before or after the key a point behind shows an edge; `_NEVER_NS` for
     static points. Fills the moments m (9,) and how far the surface goes on, reach (8,). Returns a
     bit for each sweep that agrees, the age of the youngest, the number of points in the fit, their
     weighted squares, True if something lies behind close by, and of a moving point the number of
@@ -268,7 +264,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
     across, along = points.spacing_px[i, 0], points.spacing_px[i, 1]
     su, sv, w0 = points.slope[i, 0], points.slope[i, 1], inverse[i]
-    moving = witness_ns < _ANY_AGE_NS
+    moving = witness_ns < _NEVER_NS
     far = (HIDDEN_M + HIDDEN_FRACTION / w0) * w0 * w0
     outer = inner + _EDGE_WINDOW_PX
     # Sweeps see a moving object in the same rings.
@@ -290,7 +286,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
                 close = abs(du) <= outer and abs(dv) <= outer
                 behind |= close and age_ns[k] <= witness_ns
                 continue
-            if moving and age_ns[k] <= NOW_NS:
+            if moving and age_ns[k] == 0:
                 num_now += abs(du) <= _GOES_ON * across and abs(dv) <= _GOES_ON * along
             # No branches: half of them would be predicted wrongly.
             vouches = abs(du) <= support_u + 0.5 and abs(v - v0) <= support_v
@@ -338,13 +334,13 @@ def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-u
         inner = _EDGE_REACH * points.spacing_px[i, 0] + edge_px
         m[:], reach[:] = 0.0, 0.0
         # Other sweeps saw the background where the moving object was not yet, or no more.
-        witness_ns = _MOVING_WITNESS_NS if points.moving[i] else _ANY_AGE_NS
+        witness_ns = _MOVING_WITNESS_NS if points.moving[i] else _NEVER_NS
         seen, youngest, num, squares, behind, num_now = _look_round(
             points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach
         )
-        if points.age_ns[i] <= NOW_NS and not points.hidden[i] and _count(seen) < few:
+        if points.age_ns[i] == 0 and not points.hidden[i] and _count(seen) < few:
             m[:], reach[:] = 0.0, 0.0
-            now_ns = np.int64(NOW_NS)  # of the type of witness_ns, or this is compiled twice
+            now_ns = np.int64(0)  # of the type of witness_ns, or this is compiled twice
             seen, youngest, num, squares, behind, num_now = _look_round(
                 points, shape, i, u0, v0, centre, agree, inner, now_ns, m, reach
             )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from densify.geometry.arrays import Bool
 from densify.geometry.compiled import Kernel, inlined
 
-NONE = 255
+NONE = int(np.iinfo(np.uint8).max)
 """Steps where there is no known pixel within 254."""
 _LEAST, _MOST = 0.7, 1.4  # of the inverse depth: how far a slope is followed
 

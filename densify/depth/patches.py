@@ -19,8 +19,9 @@ from densify.free_space.sensor import Sensors
 from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Bool, Cloud, Float, Float32, Patches
 
-_VETO_M, _VETO_FRACTION = 0.3, 0.015  # before what the key sweep saw; the larger counts
-_MIN_FILLED = 6  # of the nine cells around
+FREE = 0.3, 0.015
+"""What lies this far before all returns around, in metres or as a share of the range, the larger
+counts, was seen through."""
 _STEEP = 5.7  # metres farther per metre across, 10 degrees: a surface steeper on one side is a step
 _BEND_M, _BEND = 0.10, 0.25  # most change of the slope, and as a share of the change itself
 _AROUND, _MOST_CELLS = 5.0, 20  # spacings within which rays without order have neighbours
@@ -63,7 +64,7 @@ def patches(
 
 def seen_through_by_key(points: Float, velocity_m_s: Float32, key_image: RangeImage) -> Bool:
     """Return (N,) True for the points (N,3), key frame, that the key sweep saw through."""
-    return key_image.sees_through(points, _VETO_M, _VETO_FRACTION, _MIN_FILLED, velocity_m_s)
+    return key_image.sees_through(points, *FREE, velocity_m_s=velocity_m_s)
 
 
 def tangents(

@@ -17,32 +17,24 @@ import numpy as np
 from scipy import ndimage, optimize, sparse
 from scipy.sparse import linalg
 
+from densify.depth.boundary_pixels import MOST_CONFIDENCE
 from densify.geometry.types import Bool, DepthMap, Float, Float32, FullDepth, Int, Prior, PriorFit
 
 FAR_M = 120.0
 """Farther values of a prior count as sky."""
 MAX_WRONG = 0.2
 """A prior is not used if its best fit is off by more than 25 % at a larger share of the measured
-pixels, each octave of depth counted alike. Good ones had up to 0.11, those of other images 0.25 to
+pixels, each step of depth counted alike. Good ones had up to 0.11, those of other images 0.25 to
 0.6."""
 _FORMS = {"auto": ("depth", "log", "inverse"), "depth": ("depth", "log"), "inverse": ("inverse",)}
 _MIN_FITTED = 100
-_STEP, _LEAST_OF_STEP = 0.05, 0.002  # of depth's logarithm; share of the pixels that it must hold
 _WRONG = np.log(1.25)
-_TOLERANCE = 0.05  # of the logarithm of depth: smaller errors count squared, larger ones less
-_LEAST_OF_OCTAVE = 0.02  # an octave of depth with a smaller share of the pixels counts less
-_LIMIT_SHARE, _LIMIT_SEEN = 0.002, 0.1  # of the image; of those pixels, seen by the lidar
+_USUAL = 0.05  # error of a prior in the logarithm of depth; its edges are steps of more than twice
 _MAX_CELLS = 40_000
-_EDGE = 0.05  # step of the logarithm from cell to cell that the correction hardly crosses
 _SMOOTHNESS = 10.0  # against 1 for a cell all of whose pixels are known
-_TOWARDS_NONE = 0.002  # pull to no correction and the usual error, where nothing is known around
-_NUM_PASSES = 3
-_DOUBTFUL = 0.1  # deviation or steepness at which a known pixel counts half
-_LEAST_ALIKE = 1e-6  # where no cell around a pixel is on its surface, all count
-_MIXED = 0.1  # a pixel so far from both the nearest and the farthest around it is on neither
+_TOWARDS_NONE = 0.002  # pull to no correction and the mean error, where nothing is known around
 _AROUND = np.ones((5, 5), np.uint8)
-_HIGHEST = 0.2  # confidence of the prior's pixels; known ones have more
-_EMPTY = 10.0  # logarithm of a depth that is farther than all
+_EMPTY = 2 * np.log(FAR_M)  # logarithm of a depth that is farther than all
 
 
 def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
@@ -57,8 +49,8 @@ def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
     deviates from known pixels nearby and the steeper it is; all known pixels have more.
     """
     known = (prior.value > 0) & ~prior.sky
-    above = np.where(maps.filled_m > 0, _HIGHEST + (1 - _HIGHEST) * maps.confidence, 0)
-    confidence = above.astype(np.float32)
+    above = MOST_CONFIDENCE + (1 - MOST_CONFIDENCE) * maps.confidence
+    confidence = np.where(maps.filled_m > 0, above, 0).astype(np.float32)
     measured = known & (maps.depth_m > 0)
     fit = fit_prior(prior.value[measured], maps.depth_m[measured], kind)
     if not fit.used:
@@ -66,18 +58,18 @@ def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
         return FullDepth(maps.filled_m, confidence, nothing, fit, prior.source)
     log_depth = _log_depth(prior.value, fit)
     usable = known & (log_depth < np.log(FAR_M))
-    usable &= ~_far_limit(prior.value, known, measured, fit)
+    usable &= ~_at_far_limit(prior.value, known, fit)
     guide = np.where(usable, log_depth, _EMPTY).astype(np.float32)
     guide = cv2.medianBlur(guide, 5).astype(np.float32)
     farther, nearer = cv2.dilate(guide, _AROUND) - guide, guide - cv2.erode(guide, _AROUND)
     correction, spread = _correction(maps.filled_m, log_depth, guide, farther + nearer, usable)
     full_m = np.exp(np.minimum(log_depth + correction, _EMPTY)).astype(np.float32)
-    usable &= (np.minimum(farther, nearer) < _MIXED) & (full_m < FAR_M)
+    usable &= (np.minimum(farther, nearer) < 2 * _USUAL) & (full_m < FAR_M)
     from_prior = usable & (maps.filled_m == 0)
-    error = np.hypot(spread, farther + nearer) / _TOLERANCE
+    error = np.hypot(spread, farther + nearer) / _USUAL
     return FullDepth(
         np.where(from_prior, full_m, maps.filled_m),
-        np.where(from_prior, _HIGHEST / (1 + error), confidence).astype(np.float32),
+        np.where(from_prior, MOST_CONFIDENCE / (1 + error), confidence).astype(np.float32),
         from_prior,
         fit,
         prior.source,
@@ -99,13 +91,13 @@ def _fitted(form: str, p: Float, z: Float) -> PriorFit:
     values are not, and a wrong tenth of them moves no median."""
     if len(z) < _MIN_FITTED:
         return PriorFit(form, 0.0, 0.0, np.inf, 1.0, False)
-    step = np.floor(np.log(z / z.min()) / _STEP).astype(np.int64)
-    steps = np.flatnonzero(np.bincount(step) >= _LEAST_OF_STEP * len(z))
+    step = np.floor(np.log(z / z.min()) / _USUAL).astype(np.int64)
+    num = np.bincount(step)
+    steps = np.flatnonzero(num)
     middle_p = ndimage.median(p, step, steps)
     scale, shift = _line(form, middle_p, ndimage.median(z, step, steps))
     off = np.abs(_log_depth(p, PriorFit(form, scale, shift, np.inf, 1.0, False)) - np.log(z))
-    octave = np.floor(np.log2(z / z.min())).astype(np.int64)
-    weight = 1 / np.maximum(np.bincount(octave), _LEAST_OF_OCTAVE * len(z))[octave]
+    weight = 1 / np.sqrt(num)[step]
     residual = float(np.average(np.minimum(off, _WRONG), weights=weight))
     wrong = float(np.average(off > _WRONG, weights=weight))
     return PriorFit(form, scale, shift, residual, wrong, scale > 0 and wrong <= MAX_WRONG)
@@ -126,7 +118,7 @@ def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
         return A @ x - target
 
     start = np.linalg.lstsq(A, target, rcond=None)[0]
-    found = optimize.least_squares(residual, start, loss="soft_l1", f_scale=_TOLERANCE)
+    found = optimize.least_squares(residual, start, loss="soft_l1", f_scale=_USUAL)
     scale, shift = (float(x) for x in found.x)
     return (scale, shift - scale * np.log(unit)) if form == "log" else (scale / unit, shift)
 
@@ -140,18 +132,11 @@ def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
     return -of if fit.kind == "inverse" else of
 
 
-def _far_limit(value: Float32, known: Bool, measured: Bool, fit: PriorFit) -> Bool:
-    """Return (H,W) True where the prior has its farthest value, if many pixels have it and the
-    lidar saw few of these."""
+def _at_far_limit(value: Float32, known: Bool, fit: PriorFit) -> Bool:
+    """Return (H,W) True where the prior has its farthest value: many say so of the sky."""
     if not known.any():
         return known
-    limit = value[known].min() if fit.kind == "inverse" else value[known].max()
-    at_limit: Bool = known & (value == limit)
-    num = np.count_nonzero(at_limit)
-    many = num > _LIMIT_SHARE * value.size
-    if many and np.count_nonzero(at_limit & measured) < _LIMIT_SEEN * num:
-        return at_limit
-    return np.zeros(value.shape, bool)
+    return known & (value == (value[known].min() if fit.kind == "inverse" else value[known].max()))
 
 
 class _Cells(NamedTuple):
@@ -179,7 +164,7 @@ class _Cells(NamedTuple):
         number = np.arange(self.guide.size).reshape(self.guide.shape)
         first = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
         second = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
-        step = (self.guide.ravel()[first] - self.guide.ravel()[second]) / _EDGE
+        step = (self.guide.ravel()[first] - self.guide.ravel()[second]) / _USUAL
         tied = _SMOOTHNESS * np.exp(-(step**2))
         half = sparse.coo_array((tied, (first, second)), shape=(number.size, number.size))
         both = (half + half.T).tocsr()
@@ -194,7 +179,7 @@ class _Cells(NamedTuple):
         for row, row_weight in _both_ways(down, self.guide.shape[0]):
             for column, column_weight in _both_ways(right, self.guide.shape[1]):
                 place = np.ix_(row, column)
-                alike = np.exp(-(((guide - self.guide[place]) / _EDGE) ** 2)) + _LEAST_ALIKE
+                alike = np.exp(-(((guide - self.guide[place]) / _USUAL) ** 2)) + np.finfo(float).eps
                 weight = alike * np.outer(row_weight, column_weight)
                 total += weight
                 result += weight * grid[:, row[:, None], column]
@@ -215,26 +200,29 @@ def _correction(
     same surface still are from it; where none are near, no correction and the usual error."""
     cells = _Cells.over(guide)
     area, num = cells.size**2, cells.guide.size
-    near = usable & (filled_m > 0) & (np.abs(guide - cells.guide.ravel()[cells.of]) < _EDGE)
+    near = usable & (filled_m > 0) & (np.abs(guide - cells.guide.ravel()[cells.of]) < _USUAL)
     cell = cells.of[near]
     lacking = np.log(filled_m[near].astype(np.float64)) - log_depth[near]
-    # Where the prior is steep it may be blurred, and a difference there says little.
-    flat = 1 / (1 + (steepness[near].astype(np.float64) / _DOUBTFUL) ** 2)
-    membrane, off, trust = cells.membrane(), np.abs(lacking), flat
-    usual = float(np.average(off, weights=flat)) if len(off) else 0.0
-    for _ in range(_NUM_PASSES):
+    membrane = cells.membrane()
+
+    def at_rest(trust: Float, values: Float, elsewhere: float) -> Float:
+        """(RC,) where the membrane comes to rest if known pixels pull it to their values."""
         tied = np.bincount(cell, trust, num) / area + _TOWARDS_NONE
-        correction = _settled(membrane, tied, np.bincount(cell, trust * lacking, num) / area)
-        off = np.abs(lacking - correction[cell])
-        trust = flat / (1 + (off / _DOUBTFUL) ** 2)
-    tied, deviation = (np.bincount(cell, w, num) / area for w in (trust, trust * off))
-    spread = _settled(membrane, tied + _TOWARDS_NONE, deviation + _TOWARDS_NONE * usual)
+        pulled = np.bincount(cell, trust * values, num) / area + _TOWARDS_NONE * elsewhere
+        system = (membrane + sparse.diags_array(tied)).tocsc()
+        rest: Float = linalg.spsolve(system, pulled, permc_spec="MMD_AT_PLUS_A")
+        return rest
+
+    def trusted(off: Float | Float32) -> Float:
+        """(N,) weight of known pixels that are so far from what is expected."""
+        weight: Float = 1 / (1 + (off.astype(np.float64) / (2 * _USUAL)) ** 2)
+        return weight
+
+    # Where the prior is steep it may be blurred, and a difference there says little.
+    flat = trusted(steepness[near])
+    mean = float(np.average(np.abs(lacking), weights=flat)) if len(flat) else 0.0
+    trust = flat * trusted(lacking - at_rest(flat, lacking, 0.0)[cell])
+    correction = at_rest(trust, lacking, 0.0)
+    spread = at_rest(trust, np.abs(lacking - correction[cell]), mean)
     at_pixels = cells.at_pixels(np.stack([correction, spread]), guide)
     return at_pixels[0], at_pixels[1]
-
-
-def _settled(membrane: sparse.csr_array, tied: Float, pulled: Float) -> Float:
-    """Return where the membrane comes to rest if each cell is pulled to ``pulled / tied``."""
-    system = (membrane + sparse.diags_array(tied)).tocsc()
-    at_rest: Float = linalg.spsolve(system, pulled, permc_spec="MMD_AT_PLUS_A")
-    return at_rest

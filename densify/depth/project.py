@@ -31,7 +31,7 @@ from densify.geometry.types import Camera, Cloud, DepthMap, Float32, Patches, Ra
 _BLOCK_PX = 16  # over which rays lie about equally dense
 _JUMP = 1.6  # by which rays lie farther apart beyond the last of a scanner's denser rings
 _MOST_CONTRADICTED = 0.7  # of the pixels around; of what more contradicted, half or more was wrong
-_LEAST_CONFIDENCE = np.float32(1 / 255)  # 0 means no depth once written as 8 bits
+_LEAST_CONFIDENCE = np.float32(1) / np.iinfo(np.uint8).max  # 0 means no depth once written
 
 
 def project(
