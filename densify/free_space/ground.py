@@ -17,19 +17,10 @@ ABOVE_GROUND_M = 0.2
 """Points lower than this above the ground are part of it: they start no motion."""
 CELL_M = 1.0  # smaller cells follow kerbs, larger ones bridge holes
 MAX_SLOPE = 0.15  # rise per metre; steeper surfaces are objects
-_LOW_OUTLIER_M = 0.4
-_GROUND_M = 0.15  # points this close to the lowest point belong to the ground
-_NARROW_M, _HUMP_M = 7.0, 0.2  # a hump that is narrower and higher is not ground
-_FEW = 3.0  # points in and around a cell are too few for a mean
+_WINDOW = 7  # cells; a hump that is narrower is not ground, nor a pit
 
-_NUM_SWEEPS = 5
-_NEAR_M = 30.0
-_NUM_POINTS, _NUM_TRIES = 1000, 200
-_CLOSE_M, _BELOW_M = 0.1, 0.3
-_MAX_SHARE_BELOW = 0.03  # of the points; more lie below the plane of a wall or a roof
-_LEAST_SHARE = 0.1
-_UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
-_MAX_LEAN_RAD, _MIN_LEAN_RAD = np.deg2rad([50.0, 6.0])  # less is the road's slope, or load
+_NUM_POINTS, _NUM_TRIES = 2000, 200
+_LEAST_SHARE = 0.1  # on a ground plane, beyond those below it
 
 
 def ground(stretch: Stretch) -> HeightMap:
@@ -53,8 +44,8 @@ class HeightMap:
         """Find the ground under point clouds.
 
         The second lowest point of a cell is its ground (the lowest may be a stray reflection). A
-        cell far below the median of its neighbours is repaired. The slope limit then cuts cars and
-        walls away, and humps are removed. The points near this lower hull are averaged.
+        cell below all slopes from the median around it is repaired. The slope limit then cuts cars
+        and walls away, and humps are removed. The points near this lower hull are averaged.
 
         clouds: (N,3) each, metres, z up, at least one point in all.
         """
@@ -72,9 +63,9 @@ class HeightMap:
         nearest = ndimage.distance_transform_edt(
             ~known, return_distances=False, return_indices=True
         )
-        around = ndimage.median_filter(heights[tuple(nearest)], 5)
-        heights = np.where(known & (heights < around - _LOW_OUTLIER_M), around, heights)
-        heights = _slope_limited(heights, MAX_SLOPE * CELL_M)
+        around, rise_m = ndimage.median_filter(heights[tuple(nearest)], _WINDOW), MAX_SLOPE * CELL_M
+        heights = np.where(known & (heights < around - rise_m * (_WINDOW // 2)), around, heights)
+        heights = _slope_limited(heights, rise_m)
         hull = HeightMap(_without_humps(heights[tuple(nearest)]), low, CELL_M)
         return HeightMap(_averaged(hull, clouds), low, CELL_M)
 
@@ -114,17 +105,15 @@ def _averaged(hull: HeightMap, clouds: Sequence[Float]) -> Float:
     The hull itself is lower where more points were measured; an object that drives from one such
     place to another must not climb.
     """
-    number = np.zeros(hull.heights_m.shape, np.int64)
-    total = np.zeros(hull.heights_m.shape)
+    total, number = np.zeros((2, *hull.heights_m.shape))
     for points in clouds:
         over_m = points[:, 2] - hull.under(points)
-        rows = np.flatnonzero(np.abs(over_m) < _GROUND_M)
+        rows = np.flatnonzero(np.abs(over_m) < MAX_SLOPE * CELL_M)
         cells = _cells(points[rows], hull.low_m)
         np.add.at(number, cells, 1)
         np.add.at(total, cells, over_m[rows])
-    number = ndimage.uniform_filter(number.astype(float), 3, mode="constant") * 9
-    total = ndimage.uniform_filter(total, 3, mode="constant") * 9
-    mean: Float = hull.heights_m + np.where(number >= _FEW, total / np.maximum(number, 1), 0.0)
+    total, number = (ndimage.uniform_filter(n, 3, mode="constant") * 9 for n in (total, number))
+    mean: Float = hull.heights_m + total / np.maximum(number, 1)
     return mean
 
 
@@ -134,9 +123,8 @@ def _without_humps(heights: Float) -> Float:
     Morphological opening: Zhang et al., "A Progressive Morphological Filter for Removing Nonground
     Measurements from Airborne LIDAR Data", TGRS 2003.
     """
-    size = round(_NARROW_M / CELL_M)
-    opened = ndimage.grey_opening(heights, (size, size))
-    return np.where(heights - opened > _HUMP_M, opened, heights)
+    opened = ndimage.grey_opening(heights, (_WINDOW, _WINDOW))
+    return np.where(heights - opened > ABOVE_GROUND_M, opened, heights)
 
 
 def _slope_limited(heights: Float, rise: float) -> Float:
@@ -152,51 +140,47 @@ def _slope_limited(heights: Float, rise: float) -> Float:
 def find_upright(sweeps: Sequence[Sweep]) -> Float:
     """Return (3,3) ``R_level_lidar``, which turns the lidar's axes so that z is up.
 
-    The ground plane is found by RANSAC within 30 m (Fischler, Bolles, "Random sample consensus",
-    1981), as the median over at most five of the sweeps. A lidar is upside down where no sweep has
-    a ground below and some have one above. The identity is returned for less than 6 degrees, or
-    where no sweep shows a ground: a height map follows such slopes.
+    The ground plane is found by RANSAC (Fischler, Bolles, "Random sample consensus", 1981): most
+    points are on it, few below it, and the lidar is above it. A lidar is upside down if the ground
+    is found that way alone. The identity is returned where there is no ground, and for half the
+    slope that a height map follows.
     """
-    chosen = sweeps[:: max(1, len(sweeps) // _NUM_SWEEPS)][:_NUM_SWEEPS]
-    for R_hung_lidar in (np.eye(3), _UPSIDE_DOWN):
-        turned = (sweep.points @ R_hung_lidar.T for sweep in chosen)
-        normals = [n for n in map(_ground_normal, turned) if n is not None]
-        if normals:
-            return _level(np.median(normals, axis=0)) @ R_hung_lidar
+    num = sum(map(len, sweeps)) // _NUM_POINTS + 1
+    points = np.concatenate([s.points[::num] for s in sweeps])
+    for R_hung_lidar in (np.eye(3), np.diag([1.0, -1.0, -1.0])):
+        up = _ground_normal(points @ R_hung_lidar.T)
+        if up is not None:
+            return _level(up) @ R_hung_lidar
     return np.eye(3)
 
 
 def _level(up: Float) -> Float:
-    """Return the smallest rotation (3,3) that turns this direction (3,) to z."""
-    up = up / np.linalg.norm(up)
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    lean_rad = float(np.arccos(np.clip(up[2], -1, 1)))
-    if lean_rad < _MIN_LEAN_RAD:
+    """Return the smallest rotation (3,3) that turns a unit vector (3,) to z."""
+    if np.hypot(*up[:2]) < 0.5 * MAX_SLOPE * up[2]:
         return np.eye(3)
-    R: Float = Rotation.from_rotvec(axis / np.linalg.norm(axis) * lean_rad).as_matrix()
+    R: Float = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
     return R
 
 
 def _ground_normal(points: Float) -> Float | None:
     """Return the (3,) unit normal of the ground plane, upwards; None where there is none."""
-    points = points[np.linalg.norm(points, axis=1) < _NEAR_M]
-    points = points[:: len(points) // _NUM_POINTS + 1]
     if len(points) < 3:
         return None
     rng = np.random.default_rng(0)
     a, b, c = points[rng.integers(len(points), size=(_NUM_TRIES, 3))].transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1)
-    normal, a = normal[length > 0] / length[length > 0, None], a[length > 0]
-    normal *= np.where(normal[:, 2] < 0, -1, 1)[:, None]
-    level = normal[:, 2] > np.cos(_MAX_LEAN_RAD)
-    normal, a = normal[level], a[level]
-    above = points @ normal.T - np.einsum("ij,ij->i", normal, a)
-    close = (np.abs(above) < _CLOSE_M).mean(axis=0)
-    close[(above < -_BELOW_M).mean(axis=0) > _MAX_SHARE_BELOW] = 0.0
-    if not len(close) or close.max() < _LEAST_SHARE:
+    normal *= np.where(normal[:, 2:] < 0, -1, 1)
+    level = normal[:, 2] > np.hypot(*normal[:, :2].T)  # rather a floor than a wall
+    normal = normal[level] / np.linalg.norm(normal[level], axis=1, keepdims=True)
+    from_origin = np.einsum("ij,ij->i", normal, a[level])
+    above = points @ normal.T - from_origin
+    on_plane = np.abs(above) < ABOVE_GROUND_M
+    share = np.where(from_origin < 0, on_plane.mean(axis=0), 0) - (above < -ABOVE_GROUND_M).mean(
+        axis=0
+    )
+    if share.max(initial=0) < _LEAST_SHARE:
         return None
-    on_plane = points[np.abs(above[:, int(np.argmax(close))]) < _CLOSE_M]
-    _, _, axes = np.linalg.svd(on_plane - on_plane.mean(axis=0), full_matrices=False)
+    ground = points[on_plane[:, np.argmax(share)]]
+    _, _, axes = np.linalg.svd(ground - ground.mean(axis=0), full_matrices=False)
     fitted: Float = axes[2] * np.sign(axes[2, 2])
     return fitted

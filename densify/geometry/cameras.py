@@ -29,11 +29,11 @@ from densify.geometry.types import Bool, Camera, Float, Float32
 
 NEAREST_M = 0.1
 _COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
-_NUM_RATIONAL = 8
-_STEP = 1e-6  # of differences, in radians or on the plane
+_RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # any others are 0
 _NUM_ANGLES = 4096
 _NUM_STEPS = 10  # of Newton's method
-_CONVERGED = 1e-10
+_STEP_RAD = np.cbrt(np.finfo(float).eps)  # of differences, where rounding costs least
+_CONVERGED = np.sqrt(np.finfo(float).eps)  # the next step of Newton's method is exact
 
 
 def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
@@ -89,8 +89,8 @@ def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     change = np.zeros((len(ray), 2, 3))
     for axis in (aside, np.cross(ray, aside)):  # along the ray nothing changes
-        there, back = (_pixels(camera, lens, ray + step * axis) for step in (_STEP, -_STEP))
-        change += ((there - back) / (2 * _STEP))[:, :, None] * axis[:, None, :]
+        there, back = (_pixels(camera, lens, ray + step * axis) for step in (_STEP_RAD, -_STEP_RAD))
+        change += ((there - back) / (2 * _STEP_RAD))[:, :, None] * axis[:, None, :]
     return change / range_m[:, :, None]
 
 
@@ -129,8 +129,8 @@ def _lens(camera: Camera) -> _Lens:
             f"{', '.join(_COEFFICIENTS)}; rectify the images if the lens is another"
         )
     lengths = _COEFFICIENTS[camera.model]
-    if len(given) not in lengths or not np.isfinite(given).all() or any(given[_NUM_RATIONAL:]):
-        expected = " or ".join(str(n) for n in lengths if n <= _NUM_RATIONAL)
+    if len(given) not in lengths or not np.isfinite(given).all() or any(given[len(_RATIONAL) :]):
+        expected = " or ".join(str(n) for n in lengths if n <= len(_RATIONAL))
         raise InputError(
             f"camera {camera.name}: distortion: expected {expected} finite coefficients of a "
             f"{camera.model} lens in their usual order, any others 0, got {list(given)}; correct "
@@ -143,7 +143,8 @@ def _lens(camera: Camera) -> _Lens:
         above = [1.0, *given[1:3]]
         p1, p2 = given[3:]
     else:
-        k1, k2, p1, p2, k3, *others = (*given, *[0.0] * _NUM_RATIONAL)[:_NUM_RATIONAL]
+        padded = (*given, *[0.0] * len(_RATIONAL))[: len(_RATIONAL)]
+        k1, k2, p1, p2, k3, *others = padded
         above, below = [1.0, k1, k2, k3], [1.0, *others]
     numerator, denominator = Polynomial(above), Polynomial(below)
     limit = _stops_growing(numerator, denominator)
@@ -241,21 +242,23 @@ def _unbent(lens: _Lens, wanted: Float) -> Float:
     far = np.hypot(*wanted.T)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         xy = wanted * np.where(far > 0, np.interp(far, bent, radius) / far, 1.0)[:, None]
-        left, found = np.arange(len(wanted)), np.zeros(len(wanted), bool)
+        left, off = np.arange(len(wanted)), np.full(len(wanted), np.inf)
         for _ in range(_NUM_STEPS):
-            off = np.column_stack(_bent(lens, *xy[left].T)) - wanted[left]
-            done = (np.abs(off) < _CONVERGED * (1 + far[left, None])).all(axis=1)
-            found[left[done]] = True
-            left, off = left[~done], off[~done]
-            (a, b), (c, d) = (_change(lens, xy[left], axis) for axis in np.eye(2))
-            step = np.stack([d * off[:, 0] - c * off[:, 1], a * off[:, 1] - b * off[:, 0]], axis=1)
-            xy[left] -= step / (a * d - b * c)[:, None]
-        found &= (xy**2).sum(axis=1) < lens.limit
+            apart = np.stack(_bent(lens, *xy[left].T)) - wanted[left].T
+            by_x, aside, by_y = _slopes(lens, *xy[left].T)
+            step = np.stack([by_y, -aside]) * apart[0] + np.stack([-aside, by_x]) * apart[1]
+            xy[left] -= (step / (by_x * by_y - aside**2)).T
+            off[left] = np.abs(apart).max(axis=0) / (1 + far[left])
+            left = left[~(off[left] < _CONVERGED)]
+        found = (off < _CONVERGED) & ((xy**2).sum(axis=1) < lens.limit)
     return np.where(found[:, None], xy, np.nan)
 
 
-def _change(lens: _Lens, xy: Float, axis: Float) -> Float:
-    """Return (2,N) the change of the bent coordinates along an axis of the plane."""
-    step = _STEP * np.maximum(1.0, np.abs(xy).max(axis=1, keepdims=True))
-    there, back = (np.stack(_bent(lens, *(xy + s * axis).T)) for s in (step, -step))
-    return (there - back) / (2 * step[:, 0])
+def _slopes(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float, Float]:
+    """Return (N,) changes of the bent x by x, of either by the other, and of the bent y by y."""
+    s, n, d = x**2 + y**2, lens.numerator, lens.denominator
+    factor = n(s) / d(s)
+    growth = 2 * (n.deriv()(s) - factor * d.deriv()(s)) / d(s)
+    by_x = factor + growth * x**2 + 2 * lens.p1 * y + 6 * lens.p2 * x
+    by_y = factor + growth * y**2 + 6 * lens.p1 * y + 2 * lens.p2 * x
+    return by_x, growth * x * y + 2 * (lens.p1 * x + lens.p2 * y), by_y

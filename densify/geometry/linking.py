@@ -10,8 +10,6 @@ from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
-_WITHIN = 1 - 1e-9  # rounding must not part the points of a cell
-
 
 def link(points: Float, distance_m: float) -> tuple[int, Int]:
     """Group points by single linkage: points closer than ``distance_m`` share a group.
@@ -24,7 +22,7 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
     """
     if not len(points):
         return 0, np.zeros(0, np.int64)
-    side_m = distance_m * _WITHIN / np.sqrt(3)
+    side_m = distance_m / np.sqrt(3)
     cell = np.floor((points - points.min(axis=0)) / side_m).astype(np.int64)
     cells, of_point = np.unique(cell, axis=0, return_inverse=True)
     of_point = of_point.ravel()
