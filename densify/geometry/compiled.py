@@ -28,7 +28,7 @@ import numba
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
-from densify.config.user_folder import others_can_write
+from densify.config.cache import others_can_write
 
 _log = logging.getLogger("densify")
 _progress = logging.getLogger("densify.progress")
