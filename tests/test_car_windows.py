@@ -1,23 +1,30 @@
 # SPDX-License-Identifier: MIT
-"""Car windows: closed on an analytic car, left open elsewhere, by a slow twin."""
+"""Car windows: closed on an analytic car whose window loses rays, left open elsewhere."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from test_project import T_CAM_LIDAR, make_camera
 
-from densify.depth.car_windows import close_windows
+from densify.depth.car_windows import close_windows, share_lost
+from densify.depth.exposure import Exposure
+from densify.free_space.range_image import RangeImage
 from tests.depth_layers import layers_of
+from tests.fired import fired
 
-FOCAL_PX, SHAPE = 720.0, (240, 320)
+SHAPE = (240, 320)
+CAMERA = make_camera(width=SHAPE[1], height=SHAPE[0], focal=720.0)
+EXPOSURE = Exposure(CAMERA, T_CAM_LIDAR)
 ROW, COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
-RIGHT, DOWN = (COLUMN - 160) / FOCAL_PX, (ROW - 80) / FOCAL_PX  # of rays, per metre of depth
+RIGHT, DOWN = ((x - c) / 720 for x, c in ((COLUMN, CAMERA.K[0, 2]), (ROW, CAMERA.K[1, 2])))
 
 
 def street_behind():
     """Ground 1.7 m below the camera, a wall at 25 m."""
-    with np.errstate(divide="ignore"):
-        return np.where(DOWN > 1.7 / 25, 1.7 / DOWN, 25.0)
+    return np.where(DOWN > 1.7 / 25, 1.7 / np.maximum(DOWN, 1e-9), 25.0)
 
 
 def side_m(yaw=0.3, lean=0.3):
@@ -26,95 +33,102 @@ def side_m(yaw=0.3, lean=0.3):
 
 
 def box(left_m, right_m, top_m, bottom_m):
-    """Where a rectangle at 8 m is, from the middle of the image's column and horizon."""
+    """Where a rectangle at 8 m is, from the middle of the image."""
     at = 8 * RIGHT, 8 * DOWN
     return (at[0] > left_m) & (at[0] < right_m) & (at[1] > top_m) & (at[1] < bottom_m)
 
 
-BODY, WINDOW = box(-1.6, 1.6, -0.5, 1.0), box(-0.5, 0.45, -0.38, 0.05)
+BODY, WINDOW = box(-1.6, 1.6, -0.9, 1.0), box(-0.5, 0.45, -0.6, 0.05)
 
 
-def car(rng, behind_m=0.6, seen=0.5):
-    """A car's side with a window, through which seats are seen."""
+def car(behind_m=0.6, seen=0.5):
+    """A car's side with a window, through which seats are seen in patches."""
     depth_m = np.where(BODY, side_m(), street_behind())
     seats = side_m() + behind_m + 0.1 * np.sin(COLUMN / 7)
-    some = (rng.random(SHAPE) < seen) & (np.abs(8 * RIGHT) > 0.15)
-    return np.where(WINDOW, np.where(some, seats, 0), depth_m)
+    return np.where(WINDOW, np.where(np.sin(COLUMN / 9) > 1 - 2 * seen, seats, 0), depth_m)
 
 
-def test_a_window_gets_the_plane_of_its_frame():
-    layers = layers_of(car(np.random.default_rng(1)))
-    closed = close_windows(layers, FOCAL_PX)
+def lost_at(where, share):
+    """The function of the share of rays that are lost: ``share`` at the pixels ``where``."""
+
+    def lost(points):
+        column, row = np.rint(EXPOSURE.see(points, np.zeros_like(points)).uv).astype(int).T
+        return np.where(where[row, column], share, 0.02)
+
+    return lost
+
+
+def test_a_window_that_loses_rays_gets_the_plane_of_its_rim():
+    layers = layers_of(car())
+    closed = close_windows(layers, EXPOSURE, lost_at(WINDOW, 0.5))
     right = np.abs(closed.filled_m / side_m() - 1) < 0.01
-    assert right[WINDOW].mean() > 0.98  # a few corners of two pixels are left
-    assert closed.glass is not None
+    assert right[WINDOW].all()
+    assert closed.glass is not None and closed.solid is not None
     np.testing.assert_array_equal(closed.glass, (layers.depth_m > 0) & (closed.depth_m == 0))
-    assert (closed.glass == (layers.depth_m > 0))[WINDOW].mean() > 0.98
-    np.testing.assert_allclose(closed.confidence[right & WINDOW], 0.4)
+    np.testing.assert_array_equal(closed.glass, (layers.depth_m > 0) & WINDOW)
+    np.testing.assert_array_equal(closed.solid, WINDOW)
+    np.testing.assert_allclose(closed.confidence[WINDOW], 0.4)
     for before, after in ((layers.depth_m, closed.depth_m), (layers.filled_m, closed.filled_m)):
         np.testing.assert_array_equal(after[~WINDOW], before[~WINDOW])
 
 
 def test_so_does_one_through_which_the_street_beyond_is_seen():
-    rng = np.random.default_rng(6)
-    depth_m = np.where(WINDOW, street_behind(), car(rng))
-    layers = layers_of(np.where(rng.random(SHAPE) < 0.5, depth_m, 0))
-    closed = close_windows(layers, FOCAL_PX)
-    right = np.abs(closed.filled_m / side_m() - 1) < 0.01
-    assert right[WINDOW].mean() > 0.98
-    known = ~WINDOW & (layers.filled_m > 0)
-    np.testing.assert_array_equal(closed.filled_m[known], layers.filled_m[known])
-
-
-def test_a_window_without_a_measured_roof_is_closed_between_its_pillars():
-    """Thin roofs are seldom measured over their whole length."""
-    rng = np.random.default_rng(7)
-    roof = box(-9, 9, -9, -0.38) & ~box(-0.62, -0.45, -9, 9) & ~box(0.4, 0.57, -9, 9)
-    layers = layers_of(np.where(roof & BODY, 0, car(rng)))
-    closed = close_windows(layers, FOCAL_PX)
-    right = np.abs(closed.filled_m / side_m() - 1) < 0.01
-    assert right[WINDOW].mean() > 0.7 > (layers.filled_m > 0)[WINDOW].mean()
-    assert not closed.filled_m[box(-9, 9, -9, -0.53)][
-        layers.filled_m[box(-9, 9, -9, -0.53)] == 0
-    ].any()
+    layers = layers_of(np.where(WINDOW, street_behind(), car()))
+    closed = close_windows(layers, EXPOSURE, lost_at(WINDOW, 0.4))
+    assert (np.abs(closed.filled_m / side_m() - 1) < 0.01)[WINDOW].all()
 
 
 def test_what_glass_itself_sent_back_stays_measured():
-    rng = np.random.default_rng(2)
-    depth_m = car(rng)
-    pane = WINDOW & (rng.random(SHAPE) < 0.12)
+    depth_m = car()
+    pane = box(-0.4, 0.35, -0.5, -0.05) & (np.sin(ROW / 5) > 0.5) & (np.sin(COLUMN / 5) > 0.5)
     depth_m[pane] = side_m()[pane]
-    closed = close_windows(layers_of(depth_m), FOCAL_PX)
+    closed = close_windows(layers_of(depth_m), EXPOSURE, lost_at(WINDOW, 0.5))
     np.testing.assert_array_equal(closed.depth_m[pane], depth_m[pane].astype(np.float32))
-    assert (closed.depth_m[WINDOW & ~pane] == 0).mean() > 0.98
+    assert not closed.depth_m[WINDOW & ~pane].any()
 
 
-def no_window(kind, rng):
-    if kind == "a wall far behind":
-        return np.where(BODY & ~WINDOW, side_m(), side_m() + 35)
-    if kind == "a truck's open bed":
-        return np.where(BODY & ~box(-1.3, 1.3, -9, 0.3), side_m(), side_m() + 1.5)
+def no_window(kind):
+    """A map, where rays are lost in it, and their share."""
+    if kind == "a gap through which all rays go":
+        return car(), WINDOW, 0.03
+    if kind == "a hole in paint as dark":
+        return car(), BODY, 0.5
+    if kind == "a rim that lies in no plane":
+        rough_m = side_m() + np.sin(COLUMN / 8) * np.sin(ROW / 8)
+        return np.where(WINDOW, side_m() + 2, rough_m), WINDOW, 0.5
     if kind == "an open door":
-        return np.where(box(-0.5, 0.45, -0.4, 9), side_m() + 0.8, side_m())
-    if kind == "a gap between two cars":
-        return np.where(box(-0.3, 0.3, -9, 9), side_m() + 1.2, np.where(BODY, side_m(), 25))
-    if kind == "a tree's crown":
-        return 8 + rng.uniform(-1.5, 1.5, SHAPE)
-    if kind == "a shallow recess":
-        return np.where(WINDOW, side_m() + 0.15, side_m())
+        return np.where(box(-0.5, 0.45, -0.4, 9), side_m() + 0.8, side_m()), WINDOW, 0.5
+    if kind == "a gap smaller than a ray":
+        tiny = box(0, 0.024, 0, 0.024)
+        return np.where(tiny, 0, side_m()), tiny, 1.0
     assert kind == "the plain street"
-    return street_behind()
+    return street_behind(), ROW > 0, 0.3
 
 
 @pytest.mark.parametrize(
     "kind",
-    ["a wall far behind", "a truck's open bed", "an open door", "a gap between two cars"]
-    + ["a tree's crown", "a shallow recess", "the plain street"],
+    ["a gap through which all rays go", "a hole in paint as dark", "a rim that lies in no plane"]
+    + ["an open door", "a gap smaller than a ray", "the plain street"],
 )
 def test_what_is_no_window_is_left(kind):
-    rng = np.random.default_rng(3)
-    depth_m = np.where(rng.random(SHAPE) < 0.6, no_window(kind, rng), 0)
+    depth_m, where, share = no_window(kind)
     layers = layers_of(depth_m)
-    closed = close_windows(layers, FOCAL_PX)
+    closed = close_windows(layers, EXPOSURE, lost_at(where, share))
     np.testing.assert_array_equal(closed.depth_m, layers.depth_m)
     np.testing.assert_array_equal(closed.filled_m, layers.filled_m)
+
+
+def test_it_is_known_where_a_turning_scanner_lost_its_rays():
+    registered = fired("hdl64", share_heard=0.97)
+    points = registered.sweep.points
+    ahead = abs(np.arctan2(points[:, 1], points[:, 0])) < 0.06
+    heard = replace(registered, sweep=registered.sweep.select(~ahead))
+    lost = share_lost(RangeImage.of(heard))
+    azimuth = np.array([0.0, 0.3])
+    there = np.stack([9 * np.cos(azimuth), 9 * np.sin(azimuth), [-1.0, -1.0]], axis=1)
+    in_gap, beside = lost(there)
+    assert in_gap == 1 and beside < 0.3
+
+
+def test_of_a_scanner_without_order_nobody_knows():
+    assert share_lost(RangeImage.of(fired("rosette"))) is None

@@ -12,6 +12,7 @@ from test_project import KEY, T_CAM_LIDAR, make_camera, make_cloud, patches_of
 from test_seen_through import fired
 
 from densify.config import ProjectSettings
+from densify.depth import hulls
 from densify.depth import moving_bodies as stage
 from densify.depth.exposure import Exposure
 from densify.depth.moving_bodies import moving_bodies
@@ -128,8 +129,8 @@ def test_lines_cross_a_hull_where_sampling_finds_them():
     rng = np.random.default_rng(4)
     corners = rng.normal(size=(30, 3))
     start, way = rng.normal(size=(200, 3)) * 3, rng.normal(size=(200, 3)) * 3
-    enter, leave = stage._crossing(stage._half_spaces(corners), start, way)
-    assert not (stage._passes_near(corners, start, way) < (enter < leave)).any()
+    enter, leave = hulls.crossing(hulls.half_spaces(corners), start, way)
+    assert not (hulls.passes_near(corners, start, way) < (enter < leave)).any()
     t, inside = np.linspace(-3, 3, 6001), Delaunay(corners[ConvexHull(corners).vertices])
     for i in range(len(start)):
         on = t[inside.find_simplex(start[i] + t[:, None] * way[i]) >= 0]
@@ -159,6 +160,23 @@ def test_a_smooth_offset_is_the_least_of_its_sum():
     found = stage._smooth(offset, known, inside)
     for _ in range(50):
         assert cost(found + np.where(inside, rng.normal(0, 0.01, inside.shape), 0)) > cost(found)
+
+
+def test_only_what_lies_far_behind_the_front_is_inside():
+    cloud, rays = scanned(lambda y, z: within(y, z, DOOR), lambda y, z: np.zeros(len(y), bool))
+    body, exposure = moving_bodies(cloud, rays)[0], Exposure(CAMERA, T_CAM_LIDAR)
+    shape, middle = (CAMERA.height_px, CAMERA.width_px), (CAMERA.height_px // 2, 210)
+    for depth_m, inside in ((10.1, False), (11.0, True)):
+        far = stage.far_inside([body], exposure, np.full(shape, depth_m, np.float32))
+        assert far[middle] == inside and not far[0].any()
+
+
+def test_a_body_without_a_sweep_has_none_of_its_rays():
+    cloud, rays = scanned(lambda y, z: within(y, z, DOOR), lambda y, z: np.zeros(len(y), bool))
+    body = moving_bodies(cloud, rays)[0]
+    others = body.without(KEY)
+    assert set(others.frame) == set(body.frame) - {KEY}
+    assert len(others.entries) == len(others.ends) == len(others.weight) == len(others.frame)
 
 
 @pytest.mark.parametrize("num", [3, 40])

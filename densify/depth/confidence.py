@@ -37,20 +37,20 @@ from densify.scores.depth_metrics import (
 
 DECADES = 5.0
 """Confidence 1 is one wrong pixel in 10^5, each fifth less ten times as many."""
+_RAGGED = np.array([0.1, 0.5])
 GROUPS = tuple(
     f"{how}, rough from {ragged:g}"
     for how in ("window", "beyond", "filled")
-    for ragged in (0, 0.1, 0.5)
+    for ragged in (0, *_RAGGED)
 )
 """How pixels came to their depth, and the share of what is measured around that is at edges."""
 CAUSES = ("anyway", "contradicted")
 """Shares that are wrong: anyway, and for each whole by which a place is contradicted."""
 NUM_RANKS = 200
-NUM_MEASURED = 6
+NUM_MEASURED = sum(not group.startswith("filled") for group in GROUPS)
 """Groups of measured pixels; the others are of filled ones."""
 
 _FILE = Path(__file__).with_name("confidence.json")
-_RAGGED = np.array([0.1, 0.5])
 _AROUND = 4.0  # gaps between rays to all sides
 _TILT = 0.01  # decades over all ranks: pixels of different rank keep a different confidence
 _NUM_STEPS = 20

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import ConvexHull, KDTree, QhullError
@@ -26,19 +27,18 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from densify.depth.boundary_pixels import MOST_CONFIDENCE, VOTERS_REACH, voted_for
 from densify.depth.exposure import Exposure
 from densify.depth.fill import FILL_CONFIDENCE
+from densify.depth.hulls import crossing, half_spaces, passes_near
+from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
 from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
-from densify.depth.seen_through import Rays
+from densify.depth.seen_through import RAY_BLUR, Rays
 from densify.geometry import cameras, poses
 from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.types import Cloud
 
 _AROUND_M, _LEAST_AROUND = 0.25, 6  # a point of the body has six others of it around
-_LEAST_SEEN = 3  # points of a sweep that tell where the body was
-_MOVED_M = 2.0  # the scanner moves on during a sweep
 _POSE_M = 0.03  # standard deviation of the pose of the body
 _LIMBS_S = 0.1  # from the key, over which limbs keep their places
-_BLUR = 0.35  # gaps between rays over which a ray counts
 _PRIOR = 0.05  # rays that end on the body, assumed everywhere
 _WHOLE = 0.8  # share of its front at which a body is closed as a whole, as a car is
 _LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # rays that end on it: a third do at a pane
@@ -46,7 +46,6 @@ _VOTES_OF_WHOLE, _VOTES_OF_OPEN = 0.75, 0.97  # along the outline
 _DEEP_M = 0.6  # farther behind the front of the hull lie seats, axles and the far side
 _STIFF, _HELD = 3.0, 0.01  # weights of a smooth and of a small offset, against one return
 _AGREES = 2.0  # times what two static points of a surface may deviate
-_BEFORE_M, _BEFORE_FRACTION = 0.3, 0.02  # nearer by both added: it hides the body
 
 
 class MovingBody(NamedTuple):
@@ -55,7 +54,8 @@ class MovingBody(NamedTuple):
     corners: (V,3) of its convex hull. velocity_m_s: (3,). entries: (K,3) where rays enter the hull.
     ends: (K,) True if the ray ends on the object, False if it goes through. weight: (K,) of the
     ray: less long before or after the key, and where it passes just below the surface of the hull;
-    0 where it ends on the object, but far behind the front: at wheels, below a trailer.
+    0 where it ends on the object, but far behind the front: at wheels, below a trailer. frame: (K,)
+    of its sweep.
     """
 
     corners: Float
@@ -63,6 +63,17 @@ class MovingBody(NamedTuple):
     entries: Float
     ends: Bool
     weight: Float
+    frame: NDArray[np.integer]
+
+    def without(self, frame: int) -> MovingBody:
+        """Return the body without the rays of one sweep."""
+        kept = self.frame != frame
+        return self._replace(
+            entries=self.entries[kept],
+            ends=self.ends[kept],
+            weight=self.weight[kept],
+            frame=self.frame[kept],
+        )
 
 
 def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
@@ -79,7 +90,7 @@ def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
         sweep = _Sweep.of(cloud, rays, frame)
         for k in met:
             seen = own[k].frame == frame
-            if seen.sum() >= _LEAST_SEEN:
+            if seen.any():
                 T_key_there = poses.fit_rigid(own[k].rigid_points[seen], own[k].points[seen])
                 met[k].append(sweep.met(k, corners[k], T_key_there))
     return {
@@ -102,50 +113,23 @@ def _corners(points: Float) -> Float:
         return points[:0]
 
 
-def _half_spaces(corners: Float) -> Float:
-    """Return (F,4) normal n and offset d of a hull's sides; n · x + d ≤ 0 inside."""
-    return np.unique(ConvexHull(corners).equations, axis=0)
-
-
-def _crossing(spaces: Float, start: Float, way: Float) -> tuple[Float, Float]:
-    """Return (K,) the t at which lines start + t · way enter and leave a convex body; a line that
-    misses it leaves before it enters. spaces: (F,4). start: (K,3) or (3,). way: (K,3)."""
-    enter, leave = np.full(len(way), -np.inf), np.full(len(way), np.inf)
-    for side in spaces:
-        slope, outside = way @ side[:3], start @ side[:3] + side[3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = -outside / slope
-        np.maximum(enter, t, out=enter, where=slope < 0)
-        np.minimum(leave, t, out=leave, where=slope > 0)
-        leave[(slope == 0) & (outside > 0)] = -np.inf
-    return enter, leave
-
-
-def _passes_near(corners: Float, start: Float, way: Float) -> Bool:
-    """Return (K,) True where lines come within the sphere around the corners (V,3)."""
-    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    radius_m = np.linalg.norm(corners - middle, axis=1).max()
-    off = np.linalg.norm(np.cross(start - middle, way), axis=1)
-    near: Bool = off <= radius_m * np.linalg.norm(way, axis=1)
-    return near
-
-
 class _Met(NamedTuple):
     """Rays that meet a hull; the columns are those of `MovingBody`."""
 
     entries: Float
     ends: Bool
     weight: Float
+    frame: NDArray[np.integer]
 
 
-_NOT_MET = _Met(np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0))
+_NOT_MET = _Met(np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0), np.zeros(0, np.int32))
 
 
 class _Sweep(NamedTuple):
     """The returns of one sweep, key frame.
 
     origin: (3,) of the scanner at the reference time. azimuth: (N,) radians, seen from there.
-    range_m: (N,) level distance from there.
+    range_m: (N,) level distance from there. moved_m: by the scanner from there, at most.
     """
 
     cloud: Cloud
@@ -153,13 +137,15 @@ class _Sweep(NamedTuple):
     origin: Float
     azimuth: Float
     range_m: Float
+    moved_m: float
 
     @staticmethod
     def of(cloud: Cloud, rays: Rays, frame: int) -> _Sweep:
         part = cloud.select(cloud.frame == frame)
         origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
         x, y = (part.rigid_points - origin)[:, :2].T
-        return _Sweep(part, rays, origin, np.arctan2(y, x), np.hypot(x, y))
+        moved_m = np.linalg.norm(rays.starts(part) - origin, axis=1).max(initial=0)
+        return _Sweep(part, rays, origin, np.arctan2(y, x), np.hypot(x, y), float(moved_m))
 
     def met(self, instance: int, corners: Float, T_key_there: Float) -> _Met:
         """Return the rays that meet a hull, entering it where it is at the key.
@@ -169,9 +155,9 @@ class _Sweep(NamedTuple):
         part = self.cloud.select(self._toward(poses.transform(poses.inverse(T_key_there), corners)))
         start = poses.transform(T_key_there, self.rays.starts(part))
         way = poses.transform(T_key_there, part.rigid_points) - start
-        near, spaces = _passes_near(corners, start, way), _half_spaces(corners)
+        near, spaces = passes_near(corners, start, way), half_spaces(corners)
         part, start, way = part.select(near), start[near], way[near]
-        enter, leave = _crossing(spaces, start, way)
+        enter, leave = crossing(spaces, start, way)
         meets = (enter > 0) & (enter < np.minimum(leave, 1))
         part, start, way, enter = part.select(meets), start[meets], way[meets], enter[meets]
         middle = start + (enter + np.minimum(leave[meets], 1))[:, None] / 2 * way
@@ -180,13 +166,13 @@ class _Sweep(NamedTuple):
         weight = np.exp(-abs(part.since_key_ns) * 1e-9 / _LIMBS_S)
         weight[~ends] *= 1 - np.exp(-0.5 * (np.maximum(below_m[~ends], 0) / _POSE_M) ** 2)
         weight[ends & ((1 - enter) * np.linalg.norm(way, axis=1) > _DEEP_M)] = 0
-        return _Met(start + enter[:, None] * way, ends, weight)
+        return _Met(start + enter[:, None] * way, ends, weight, part.frame)
 
     def _toward(self, corners: Float) -> Bool:
         """Return (N,) True for all returns whose rays may meet a hull with these corners (V,3)."""
         x, y = (corners - self.origin)[:, :2].T
         middle_x, middle_y = x.mean(), y.mean()
-        radius_m = np.hypot(x - middle_x, y - middle_y).max() + _MOVED_M
+        radius_m = np.hypot(x - middle_x, y - middle_y).max() + self.moved_m
         range_m = np.hypot(middle_x, middle_y)
         aside = self.azimuth - np.arctan2(middle_y, middle_x)
         aside = abs((aside + np.pi) % (2 * np.pi) - np.pi)
@@ -217,6 +203,19 @@ def close_bodies(
             part = layers.part(front.box)
             solid[front.box] |= _close(part, cloud, exposure, rows, body, front)
     return replace(layers, solid=solid if layers.solid is None else layers.solid | solid)
+
+
+def far_inside(bodies: Iterable[MovingBody], exposure: Exposure, depth_m: Float32) -> Bool:
+    """Return (H,W) True where a depth (H,W) lies far behind the front of a body: behind its glass,
+    or where the hull is not tight."""
+    far = np.zeros(depth_m.shape, bool)
+    for body in bodies:
+        front = _Front.of(body, exposure, 0)
+        if front is not None:
+            far[front.box] |= (front.inverse > 0) & (
+                depth_m[front.box] * front.inverse > 1 + _DEEP_M * front.inverse
+            )
+    return far
 
 
 def outlines(bodies: Iterable[MovingBody], exposure: Exposure) -> Bool:
@@ -254,7 +253,7 @@ class _Front(NamedTuple):
         row, column = np.mgrid[low[1] : high[1], low[0] : high[0]]
         uv = np.column_stack([column.ravel(), row.ravel()]).astype(np.float64)
         ray = cameras.rays(camera, uv)
-        enter, leave = _crossing(_half_spaces(sight.points_cam), np.zeros(3), ray)
+        enter, leave = crossing(half_spaces(sight.points_cam), np.zeros(3), ray)
         inside = (enter > 0) & (enter < leave)
         depth_m = exposure.depth_m(np.where(inside, enter, 1)[:, None] * ray)
         inside &= depth_m > cameras.NEAREST_M
@@ -275,10 +274,10 @@ class _Front(NamedTuple):
 
     def closed(self, body: MovingBody, exposure: Exposure, spacing_px: Float32) -> Float:
         """Return (h,w) the share of the rays that end on the body, of those that enter there."""
-        blur_px = np.maximum(_BLUR * np.median(spacing_px, axis=(0, 1)), 1.0)
+        blur_px = np.maximum(RAY_BLUR * np.median(spacing_px, axis=(0, 1)), 1.0)
         at = self.pixels(exposure, body.entries, _each(body.velocity_m_s, body.entries))
         front_m = 1 / np.maximum(self.inverse[at.place], 1e-6)
-        faces = at.depth_m < front_m + _BEFORE_M + _BEFORE_FRACTION * front_m
+        faces = at.depth_m < front_m + HIDDEN_M + HIDDEN_FRACTION * front_m
         counts = np.zeros((2, *self.inverse.shape))
         ends = body.ends[at.which].astype(np.int64)
         np.add.at(counts, (ends, *at.place), np.where(faces, body.weight[at.which], 0))
@@ -351,7 +350,7 @@ def _shown(
     """
     inside, now_m, surface_m = share > 0, layers.filled_m, (1 / surface).astype(np.float32)
     whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
-    before = (now_m > 0) & (now_m < surface_m - _BEFORE_M - _BEFORE_FRACTION * surface_m)
+    before = (now_m > 0) & (now_m < surface_m - HIDDEN_M - HIDDEN_FRACTION * surface_m)
     closed = share >= (_LEAST_OF_WHOLE if whole else _LEAST_OF_OPEN)
     core = _well_inside(closed, float(np.median(layers.gap_px[inside]))) & ~before
     moves = (layers.depth_m > 0) & cloud.moving[layers.point]

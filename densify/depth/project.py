@@ -7,7 +7,7 @@ where depth is the range.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from densify.depth.measured_pixels import MeasuredPixels, nearest_pixels, visibl
 from densify.depth.moving_bodies import MovingBody, close_bodies
 from densify.depth.seen_through import Rays, without_seen_through
 from densify.depth.spots import measure_spots
-from densify.geometry.types import Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
+from densify.geometry.types import Camera, Cloud, DepthMap, Float, Float32, Patches, Ranked, Reason
 
 _BLOCK_PX = 16  # over which rays lie about equally dense
 _JUMP = 1.6  # by which rays lie farther apart beyond the last of a scanner's denser rings
@@ -42,6 +42,7 @@ def project(
     filled: bool = True,
     lab: Float32 | None = None,
     rays: Rays | None = None,
+    share_lost: Callable[[Float], Float] | None = None,
     bodies: Mapping[int, MovingBody] | None = None,
 ) -> DepthMap:
     """Return the depth map of a cloud as a camera sees it.
@@ -50,7 +51,8 @@ def project(
     then. settings: knobs; without ``visibility`` the nearest point of each pixel is taken as it is.
     patches: of the cloud. filled: False leaves out the fill. lab: (H,W,3) the image in L*a*b*;
     without it no boundary pixel is accepted. rays: of the window; without them no pixel is taken
-    out as seen through.
+    out as seen through. share_lost: of `densify.depth.car_windows.share_lost`; without it no window
+    is closed. bodies: of moving objects, by instance.
     """
     view, camera, visible = exposure.sees(cloud), exposure.camera, settings.visibility
     points = points_in_image(cloud, view, patches, vetoed=visible)
@@ -64,8 +66,8 @@ def project(
     layers = accept_boundary_pixels(_layers_of(pixels, points, camera, lab), settings.rims)
     if filled:
         layers = fill(layers, settings.fill_reach)
-        if visible and settings.glass == "plane":
-            layers = close_windows(layers, camera.focal_px)
+        if visible and share_lost is not None and settings.glass == "plane":
+            layers = close_windows(layers, exposure, share_lost)
         layers = without_shreds(fill_stars(layers))
         if visible and bodies:
             layers = close_bodies(layers, cloud, exposure, bodies)

@@ -9,7 +9,6 @@ evidence as in occupancy grids: Thrun et al., "Probabilistic Robotics", 2005, ch
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,17 +18,14 @@ from scipy import ndimage
 from densify.depth.exposure import Exposure, InView
 from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
+from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
 from densify.geometry import poses
 from densify.geometry.types import Bool, Cloud, Float, Float32, Reason, Stretch
 
 _SHARE = 0.25  # of the rays that went through a pixel that is taken out
-_OF_FILLED = 0.5  # of that share, around a filled pixel
-_LEAST_RAYS = 0.9  # through a pixel
-_GAPS, _GAPS_AROUND = 0.25, 0.7  # between rays, over which they count: standard deviation
-_LEAST_BLUR_PX = 1.0
-_KEY_GAPS = 3.6  # between rays, around a surface that only the key sweep measured
+RAY_BLUR = 0.35
+"""Standard deviation of the place at which a ray counts, in gaps between rays."""
 _NUM_STEPS = 6
-_SAME_M, _SAME_FRACTION = 0.05, 0.01  # from one step to the next: the crossing is found
 
 
 @dataclass(frozen=True)
@@ -67,11 +63,10 @@ def without_seen_through(
     view: of the cloud. reason: (M,) `Reason` of each point so far.
 
     A ray of a hidden point went through where it crosses the surface of the map, clearly before its
-    end. A ray of another point stopped in its pixel. Both are blurred by a quarter of the gap
-    between rays; a pixel goes if a quarter of the rays went through. A filled pixel also goes if
-    an eighth did, blurred by 0.7 gaps, and no less in the pixel itself. Closed car windows and
-    moving bodies stay, and what is near surfaces that only the key sweep measured: an object that
-    moves without being noticed was elsewhere at other times.
+    end. A ray of another point stopped in its pixel. Both are blurred by about a third of the gap
+    between rays; a pixel goes if a quarter of the rays went through. Closed car windows and moving
+    bodies stay, and what is within a gap of surfaces that only the key sweep measured: an object
+    that moves without being noticed was elsewhere at other times.
     """
     counts = np.isin(cloud.frame, rays.stretch.frames)
     counts &= (reason != Reason.OUTSIDE) & (reason != Reason.VETOED)
@@ -86,39 +81,16 @@ def without_seen_through(
         ends = cloud.select(hits)
         return crossings(layers.filled_m, rays.starts(ends), ends.points, view.exposure)
 
-    by_all, ends_px = through(passed), view.uv[stopped[view.rows]]
-    here, around = (
-        _Passed.by(by_all, ends_px, blur_px, shape)
-        for blur_px in (max(_LEAST_BLUR_PX, wide * gap_px) for wide in (_GAPS, _GAPS_AROUND))
+    num, num_stopped = (
+        _counts(uv, shape, RAY_BLUR * gap_px)
+        for uv in (through(passed), view.uv[stopped[view.rows]])
     )
-    gaps = around.opens(_OF_FILLED * _SHARE) & (here.share >= around.share)
-    dropped = here.opens(_SHARE) | (gaps & (layers.depth_m == 0))
+    dropped = num > _SHARE * (num + num_stopped)
     if layers.key_only is not None:
-        dropped &= ~ndimage.maximum_filter(layers.key_only, 2 * round(_KEY_GAPS * gap_px) + 1)
+        dropped &= ~ndimage.maximum_filter(layers.key_only, 2 * round(gap_px) + 1)
     if layers.solid is not None:
         dropped &= ~layers.solid
     return layers.without(dropped)
-
-
-class _Passed(NamedTuple):
-    """Rays through each pixel (H,W): their number, and their share of those that met it."""
-
-    num: Float32
-    share: Float32
-
-    @staticmethod
-    def by(through: Float, stopped: Float, blur_px: float, shape: tuple[int, ...]) -> _Passed:
-        """through, stopped: (K,2) px. blur_px: standard deviation."""
-        num, num_stopped = (
-            _counts(uv, shape, blur_px) * (2 * np.pi * blur_px**2) for uv in (through, stopped)
-        )
-        met = num + num_stopped
-        return _Passed(num, np.divide(num, met, out=np.zeros_like(met), where=met > 0))
-
-    def opens(self, share: float) -> Bool:
-        """Return (H,W) True where more than ``share`` of the rays went through, and enough."""
-        opened: Bool = (self.share > share) & (self.num >= _LEAST_RAYS)
-        return opened
 
 
 def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
@@ -148,7 +120,7 @@ def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Expo
         column, row = np.rint(np.where(good[:, None], uv, 0)).astype(np.int64).T
         there_m = surface_m[row, column].astype(np.float64)
         with np.errstate(invalid="ignore"):
-            same = abs(there_m - depth_m) <= _SAME_M + _SAME_FRACTION * depth_m
+            same = abs(there_m - depth_m) <= AGREE_M + AGREE_FRACTION * depth_m
         depth_m = there_m
         share = _share(start, end, depth_m, exposure.measure)
         good &= (depth_m > 0) & (share > 0) & (share < 1)

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import Config, ProjectSettings
+from densify.depth.car_windows import share_lost
 from densify.depth.confidence import reliability
 from densify.depth.exposure import Exposure, Shot
 from densify.depth.far import far_cloud
 from densify.depth.image_alignment import lab
-from densify.depth.moving_bodies import MovingBody, moving_bodies, outlines
+from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
+from densify.depth.moving_bodies import MovingBody, far_inside, moving_bodies, outlines
 from densify.depth.patches import patches, seen_through_by_key
 from densify.depth.project import project
 from densify.depth.seen_through import Rays
@@ -40,8 +42,6 @@ from densify.geometry.types import (
     Truth,
 )
 from densify.scores import depth_metrics
-
-_BEHIND_M, _BEHIND_FRACTION = 0.15, 0.02  # the map's surface; a point farther behind has no colour
 
 
 class SeenCloud(NamedTuple):
@@ -138,6 +138,7 @@ class Views:
         """Return depth maps by name; visible: without what is hidden, seen through or unsupported;
         filled: with the fill."""
         settings = replace(self.settings, visibility=visible)
+        lost = None if self.key_image is None else share_lost(self.key_image)
         return {
             name: project(
                 seen.cloud,
@@ -147,6 +148,7 @@ class Views:
                 filled,
                 self.lab.get(name),
                 self.rays,
+                lost,
                 seen.bodies,
             )
             for name, exposure in self.exposures.items()
@@ -168,7 +170,7 @@ class Views:
             view = self.exposures[name].sees(seen.cloud)
             u, v = np.rint(view.uv).astype(np.int64).T
             surface_m = depth[name].filled_m[v, u]
-            reach_m = surface_m + _BEHIND_M + _BEHIND_FRACTION * surface_m
+            reach_m = surface_m + HIDDEN_M + HIDDEN_FRACTION * surface_m
             shows = (surface_m > 0) & (view.exposure.depth_m(view.points_cam) <= reach_m)
             rgb[view.rows[shows]] = image[v[shows], u[shows]]
         return replace(seen.cloud, rgb=rgb)
@@ -320,23 +322,29 @@ class HeldOut:
         others = seen.cloud.frame != self.views.key
         surface = seen.patches.select(others)
         surface = replace(surface, free=np.zeros(len(surface.free), bool))
-        cloud = seen.cloud.select(others)
-        bodies = self.views.bodies(cloud) if seen.bodies else {}
-        return SeenCloud(cloud, surface, bodies)
+        bodies = {k: body.without(self.views.key) for k, body in seen.bodies.items()}
+        return SeenCloud(seen.cloud.select(others), surface, bodies)
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Return scores by name, with the ``curve`` of precision over density, ``reliability``, and
         the share of filled pixels ``unjudged`` for want of a return of the key sweep within a gap
-        between rays; None for a cloud of the key sweep alone."""
+        between rays; None for a cloud of the key sweep alone.
+
+        Returns from far inside a moving body are no truth: the key sweep measured them through its
+        windows, and the map shows the glass.
+        """
         others = self.without_key(seen)
         if not len(others.cloud):
             return None
         made = self.views.depth(others, visible)
         scores: dict[str, Any] = {}
         for name, maps in made.items():
-            truth_m, camera = self.key_alone[name].depth_m, self.views.exposures[name].camera
+            exposure, moving = self.views.exposures[name], self.moving[name]
+            camera, truth_m = exposure.camera, self.key_alone[name].depth_m
+            inside = moving & far_inside(seen.bodies.values(), exposure, truth_m)
+            truth_m = np.where(inside, np.float32(0), truth_m)
             scores[name] = {
-                **depth_metrics.depth_scores(maps, truth_m, self.moving[name], camera),
+                **depth_metrics.depth_scores(maps, truth_m, moving & ~inside, camera),
                 "curve": depth_metrics.precision_density(maps, truth_m, camera),
                 "reliability": reliability(maps, truth_m, camera),
                 "unjudged": self._unjudged(name, maps, seen.bodies),
