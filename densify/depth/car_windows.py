@@ -73,21 +73,22 @@ def close_windows(
             float(share_lost(_points(exposure, uv[of], depth_m[of])).mean()) for of in (hole, rim)
         ]
         if _num_rays(part, hole) * _log_odds(*lost) > _LEAST_LOG_ODDS:
-            _close(part, hole, depth_m, plane[1:], part.confidence[rim].min())
+            window[box] |= hole
+            glass[box] |= _close(part, hole, depth_m, plane[1:], part.confidence[rim].min())
     return layers
 
 
-def _close(layers: Layers, hole: Bool, depth_m: Float32, slopes: Float, least: np.float32) -> None:
-    """Put a plane into a hole, but not behind what is known there. least: confidence of the rim."""
+def _close(layers: Layers, hole: Bool, depth_m: Float32, slopes: Float, least: np.float32) -> Bool:
+    """Put a plane into a hole, but not behind what is known there; return (h,w) where it took out
+    what was measured. least: confidence of the rim."""
     known_m = layers.filled_m
     takes = hole & ((known_m == 0) | (known_m > depth_m + _agree_m(depth_m)))
-    assert layers.solid is not None and layers.glass is not None
-    layers.solid[hole] = True
-    layers.glass[takes] = layers.depth_m[takes] > 0
+    taken: Bool = takes & (layers.depth_m > 0)
     layers.depth_m[takes] = 0
     layers.filled_m[takes] = depth_m[takes]
     layers.tilt[takes] = slopes
     layers.confidence[takes] = least * np.float32(FILL_CONFIDENCE)
+    return taken
 
 
 def _agree_m(depth_m: Float | Float32) -> Float:
@@ -122,7 +123,8 @@ def _holes(layers: Layers) -> Iterator[tuple[tuple[slice, slice], Bool, Bool]]:
     away_px = max(1, round(float(np.median(layers.gap_px))))
     for number, box in enumerate(ndimage.find_objects(label), start=1):
         surface = label[box] == number
-        holes, _ = ndimage.label(ndimage.binary_fill_holes(surface) & ~surface)
+        joined = ndimage.binary_closing(surface, _EIGHT)  # a rim may have gaps of a pixel or two
+        holes, _ = ndimage.label(ndimage.binary_fill_holes(joined) & ~surface)
         for k, inner in enumerate(ndimage.find_objects(holes), start=1):
             around = tuple(slice(max(0, s.start - away_px), s.stop + away_px) for s in inner)
             hole = holes[around] == k
