@@ -15,7 +15,7 @@ from densify.config import ProjectSettings
 from densify.depth import hulls
 from densify.depth import moving_bodies as stage
 from densify.depth.exposure import Exposure
-from densify.depth.moving_bodies import moving_bodies
+from densify.depth.moving_bodies import moving_bodies, without_sweep
 from densify.depth.project import project
 from densify.depth.seen_through import Rays
 from densify.geometry.types import Stretch
@@ -171,12 +171,14 @@ def test_only_what_lies_far_behind_the_front_is_inside():
         assert far[middle] == inside and not far[0].any()
 
 
-def test_a_body_without_a_sweep_has_none_of_its_rays():
+def test_a_body_without_a_sweep_has_none_of_its_rays_and_points():
     cloud, rays = scanned(lambda y, z: within(y, z, DOOR), lambda y, z: np.zeros(len(y), bool))
     body = moving_bodies(cloud, rays)[0]
-    others = body.without(KEY)
-    assert set(others.frame) == set(body.frame) - {KEY}
-    assert len(others.entries) == len(others.ends) == len(others.weight) == len(others.frame)
+    others = cloud.select(cloud.frame != KEY)
+    told = without_sweep({0: body}, others, KEY)[0]
+    assert set(told.frame) == set(body.frame) - {KEY}
+    assert len(told.entries) == len(told.ends) == len(told.weight) == len(told.frame)
+    assert set(map(tuple, told.corners)) <= set(map(tuple, others.points))
 
 
 @pytest.mark.parametrize("num", [3, 40])

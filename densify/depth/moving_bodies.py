@@ -65,16 +65,6 @@ class MovingBody(NamedTuple):
     weight: Float
     frame: NDArray[np.integer]
 
-    def without(self, frame: int) -> MovingBody:
-        """Return the body without the rays of one sweep."""
-        kept = self.frame != frame
-        return self._replace(
-            entries=self.entries[kept],
-            ends=self.ends[kept],
-            weight=self.weight[kept],
-            frame=self.frame[kept],
-        )
-
 
 def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
     """Return the bodies of moving objects by instance.
@@ -101,6 +91,20 @@ def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
         )
         for k, found in met.items()
     }
+
+
+def without_sweep(
+    bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
+) -> dict[int, MovingBody]:
+    """Return the bodies as told by the other sweeps alone. cloud: their points."""
+    told = {}
+    for k, body in bodies.items():
+        corners = _corners(cloud.points[cloud.moving & (cloud.instance == k)])
+        kept = body.frame != frame
+        if len(corners):
+            rays = (column[kept] for column in (body.entries, body.ends, body.weight, body.frame))
+            told[k] = MovingBody(corners, body.velocity_m_s, *rays)
+    return told
 
 
 def _corners(points: Float) -> Float:

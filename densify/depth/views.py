@@ -18,7 +18,13 @@ from densify.depth.exposure import Exposure, Shot
 from densify.depth.far import far_cloud
 from densify.depth.image_alignment import lab
 from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
-from densify.depth.moving_bodies import MovingBody, far_inside, moving_bodies, outlines
+from densify.depth.moving_bodies import (
+    MovingBody,
+    far_inside,
+    moving_bodies,
+    outlines,
+    without_sweep,
+)
 from densify.depth.patches import patches, seen_through_by_key
 from densify.depth.project import project
 from densify.depth.seen_through import Rays
@@ -322,8 +328,8 @@ class HeldOut:
         others = seen.cloud.frame != self.views.key
         surface = seen.patches.select(others)
         surface = replace(surface, free=np.zeros(len(surface.free), bool))
-        bodies = {k: body.without(self.views.key) for k, body in seen.bodies.items()}
-        return SeenCloud(seen.cloud.select(others), surface, bodies)
+        cloud = seen.cloud.select(others)
+        return SeenCloud(cloud, surface, without_sweep(seen.bodies, cloud, self.views.key))
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Return scores by name, with the ``curve`` of precision over density, ``reliability``, and
