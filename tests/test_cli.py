@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import yaml
 
+from densify.cli import verbs
 from densify.cli.screen import Answer
 from densify.cli.verbs import recordings
 from densify.config import Config, as_mapping, resolve
@@ -173,6 +174,14 @@ def test_the_recording_is_an_argument_or_an_option(border_drive: Path, capsys) -
     assert told[0] == told[1]
     assert BORDER in told[0]["frames"] and "image_02" in told[0]["cameras"]
     assert "got 2 recordings" in refused(capsys, 2, "info", "street", "--data", "street")
+
+
+def test_verbs_have_few_options() -> None:
+    parser = verbs._command_line()
+    (subparsers,) = (a for a in parser._actions if hasattr(a, "choices") and a.choices)
+    for verb in ("run", "dataset"):
+        options = [a for a in subparsers.choices[verb]._actions if a.option_strings]
+        assert len(options) <= 16
 
 
 # One command each that cannot work, and what its one line must say. {tmp} is an empty folder.

@@ -211,6 +211,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "distributed": "densify/dataset/executor.py",
     "foxglove": "densify/outputs/export/mcap.py",
     "rerun": "densify/outputs/export/rrd.py",
+    "open3d": "densify/outputs/export/open3d_window.py",
     "matplotlib": "densify/outputs/plots.py",
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/registration/odometry.py",

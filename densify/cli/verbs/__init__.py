@@ -20,7 +20,7 @@ from densify.config.errors import brief, did_you_mean
 _ADD = (
     *(run.add_run, run.add_compare, dataset.add, flow.add_flow, train.add, flow.add_labels),
     *(recordings.add_info, recordings.add_doctor, recordings.add_simulate, finished.add_export),
-    *(finished.add_report, evaluate.add, bench.add),
+    *(finished.add_report, finished.add_view, evaluate.add, bench.add),
 )
 
 

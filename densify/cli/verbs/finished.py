@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Verbs of finished runs: ``densify export`` for other tools, ``densify report`` for a page."""
+"""Verbs of finished runs: ``densify export`` for other tools, ``densify report`` for a page,
+``densify view`` for a window."""
 
 from __future__ import annotations
 
@@ -76,3 +77,31 @@ def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.dataset.report import write_report
 
     yield Answer(files=write_report(options.place, options.overwrite))
+
+
+def add_view(commands: Any) -> None:
+    """Add the options of ``view``."""
+    parser = add_verb(
+        commands,
+        "view",
+        answer_view,
+        "a run, or keys of a drive, in a window: cloud, moving objects, in rerun over time",
+        "Needs a screen, and pip install 'densify[rerun]' or 'densify[open3d]'. densify report "
+        "needs nothing but a browser.",
+    )
+    about = f"{_ONE}, or of several of a drive"
+    parser.add_argument("place", metavar="DIR", type=Path, help=about)
+    about = "rerun (default) or open3d"
+    option(parser, "--with VIEWER", about, choices=("rerun", "open3d"), default="rerun", dest="by")
+    add_common(parser, "camera")
+
+
+def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
+    """Show it."""
+    from densify.outputs.export import open3d_window, rrd
+    from densify.outputs.export.finished_run import finished_runs
+
+    runs = finished_runs(options.place, cameras=options.cameras)
+    (rrd if options.by == "rerun" else open3d_window).show(runs)
+    keys = [run.key for run in runs]
+    yield Answer(f"shown: key {', '.join(map(str, keys))}", {"keys": keys})

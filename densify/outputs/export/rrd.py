@@ -30,18 +30,37 @@ _POINT, _SWEEP_POINT = -1.5, -2.5  # radii in points of the screen, as rerun wri
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``recording.rrd``. rerun numbers its chunks by the clock, so bytes differ. Raises
     InputError without rerun, and as `timelines`."""
+    with _stream(runs) as stream:
+        stream.save(folder / "recording.rrd")
+        _log(stream, runs)
+
+
+def show(runs: Sequence[FinishedRun]) -> None:
+    """Show the same in rerun's viewer, which stays open. Raises InputError as `write_rrd`."""
+    with _stream(runs) as stream:
+        stream.spawn()
+        _log(stream, runs)
+        stream.flush()
+
+
+def _stream(runs: Sequence[FinishedRun]) -> Any:
     rr = needed("rerun", "rerun", "Recordings for rerun")
     name = f"key-{runs[0].key}-{runs[-1].key}"
-    with rr.RecordingStream("densify", recording_id=name, send_properties=False) as stream:
-        stream.set_log_time_enabled(False)
-        stream.set_log_tick_enabled(False)
-        stream.save(folder / "recording.rrd")
-        stream.log("world", rr.ViewCoordinates.FLU, static=True, strict=True)
-        entities = (entity for timeline in timelines(runs) for entity in _entities(timeline))
-        for frame, stamp_ns, name, shown in entities:
-            stream.set_time("time", timestamp=np.datetime64(stamp_ns, "ns"))
-            stream.set_time("frame", sequence=frame)
-            stream.log(f"{_KEY}/{name}".rstrip("/"), shown, strict=True)
+    stream = rr.RecordingStream("densify", recording_id=name, send_properties=False)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    return stream
+
+
+def _log(stream: Any, runs: Sequence[FinishedRun]) -> None:
+    import rerun as rr
+
+    stream.log("world", rr.ViewCoordinates.FLU, static=True, strict=True)
+    entities = (entity for timeline in timelines(runs) for entity in _entities(timeline))
+    for frame, stamp_ns, name, shown in entities:
+        stream.set_time("time", timestamp=np.datetime64(stamp_ns, "ns"))
+        stream.set_time("frame", sequence=frame)
+        stream.log(f"{_KEY}/{name}".rstrip("/"), shown, strict=True)
 
 
 def _entities(timeline: Timeline) -> Iterator[tuple[int, int, str, Any]]:
