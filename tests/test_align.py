@@ -32,7 +32,6 @@ def slow_information(points: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 def slow_align(model: Model, points, predicted) -> np.ndarray | None:
     """Gauss-Newton with numerical derivatives, neighbours from another tree."""
-    points = points[:: len(points) // 300 + 1]
     tree = cKDTree(model.points)
     _, near = tree.query(model.points, min(12, len(model.points)))
     information = slow_information(model.points, near.reshape(len(model.points), -1))

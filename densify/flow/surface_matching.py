@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from densify.geometry.compiled import Kernel
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Int
 
@@ -20,7 +19,6 @@ MIN_FIT = 5  # matches
 _SURFACE_M = 0.05  # noise of a surface point
 _RIDGE = 0.02  # of the mean variance, for points on a line
 _MAX_MODEL_POINTS = 1500
-_MANY_ALIGNED = 300  # more do not locate an object better, as their weight is bounded
 _LOOSE = 10.0  # of the covariance: sliding along a surface must not be held up by its own points
 
 
@@ -87,59 +85,24 @@ class Model:
         points: (N,3), all at one time. centre: (3,). predicted: (4,) where to start.
         prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
         """
-        points = points[:: len(points) // _MANY_ALIGNED + 1]
         state, prior = predicted.copy(), prediction_std**-2
         for gate_m in GATES_M:
             at_model = undo(state, points, centre)
             distance_m, row = nearest(self._tree, at_model, gate_m)
-            H, g = np.diag(prior), prior * (predicted - state)[[0, 1, 3]]
-            arms = at_model - centre
-            off = at_model - self.points[row]
-            num = _add_matches(
-                arms, off, row, distance_m / gate_m, self.information, float(state[3]), H, g
-            )
-            if num < MIN_FIT:
+            found = np.flatnonzero(row >= 0)
+            if len(found) < MIN_FIT:
                 return None
+            row, arm = row[found], at_model[found] - centre
+            weight = (1 - (distance_m[found] / gate_m) ** 2) ** 2
+            cos, sin = np.cos(state[3]), np.sin(state[3])
+            J = np.zeros((len(found), 3, 3))  # of the model's point by x, y and yaw
+            J[:, 0, 0], J[:, 1, 0] = cos, -sin
+            J[:, 0, 1], J[:, 1, 1] = sin, cos
+            J[:, 0, 2], J[:, 1, 2] = -arm[:, 1], arm[:, 0]
+            weight *= min(1.0, MAX_WEIGHT / len(found))
+            JA = J.transpose(0, 2, 1) @ (self.information[row] * weight[:, None, None])
+            H = (JA @ J).sum(axis=0) + np.diag(prior)
+            off = at_model[found] - self.points[row]
+            g = (JA @ off[:, :, None]).sum(axis=0)[:, 0] + prior * (predicted - state)[[0, 1, 3]]
             state[[0, 1, 3]] += np.linalg.solve(H, g)
         return state
-
-
-@Kernel
-def _add_matches(
-    arms: Float,
-    off: Float,
-    row: Int,
-    away: Float,
-    information: Float,
-    yaw: float,
-    H: Float,
-    g: Float,
-) -> int:
-    """Add the normal equations of the matches to H (3,3) and g (3,), in place.
-
-    arms: (N,3) m, from the centre to the points, in the model's frame. off: (N,3) m, from their
-    matches. row: (N,) of the matches in the model, -1 for none. away: (N,) distance as a share of
-    the gate. information: (M,3,3) of the model's points. yaw: rad, of the object.
-
-    Returns the number of matches.
-    """
-    num = 0
-    for i in range(len(row)):
-        num += row[i] >= 0
-    scale = min(1.0, MAX_WEIGHT / max(num, 1))
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    J, JA = np.zeros((3, 3)), np.zeros((3, 3))  # J: of the model's point by x, y and yaw
-    J[0, 0], J[1, 0], J[0, 1], J[1, 1] = cos, -sin, sin, cos
-    for i in range(len(row)):
-        if row[i] < 0:
-            continue
-        A, weight = information[row[i]], scale * (1 - away[i] ** 2) ** 2
-        J[0, 2], J[1, 2] = -arms[i, 1], arms[i, 0]
-        for a in range(3):
-            for c in range(3):
-                JA[a, c] = weight * (J[0, a] * A[0, c] + J[1, a] * A[1, c])
-        for a in range(3):
-            g[a] += JA[a, 0] * off[i, 0] + JA[a, 1] * off[i, 1] + JA[a, 2] * off[i, 2]
-            for b in range(3):
-                H[a, b] += JA[a, 0] * J[0, b] + JA[a, 1] * J[1, b]
-    return num

@@ -7,10 +7,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.nearest import is_near, thinned, tree_of
+from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
-
-_THINNED = 0.1  # of the distance: denser points tell no more of a share
 
 
 def link(points: Float, distance_m: float) -> tuple[int, Int]:
@@ -45,25 +43,21 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
 def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
     """Return (N,) True for the points closer than ``within_m`` to a seed that counts.
 
-    A seed counts if seeds are at least ``least_share`` of the points within that distance of it,
-    where dense points are thinned.
+    A seed counts if seeds are at least ``least_share`` of the points within that distance of it.
 
     points: (N,3). seed: (N,).
     """
-    close, seeds = np.zeros(len(points), bool), points[seed]
+    seeds = points[seed]
     if not len(seeds):
-        return close
-    near = np.flatnonzero(is_near(tree_of(seeds), points, within_m))
-    some = near[thinned(points[near], np.arange(len(near)), _THINNED * within_m, 1)]
-    seeds = points[some[seed[some]]]
+        return np.zeros(len(points), bool)
     num_points, num_seeds = (
         tree_of(cloud).query_ball_point(seeds, within_m, return_length=True)
-        for cloud in (points[some], seeds)
+        for cloud in (points, seeds)
     )
     seeds = seeds[num_seeds >= least_share * num_points]
-    if len(seeds):
-        close[near] = is_near(tree_of(seeds), points[near], within_m)
-    return close
+    if not len(seeds):
+        return np.zeros(len(points), bool)
+    return is_near(tree_of(seeds), points, within_m)
 
 
 @Kernel
