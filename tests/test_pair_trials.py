@@ -27,17 +27,21 @@ def bar(num: int, length_m: float, yaw: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize("yaw", [0.0, 1.1])
 @pytest.mark.parametrize(
-    ("direction", "slides"),
+    ("num", "length_m", "direction", "slides"),
     [
-        (np.pi / 2, False),  # the back of a car, far away, and it drives away
-        (np.pi / 2 + 0.1, False),
-        (0.0, True),  # a rail along itself,
-        (1.2, True),  # or to the rail beside
+        (30, 1.7, np.pi / 2, False),  # the back of a car, far away, and it drives away
+        (30, 1.7, np.pi / 2 + 0.1, False),
+        (30, 1.7, 0.0, True),  # a rail along itself,
+        (30, 1.7, 1.2, True),  # or to the rail beside
+        (30, 4.0, np.pi / 2, True),  # no car is so wide
+        (150, 1.7, np.pi / 2, True),  # or so low, so near
     ],
 )
-def test_a_level_bar_does_not_move_along_itself(direction, slides, yaw):
+def test_a_level_bar_moves_only_as_the_back_of_a_far_car_does(
+    num, length_m, direction, slides, yaw
+):
     way = np.array([np.cos(yaw + direction), np.sin(yaw + direction), 0.0])
-    assert _ambiguous(bar(30, 1.7, yaw), way) == slides
+    assert _ambiguous(bar(num, length_m, yaw), way) == slides
 
 
 def corner(num: int, seed: int) -> np.ndarray:
@@ -49,17 +53,21 @@ def corner(num: int, seed: int) -> np.ndarray:
     return np.column_stack([x, y, 1.3 * v]) + 0.01 * rng.standard_normal((num, 3))
 
 
-@pytest.mark.parametrize("way", [WAY, 0 * WAY], ids=["moved", "static"])
-def test_surfaces_are_thin_where_it_went(way):
+@pytest.mark.parametrize("moved", [True, False])
+def test_surfaces_tell_whether_it_moved(moved):
+    """Thin at the true motion; as thin without where it stands, much thicker where it moved."""
+    way = WAY if moved else 0 * WAY
     source = PairCloud(corner(600, 1), np.zeros(600))
     target = PairCloud(corner(600, 2) + way, np.zeros(600))
     x, y = np.meshgrid(np.arange(-10, 10, 0.3), np.arange(-10, 10, 0.3))
     ground = HeightMap.of([np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])])
     start = RigidMotion(np.append(way + [0.1, 0, 0], 0.0), source.points.mean(0), 1.0)
     rows = np.arange(600)
-    found, thickness_m = refined(start, rows, source, target, rows, ground, timed=False)
-    assert np.abs(found.state[:3] - way).max() < 0.03
-    assert thickness_m < 0.05
+    found = refined(start, rows, source, target, rows, ground, timed=False)
+    assert np.abs(found.motion.state[:3] - way).max() < 0.03
+    assert found.thickness_m is not None and found.thickness_m < 0.05
+    assert found.of_standing is not None
+    assert found.of_standing < 0.5 if moved else found.of_standing > 0.9
 
 
 @pytest.mark.parametrize("timed", [False, True])

@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from densify.config import Config
 from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
-from densify.flow.pairs.estimate import estimate_flow
+from densify.flow.pairs.estimate import flow_between
 from densify.free_space.ground import ABOVE_GROUND_M
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Motion
@@ -32,8 +30,7 @@ def _step(scene: Scene, here: int, there: int, settings: Config) -> FlowField:
     above, above_there = (scene.ground.above(c) >= ABOVE_GROUND_M for c in clouds)
     field = FlowField.zero(len(above))
     if above.any() and above_there.any():
-        of_paper = replace(settings, flow=replace(settings.flow, engine="paper"))
-        pair = estimate_flow(clouds[0][above], clouds[1][above_there], of_paper)
+        pair = flow_between(clouds[0][above], clouds[1][above_there], settings.objective)
         R_world_lidar = scene.stretch.sweeps[here].T_world_lidar[:3, :3]
         field.displacement[above] = pair.displacement @ R_world_lidar
         field.moving[above] = pair.moving

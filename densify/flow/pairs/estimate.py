@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
-from densify.config import Config, resolve
+from densify.config import Config, ObjectiveSettings, resolve
 from densify.config.errors import InputError
 from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
@@ -22,13 +23,20 @@ from densify.flow.pairs.hypotheses import PairCloud
 from densify.flow.pairs.movers import find_movers
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.geometry import poses
+from densify.geometry.linking import link
 from densify.geometry.nearest import nearest, tree_of
 from densify.geometry.types import Float, FlowField, Int, Motion, Stretch, Sweep
 
+_LEAST_MOTION_M = 0.15
+_LINK_M = 0.6
+_MIN_POINTS = 8
+_REACH_M = 0.5
+_MIN_GAIN_M = 0.07
 _MAX_EXTENT_M = 400.0
 _MIN_LOW_M = 0.04
 _BELOW_M = 0.3
-_HALF = 0.5  # of the length of the mean direction: more agree, fewer do not
+_MIDDLE_M = 3.0  # nearer, the direction is not that from a scanner
+_MIN_AGREEMENT, _MAX_SINGLE = 0.8, 0.3
 
 
 def estimate_flow(
@@ -75,22 +83,34 @@ def estimate_flow(
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
     if lidars is None and times is not None:
         lidars = _tell_scanners(clouds, times.lag)
+    if not settings.objective.static_prior or settings.flow.engine == "paper":
+        return flow_between(*clouds, settings.objective, initial)
     start = None if initial is None else checked_cloud(initial, "initial")
     if start is not None and start.shape != clouds[0].shape:
         raise InputError(
             f"initial: got shape {start.shape}, expected the source's {clouds[0].shape}"
         )
-    objective = settings.objective
-    if objective.static_prior:
-        field = _flow_of_groups(clouds, settings, start, times, lidars)
-        if settings.flow.engine == "groups":
-            return field
-        field = replace(field, to_reference=None)
-    else:
-        field = replace(FlowField.zero(len(clouds[0])), moving=np.ones(len(clouds[0]), bool))
-    options = SolverSettings(objective.solver, objective.alpha, objective.num_neighbors)
-    flow = solve(*clouds, options, initial).flow
-    return replace(field, displacement=np.where(field.moving[:, None], flow, 0.0))
+    return _flow_of_groups(clouds, settings, start, times, lidars)
+
+
+def flow_between(
+    source: ArrayLike,
+    target: ArrayLike,
+    settings: ObjectiveSettings,
+    initial: ArrayLike | None = None,
+) -> FlowField:
+    """The published objective's flow; with ``static_prior`` only of groups that it certainly
+    moves. Arguments and errors as `estimate_flow`."""
+    objective = SolverSettings(
+        solver=settings.solver,
+        alpha=settings.alpha,
+        num_neighbors=settings.num_neighbors,
+    )
+    flow = solve(source, target, objective, initial).flow
+    if settings.static_prior:
+        return _only_proven(np.asarray(source, float), np.asarray(target, float), flow)
+    still = FlowField.zero(len(flow))
+    return replace(still, displacement=flow, moving=np.ones(len(flow), bool))
 
 
 def _flow_of_groups(
@@ -149,14 +169,15 @@ def _tell_scanners(clouds: tuple[Float, Float], lag: tuple[Float, Float]) -> tup
     lag: of the points, as a share of the time between the clouds, a whole number of turns.
     """
     both = np.concatenate(clouds)
+    far = np.hypot(both[:, 0], both[:, 1]) > _MIDDLE_M
     share = max(float(np.ptp(late)) for late in lag)  # of a sweep in the time between the clouds
-    if share <= 0:
+    if not far.any() or share <= 0:
         return None
     turned = np.concatenate(lag) * (2 * np.pi * max(1, round(1 / share)))
     azimuth = np.arctan2(both[:, 1], both[:, 0])
     for phase in (turned + azimuth, turned - azimuth):
-        doubled = np.exp(2j * phase).mean()
-        if abs(doubled) < _HALF or abs(np.exp(1j * phase).mean()) > _HALF:
+        doubled = np.exp(2j * phase[far]).mean()
+        if abs(doubled) < _MIN_AGREEMENT or abs(np.exp(1j * phase[far]).mean()) > _MAX_SINGLE:
             continue
         lidar = (np.cos(phase - np.angle(doubled) / 2) < 0).astype(np.int64)
         return lidar[: len(clouds[0])], lidar[len(clouds[0]) :]
@@ -209,6 +230,44 @@ def _times(times_ns: tuple[Int, Int] | None) -> _Times | None:
         return None
     first, second = ((times - m) / gap for times, m in zip(times_ns, middle, strict=True))
     return _Times((first, second), abs(gap) * 1e-9)
+
+
+def _only_proven(source: Float, target: Float, flow: Float) -> FlowField:
+    """Keep the flow of groups that beat "did not move" in both directions."""
+    field = FlowField.zero(len(source))
+    moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > _LEAST_MOTION_M)
+    num_groups, group = link(source[moved], _LINK_M)
+    trees = cKDTree(source), cKDTree(target)
+    instance = 0
+    for k in range(num_groups):
+        rows = moved[group == k]
+        if len(rows) < _MIN_POINTS:
+            continue
+        if _beats_standing_still(source[rows], target, flow[rows], trees):
+            field.displacement[rows] = flow[rows]
+            field.moving[rows] = True
+            field.instance[rows] = instance
+            instance += 1
+    return field
+
+
+def _beats_standing_still(
+    group: Float, target: Float, flow: Float, trees: tuple[cKDTree, cKDTree]
+) -> bool:
+    """Judged by the group's common translation: a free flow always comes closer to the target."""
+    source_tree, target_tree = trees
+    arrived = group + np.median(flow, axis=0)
+
+    def mean_distance(tree: cKDTree, points: Float) -> float:
+        return float(np.minimum(tree.query(points)[0], _REACH_M).mean())
+
+    reached = np.unique(np.concatenate(target_tree.query_ball_point(arrived, _REACH_M))).astype(int)
+    if not len(reached):
+        return False
+    forward = mean_distance(target_tree, group) - mean_distance(target_tree, arrived)
+    there = target[reached]
+    backward = mean_distance(source_tree, there) - mean_distance(cKDTree(arrived), there)
+    return min(forward, backward) >= _MIN_GAIN_M
 
 
 # --- as an engine

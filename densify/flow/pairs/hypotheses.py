@@ -25,16 +25,19 @@ from densify.free_space.ground import HeightMap
 from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Float, Int
 
-EVEN_M = 0.06  # side of the cubes in which points are thinned
-EXPLAINED_M = 0.1  # a nearer point is a counterpart
-REACH_M = 0.5  # a distance beyond it counts as this
+_EVEN_M = 0.06
 _MAX_SPEED_M_S = 38.0
 _USUAL_S, _LONGEST_S = 0.1, 0.4  # between the clouds where nothing is known of it; at the most
-_VOTE_STEP_M, _VOTE_SLACK_M = 0.2, 0.3  # horizontal; vertical
+_VOTE_STEP_M = 0.2
+_VOTE_SLACK_M = 0.3  # vertical
+_VOTE_POINTS, _VOTE_TARGETS = 60, 800
 _NUM_VOTED = 5
-SAMPLE, MANY = 150, 600  # points that are enough to align a group, and to see its surfaces
+_APART_M = 0.5
+_ALIGN_POINTS = 150
 _PRECISION = 1 / np.array([1.0, 1.0, 0.01, 0.06]) ** 2  # of m from the start; of rad from zero
+_FROM_START = np.array([1.0, 1.0, 1.0, 0.0])
 _SLOPE_STEP_M, _SLOPE_STEPS = 2.0, 4  # of a grid around a place
+_ROUGH_M = 0.1  # off a plane: no ground to tell a slope
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class PairCloud:
     def even_tree(self) -> cKDTree:
         """The tree of one point per voxel, since points are denser along scan lines."""
         places = self.places(self.points, np.arange(len(self.points)))
-        return tree_of(places[one_per_voxel(places, EVEN_M)])
+        return tree_of(places[one_per_voxel(places, _EVEN_M)])
 
     def places(self, points: Float, rows: Int) -> Float:
         """Return coordinates in which points of different scanners are far from each other: each
@@ -132,8 +135,8 @@ class Hypotheses:
         there = target.points[candidates]
         num_steps = _num_vote_steps(apart_s)
         for k, members in enumerate(groups):
-            sample = thinned(members, SAMPLE)
-            starts = _vote(source.points[sample], there, num_steps)
+            sample = thinned(members, _ALIGN_POINTS)
+            starts = _vote(source.points[thinned(members, _VOTE_POINTS)], there, num_steps)
             if initial is not None:
                 starts = np.vstack([starts, np.median(initial[members], axis=0)])
             middle = source.points[sample].mean(0)
@@ -182,7 +185,7 @@ class Hypotheses:
                 share[near],
                 surface.information[match] * weight[:, None, None],
                 h,
-                _PRECISION * (self.state - start),
+                _PRECISION * (self.state - start * _FROM_START),
             )
             matched = count > 0
             total = np.bincount(h, share[near], len(count))
@@ -219,7 +222,7 @@ def _vote(points: Float, there: Float, n: int) -> Float:
     zero = np.zeros((1, 3))
     span_m = np.array([n * _VOTE_STEP_M, n * _VOTE_STEP_M, _VOTE_SLACK_M])
     around = ((there > points.min(0) - span_m) & (there < points.max(0) + span_m)).all(1)
-    there = there[thinned(np.flatnonzero(around), MANY)]
+    there = there[thinned(np.flatnonzero(around), _VOTE_TARGETS)]
     if not len(there):
         return zero
     way = there - points[:, None, :]
@@ -241,7 +244,7 @@ def _vote(points: Float, there: Float, n: int) -> Float:
     for _ in range(_NUM_VOTED):
         best = place[np.argmax(score)]
         starts.append(best[None])
-        score[np.linalg.norm(place - best, axis=1) < REACH_M] = -1
+        score[np.linalg.norm(place - best, axis=1) < _APART_M] = -1
     return np.concatenate(starts)
 
 
@@ -253,7 +256,7 @@ def slope_of(ground: HeightMap, place: Float) -> Float:
     height_m = ground.under(place[:2] + arm)
     height_m -= height_m.mean()
     slope: Float = arm.T @ height_m / (arm**2).sum(axis=0)
-    return slope if (height_m - arm @ slope).std() <= EXPLAINED_M else np.zeros(2)
+    return slope if (height_m - arm @ slope).std() <= _ROUGH_M else np.zeros(2)
 
 
 def one_per_voxel(places: Float, side_m: float) -> Int:

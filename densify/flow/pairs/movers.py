@@ -10,25 +10,27 @@ are unexplained if it is static.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from densify.flow.pairs.hypotheses import (
-    REACH_M,
     Hypotheses,
     PairCloud,
     RigidMotion,
     Surface,
 )
-from densify.flow.pairs.refine import refined
+from densify.flow.pairs.refine import Refined, refined
 from densify.flow.pairs.trials import Trial, promising
 from densify.flow.pairs.unexplained import Unexplained, distances_m
 from densify.free_space.ground import HeightMap
-from densify.geometry.nearest import nearest, tree_of
+from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int
 
+_CLOSE_BY_M = 1.0
 _ATTACH_M = 0.3
+_ATTACH_UNEXPLAINED_M = 1.0
 
 
 def find_movers(
@@ -57,12 +59,13 @@ def find_movers(
 
     def tried(start: tuple[int, RigidMotion]) -> Trial | None:
         k, motion = start
-        trial = Trial.of(k, groups[k], motion, ours, theirs)
+        trial = Trial.of(k, groups[k], Refined(motion), ours, theirs)
         if not trial.may_prove():
             return None
-        motion, thickness_m = refined(motion, groups[k], source, target, there, ground, timed)
-        settled = Trial.of(k, groups[k], motion, ours, theirs)
-        return trial.after(settled, thickness_m) if settled.may_prove() else None
+        found = refined(motion, groups[k], source, target, there, ground, timed)
+        if found.motion is motion:
+            return replace(trial, refined=found)
+        return trial.after(found, Trial.of(k, groups[k], found, ours, theirs))
 
     starts = promising(hypotheses, ours, theirs)
     with ThreadPoolExecutor(2) as pool:
@@ -77,38 +80,57 @@ def _choose(
 ) -> tuple[list[RigidMotion], Int]:
     """Choose at most one motion per group, so that each target is explained once."""
     free = np.ones(len(theirs.unexplained), bool)
-    worth = {t: t.worth(free) for t in trials}
-    trials = [t for t in trials if worth[t] > 0]
-    assigned = _assigned(trials, worth, theirs.group)
+    trials = _thinnest([t for t in trials if t.proves(free)])
+    assigned = _assigned(trials, theirs.group)
     motions: list[RigidMotion] = []
     instance = np.full(len(ours.unexplained), -1)
     done: set[int] = set()
-    for trial in sorted(trials, key=lambda t: (t not in assigned, -worth[t])):
-        if trial.group not in done and trial.worth(free) > 0:
+    for trial in sorted(trials, key=lambda t: (t not in assigned, -t.gain_m)):
+        if trial.group not in done and trial.proves(free):
             done.add(trial.group)
             free[trial.explained] = False
             instance[groups[trial.group]] = len(motions)
-            motions.append(trial.motion)
+            motions.append(trial.refined.motion)
     return motions, instance
 
 
-def _assigned(trials: list[Trial], worth: dict[Trial, float], target_group: Int) -> list[Trial]:
-    """Assign groups to groups of the target with the greatest total worth.
+def _thinnest(trials: list[Trial]) -> list[Trial]:
+    """Drop the trials whose surfaces are thicker than those of another motion close by: nearest
+    points fit any ring."""
+    kept = []
+    for trial in trials:
+        others_m = [
+            t.refined.thickness_m
+            for t in trials
+            if t.group == trial.group
+            and t.refined.thickness_m is not None
+            and np.abs(t.refined.motion.state - trial.refined.motion.state)[:2].max() < _CLOSE_BY_M
+        ]
+        if trial.refined.thickness_m is None or trial.refined.thickness_m <= min(others_m):
+            kept.append(trial)
+    return kept
+
+
+def _assigned(trials: list[Trial], target_group: Int) -> list[Trial]:
+    """Assign groups to groups of the target with the greatest total gain.
 
     In a row of similar cars, each could take the place of the next, but the last would find none.
+    A group that is only a part of an object may stay unassigned, for its own gain.
     """
     best: dict[tuple[int, int], Trial] = {}
     for trial in trials:
         there = target_group[trial.explained]
         key = trial.group, int(np.bincount(there[there >= 0] + 1, minlength=1).argmax())
-        if key not in best or worth[trial] > worth[best[key]]:
+        if key not in best or trial.gain_m > best[key].gain_m:
             best[key] = trial
     rows, columns = (sorted({key[i] for key in best}) for i in (0, 1))
-    value = np.zeros((len(rows), len(columns)))
+    gain_m = np.zeros((len(rows), len(columns) + len(rows)))
     for (group, column), trial in best.items():
-        value[rows.index(group), columns.index(column)] = worth[trial]
-    pairs = zip(*linear_sum_assignment(value, maximize=True), strict=True)
-    chosen = [(rows[i], columns[j]) for i, j in pairs]
+        i = rows.index(group)
+        gain_m[i, columns.index(column)] = trial.gain_m
+        gain_m[i, len(columns) + i] = max(gain_m[i, len(columns) + i], trial.own_gain_m)
+    pairs = zip(*linear_sum_assignment(gain_m, maximize=True), strict=True)
+    chosen = [(rows[i], columns[j]) for i, j in pairs if j < len(columns)]
     return [best[key] for key in chosen if key in best]
 
 
@@ -119,11 +141,19 @@ def _attach(
     from farther away."""
     points = ours.cloud.points
     members, others = np.flatnonzero(instance >= 0), np.flatnonzero(instance < 0)
-    if not len(members):
+    if not len(members) or not len(others):
         return
-    far, row = nearest(tree_of(points[members]), points[others], 2 * REACH_M)
-    close = far < np.where(ours.unexplained[others], 2 * REACH_M, _ATTACH_M)
-    others, mine = others[close], instance[members[row[close]]]
+    low, high = (
+        points[members].min(0) - _ATTACH_UNEXPLAINED_M,
+        points[members].max(0) + _ATTACH_UNEXPLAINED_M,
+    )
+    others = others[((points[others] > low) & (points[others] < high)).all(1)]
+    far, nearest = tree_of(points[members]).query(
+        points[others], distance_upper_bound=_ATTACH_UNEXPLAINED_M, workers=-1
+    )
+    reach_m = np.where(ours.unexplained[others], _ATTACH_UNEXPLAINED_M, _ATTACH_M)
+    close = np.flatnonzero(far < reach_m)
+    others, mine = others[close], instance[members[np.asarray(nearest)[close]]]
     arrived = points[others]
     for k in np.unique(mine):
         arrived[mine == k] = motions[k].seen(points[others[mine == k]])

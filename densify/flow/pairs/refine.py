@@ -11,39 +11,52 @@ are made anew in every step, from all other points of the object, each at its ow
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from densify.flow.pairs.hypotheses import (
-    EVEN_M,
-    EXPLAINED_M,
-    MANY,
-    REACH_M,
     PairCloud,
     RigidMotion,
     one_per_voxel,
     slope_of,
     thinned,
 )
-from densify.flow.surface_matching import MAX_WEIGHT
 from densify.free_space.ground import HeightMap
 from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _MIN_POINTS = 40  # fewer show no surfaces
+_MAX_POINTS = 600  # of each cloud; of 400 the thickness hangs on how the axes lie
+_SIDE_M = 0.06
 _REACH_M, _MAX_REACH_M, _WIDER = 0.4, 1.0, 1.5
 _MIN_PLANES = 0.6  # share of points that must have one
-_GATE_M, _NUM_STEPS = 0.3, 5  # of the first steps; those of the last are finer
-_LIMIT_M = _GATE_M / 2
-MAX_THICK_M = 0.09  # thicker ones are sparse or no surfaces: nothing is learnt from them
-THIN_M = 0.05  # neighbours on one ring alone, which are narrower, span no plane
+_GATES_M, _LAST_GATES_M = np.array([0.3, 0.3, 0.3, 0.2, 0.2]), np.array([0.15, 0.15, 0.1, 0.1, 0.1])
+_NO_GATES = np.zeros(0)
+_STANDING = np.zeros(4)
+_LIMIT_M = 0.15
+_MAX_THICK_M = 0.09  # thicker ones are sparse or no surfaces: nothing is learnt from them
+_MAX_WEIGHT = 60.0
 _MIN_NEIGHBORS = 6
-_SIGMA_M = 0.02  # noise of a surface point
-_PRECISION = 1 / np.array([0.03, 0.03, 0.002, 0.01]) ** 2  # of m and rad from where it starts
-_HALF_TURN = 0.5  # by which two scanners may be apart
+_MIN_WIDTH_M2 = 0.05**2  # neighbours on one ring alone span no plane
+_SIGMA_M2 = 0.02**2  # noise of a surface point
+_PRECISION = np.array([1e3, 1e3, 3e5, 1e4])  # 1/m² from where it starts; 1/rad²
+_SHIFTS_M = (0.3, -0.3)
+_FACTORS = (2.0, 2 / 3)  # where one appearance was taken for the other
 _CLEARLY = 0.9  # how much thinner another start must come out,
 _SURELY = 0.95  # and the refined motion where times are not known
+_NEAR_M = 0.5  # of where the object may arrive
+_ARRIVED_POINTS = 300
+
+
+class Refined(NamedTuple):
+    """A motion with the thickness of the object's surfaces (m), and its ratio to that of the static
+    object; None where too few points lie on surfaces."""
+
+    motion: RigidMotion
+    thickness_m: float | None = None
+    of_standing: float | None = None
 
 
 def refined(
@@ -54,51 +67,46 @@ def refined(
     candidates: Int,
     ground: HeightMap,
     timed: bool,
-) -> tuple[RigidMotion, float]:
+) -> Refined:
     """Refine the motion of the source's ``members``; keep it as it is if that is no thinner.
-
-    Returns it with the thickness of the surfaces (m), `MAX_THICK_M` where too few points lie on
-    any.
 
     candidates: rows of the target that may be the object's. timed: lags are known: every scanner's
     points are compared with those of all others, each at its own time; otherwise with the other
     cloud's, of the same scanner if that is known.
     """
     if len(members) < _MIN_POINTS:
-        return motion, MAX_THICK_M
+        return Refined(motion)
     starts = _starts(motion, slope_of(ground, motion.centre), source, timed)
-    places = [replace(motion, state=s) for s in (*starts, np.zeros(4))]
+    places = [replace(motion, state=s) for s in (*starts, _STANDING)]
     near = _arrivals(places, members, source, target, candidates)
     if len(near) < _MIN_POINTS:
-        return motion, MAX_THICK_M
+        return Refined(motion)
     surfaces = _Surfaces.of(motion.centre, members, near, source, target, timed)
-    while surfaces.settled(starts[0], np.zeros(0))[2] <= _MIN_PLANES:
+    while surfaces.settled(starts[0], _NO_GATES)[2] <= _MIN_PLANES:
         if surfaces.reach_m * _WIDER > _MAX_REACH_M:
-            return motion, MAX_THICK_M
+            return Refined(motion)
         surfaces = replace(surfaces, reach_m=surfaces.reach_m * _WIDER)
     best, thick_m = starts[0], np.inf
     for start in starts:
-        state, found_m, _ = surfaces.settled(start, np.full(_NUM_STEPS, _GATE_M))
+        state, found_m, _ = surfaces.settled(start, _GATES_M)
         if found_m < _CLEARLY * thick_m:
             best, thick_m = state, found_m
-    best, thick_m, _ = surfaces.settled(best, np.full(_NUM_STEPS, EXPLAINED_M))
-    _, before_m, _ = surfaces.settled(motion.state, np.zeros(0))
+    best, thick_m, _ = surfaces.settled(best, _LAST_GATES_M)
+    _, before_m, _ = surfaces.settled(motion.state, _NO_GATES)
     enough_m = before_m if timed else _SURELY * before_m
-    if thick_m < min(enough_m, MAX_THICK_M):
+    _, standing_m, _ = surfaces.settled(_STANDING, _NO_GATES)
+    if thick_m < min(enough_m, _MAX_THICK_M):
         motion, before_m = replace(motion, state=best), thick_m
-    return motion, min(before_m, MAX_THICK_M)
+    return Refined(motion, before_m, before_m / max(standing_m, _SIDE_M * 1e-3))
 
 
 def _starts(motion: RigidMotion, slope: Float, source: PairCloud, timed: bool) -> list[Float]:
     """Return starts on the ground: the motion, and others from which it may be held back."""
     way = motion.state[:2]
     length_m = np.linalg.norm(way)
-    factors = (
-        1.0,
-        *(1 + shift / length_m for shift in (_GATE_M, -_GATE_M) if length_m + shift > 0),
-    )
+    factors = (1.0, *(1 + shift / length_m for shift in _SHIFTS_M if length_m + shift > 0))
     if not timed and source.lidar is None:
-        factors += (1 / (1 - _HALF_TURN), 1 / (1 + _HALF_TURN))  # one appearance for the other
+        factors += _FACTORS
     ways = [way * factor for factor in factors]
     yaws = [motion.state[3]] + [0.0] * (len(ways) - 1)
     return [np.array([*w, w @ slope, yaw]) for w, yaw in zip(ways, yaws, strict=True)]
@@ -112,12 +120,12 @@ def _arrivals(
     candidates: Int,
 ) -> Int:
     """Return the target's candidates near the members after one of the motions."""
-    points = source.points[thinned(members, MANY)]
+    points = source.points[thinned(members, _ARRIVED_POINTS)]
     arrived = np.concatenate([motion.seen(points) for motion in motions])
-    low, high = arrived.min(0) - REACH_M, arrived.max(0) + REACH_M
+    low, high = arrived.min(0) - _NEAR_M, arrived.max(0) + _NEAR_M
     at = target.points[candidates]
     box = candidates[((at > low) & (at < high)).all(1)]
-    far, _ = tree_of(arrived).query(target.points[box], distance_upper_bound=REACH_M)
+    far, _ = tree_of(arrived).query(target.points[box], distance_upper_bound=_NEAR_M)
     near: Int = box[np.isfinite(far)]
     return near
 
@@ -177,10 +185,10 @@ class _Surfaces:
 
 def _evenly(cloud: PairCloud, rows: Int) -> Int:
     """Thin the rows to one point of each scanner per voxel, few enough in all."""
-    side_m = EVEN_M
+    side_m = _SIDE_M
     while True:
         first = one_per_voxel(cloud.places(cloud.points[rows], rows), side_m)
-        if len(first) <= MANY:
+        if len(first) <= _MAX_POINTS:
             return rows[first]
         side_m *= _WIDER
 
@@ -213,7 +221,7 @@ def _settle(
         total = _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told)
         if total <= 0:
             break
-        scale = min(1.0, MAX_WEIGHT / total) / (_SIGMA_M * _SIGMA_M)
+        scale = min(1.0, _MAX_WEIGHT / total) / _SIGMA_M2
         for m in range(4):
             g[m] = scale * g[m] + precision[m] * (state[m] - start[m])
             for n in range(4):
@@ -293,7 +301,7 @@ def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told):  
         C[1, 0], C[2, 0], C[2, 1] = xy, xz, yz  # of a symmetric matrix the lower half is read
         variances, axes = np.linalg.eigh(C)
         thick, a, b, c = max(variances[0], 0.0), axes[0, 0], axes[1, 0], axes[2, 0]
-        if variances[1] < THIN_M * THIN_M:
+        if variances[1] < _MIN_WIDTH_M2:
             distance_m += _LIMIT_M
             continue
         off_m = -(a * mx + b * my + c * mz)
@@ -301,9 +309,7 @@ def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told):  
         num_planes += 1
         if abs(off_m) >= gate_m:
             continue
-        weight = (
-            (1 - (off_m / gate_m) ** 2) ** 2 * _SIGMA_M * _SIGMA_M / (_SIGMA_M * _SIGMA_M + thick)
-        )
+        weight = (1 - (off_m / gate_m) ** 2) ** 2 * _SIGMA_M2 / (_SIGMA_M2 + thick)
         # The more of the motion the plane was seen after than the point, the farther it is back.
         later = t - when[k]
         J[0], J[1], J[2] = a * later, b * later, c * later

@@ -3,7 +3,8 @@
 
 Nearest points alone cannot tell. The rings of a scanner lie elsewhere on an object that has moved.
 Each promising motion is refined until the object's surfaces are thin (`densify.flow.pairs.refine`).
-Its doubt is a product: what it leaves unexplained in both clouds, times the surfaces' thickness.
+It is judged by the points that it explains, and by the thickness of the surfaces compared with that
+of a static object.
 """
 
 from __future__ import annotations
@@ -12,101 +13,133 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from densify.flow.pairs.hypotheses import (
-    EXPLAINED_M,
-    REACH_M,
-    SAMPLE,
-    Hypotheses,
-    RigidMotion,
-    thinned,
-)
-from densify.flow.pairs.refine import THIN_M
-from densify.flow.pairs.unexplained import Unexplained, distances_m
+from densify.flow.pairs.hypotheses import Hypotheses, RigidMotion, thinned
+from densify.flow.pairs.refine import Refined
+from densify.flow.pairs.unexplained import EXPLAINED_M, MIN_UNEXPLAINED, Unexplained, distances_m
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Int
 
-_MAX_DOUBT_M = 0.05
-_MIN_FIRMLY = 2.0  # unexplained points; per metre as many more: the farther, the more places fit
-_JUDGE_POINTS = 2000  # fewer make the counterparts of near objects too far apart
-_ALONG = 0.3
-_BAR_M = 0.12  # width (rms) of a rail
+_MIN_TOGETHER, _MIN_TOGETHER_PER_M = 10, 3.5  # the farther, the more places fit by chance
+_MIN_MOTION_M = 0.1
+_MAX_RISE_M, _MAX_RISE = 0.12, 0.15  # and per metre
+_SAME_M, _SAME_RAD = 0.25, 0.06
+_LOOK_POINTS, _JUDGE_POINTS = 150, 2000
+_THIN_M, _ALONG = 0.05, 0.3
+_BAR_M, _LEVEL, _ACROSS = 0.12, 0.5, 0.2  # of a rail: its width (rms), its rise, its motion
+_MAX_BAR_M, _MAX_BAR_POINTS = 0.75, 60  # length (rms) of the back of a car, far away
+_AROUND_M = 0.5
+_MAX_LEFT = 0.4  # of what standing still leaves unexplained, in both clouds together
+_MAX_LEFT_EACH, _MAX_LEFT_START = 0.6, 0.75  # before a motion is refined
+_MAX_MISFIT = 0.82  # share left and mean distance in tolerances, together
+_MAX_MISFIT_THIN = 1.2  # where surfaces are so thin,
+_THIN_SURFACES_M, _THIN_OF_STANDING = 0.075, 0.65  # also compared with an object that stands
+_MAX_OF_STANDING = 0.82  # where much is left
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
     """The evidence for a motion of a group, in the group and around its place in the target.
 
-    group: its number. unexplained: source points of a sample, and targets around, without a
-    counterpart if the group is static. left: those of the sample with the motion. misfit: mean
-    distance to the target with it, as a share of the tolerance. firmly: points that no scanner
-    explains, in the cloud that has fewer. around: targets that are near. explained: those of them
-    that it explains. gain_m: by how much all distances, from the group and from the targets around,
-    become shorter. thickness_m: of the object's surfaces.
+    group: its number. still: unexplained source points without the motion, left: with it, both of a
+    sample. misfit: mean distance to the target with it, as a share of the tolerance. still_there:
+    unexplained targets without it. firmly, firmly_there: those of all points that no scanner
+    explains. around: targets that are near. explained: those of them that it explains. own_gain_m:
+    by how much all distances from the group to the target become shorter, gain_m: and those from
+    the target around.
     """
 
     group: int
-    motion: RigidMotion
-    unexplained: int
+    refined: Refined
+    still: int
     firmly: int
     left: int
     misfit: float
+    still_there: int
+    firmly_there: int
     around: Int
     explained: Int
+    own_gain_m: float
     gain_m: float
-    thickness_m: float
 
     @staticmethod
     def of(
-        group: int, members: Int, motion: RigidMotion, ours: Unexplained, theirs: Unexplained
+        group: int, members: Int, refined: Refined, ours: Unexplained, theirs: Unexplained
     ) -> Trial:
-        """Judge the motion of the source's ``members`` by nearest points alone."""
-        sample = thinned(members, SAMPLE)
-        place = ours.cloud.places(motion.seen(ours.cloud.points[sample]), sample)
+        """Judge the motion of the source's ``members`` by nearest points."""
+        sample = thinned(members, _LOOK_POINTS)
+        place = ours.cloud.places(refined.motion.seen(ours.cloud.points[sample]), sample)
         far, tolerance_m = distances_m(place, theirs.cloud.tree), ours.tolerance_m(sample)
-        around, explained, back_m = _looked_back(motion, members, ours, theirs)
+        around, explained, back_m = _looked_back(refined.motion, members, ours, theirs)
         own_gain_m = float((ours.distance_m[sample] - far).mean() * len(members))
         return Trial(
             group=group,
-            motion=motion,
-            unexplained=int(ours.unexplained[sample].sum() + theirs.unexplained[around].sum()),
-            firmly=int(min(ours.firmly[members].sum(), theirs.firmly[around].sum())),
+            refined=refined,
+            still=int(ours.unexplained[sample].sum()),
+            firmly=int(ours.firmly[members].sum()),
             left=int((far > tolerance_m).sum()),
             misfit=float((far / tolerance_m).mean()),
+            still_there=int(theirs.unexplained[around].sum()),
+            firmly_there=int(theirs.firmly[around].sum()),
             around=around,
             explained=explained,
+            own_gain_m=own_gain_m,
             gain_m=own_gain_m + back_m,
-            thickness_m=np.inf,
         )
 
-    def may_prove(self) -> bool:
-        """Return True if it moves, and so many points differ that it hardly fits by chance."""
-        length_m = float(np.linalg.norm(self.motion.state[:2]))
-        return length_m >= EXPLAINED_M and self.firmly >= _MIN_FIRMLY * (1 + length_m)
-
-    def worth(self, free: Bool) -> float:
-        """Return by how many metres the motion brings the clouds closer, less its doubt; 0 where it
-        is not confirmed. free: (M,) targets that no other motion explains."""
-        left = self.left + len(self.around) - int(free[self.explained].sum())
-        doubt_m = self._off(left) * self.thickness_m
-        return self.gain_m * max(0.0, 1 - doubt_m / _MAX_DOUBT_M)
-
-    def after(self, settled: Trial, thickness_m: float) -> Trial:
+    def after(self, found: Refined, settled: Trial) -> Trial:
         """Return the trial of the refined motion. It is judged by nearest points before or after
         the refinement, whichever fits better: rings drawn onto each other fit, but hold back."""
-        here, there = (t._off(t.left + len(t.around) - len(t.explained)) for t in (self, settled))
-        better = self if here < there else settled
-        return replace(better, motion=settled.motion, thickness_m=thickness_m)
+        here, there = (t._off(len(t.around) - len(t.explained)) for t in (self, settled))
+        return replace(self, refined=found) if here < there else settled
 
-    def _off(self, left: int) -> float:
+    def left_there(self, free: Bool) -> int:
+        """Return the targets left unexplained. free: (M,) those that no other motion explains."""
+        return len(self.around) - int(free[self.explained].sum())
+
+    def may_prove(self) -> bool:
+        """Return True if it explains enough, provided that its surfaces come out thin."""
+        far_m = float(np.linalg.norm(self.refined.motion.state[:2]))
+        return (
+            self.firmly >= MIN_UNEXPLAINED[0]
+            and self.firmly_there >= MIN_UNEXPLAINED[1]
+            and self.firmly + self.firmly_there >= _MIN_TOGETHER + _MIN_TOGETHER_PER_M * far_m
+            and self.left <= _MAX_LEFT_START * self.still
+            and self._off(len(self.around) - len(self.explained)) <= _MAX_MISFIT_THIN
+        )
+
+    def proves(self, free: Bool) -> bool:
+        """Return True if the motion is confirmed. Less must be explained where the surfaces are
+        thin, and nearly all where they are as thin without the motion."""
+        left_there = self.left_there(free)
+        off = self._off(left_there)
+        if (
+            not self.may_prove()
+            or self.left > _MAX_LEFT_EACH * self.still
+            or off > _MAX_MISFIT_THIN
+        ):
+            return False
+        thickness_m, of_standing = self.refined.thickness_m, self.refined.of_standing
+        if thickness_m is not None and of_standing is not None:
+            if of_standing > _MAX_OF_STANDING and 2 * off > _MAX_MISFIT:
+                return False
+            if of_standing <= _THIN_OF_STANDING and thickness_m <= _THIN_SURFACES_M:
+                return True
+        return (
+            left_there <= _MAX_LEFT_EACH * self.still_there
+            and self.left + left_there <= _MAX_LEFT * (self.still + self.still_there)
+            and off <= _MAX_MISFIT
+        )
+
+    def _off(self, left_there: int) -> float:
         # A sample of many points may hold none that are unexplained.
-        return left / max(self.unexplained, 1) + self.misfit
+        return (self.left + left_there) / max(self.still + self.still_there, 1) + self.misfit
 
 
 def promising(
     hypotheses: Hypotheses, ours: Unexplained, theirs: Unexplained
 ) -> list[tuple[int, RigidMotion]]:
-    """Return the groups and motions that explain anything in the source; of several that are the
-    same the one that fits best."""
+    """Groups and motions that pass a first look, in the source alone; of several that are the same
+    the one that leaves least."""
     num = len(hypotheses.state)
     row, of_point, state = hypotheses.row, hypotheses.of_point, hypotheses.state
     place = ours.cloud.places(hypotheses.seen(hypotheses.share[of_point]), row)
@@ -117,16 +150,18 @@ def promising(
     left = np.bincount(of_point, far > tolerance_m, num)
     misfit = np.bincount(of_point, far / tolerance_m, num)
     length_m = np.linalg.norm(state[:, :2], axis=1)
-    passed = (length_m >= EXPLAINED_M) & (left < still)
+    level = np.abs(state[:, 2]) <= _MAX_RISE_M + _MAX_RISE * length_m
+    passed = level & (length_m >= _MIN_MOTION_M) & (left <= _MAX_LEFT_START * still)
     found: dict[int, list[Float]] = {}
     chosen = []
     for h in np.flatnonzero(passed)[np.argsort(misfit[passed], kind="stable")]:
-        k, place_m = int(hypotheses.group[h]), state[h, :2]
-        if any(np.abs(other - place_m).max() < EXPLAINED_M for other in found.get(k, [])):
+        k = int(hypotheses.group[h])
+        off = [np.abs(other - state[h]) for other in found.get(k, [])]
+        if any(o[:2].max() < _SAME_M and o[3] < _SAME_RAD for o in off):
             continue
         if _ambiguous(ours.cloud.points[row[of_point == h]], state[h, :3]):
             continue
-        found.setdefault(k, []).append(place_m)
+        found.setdefault(k, []).append(state[h])
         share = float(hypotheses.share[h])
         chosen.append((k, RigidMotion(state[h], hypotheses.centre[h], share)))
     return chosen
@@ -135,30 +170,32 @@ def promising(
 def _ambiguous(points: Float, way: Float) -> bool:
     """Return True if the group cannot be told from another part of the same surface.
 
-    A flat group that moves along itself may be the strip of a wall seen through a gap, and a bar
-    any piece of a rail.
+    A flat group that moves along itself may be the strip of a wall seen through a gap. A level bar
+    may be any piece of a rail, unless it moves across itself and has the size of a far car's back.
     """
     _, scale, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
-    _, width_m, thickness_m = scale / np.sqrt(len(points))
-    along_m = _ALONG * np.linalg.norm(way)
-    if width_m < _BAR_M and abs(axes[0] @ way) > along_m:
-        return True
-    return bool(thickness_m < THIN_M and abs(axes[-1] @ way) < along_m)
+    length_m, width_m, thickness_m = scale / np.sqrt(len(points))
+    far_m = np.linalg.norm(way)
+    if width_m < _BAR_M and abs(axes[0, 2]) < _LEVEL:
+        far_car = len(points) < _MAX_BAR_POINTS and length_m < _MAX_BAR_M
+        return bool(not far_car or abs(axes[0] @ way) > _ACROSS * far_m)
+    along = abs(axes[-1] @ way) < _ALONG * far_m
+    return bool(thickness_m < _THIN_M and (along or width_m < _THIN_M))
 
 
 def _looked_back(
     motion: RigidMotion, members: Int, ours: Unexplained, theirs: Unexplained
 ) -> tuple[Int, Int, float]:
-    """Return what the target tells of the group where it arrives: `Trial`'s around, explained, and
-    by how much the distances become shorter (m)."""
+    """What the target tells of the group where it arrives: `Trial`'s around, explained, and by how
+    much the distances become shorter (m)."""
     sample = thinned(members, _JUDGE_POINTS)
     arrived = motion.seen(ours.cloud.points[sample])
-    low, high = arrived.min(0) - REACH_M, arrived.max(0) + REACH_M
+    low, high = arrived.min(0) - _AROUND_M, arrived.max(0) + _AROUND_M
     at = theirs.cloud.points
     box = thinned(np.flatnonzero(((at > low) & (at < high)).all(1)), 2 * _JUDGE_POINTS)
     tree = tree_of(ours.cloud.places(arrived, sample))
     far = distances_m(theirs.cloud.places(at[box], box), tree)
-    around, far = box[far < REACH_M], far[far < REACH_M]
+    around, far = box[far < _AROUND_M], far[far < _AROUND_M]
     explained = far <= EXPLAINED_M
     unsure = np.flatnonzero(~explained)
     thinning = np.sqrt(len(members) / len(sample))

@@ -6,24 +6,30 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from densify.flow.pairs.hypotheses import EXPLAINED_M, REACH_M, PairCloud
-from densify.flow.tracking.candidates import LINK_M, cluster_around
-from densify.flow.tracking.following import MIN_POINTS
+from densify.flow.pairs.hypotheses import PairCloud
 from densify.free_space.ground import HeightMap
-from densify.geometry.linking import link
+from densify.geometry.linking import close_to_seeds, link
 from densify.geometry.nearest import tree_of
-from densify.geometry.types import Bool, Float, Int
+from densify.geometry.types import Bool, Float, Float32, Int
 
-_NUM_SPACING = 8  # a counterpart is nearer than so many neighbours
+EXPLAINED_M = 0.1  # a nearer point is a counterpart,
+MIN_UNEXPLAINED = 5, 3  # in the source, in the target
+_REACH_M = 0.6  # a distance beyond it counts as this
+_MAX_EXPLAINED_M = 0.5
+_NUM_SPACING = 8  # or one within the radius of so many neighbours
+_LINK_M = 0.6
+_NEAR_M = 0.4
 _MIN_SHARE = 0.1  # unexplained, of a group taken as a whole
 _MAX_EXTENT_M = 20.0
-_MAX_HEIGHT_M = 3.4  # above the ground, of its middle
+_MIN_SEED_SHARE = 0.3
+_MIN_POINTS = 8
+_MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # above the ground, of its lowest and highest points
 
 
 class Unexplained:
     """The points of a cloud that the other one does not explain, and the groups they form.
 
-    distance_m: (N,) to the other cloud, at most 0.5 m. unexplained: (N,). firmly: (N,) unexplained
+    distance_m: (N,) to the other cloud, at most 0.6 m. unexplained: (N,). firmly: (N,) unexplained
     by the other scanners too: two scanners see the posts of a rail by different rings.
     candidates: (C,) rows that belong to a group. group: (N,) its label, -1 for none.
     """
@@ -31,7 +37,7 @@ class Unexplained:
     def __init__(self, cloud: PairCloud, distance_m: Float, alone: Bool) -> None:
         self.cloud, self.distance_m = cloud, distance_m
         self.unexplained = distance_m > EXPLAINED_M
-        far = np.flatnonzero(self.unexplained & (distance_m < REACH_M))
+        far = np.flatnonzero(self.unexplained & (distance_m < _MAX_EXPLAINED_M))
         self.unexplained[far] = distance_m[far] > self.tolerance_m(far)
         self.firmly = self.unexplained & alone
         self.group = self._grouped()
@@ -52,7 +58,7 @@ class Unexplained:
         k = min(_NUM_SPACING + 1, self.cloud.even_tree.n)
         place = self.cloud.places(self.cloud.points[rows], rows)
         spacing_m = np.asarray(self.cloud.even_tree.query(place, [k])[0])[:, 0]
-        return np.clip(spacing_m, EXPLAINED_M, REACH_M)
+        return np.clip(spacing_m, EXPLAINED_M, _MAX_EXPLAINED_M)
 
     def groups(self, ground: HeightMap) -> list[Int]:
         """Return the rows of each group that may be a road user: no crowns of trees, no walls."""
@@ -61,23 +67,24 @@ class Unexplained:
         return [
             part
             for part in parts
-            if len(part) >= MIN_POINTS
-            and self.firmly[part].any()
-            and np.median(ground.above(self.cloud.points[part])) <= _MAX_HEIGHT_M
+            if len(part) >= _MIN_POINTS
+            and self.firmly[part].sum() >= MIN_UNEXPLAINED[0]
+            and _may_drive(ground.above(self.cloud.points[part]))
         ]
 
     def _grouped(self) -> Int:
         """Return (N,) labels. Connected points are one group if it is no longer than a vehicle and
         much of it is unexplained; elsewhere only the points close to unexplained ones."""
         points = self.cloud.points
-        num, label = link(points, LINK_M)
+        num, label = link(points, _LINK_M)
         size = np.bincount(label, minlength=num)
         share = np.bincount(label, self.unexplained, num) / np.maximum(size, 1)
         whole = (share >= _MIN_SHARE) & (_extents_m(points, label, num) <= _MAX_EXTENT_M)
         group = np.where(whole[label], label, -1)
         rest = np.flatnonzero(~whole[label])
-        _, near = cluster_around(points[rest], self.unexplained[rest])
-        group[rest] = np.where(near >= 0, num + near, -1)
+        seed = self.unexplained[rest]
+        near = rest[close_to_seeds(points[rest], seed, _NEAR_M, _MIN_SEED_SHARE)]
+        group[near] = num + link(points[near], _LINK_M)[1]
         return group
 
 
@@ -89,7 +96,13 @@ def _extents_m(points: Float, label: Int, num: int) -> Float:
     return np.linalg.norm(high - low, axis=1)
 
 
+def _may_drive(height_m: Float32) -> bool:
+    """Return True if a group with those heights above the ground may be a road user."""
+    low_m, high_m = np.percentile(height_m, (5, 95))
+    return bool(low_m <= _MAX_LOW_M and high_m <= _MAX_HIGH_M)
+
+
 def distances_m(points: Float, tree: cKDTree, workers: int = 1) -> Float:
-    """Return (N,) distances to the nearest point of the tree, at most 0.5 m."""
-    far = tree.query(points, distance_upper_bound=REACH_M, workers=workers)[0]
-    return np.minimum(far, REACH_M)
+    """Return (N,) distances to the nearest point of the tree, at most 0.6 m."""
+    far = tree.query(points, distance_upper_bound=_REACH_M, workers=workers)[0]
+    return np.minimum(far, _REACH_M)
