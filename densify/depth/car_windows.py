@@ -42,6 +42,7 @@ def share_lost(key_image: RangeImage) -> Callable[[Float], Float] | None:
     anywhere_m = (-np.inf, -np.inf)
 
     def share(points: Float) -> Float:
+        # Returns in a point's cell and its eight neighbours, at whatever range.
         around = turning.num_beyond(points, anywhere_m, least=0).max(axis=0)
         return 1 - around / _EIGHT.size
 
@@ -92,7 +93,7 @@ def _close(layers: Layers, hole: Bool, depth_m: Float32, slopes: Float, least: n
 
 
 def _agree_m(depth_m: Float | Float32) -> Float:
-    """Return by how much points of one surface deviate at most."""
+    """Return the largest deviation (N,) metres of points on one surface."""
     return AGREE_M + AGREE_FRACTION * depth_m.astype(np.float64)
 
 
@@ -102,11 +103,11 @@ def _num_rays(layers: Layers, pixels: Bool) -> float:
 
 
 def _log_odds(lost: float, on_rim: float) -> float:
-    """Return how much likelier a ray's fate is in glass than on a surface as that of the rim.
+    """Return the mean log-likelihood ratio of a ray, glass against a surface like the rim.
 
-    lost, on_rim: shares of the rays without a return, in the hole and on the rim. A ray without one
-    adds log(P(none | glass) / P(none | surface)), another log((1 - P) / (1 - P)) of the same. Some
-    glass loses more rays than most.
+    lost, on_rim: shares of the rays without a return, in the hole and on the rim. A missing return
+    adds log(P(none | glass) / P(none | surface)); a return adds the log ratio of 1 - P(none).
+    P(none | glass) is the measured share where that is larger than the usual one.
     """
     ordinary = max(on_rim, _LEAST_LOST)
     in_glass = min(max(lost, _LOST_IN_GLASS), 1 - _LEAST_LOST)

@@ -20,8 +20,8 @@ from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Bool, Cloud, Float, Float32, Patches
 
 FREE = 0.3, 0.015
-"""What lies this far before all returns around, in metres or as a share of the range, the larger
-counts, was seen through."""
+"""A point is seen through if it is nearer than all returns around by this much: the larger of a
+distance in metres and a share of the range."""
 _STEEP = 5.7  # metres farther per metre across, 10 degrees: a surface steeper on one side is a step
 _BEND_M, _BEND = 0.10, 0.25  # most change of the slope, and as a share of the change itself
 _AROUND, _MOST_CELLS = 5.0, 20  # spacings within which rays without order have neighbours

@@ -88,7 +88,7 @@ def _dress_street(
     for stretch in stretches:
         furnish(scenery, stretch, 27.0, trees=stretch.road is main)
     for stretch in stretches[:3]:
-        # some gaps near the key, so that one sees who walks behind
+        # Gaps near the key show the pedestrians behind the parked cars.
         free = [(key_m + 4, key_m + 16)] if stretch.side > 0 else [(key_m + 8, key_m + 15)]
         free.append((mouth_m - 24, mouth_m + 24) if stretch.side > 0 else (0.0, 0.0))
         park_cars(scenery, stretch, 0.62, free)
