@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A camera's image in L*a*b*, and where it lies over the depth map.
 
-Where an image fits, it changes across the edges of depth. The sum of its changes there is compared
-with that of the image shifted, in steps of a third of the gap between rays: a cross-correlation.
+The image is shifted in steps of a third of the gap between rays. Where it fits, its edges lie on
+the edges of depth, and the sum of its changes there stands out from that of all other shifts.
 """
 
 from __future__ import annotations
@@ -14,14 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.depth.layers import Layers
-from densify.geometry.types import Float, Float32
+from densify.geometry.types import Float, Float32, Int
 
 _BLUR_PX = 0.6  # standard deviation; noise and the colour filter's pattern
 _LEAST_LIGHT = 70.0  # L of the lightest hundredth; a darker image is lightened
-_ASIDE = 3  # steps; nearer than these and it fits, farther than twice as many and it cannot
-# Standard deviations of the shifts at which it cannot fit. Right images reach 3.8 to 7.2, and where
-# they are at most 0.7 less; mirrored ones and those of other scenes reach 3.1.
-_LEAST, _CLEARLY = 3.5, 1.2
+_REACH = 14  # steps to all sides
+_ASIDE, _ELSEWHERE = 3.2, 6.0  # steps; nearer and it fits, farther and it cannot
+# Standard deviations of the shifts elsewhere. Right images reach 3.1 to 11 where they are, and at
+# most 1.9 more beside that; mirrored ones reach 3.0.
+_LEAST, _LEAST_ASIDE, _CLEARLY = 3.05, 5.0, 1.9
+_TREND = 3  # degree of what changes slowly with the shift
+_MOST = 6000  # edges of each kind that are looked at
+_JUMPS_COUNT = 0.4  # of what boundary pixels count, each kind
+_ONE_SURFACE, _JUMP = (0.1, 0.02), (0.3, 0.05)  # metres plus share of the depth
+_GAP, _STRICT_GAP = 3, 10  # steps between neighbouring pixels, without boundary pixels
+_EDGE_PX = 1.5  # standard deviation of the blur that tells which way depth changes
+_AROUND_PX, _STRONG = 20.0, 4.0  # over which image edges are compared; stronger ones count no more
+_REBLUR_PX, _MOST_BLUR, _EDGES_LOOKED_AT = 1.5, 2.0, 0.03  # px; steps; share of the pixels
 
 
 def lab(image: NDArray[np.uint8]) -> Float32:
@@ -51,73 +60,146 @@ class Aligned(NamedTuple):
 
 
 def align_image(layers: Layers) -> Aligned | None:
-    """Return the image of the layers, moved to where it fits; None if it fits nowhere near.
+    """Return the image of the layers, moved to where it fits; None if it does not, or is blurred.
 
-    At most 3 steps away its edges must stand out by 3.5 standard deviations. It is moved there if
-    they stand out by 1.2 more than where it is.
+    Its edges must stand out most at most 3.2 steps away. It stays if they stand out by 3.05 as it
+    is, and by at most 1.9 less than where most; else it is moved, if they stand out by 5 there. It
+    is blurred if its edges are by more than two steps: the sharper an edge, the more another blur
+    takes from its gradient (Zhuo and Sim, "Defocus map estimation from a single image", 2011).
     """
     lab, step_px = layers.lab, max(1, round(0.3 * float(np.median(layers.gap_px))))
-    if lab is None:
+    if lab is None or _blur_px(lab) > _MOST_BLUR * step_px:
         return None
-    reach = 4 * _ASIDE
-    right, down = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
-    sums = _edge_sums(lab, layers, step_px)[down, right]
-    away = np.hypot(right, down)
-    elsewhere = away > 2 * _ASIDE
-    terms = np.stack([right, down, np.ones_like(right)], axis=2)
-    trend = np.linalg.lstsq(terms[elsewhere], sums[elsewhere], rcond=None)[0]
-    left = sums - terms @ trend
-    stands_out = left / max(float(left[elsewhere].std()), float(np.finfo(np.float32).tiny))
-    stands_out[away > _ASIDE] = -np.inf
-    best = np.unravel_index(stands_out.argmax(), away.shape)
-    if stands_out[best] < _LEAST:
+    found = _standing_out(_edge_sums(lab, layers, step_px))
+    here, most = found[_REACH, _REACH], found.max()
+    down, right = np.array(np.unravel_index(found.argmax(), found.shape)) - _REACH
+    if np.hypot(down, right) > _ASIDE:
         return None
-    if stands_out[best] - stands_out[reach, reach] <= _CLEARLY:
+    if here >= _LEAST and most - here <= _CLEARLY:
         return Aligned(lab)
-    by_px = step_px * down[best], step_px * right[best]
+    if most < _LEAST_ASIDE:
+        return None
+    down, right = step_px * down, step_px * right
     rows, columns = (
         np.clip(np.arange(size) + off, 0, size - 1)
-        for size, off in zip(lab.shape[:2], by_px, strict=True)
+        for size, off in zip(lab.shape[:2], (down, right), strict=True)
     )
-    return Aligned(np.ascontiguousarray(lab[rows[:, None], columns]), int(by_px[1]), int(by_px[0]))
+    return Aligned(np.ascontiguousarray(lab[rows[:, None], columns]), int(right), int(down))
+
+
+def _standing_out(sums: Float) -> Float:
+    """Return (29,29) how far each of the sums stands out, in standard deviations of those
+    elsewhere, once their slow trend is taken off."""
+    offsets = np.arange(-_REACH, _REACH + 1)
+    right, down = np.meshgrid(offsets, offsets)
+    elsewhere = np.hypot(right, down) > _ELSEWHERE
+    powers = [(i, j) for i in range(_TREND + 1) for j in range(_TREND + 1 - i)]
+    terms = np.stack([(right / _REACH) ** i * (down / _REACH) ** j for i, j in powers], axis=2)
+    trend = np.linalg.lstsq(terms[elsewhere], sums[elsewhere], rcond=None)[0]
+    left: Float = sums - terms @ trend
+    return left / max(float(left[elsewhere].std()), 1e-12)
 
 
 def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
-    """Return (H,W) how much the image changes across the edges of depth, by the steps that it is
-    shifted down and to the right; negative ones count from the end.
+    """Return (29,29) how much the image, shifted so many steps down and to the right, changes
+    across the edges of depth.
 
-    Of each boundary pixel it is the squared gradient of lightness along the gradient of depth.
-    Gradients are a share of their sum with the usual one: a strong one counts no more than a few.
+    These are boundary pixels, and jumps between neighbouring known pixels, with boundary pixels and
+    without. Each kind counts as a multiple of its mean.
     """
-    clear_m = np.where(layers.veiled, np.float32(0), np.maximum(layers.depth_m, layers.rim_m))
-    known = clear_m > 0
-    inverse = np.divide(1, clear_m, out=np.zeros_like(clear_m), where=known)
-    light, nearness, weight, rims = (
-        _reduced(part, step_px)
-        for part in (lab[..., 0], inverse, known, known & (layers.rim_m > 0))
-    )
-    change = _gradient(light)
-    size = np.hypot(*change)
-    change /= np.maximum(size + np.median(size), np.finfo(np.float32).tiny)
-    nearness, weight = (
-        cv2.GaussianBlur(a, (0, 0), 1).astype(np.float32, copy=False) for a in (nearness, weight)
-    )
-    across = _gradient(nearness / np.maximum(weight, np.finfo(np.float32).eps))
-    across /= np.maximum(np.hypot(*across), np.finfo(np.float32).tiny)
-    spectrum = sum(
-        np.fft.rfft2(change[i] * change[j]) * np.conj(np.fft.rfft2(rims * across[i] * across[j]))
-        for i in (0, 1)
-        for j in (0, 1)
-    )
-    sums: Float = np.fft.irfft2(spectrum, light.shape)
-    return sums
+    known_m = np.maximum(layers.depth_m, layers.rim_m)
+    strict_m = np.where(layers.rim_m == 0, layers.depth_m, np.float32(0))
+    clear_m = np.where(layers.veiled, np.float32(0), known_m)
+    row, column = (_some(f) // step_px for f in np.nonzero((clear_m > 0) & (layers.rim_m > 0)))
+    changes = _changes(_reduced(lab, step_px))
+    changes = np.pad(changes, ((0, 0), (_REACH, _REACH), (_REACH, _REACH)), "edge")
+    sums = _sums(changes, row, column, *_across(clear_m, step_px)[:, row, column])
+    total = sums / max(float(sums.mean()), 1e-12)
+    for depth_m, gap in ((known_m, _GAP), (strict_m, _STRICT_GAP)):
+        row, column = _jumps(depth_m, gap, step_px)
+        sums = _sums(changes, row, column, 1.0, 0.0)
+        column, row = _jumps(np.ascontiguousarray(depth_m.T), gap, step_px)
+        sums += _sums(changes, row, column, 0.0, 1.0)
+        total += _JUMPS_COUNT * sums / max(float(sums.mean()), 1e-12)
+    return total
 
 
-def _reduced(image: NDArray[np.generic], step_px: int) -> Float32:
+def _sums(
+    changes: Float32, row: Int, column: Int, right: float | Float32, down: float | Float32
+) -> Float:
+    """Return (29,29) the changes at rows and columns (E,) along ``right`` and ``down``, (E,) or the
+    same everywhere."""
+    width, (x, y) = changes.shape[2], changes.reshape(2, -1)
+    offsets = np.arange(-_REACH, _REACH + 1)
+    beside = (row + _REACH) * width + column + _REACH + offsets[:, None]
+    rows = []
+    for there in (beside + down_steps * width for down_steps in offsets):
+        rows.append(np.abs(x.take(there) * right + y.take(there) * down).sum(axis=1))
+    return np.array(rows, np.float64)
+
+
+def _some(values: Int) -> Int:
+    """Return the values, or 6,000 of them, evenly."""
+    return values[:: len(values) // _MOST + 1]
+
+
+def _jumps(depth_m: Float32, gap: int, step_px: int) -> tuple[Int, Int]:
+    """Return rows and columns, in steps, where depth (H,W) jumps from one surface to another
+    between neighbouring known pixels of a row, at most ``gap`` steps apart. Both surfaces go on,
+    which leaves out most of leaves."""
+    row, column = np.nonzero(depth_m)
+    known_m = depth_m[row, column]
+    off_m, least_m = np.abs(np.diff(known_m)), np.minimum(known_m[1:], known_m[:-1])
+    near = (np.diff(row) == 0) & (np.diff(column) <= gap * step_px)
+    on = near & (off_m < _ONE_SURFACE[0] + _ONE_SURFACE[1] * least_m)
+    jumps = near & (off_m >= _JUMP[0] + _JUMP[1] * least_m)
+    at = 1 + np.flatnonzero(on[:-2] & jumps[1:-1] & on[2:])
+    middle = (column[at] + column[at + 1]) // 2
+    return _some(row[at]) // step_px, _some(middle) // step_px
+
+
+def _blur_px(lab: Float32) -> float:
+    """Return the standard deviation of the blur of the image's strongest edges."""
+    light = lab[..., 0]
+    again = cv2.GaussianBlur(light, (0, 0), _REBLUR_PX).astype(np.float32, copy=False)
+    before, after = (np.hypot(*_gradient(image)) for image in (light, again))
+    edges = after >= max(float(np.quantile(after, 1 - _EDGES_LOOKED_AT)), 1e-6)
+    if not edges.any():
+        return np.inf
+    steeper = float(np.median(before[edges] / after[edges]))
+    return _REBLUR_PX / float(np.sqrt(max(steeper**2 - 1, 1e-6)))
+
+
+def _reduced(image: Float32, step_px: int) -> Float32:
     """Return an image each pixel of which is the mean of ``step_px`` by ``step_px``."""
+    if step_px == 1:
+        return image
     size = (-(-image.shape[1] // step_px), -(-image.shape[0] // step_px))
-    reduced = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return reduced.astype(np.float32, copy=False)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32, copy=False)
+
+
+def _across(depth_m: Float32, step_px: int) -> Float32:
+    """Return (2,H,W) the direction right and down in which depth changes most, reduced."""
+    known = depth_m > 0
+    inverse = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=known)
+    sums, weight = (
+        cv2.GaussianBlur(_reduced(part, step_px), (0, 0), _EDGE_PX)
+        for part in (inverse, known.astype(np.float32))
+    )
+    direction = _gradient((sums / (weight + 1e-3)).astype(np.float32, copy=False))
+    return direction / np.maximum(np.hypot(*direction), 1e-12)
+
+
+def _changes(lab: Float32) -> Float32:
+    """Return (2,H,W) the gradient of the channel that changes most, against those around."""
+    change, size = _gradient(lab[..., 0]), np.zeros(lab.shape[:2], np.float32)
+    for channel in np.moveaxis(lab, 2, 0):
+        gradient = _gradient(channel)
+        length = np.hypot(*gradient)
+        change = np.where(length > size, gradient, change)
+        size = np.maximum(length, size)
+    around = cv2.GaussianBlur(size, (0, 0), _AROUND_PX) + 1
+    return change / np.maximum(around, size / _STRONG)
 
 
 def _gradient(image: Float32) -> Float32:
