@@ -8,6 +8,7 @@ import runpy
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -55,6 +56,21 @@ def test_kitti(output_of, short_drive: Path, tmp_path: Path) -> None:
     assert number_before(text, "points\n") > 5 * 100_000
     assert number_before(text, "points moved") > 100
     assert not list(tmp_path.iterdir())
+
+
+def test_kitti_stereo(output_of, tmp_path: Path) -> None:
+    street = Street("street", 0, "vlp16")
+    drive = write_street("kitti", street, tmp_path, range(119, 122), ["image_02"])
+    true_m, path = street.truth.depth_m("image_02", 120), str(tmp_path / "{}.png")
+    disparity = 256 * 0.532725 * street.cameras["image_02"].focal_px / np.maximum(true_m, 1)
+    cv2.imwrite(path.format("true"), np.where(true_m > 0, disparity, 0).astype(np.uint16))
+    moving = street.truth.moving_mask("image_02", 120)
+    cv2.imwrite(path.format("objects"), moving.astype(np.uint8))
+    text = output_of("kitti_stereo.py", str(drive), "120", *map(path.format, ("true", "objects")))
+    rows = re.findall(r"(\w+, \w+, \w+) +outliers +([\d.]+)%, coverage ([\d.]+)", text)
+    outliers = {name: float(percent) for name, percent, _ in rows}
+    assert len(outliers) == 18
+    assert outliers["flow, measured, moving"] < 0.2 * outliers["icp, measured, moving"]
 
 
 def test_train_completion(output_of, tmp_path: Path) -> None:

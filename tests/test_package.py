@@ -11,7 +11,9 @@ import sys
 from importlib.metadata import entry_points, version
 from pathlib import Path
 
+import numpy as np
 import pytest
+import yaml
 
 import densify
 from densify.config import Config, as_mapping, presets, resolve
@@ -84,7 +86,7 @@ def test_unknown_name_is_an_attribute_error() -> None:
 
 @needs_installation
 def test_one_version() -> None:
-    assert version("densify") == densify.__version__
+    assert version("densify-lidar") == densify.__version__
     assert f"## {densify.__version__}" in (CHECKOUT / "CHANGES.md").read_text("utf-8")
 
 
@@ -113,14 +115,39 @@ def test_the_installed_package_is_tested() -> None:
     assert not missing
 
 
-PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
+PAGES = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]
 
 
 def test_the_readme_is_short_and_links_lead_somewhere() -> None:
-    assert len(PAGES[0].read_text("utf-8").splitlines()) <= 150
+    readme = PAGES[0].read_text("utf-8")
+    assert len(readme.splitlines()) <= 110 and len(readme.split()) <= 900
+    assert len((CHECKOUT / "docs/results.md").read_text("utf-8").splitlines()) <= 150
     for page in PAGES:
         for link in re.findall(r"\]\(([^)#]+)", page.read_text("utf-8")):
             assert link.startswith("https://") or (page.parent / link).exists(), f"{page}: {link}"
+
+
+def test_messages_and_pages_name_what_can_be_installed() -> None:
+    """``densify`` on the package index is another project."""
+    extras = set(re.findall(r"^(\w+) = \[", (CHECKOUT / "pyproject.toml").read_text(), re.M))
+    code = [path.read_text("utf-8") for path in (CHECKOUT / "densify").rglob("*.py")]
+    named = re.findall(r'(?:needed\("[\w.]+", |how_to_install\()["\'](\w+)', "".join(code))
+    texts = [*code, *(page.read_text("utf-8") for page in PAGES)]
+    assert not [text for text in texts if re.search(r"pip install '?densify\b(?!-lidar)", text)]
+    named += re.findall(r"pip install '(?:densify-lidar|\.)\[([\w,]+)\]'", "".join(texts))
+    assert len(named) > 15 and {e for names in named for e in names.split(",")} <= extras
+
+
+def test_the_numbers_of_the_pictures_are_those_of_the_gate() -> None:
+    """The streets of the gallery are keys of the gate, which makes their numbers again."""
+    drawn = json.loads((CHECKOUT / "docs/pictures/numbers.json").read_text())
+    gate = yaml.safe_load((CHECKOUT / "tests/gate.yaml").read_text())
+    for name, held in (("street", "street"), ("crossing", "street:crossing")):
+        for product in ("measured", "filled"):
+            numbers, kept = drawn[name][f"flow {product}"], gate[held]
+            expected = kept[f"{product} all coverage"], kept[f"{product} all outliers_percent"]
+            found = numbers["coverage"], 100 * numbers["outliers"]
+            assert np.allclose(found, expected, rtol=0, atol=(0.004, 0.03)), (name, product)
 
 
 def test_the_pages_name_knobs_that_exist() -> None:

@@ -134,8 +134,8 @@ def _row_of_depth(scene: Scene) -> list[str]:
     cells = [str(scene)]
     for product, part in (("measured", "all"), ("filled", "all"), ("filled", "moving")):
         score = scores[source][product][part]
-        cells.append("–" if score["coverage"] is None else f"{score['coverage']:.2f}")
-        cells.append(_times_100(score["outliers"], 2, " %"))
+        coverage = "–" if score["coverage"] is None else f"{score['coverage']:.2f}"
+        cells.append(f"{_times_100(score['outliers'], 2, ' %')} ({coverage})")
     return cells
 
 
@@ -176,16 +176,16 @@ def _row_of_registration(scene: Scene) -> list[str]:
 
 TABLES: Mapping[str, _Table] = {
     "depth": _Table(
-        "Coverage of the true pixels within a scanner's reach, and outliers.",
-        "measured | outliers | filled | outliers | moving, filled | outliers",
+        "Outliers among the true pixels within a scanner's reach, and in brackets their coverage.",
+        "measured | filled | moving, filled",
         _DEPTH,
         _row_of_depth,
         real=True,
     ),
     "flow": _Table(
-        "Moving points found, their error with missed points counted as static, and in brackets of "
-        "those found.",
-        "found | one sweep | five sweeps | falsely moving | ghosts",
+        "Recall of moving points, their error with missed points counted as static, and in "
+        "brackets of those found.",
+        "recall | one sweep | five sweeps | false positives | ghosts",
         _FLOW,
         _row_of_flow,
     ),

@@ -24,6 +24,12 @@ def _cut(text: str, num_characters: int) -> str:
     return f"{text[: num_characters - end - 3]}...{text[-end:]}"
 
 
+def how_to_install(extra: str) -> str:
+    """Return the commands that install an optional extra. ``densify`` on the package index is
+    another project."""
+    return f"pip install 'densify-lidar[{extra}]', or in a checkout pip install '.[{extra}]'"
+
+
 def did_you_mean(got: str, known: Iterable[str]) -> str:
     """Return ``did you mean NAME? `` with the known name most like ``got``, "" if none is."""
     close = difflib.get_close_matches(got, list(known), n=1, cutoff=0.6)

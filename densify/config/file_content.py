@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from densify.config.errors import InputError
+from densify.config.errors import InputError, how_to_install
 
 MOST_BYTES = 1 << 30
 """Largest content that is read into memory, unpacked. A sweep has 2 to 10 MB."""
@@ -137,17 +137,18 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
 
 
 def needed(module: str, extra: str, what: str) -> Any:
-    """Return the imported module. Raises InputError, with what mends it, if that fails.
+    """Return the imported module.
 
-    extra: of densify, that brings it. what: needs it, such as "Argoverse 2 recordings".
+    extra: the optional extra of densify that installs it.
+    what: the things that need it, such as "Argoverse 2 recordings", for the message.
+    Raises InputError, with the command that installs it.
     """
     package = module.partition(".")[0]
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
         raise InputError(
-            f"{what} need the package {package} ({error}); install it with "
-            f"pip install 'densify[{extra}]'"
+            f"{what} need the package {package} ({error}); {how_to_install(extra)}"
         ) from None
     except ImportError as error:
         raise InputError(

@@ -18,12 +18,17 @@ _SECTIONS: dict[str, Any] = {f.name: type(f.default) for f in dataclasses.fields
 def resolve(
     config: Config | str | Path | Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
 ) -> Config:
-    """Return the configuration that `config` and the overrides name.
+    """Return the settings that ``config`` and the overrides name.
 
-    config: None for the defaults; a Config; a mapping ``{section: {key: value}}`` of differences
-    from them; a Path to a YAML file of that form; or a str, a preset's name or else a file's.
-    overrides: ``section.key=value`` each, values as in YAML; later ones win. Raises InputError for
-    anything unknown, of the wrong type or out of range, naming where it comes from.
+    Args:
+        config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a
+            YAML file of that form; or a str, the name of a preset or else a file. Only differences
+            from the defaults need to be named.
+        overrides: ``section.key=value`` each, values written as in YAML; later ones win.
+
+    Raises:
+        InputError: A name is unknown (the message suggests the right one), or a value is of the
+            wrong type or out of range. The message names the file or ``--set`` that it comes from.
     """
     values = as_mapping(config if isinstance(config, Config) else Config())
     if isinstance(config, Mapping):

@@ -28,7 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from densify.config.errors import ComputationError, InputError, OutputError
+from densify.config.errors import ComputationError, InputError, OutputError, how_to_install
 from densify.pipeline.heap import keep_freed_memory
 
 Item = TypeVar("Item")
@@ -183,7 +183,7 @@ def _open_dask(scheduler: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
     except ImportError as error:
         raise InputError(
             f"--scheduler {scheduler}: needs Dask, which is not installed; "
-            "pip install 'densify[cluster]'"
+            f"{how_to_install('cluster')}"
         ) from error
     except Exception as error:  # of many types
         raise InputError(

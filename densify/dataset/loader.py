@@ -51,14 +51,22 @@ class DepthDataset(Dataset[dict[str, Any]]):
         data: Mapping[str, str | Path] | None = None,
         split: Literal["train", "val"] | None = None,
     ) -> None:
-        """root: ``--out`` of `densify dataset`. cameras: names, all if None. filled: dense depth
-        has the pixels interpolated between measured ones too. crop: (height_px, width_px), cut out
-        at the bottom of the image and at a random place from left to right. flip: mirror every
-        other sample, at random. data: drive -> where its recording is now, of those that have
-        moved. split: "train" or "val", KITTI's; both if None.
+        """Find the finished keys of a set.
 
-        Raises InputError if there is no set of this layout or nothing in it is left to load;
-        loading raises it for a crop larger than an image, and files that are missing or damaged.
+        Args:
+            root: ``--out`` of `densify dataset`.
+            cameras: Names; None for all.
+            filled: Take the filled map as dense depth.
+            crop: (height_px, width_px), cut out at the bottom of the image, where the depth is, and
+                at a random place from left to right.
+            flip: Mirror every other sample, at random.
+            data: Drive -> where its recording is now, for `densify.open_sequence`. It is needed for
+                those that have moved since the set was made.
+            split: ``train`` or ``val``, KITTI's; None for both.
+
+        Raises:
+            InputError: There is no set of this layout, or no finished key in it. Loading raises it
+                for a crop larger than an image, and for files that are missing or damaged.
         """
         self._root, self._crop, self._flip = Path(root), crop, flip
         self._dense = "groundtruth_filled" if filled else "groundtruth"

@@ -87,21 +87,33 @@ def make_dataset(
     verify: bool = False,
     report: Callable[[Summary], None] | None = None,
 ) -> Summary:
-    """Make every key of whole recordings, as a training set in the folder ``out``.
+    """Make every key of whole recordings, as a training set.
 
-    data: as `densify.open_sequence` takes them. keys: the frames ``start`` to ``stop`` - 1 by
-    ``step`` that exist; all if None. recipe: the usual one if None. num_workers: processes; 1 works
-    in this one, None takes as many as cores, free memory and keys suffice for (a script that starts
-    several needs ``if __name__ == "__main__"``). scheduler: address of a Dask scheduler whose
-    workers are used instead, with the same files at the same paths; ``tcp://`` trusts everybody on
-    that network, ``tls://`` takes certificates. shard: (i, n), the i-th of n parts, from 1, which
-    may run at once on machines that share ``out``. verify: compare finished files with their
-    hashes, and make damaged ones again. report: called before the first key and after every one.
+    Run again, it goes on where it was stopped: finished keys are kept, failed ones are tried again.
+    The files do not depend on the number of processes, on shards or on interruptions. The manifest
+    says what became of every key.
 
-    Run again, it goes on where it was stopped; failed keys are tried again. The files do not depend
-    on processes, shards or interruptions; the manifest says what became of every key. Raises
-    InputError for what cannot be used, and where another run is at work on the same part;
-    ComputationError where the disk is full or the workers are lost: what is finished is kept.
+    Args:
+        data: Recordings, as `densify.open_sequence` takes them.
+        out: The folder of the set.
+        keys: The existing frames ``start`` to ``stop`` - 1 by ``step``; None for all.
+        recipe: Window, method, cameras, limits of the scores and settings; None for the usual ones.
+        num_workers: Number of processes. 1 works in this one. None takes as many as cores, free
+            memory and keys allow. A script that starts several needs
+            ``if __name__ == "__main__"``.
+        scheduler: Address of a Dask scheduler whose workers are used instead. They need the same
+            files at the same paths. ``tcp://`` trusts everybody on that network.
+        shard: (i, n), the i-th of n parts of the work, from 1. Parts may run at the same time on
+            machines that share ``out``.
+        verify: Compare finished files with their recorded hashes, and make damaged ones again.
+        report: Is called before the first key and after every one.
+
+    Returns:
+        How far the set is.
+
+    Raises:
+        InputError: Something cannot be used, or another run works on the same part.
+        ComputationError: The disk is full or the workers are lost. What is finished is kept.
     """
     if isinstance(data, str) or not data:
         raise InputError(f"data: got {data!r}, expected a list of recordings, such as ['street']")

@@ -47,14 +47,16 @@ _CAMERA = [f.name for f in fields(Camera) if f.name != "name"]
 
 @dataclass(frozen=True)
 class Gate(Section):
-    """``--set dataset.NAME=VALUE``: limits beyond which a key is put aside, by scores that need no
-    truth, None is no limit; and the split of the tree, kitti for KITTI's official one.
+    """``--set dataset.NAME=VALUE``: limits of the scores beyond which a key is put aside.
 
-    max_ghost: share of the accumulated points that the key sweep saw through.
-    min_density: share of the image's pixels with a measured depth, in every camera.
-    max_outliers: share of the key sweep's returns, held out, that are outliers by KITTI's rule, in
-        every camera.
-    min_sweeps: number of sweeps in the window, which ends and gaps of the recording cut.
+    None is no limit. The scores need no ground truth.
+
+    Attributes:
+        max_ghost: Share of the accumulated points that the key sweep saw through.
+        min_density: Share of the image's pixels with a measured depth, in every camera.
+        max_outliers: Share of outliers among the key's returns, held out, in every camera.
+        min_sweeps: Number of sweeps in the window, which ends and gaps of the recording cut.
+        split: ``train`` or ``val``, the split of the tree; ``kitti`` for KITTI's official one.
     """
 
     max_ghost: float | None = within(None, 0, 1)
@@ -81,12 +83,15 @@ class Gate(Section):
 
 @dataclass(frozen=True)
 class Recipe:
-    """How every key of a set is made.
+    """How every key of a training set is made.
 
-    window: sweeps on each side of a key. method: flow, icp or none.
-    layout: ``kitti-depth``, KITTI's depth tree, or ``densify``, what ``densify run`` writes.
-    cameras: names, None for all. gate: limits of the scores, and the split of the tree.
-    config: what `densify.config.resolve` returns.
+    Attributes:
+        window: Number of sweeps on each side of a key.
+        method: ``flow``, ``icp`` or ``none``.
+        layout: ``kitti-depth``, KITTI's depth tree, or ``densify``, what ``densify run`` writes.
+        cameras: Names; None for all.
+        gate: Limits of the scores, and the split of the tree.
+        config: Settings, from `densify.config.resolve`.
     """
 
     window: int = 5

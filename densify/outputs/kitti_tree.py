@@ -134,7 +134,8 @@ val holds KITTI's 13 validation drives, train every other recording.
 
 Depth is a 16-bit gray PNG, metres along the camera's optical axis, 0 is none:
 depth_m = cv2.imread(path, cv2.IMREAD_UNCHANGED) / 256.0. Confidence is an 8-bit gray PNG: 255 is
-most certain, 0 is no depth. It ranks pixels and is no probability: (value - 1) / 254 is 0 to 1.
+most certain, 0 is no depth. With c = (value - 1) / 254, one pixel in 10^(5 c) is expected to be
+wrong by KITTI's rule: more than 3 px of disparity and 5 %.
 
 All maps show the moment in which their own image was exposed (the middle of the sweep, where the
 settings say "at: sweep"). velodyne_raw is densify's own projection and differs from KITTI's files.

@@ -62,18 +62,24 @@ def run(
 ) -> Result:
     """Densify one key.
 
-    key: absolute frame number.
-    window: sweeps on each side of it. It is cut, with a warning, at the ends of the recording, at
-        a hole in time of more than three usual periods, and at a sweep that cannot be used.
-    method: none, icp or flow, see `METHODS`.
-    cameras: names, all if None.
-    config: what `densify.config.resolve` takes.
-    progress: called with (stage, done, total).
-    prior: a folder of depth images that complete the maps where nothing is measured or filled, see
-        `densify.readers.prior_files`.
+    Args:
+        sequence: The recording.
+        key: Absolute frame number.
+        window: Number of sweeps on each side of the key. The window is cut, with a warning, at the
+            ends of the recording, at a hole in time of more than three usual periods, and at a
+            sweep that cannot be used.
+        method: ``flow`` (scene flow), ``icp`` (rigid accumulation) or ``none`` (single sweep).
+        cameras: Names; None for all.
+        config: Settings, see `densify.config.resolve`.
+        progress: Is called with (stage, done, total).
+        prior: A folder of depth images that complete the maps where nothing is measured or filled.
 
-    Returns the result with its baselines. Raises InputError for what cannot be used,
-    ComputationError where registration fails.
+    Returns:
+        The result, with the simpler methods as its ``baselines``.
+
+    Raises:
+        InputError: The recording or the settings cannot be used.
+        ComputationError: Registration fails.
     """
     methods = with_baselines(method)
     made = compare(sequence, key, window, cameras, config, progress, methods, prior=prior)
@@ -120,10 +126,26 @@ def compare(
     cache: Cache | None = None,
     prior: str | Path | None = None,
 ) -> dict[str, Result]:
-    """Return results by method on the same registration, each with those before as its baselines.
+    """Densify one key with several methods, on the same registration.
 
-    methods: some of `METHODS`. cache: keeps the results of steps. prior: completes the maps of the
-    last method. The rest as `run`.
+    Args:
+        sequence: The recording.
+        key: Absolute frame number.
+        window: Number of sweeps on each side of the key.
+        cameras: Names; None for all.
+        config: Settings, see `densify.config.resolve`.
+        progress: Is called with (stage, done, total).
+        methods: Some of ``none``, ``icp``, ``icp-visible``, ``icp-far``, ``flow-plain``, ``paper``
+            and ``flow``.
+        cache: Keeps the results of steps.
+        prior: A folder of depth images that complete the maps of the last method.
+
+    Returns:
+        The result of each method. Those before it are its ``baselines``.
+
+    Raises:
+        InputError: The recording or the settings cannot be used.
+        ComputationError: Registration fails.
     """
     watch = Watch(progress)
     recording = _open(sequence, [key], window, methods, cameras, config, cache, watch)

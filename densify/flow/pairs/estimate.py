@@ -49,28 +49,34 @@ def estimate_flow(
     source_lidar: ArrayLike | None = None,
     target_lidar: ArrayLike | None = None,
 ) -> FlowField:
-    """Scene flow of two clouds in one coordinate frame, metres, z up, with or without the ground.
+    """Estimate the scene flow between two clouds in one coordinate frame.
 
-    source: (N,3), target: (M,3). config: its ``flow`` and ``ground`` sections are used.
-    initial: (N,3) flow to start from; needed only where something moves farther than is looked
-    for: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m where that is not known.
+    Only groups of points move whose motion explains in both clouds what standing still leaves
+    unexplained. The flow of all other points is exactly 0, as it is farther than 400 m from the
+    middle. Without ``objective.static_prior`` every point takes the published objective's flow;
+    with ``flow.engine=paper`` the groups that move take it.
 
-    source_offset_ns, target_offset_ns: (N,), (M,) when each point was measured, both or neither.
-    On one clock, or each from its own sweep's reference time: then the target is taken for the next
-    revolution. With them the flow is that between the middles of the two clouds' times, and
-    ``to_reference`` that from a point's own time to the source's middle. Without them an object the
-    scanner meets earlier or later in the second sweep comes out too slow or too fast.
-    source_lidar, target_lidar: (N,), (M,) whole numbers, which scanner measured each point, both or
-    neither: each scanner's points are compared with its own, for each sees a mover at another time;
-    with the times, with the others' too, each at its own. Times alone tell two scanners that spin
-    half a turn apart about the frame's origin, as the source's own frame has them.
+    Args:
+        source: (N,3) metres, z up, with or without the ground.
+        target: (M,3) metres.
+        config: Settings; the sections ``flow`` and ``objective`` are used.
+        initial: (N,3) flow to start from. It is needed only where something moves farther than is
+            searched: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
+        source_offset_ns: (N,) time of each point. Give both clouds' times or neither. They are on
+            one clock, or each counts from its own sweep's reference time; then the target is taken
+            for the next revolution. Without times, an object that the scanner meets earlier or
+            later in the second sweep comes out too slow or too fast.
+        target_offset_ns: (M,) time of each point.
+        source_lidar: (N,) number of the scanner that measured each point. Give both or neither.
+            Each scanner's points are compared with its own; with times, with the others' too.
+        target_lidar: (M,) number of the scanner that measured each point.
 
-    With ``objective.static_prior`` only groups of points move whose motion explains in both clouds
-    what standing still leaves unexplained; the flow of all others is exactly 0, as it is farther
-    than 400 m from the middle. ``flow.engine=paper`` takes the published objective's flow for them.
-    Without the prior every point takes the objective's flow.
+    Returns:
+        The flow from the middle of the source's times to that of the target's. With times,
+        ``to_reference`` is the motion from a point's own time to the source's middle.
 
-    Raises InputError for no points, wrong shapes, NaN or another engine, which needs a recording.
+    Raises:
+        InputError: No points, wrong shapes, NaN, or an engine that needs a recording.
     """
     settings = resolve(config)
     if settings.flow.engine not in ("groups", "paper"):

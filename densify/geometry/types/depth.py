@@ -18,17 +18,22 @@ from densify.geometry.poses import inverse
 
 @dataclass(frozen=True)
 class Cloud:
-    """M accumulated points at the key's moment.
+    """M accumulated points at the key's time.
 
-    points: (M,3) metres, key frame.
-    rigid_points: (M,3) where registration alone puts them.
-    frame: (M,) int32 source sweep. since_key_ns: (M,) int64 from the key's reference time to the
-    source sweep's. row: (M,) int64 in the source sweep's file. lidar: (M,) uint8, which of its
-    scanners measured the point.
-    moving: (M,) bool. instance: (M,) int32, -1 none. velocity_m_s: (M,3) float32 at the key's
-    moment, ego-motion removed, 0 where nothing moves. confidence: (M,) float32, 0 to 1.
-    intensity: (M,) float32. rgb: (M,3) uint8, black where no camera saw the point. far: (M,) bool,
-    from a sweep beyond the window (``accumulate.far_m``).
+    Attributes:
+        points: (M,3) metres, key frame.
+        rigid_points: (M,3) positions by registration alone.
+        frame: (M,) int32 frame of the source sweep.
+        since_key_ns: (M,) int64 from the key's reference time to that of the source sweep.
+        row: (M,) int64 row in the source sweep's file.
+        lidar: (M,) uint8 number of the scanner that measured the point.
+        moving: (M,) bool.
+        instance: (M,) int32 number of the moving object, -1 none.
+        velocity_m_s: (M,3) float32 at the key's time, ego-motion removed, 0 for static points.
+        confidence: (M,) float32, 0 to 1.
+        intensity: (M,) float32.
+        rgb: (M,3) uint8, black where no camera observed the point.
+        far: (M,) bool, from a sweep beyond the window (``accumulate.far_m``).
     """
 
     points: Float
@@ -165,16 +170,21 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera, rectified or with its lens; `densify.geometry.cameras` has the models.
+    """A camera, rectified or with its lens.
 
-    width_px, height_px: image size. K: (3,3) pixels; pixel (u,v) is an integer at its centre.
-    T_cam_lidar: (4,4). model: pinhole, fisheye (Kannala-Brandt) or mei. distortion: the lens's
-    coefficients: of a pinhole OpenCV's (k1 k2 p1 p2 k3 ...), empty if rectified; of a fisheye k1 k2
-    k3 k4; of mei xi k1 k2 p1 p2. max_angle_deg: beyond this angle off its axis the lens sees
-    nothing. row_time_s: seconds from the exposure of a row of the image to that of the row below,
-    negative if it is read from the bottom, 0 for all at once. column_time_s: the same from a column
-    to the one on its right, of a shutter that runs sideways. The stamp is that of the image's
-    middle.
+    Attributes:
+        name: As in the recording.
+        width_px: Width of the image.
+        height_px: Height of the image.
+        K: (3,3) intrinsics in pixels; an integer coordinate is the centre of a pixel.
+        T_cam_lidar: (4,4) pose.
+        distortion: Coefficients of the lens. Of a pinhole OpenCV's (k1 k2 p1 p2 k3 ...), empty if
+            rectified; of a fisheye k1 k2 k3 k4; of mei xi k1 k2 p1 p2.
+        model: ``pinhole``, ``fisheye`` (Kannala-Brandt) or ``mei``.
+        max_angle_deg: Angle off its axis beyond which the lens sees nothing.
+        row_time_s: Time from the exposure of a row to that of the row below, negative if the image
+            is read from the bottom, 0 for all at once. Stamps are those of the image's middle.
+        column_time_s: The same from a column to the one on its right.
     """
 
     name: str
@@ -245,16 +255,21 @@ class CameraView:
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Dense depth of one camera; (H,W) everywhere.
+    """Dense depth of one camera; (H,W) each.
 
-    depth_m: float32 of measured pixels, 0 none; as measure says camera ``z``, or ``range`` from the
-    lens. filled_m: the same plus pixels interpolated between measured ones. confidence: float32 0
-    to 1, of every pixel in ``filled_m``. frame: int32 source sweep of measured pixels, -1
-    elsewhere. age_s: float32 seconds between the moment the map shows and the reference time of the
-    sweep that measured the pixel, of every pixel in ``filled_m``, nan elsewhere; None before
-    `densify.depth.views.with_ages`. reason: (M,) uint8, a `Reason` for each point of the cloud;
-    empty if the cloud is not at hand. warnings: what could not be done as asked. ranked: what a
-    calibrated confidence was made from, None of another one.
+    Attributes:
+        camera: Name of the camera.
+        depth_m: float32 metres of measured pixels, 0 none.
+        filled_m: The same, and pixels interpolated between measured ones.
+        confidence: float32 0 to 1, of every pixel in ``filled_m``.
+        frame: int32 frame of the sweep that measured the pixel, -1 elsewhere.
+        reason: (M,) uint8 `Reason` of each point of the cloud; empty if the cloud is not at hand.
+        age_s: float32 time between the moment of the map and the sweep that measured the pixel, of
+            every pixel in ``filled_m``, nan elsewhere; None before
+            `densify.depth.views.with_ages`.
+        measure: ``z`` along the camera's axis, or ``range`` from the lens.
+        warnings: What could not be done as asked.
+        ranked: Inputs of the calibrated confidence; None for another one.
     """
 
     camera: str
@@ -273,8 +288,12 @@ class DepthMap:
 
         Moving objects are where they were at the exposure.
 
-        view: ``Result.views`` of the same name. filled: with the interpolated pixels.
-        Raises InputError for a camera that is not rectified, or a map of ranges.
+        Args:
+            view: ``Result.views`` of the same name.
+            filled: Take the interpolated pixels too.
+
+        Raises:
+            InputError: The camera is not rectified, or the map holds ranges.
         """
         camera = view.camera
         if not camera.is_rectified or self.measure != "z":

@@ -19,17 +19,19 @@ from densify.geometry.poses import inverse
 class Sweep:
     """One lidar revolution of N returns.
 
-    points: (N,3) metres, lidar frame; as read, each at its own firing time, and after deskewing all
-        at ``stamp_ns``.
-    stamp_ns: the reference time, as the data set stamps its sweeps: begin, middle or end.
-    intensity: (N,) float32, 0 to 1.
-    offset_ns: (N,) int64, firing time minus ``stamp_ns``; None where the data cannot tell.
-    lidar: (N,) uint8, which of several scanners in one sweep fired.
-    row: (N,) int64, row of the return in the source file (invalid rows are dropped on reading).
-    scanner_origins: (S,3) metres, lidar frame, where the rays of each scanner start; None where all
-        start at the frame's origin.
-    R_scanner_lidar: (S,3,3) turns the lidar frame's axes into each scanner's, z along the one it
-        spins about, upwards; None where they are the frame's.
+    Attributes:
+        frame: Absolute number.
+        stamp_ns: The reference time, as the data set stamps its sweeps: begin, middle or end.
+        points: (N,3) metres, lidar frame. As read, each at its own firing time; after deskewing,
+            all at ``stamp_ns``.
+        intensity: (N,) float32, 0 to 1.
+        offset_ns: (N,) int64, firing time minus ``stamp_ns``; None where the data cannot tell.
+        lidar: (N,) uint8 number of the scanner that fired.
+        row: (N,) int64 row of the return in the source file. Invalid rows are dropped on reading.
+        scanner_origins: (S,3) metres, lidar frame, start of the rays of each scanner; None where
+            all start at the frame's origin.
+        R_scanner_lidar: (S,3,3) turns the lidar frame's axes into each scanner's, z along the one
+            it spins about, upwards; None where they are the frame's.
     """
 
     frame: int
@@ -157,18 +159,20 @@ class Stretch:
 
 @dataclass(frozen=True)
 class FlowField:
-    """Scene flow of one sweep's (or point file's) N points to another time, ego-motion removed.
+    """Scene flow of a sweep's (or point file's) N points to another time, ego-motion removed.
 
-    From the sweep's reference time: a moving point that was measured earlier or later is first
-    brought there by ``to_reference``.
+    The flow counts from the sweep's reference time. A moving point that was measured earlier or
+    later is first brought there by ``to_reference``.
 
-    displacement: (N,3) metres, in the coordinates the points are in; exactly 0 where not moving.
-    moving: (N,) bool, proven to move.
-    instance: (N,) int32, the moving object the point belongs to, -1 none.
-    lost: (N,) bool, belongs to something that moves but cannot be followed to the target time.
-    to_reference: (N,3) metres, own motion between a point's firing and the sweep's reference time,
-        in the same coordinates; None where nothing is known of it.
-    velocity_m_s: (N,3) at the target time, in the same coordinates; None where nothing is known.
+    Attributes:
+        displacement: (N,3) metres, in the coordinates of the points; exactly 0 where not moving.
+        moving: (N,) bool, confirmed to move.
+        instance: (N,) int32 number of the moving object, -1 none.
+        lost: (N,) bool, belongs to a moving object that cannot be followed to the target time.
+        to_reference: (N,3) metres, own motion between a point's firing and the sweep's reference
+            time, in the same coordinates; None where nothing is known of it.
+        velocity_m_s: (N,3) at the target time, in the same coordinates; None where nothing is
+            known.
     """
 
     displacement: Float

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One key or a drive as MCAP in Foxglove's schemas (``densify[mcap]``), for Foxglove, Lichtblick
+"""One key or a drive as MCAP in Foxglove's schemas (extra ``mcap``), for Foxglove, Lichtblick
 and others.
 
 Topics::

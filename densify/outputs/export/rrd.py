@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One key or a drive for rerun's viewer (https://rerun.io, ``densify[rerun]``).
+"""One key or a drive for rerun's viewer (https://rerun.io, extra ``rerun``).
 
 By ``time`` (the recording's clock as UNIX time) and ``frame`` there are in ``world/key``::
 
