@@ -38,10 +38,10 @@ def test_every_camera_and_method_is_drawn_through_its_points() -> None:
         lines = {line.get_label(): line.get_xydata() for line in axes.lines}
         assert len(lines) == 4
         np.testing.assert_allclose(
-            lines["flow, filled: 48.0 % of pixels, 0.40 % outliers"],
+            lines["scene flow, filled: 48.0 % of pixels, 0.40 % outliers"],
             [[48, 0.4], [40, 0.1], [20, 0.0]],
         )
-        measured = lines["icp, measured: 22.5 % of pixels, 8.50 % outliers"]
+        measured = lines["rigid accumulation, measured: 22.5 % of pixels, 8.50 % outliers"]
         np.testing.assert_allclose(measured[0], [22.5, 8.5])
         low, high = axes.get_ylim()
         assert low == 0 and high > 17  # no outlier at all is on the axis too

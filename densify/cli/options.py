@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import math
 import os
 from collections.abc import Callable, Iterable
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from densify.geometry.types import LidarSequence
 
 _DATA = (
-    "a recording's folder, READER:PATH, or the built-in "
+    "the recording: a folder or file, READER:PATH, or the built-in simulation "
     "street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG] (default: street)"
 )
 _MOST_DIGITS = 18
@@ -39,7 +40,7 @@ def add_verb(
     )
     if verb is not None:
         parser.set_defaults(verb=verb, name=name)
-        option(parser, "--json", "print one JSON object, nothing else")
+        option(parser, "--json", "print the results as one JSON object")
     return parser
 
 
@@ -54,33 +55,51 @@ def add_recording(parser: argparse.ArgumentParser, several: bool = False) -> Non
     """Add the recording, as a positional argument and as ``--data``."""
     parser.add_argument("recording", metavar="SPEC", nargs="*" if several else "?", help=_DATA)
     number = "+" if several else 1
-    option(parser, "--data SPEC", "the same", nargs=number, action="extend", default=[])
+    option(
+        parser,
+        "--data SPEC",
+        "the recording, as an option",
+        nargs=number,
+        action="extend",
+        default=[],
+    )
 
 
 def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
     """Add those of the options that several verbs have: window, method, camera, config (with
     ``--set``), overwrite."""
     if "window" in names:
-        about = "sweeps on each side of the key for moving objects (default: 5, at 10 Hz 0.5 s)"
+        about = (
+            "number of sweeps on each side of the key (default: 5). More sweeps are denser and "
+            "slower. Take twice as many at 20 Hz"
+        )
         option(parser, "--window W", about, type=natural, default=5)
     if "method" in names:
-        about = "flow (default): with scene flow; icp: registration only; none: the key sweep alone"
+        about = "flow: scene flow (default); icp: rigid accumulation; none: single sweep"
         parser.add_argument("--method", choices=("flow", "icp", "none"), default="flow", help=about)
     if "camera" in names:
-        about = "only this camera; may be given several times (default: all)"
+        about = "take only this camera; may be given several times (default: all cameras)"
         option(parser, "--camera NAME", about, action="append", dest="cameras")
     if "config" in names:
-        option(parser, "--config FILE|NAME", f"a YAML file or a preset: {', '.join(presets())}")
-        knob, about = "--set section.key=value", "set one knob; may be given several times"
+        option(
+            parser,
+            "--config FILE|NAME",
+            f"settings: a YAML file, or a preset: {', '.join(presets())}",
+        )
+        knob, about = "--set section.key=value", "change one setting; may be given several times"
         option(parser, knob, about, action="append", default=[], dest="overrides")
     if "overwrite" in names:
-        option(parser, "--overwrite", "replace what is already there (default: keep it)")
+        option(parser, "--overwrite", "replace existing files (default: stop before them)")
 
 
 def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
-    """Return the specs of the recordings that a command names."""
+    """Return the specs of the recordings that a command names. Without any, log that the simulator
+    is used and return ``default``."""
     given = options.recording or []
-    return [*([given] if isinstance(given, str) else given), *options.data] or [default]
+    specs = [*([given] if isinstance(given, str) else given), *options.data]
+    if not specs:
+        logging.getLogger("densify").info("no recording given: taking the simulator, %s", default)
+    return specs or [default]
 
 
 def recording_of(options: argparse.Namespace) -> str:

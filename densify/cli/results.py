@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from densify.cli.screen import aligned, look_up, percent, written
-from densify.geometry.types import Result
+from densify.geometry.types import METHOD_NAMES, Result
 from densify.outputs import Export
 from densify.outputs.atomic import plain
 from densify.readers.timeline import format_frames
@@ -49,8 +49,9 @@ def summary(result: Result) -> str:
     if result.movers:
         num_apart = sum(len(mover.cloud) for mover in result.movers.values())
         moving = f"{num_apart:,} more apart, on {len(result.movers)} moving objects"
+    method = METHOD_NAMES.get(result.method, result.method)
     lines = [
-        f"key {result.key}, {result.method}: {len(cloud):,} points of {len(result.frames)} sweeps "
+        f"key {result.key}, {method}: {len(cloud):,} points of {len(result.frames)} sweeps "
         f"({format_frames(result.frames)}), {moving}"
     ]
     for name in result.depth:
@@ -79,7 +80,7 @@ def _beside_icp(result: Result, *path: str) -> str:
     share = look_up(result.metrics, *path)
     rigid = result.baselines.get("icp")
     by_icp = look_up(rigid.metrics, *path) if rigid is not None else None
-    beside = "" if by_icp is None else f" ({percent(by_icp)} by registration alone)"
+    beside = "" if by_icp is None else f" ({percent(by_icp)} with rigid accumulation)"
     return "" if share is None else percent(share) + beside
 
 
@@ -120,7 +121,7 @@ def comparison(results: Mapping[str, Result]) -> str:
                 for score, key, form in _SCORES:
                     path = (source, camera, "measured", part, key)
                     rows.append((f"{camera} {said}, {part}, {score}", path, form))
-    lines = [["", *results]]
+    lines = [["", *(METHOD_NAMES.get(name, name) for name in results)]]
     for title, places, form in rows:
         numbers = [look_up(result.metrics, *places) for result in results.values()]
         if any(number is not None for number in numbers):

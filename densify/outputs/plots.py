@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from densify.geometry.types import Float32, Result
+from densify.geometry.types import METHOD_NAMES, Float32, Result
 from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import Picture
 from densify.outputs.key_outputs import Context
@@ -33,7 +33,6 @@ _MIN_WIDTH_PX = 480
 _POINT_SIZE_PX = 3
 _TITLE_PX, _SCALE_PX = 36, 60
 _FONT_PT, _LETTER_PX = 13.0, 0.85  # width of a letter, per point of the font
-_TITLES = {"none": "sparse"}
 _FEWEST_OUTLIERS = 1e-4  # below, the scale is linear down to 0
 _MEDIAN_SHARE = 20  # the running median covers one part in so many of all steps
 
@@ -57,9 +56,9 @@ def write_figure(path: Path, results: Mapping[str, Result]) -> None:
     if not last.depth:
         return
     camera = next(iter(last.depth))
-    panels = [(_TITLES.get(m, m), r, "measured") for m, r in results.items()]
+    panels = [(METHOD_NAMES.get(m, m), r, "measured") for m, r in results.items()]
     if camera in last.full:
-        panels.append((f"{method} and prior", last, "full"))
+        panels.append((f"{METHOD_NAMES.get(method, method)} and prior", last, "full"))
     drawn = {}
     for title, result, product in panels:
         depth_m = (result.full if product == "full" else result.depth)[camera].depth_m
@@ -145,7 +144,7 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
                 known = [p for p in curve if p[f"outliers_{kind}"] is not None]
                 density = [100 * p[f"density_{kind}"] for p in known]
                 outliers = [100 * p[f"outliers_{kind}"] for p in known]
-                label = f"{method}, {kind}"
+                label = f"{METHOD_NAMES.get(method, method)}, {kind}"
                 if known:
                     label += f": {density[0]:.1f} % of pixels, {outliers[0]:.2f} % outliers"
                 line = axes.plot(density, outliers, "o-", color=f"C{number}", label=label)[0]

@@ -17,10 +17,13 @@ from densify import __version__
 from densify.cli.verbs import bench, dataset, evaluate, finished, flow, recordings, run, train
 from densify.config.errors import brief, did_you_mean
 
-_ADD = (
-    *(run.add_run, run.add_compare, dataset.add, flow.add_flow, train.add, flow.add_labels),
-    *(recordings.add_info, recordings.add_doctor, recordings.add_simulate, finished.add_export),
-    *(finished.add_report, finished.add_view, evaluate.add, bench.add),
+_USUAL = (
+    *(recordings.add_info, recordings.add_doctor, run.add_run, run.add_compare, dataset.add),
+    *(finished.add_report, finished.add_export),
+)
+_MORE = (
+    *(finished.add_view, flow.add_flow, evaluate.add, recordings.add_simulate, flow.add_labels),
+    *(train.add, bench.add),
 )
 
 
@@ -40,13 +43,25 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def _command_line() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="densify",
-        description="Dense depth maps from lidar recordings, with the moving objects kept sharp.",
-        epilog="Exit codes: 0 done, 1 the computation failed, 2 bad input, 130 interrupted.",
+        usage="densify VERB [SPEC] [options]",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"densify {__version__}")
-    commands = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
-    for add in _ADD:
+    commands = parser.add_subparsers(
+        prog="densify", metavar="VERB", required=True, help=argparse.SUPPRESS
+    )
+    for add in (*_USUAL, *_MORE):
         add(commands)
+    abouts = [f"  {name:<10}{verb.description}" for name, verb in commands.choices.items()]
+    usual, more = "\n".join(abouts[: len(_USUAL)]), "\n".join(abouts[len(_USUAL) :])
+    parser.description = (
+        "Dense depth maps from lidar recordings, with the moving objects kept sharp.\n\n"
+        f"verbs:\n{usual}\n\nmore:\n{more}"
+    )
+    parser.epilog = (
+        "densify VERB --help explains a verb. A first try: densify run --key 120\n"
+        "Exit codes: 0 done, 1 the computation failed, 2 bad input, 130 interrupted."
+    )
     return parser
 
 

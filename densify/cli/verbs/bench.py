@@ -36,18 +36,20 @@ _UNSEEN = (
 
 def add(commands: Any) -> None:
     """Add ``bench`` and its tables."""
-    about = "measured tables: this package's methods beside published ones"
+    about = "measure tables: this package's methods beside published ones"
     parser = add_verb(commands, "bench", None, about)
     benches = parser.add_subparsers(title="benches", metavar="WHAT", required=True)
     _add_flow(benches)
     _add_depth(benches)
     _add_paper(benches)
-    about = "the tables of docs/results.md made again, as Markdown on stdout; all take an hour"
+    about = "make the tables of docs/results.md again, as Markdown on stdout; all take an hour"
     parser = add_verb(benches, "readme", _answer_readme, about)
     names = "depth, flow, registration"
-    parser.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {names} (default: all)")
-    option(parser, "--kitti DIR", "drive 2011_09_26_drive_0013_sync, for its rows", type=Path)
-    option(parser, "--pandaset DIR", "sequence 002, for its rows", type=Path)
+    parser.add_argument("tables", nargs="*", metavar="TABLE", help=f"{names} (default: all)")
+    option(
+        parser, "--kitti DIR", "folder of drive 2011_09_26_drive_0013_sync, for its rows", type=Path
+    )
+    option(parser, "--pandaset DIR", "folder of sequence 002, for its rows", type=Path)
 
 
 def _add_flow(benches: Any) -> None:
@@ -55,19 +57,19 @@ def _add_flow(benches: Any) -> None:
         benches,
         "flow",
         _answer_flow,
-        "engines of scene flow on the same windows: errors, seconds",
+        "compare scene flow engines on the same windows",
         "Methods: ours (the configured engine, all sweeps), ours-pair (two sweeps), paper (the "
-        "published objective, our solver), paper-adam (its own solver, 1,500 steps: minutes), "
-        "rigid. Errors need --truth, or a recording with exact truth. The last tables are scored "
-        "as the Argoverse 2 challenges are: within 35 m, without the ground, moving from 0.05 m a "
-        "sweep; three-way end-point errors, and errors as parts of the speed in buckets of it.",
+        "published objective with our solver), paper-adam (its own solver, minutes a pair), rigid. "
+        "Errors need --truth, or a recording with exact truth. The last tables follow the "
+        "Argoverse 2 challenges: points within 35 m, without the ground, moving from 0.05 m a "
+        "sweep.",
     )
     add_recording(parser, several=True)
     _add_common(parser)
-    option(parser, "--methods NAME,…", "(default: all but paper-adam)", type=words)
+    option(parser, "--methods NAME,…", "the methods (default: all but paper-adam)", type=words)
     about = (
-        "true flow of the sweeps to the next ones: FRAME_NEXT.npz (flow files) or "
-        "STAMP.feather (Argoverse 2's labels); pairs before the key are scored"
+        "folder of true flow from each sweep to the next one: FRAME_NEXT.npz or STAMP.feather. "
+        "Pairs before the key are scored"
     )
     option(parser, "--truth DIR", about, type=Path)
 
@@ -77,23 +79,23 @@ def _add_depth(benches: Any) -> None:
         benches,
         "depth",
         _answer_depth,
-        "depth maps of several configurations side by side, against every truth there is",
-        "Truths: exact depth of the built-in street, where a scanner in the key sweep can reach; "
-        "the key sweep's returns, for the key made without them; with --scanner the returns of one "
-        "of several scanners, for maps made without it.",
+        "compare depth maps of several settings",
+        "Truths: on the simulated street, exact depth within reach of a scanner of the key sweep. "
+        "On other recordings, the returns of the key sweep, for maps made without it. With "
+        "--scanner, the returns of one of several scanners, for maps made without it.",
     )
     add_recording(parser)
     _add_common(parser)
     add_common(parser, "camera")
-    option(parser, "--method NAME", "as of compare (default: flow)", default="flow")
+    option(parser, "--method NAME", "a method of densify compare (default: flow)", default="flow")
     names, about = (
         ("NAME", "section.key=value"),
-        "a configuration beside the given one; several times",
+        "other settings to compare; may be given several times",
     )
     parser.add_argument(
         "--variant", nargs="+", action="append", default=[], metavar=names, help=about
     )
-    option(parser, "--scanner N", "whose returns are the truth", type=natural)
+    option(parser, "--scanner N", "number of the scanner whose returns are the truth", type=natural)
 
 
 def _add_paper(benches: Any) -> None:
@@ -101,25 +103,36 @@ def _add_paper(benches: Any) -> None:
         benches,
         "paper",
         _answer_paper,
-        "the tables of Pontes, Hays, Lucey (3DV 2020), with the published figures beside",
-        "Of recordings (--data, default: four streets) the frame and the next sweep, without the "
-        "motion of the vehicle; without exact truth the flow is that of this package's engine. "
-        "Methods: rest, icp, paper-adam (as published: minutes a pair), paper (this package's "
-        "solver), no-laplacian (Table 2), ours.",
+        "make the tables of Pontes, Hays, Lucey (3DV 2020), beside the published figures",
+        "A pair is a frame of a recording and the next sweep, without ego-motion (--data, default: "
+        "four streets). Without exact truth, the flow of this package is the truth. Methods: rest "
+        "(nothing moves), paper (the published objective), paper-adam (its own solver, minutes a "
+        "pair), no-laplacian (Table 2), ours.",
     )
     files = "as FlowNet3D's authors made them"
     option(parser, "--flyingthings DIR", f".npz files of FlyingThings3D {files}", type=Path)
     option(parser, "--kitti DIR", f".npz files of KITTI's scene flow 2015 {files}", type=Path)
-    option(parser, "--data SPEC@K,…", "recordings and frames", action="append")
-    option(parser, "--methods NAME,…", "(default: the fast ones)", type=words)
+    option(
+        parser,
+        "--data SPEC@K,…",
+        "recordings with frames, such as street@60,80; may be given several times",
+        action="append",
+    )
+    option(parser, "--methods NAME,…", "the methods (default: the fast ones)", type=words)
     about = "a network of densify train flow; may be given several times"
     option(parser, "--model FILE", about, type=Path, action="append", default=[], dest="models")
-    option(parser, "--points N", "drawn (default: 2048)", type=natural, default=2048)
-    option(parser, "--pairs N", "of a set (default: 0, all)", type=natural, default=0)
+    option(
+        parser,
+        "--points N",
+        "points drawn from a cloud (default: 2048)",
+        type=natural,
+        default=2048,
+    )
+    option(parser, "--pairs N", "pairs of a set (default: 0, all)", type=natural, default=0)
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
-    about = "frame in the middle; may be given several times (default: 120)"
+    about = "key frame; may be given several times (default: 120)"
     option(parser, "--key K", about, type=natural, action="append", dest="keys")
     add_common(parser, "window", "config")
 

@@ -42,35 +42,38 @@ def add(commands: Any) -> None:
         commands,
         "dataset",
         answer,
-        "every key of whole recordings, as a training set",
-        "Run again, the same command goes on where it was stopped. --set takes, beside the knobs "
-        f"in {presets()['default']}, limits beyond which a key is put aside (it is in the "
-        "manifest, not in the set): dataset.max_ghost, ghosts among the accumulated points; "
-        "dataset.min_density, pixels with a measured depth; dataset.max_outliers, outliers, the "
-        "key held out; dataset.min_sweeps, sweeps of the window; and dataset.split of the tree, "
-        "kitti, train or val.",
+        "make a training set of whole recordings",
+        "The same command, run again, continues an interrupted set. --set takes the settings in "
+        f"{presets()['default']}. It also takes limits. A key beyond a limit is listed in the "
+        "manifest and left out of the set: dataset.max_ghost, share of ghosts; "
+        "dataset.min_density, share of pixels with a measured depth; dataset.max_outliers, share "
+        "of outliers with the key held out; dataset.min_sweeps, sweeps in the window. "
+        "dataset.split is kitti, train or val.",
     )
     add_recording(parser, several=True)
     add_common(parser, "window", "method", "camera", "config")
-    about = "frames A to B-1, every S-th, those that exist (default: all)"
+    about = "frames A to B-1, every S-th (default: all)"
     option(parser, "--keys all|A:B[:S]", about, type=all_or_range, default="all")
-    option(parser, "--out DIR", "the set's folder: a new one, or one to go on with", type=Path)
+    option(parser, "--out DIR", "folder of the set: a new one, or one to continue", type=Path)
     layouts = ("kitti-depth", "densify")
-    about = "KITTI's depth completion tree (default), or what densify run writes"
+    about = "the tree of KITTI's depth completion benchmark (default), or the files of densify run"
     parser.add_argument("--layout", choices=layouts, default=layouts[0], help=about)
-    option(parser, "--workers N", "processes (default: as many as fit)", type=natural)
+    option(
+        parser,
+        "--workers N",
+        "number of processes (default: one for each core, as far as the memory allows)",
+        type=natural,
+    )
     about = (
-        "of a running Dask scheduler, whose workers are used; they need the same files at the "
-        "same paths. tcp://host:8786 trusts everybody on that network: whoever reaches the "
-        "scheduler can run anything on its workers and here. tls://host:8786 lets in only who has "
-        "a certificate, by Dask's configuration (distributed.comm.tls)"
+        "use the workers of a Dask scheduler; they need the same paths. tls://host:8786 accepts "
+        "holders of a certificate. tcp://host:8786 lets everybody on the network run programs here"
     )
     option(parser, "--scheduler ADDRESS", about)
-    option(parser, "--shard i/n", "the i-th of n parts, for several machines", type=shard)
-    option(parser, "--status DIR", "how far the set in DIR is; makes nothing", type=Path)
+    option(parser, "--shard i/n", "make the i-th of n parts, for several machines", type=shard)
+    option(parser, "--status DIR", "say how far the set in DIR is, and make nothing", type=Path)
     about = (
-        "compare all finished files with the hashes in the manifest: damaged ones are made "
-        "anew, or with --status listed (exit code 1)"
+        "compare finished files with the hashes in the manifest. Damaged files are made again, "
+        "or with --status listed (exit code 1)"
     )
     option(parser, "--verify", about)
 

@@ -25,22 +25,22 @@ def add(commands: Any) -> None:
         commands,
         "evaluate",
         answer,
-        "scores of depth maps against true ones, as KITTI's depth benchmark defines them",
-        "PREDICTED and TRUTH: a depth PNG (KITTI's format) each, or folders, of which every PNG "
-        "is paired by drive, camera and frame: KITTI depth trees "
+        "score depth maps against true depth, as KITTI's benchmark does",
+        "PREDICTED and TRUTH are depth PNGs in KITTI's format, or folders of them. Files are "
+        "paired by drive, camera and frame. Folders may be KITTI depth trees "
         "(DRIVE/proj_depth/groundtruth/image_02/0000000005.png), densify's output "
-        "(000005/depth/image_02.png), sets of densify dataset, or plain folders of equal names. A "
-        "pixel that PREDICTED lacks costs coverage and is no error. Numbers are means over images.",
+        "(000005/depth/image_02.png), training sets, or plain folders of equal names. A pixel that "
+        "PREDICTED lacks lowers the coverage and is no error. Numbers are means over images.",
     )
     parser.add_argument("predicted", metavar="PREDICTED", type=Path, help="a PNG or a folder")
     parser.add_argument("truth", metavar="TRUTH", type=Path, help="a PNG or a folder")
     about = (
-        "moving objects, not 0 in an image or a folder of them: their scores and the others' too"
+        "masks of moving objects (pixels that are not 0), for scores of moving and static pixels"
     )
     option(parser, "--mask PNG|DIR", about, type=Path)
-    about = "of what densify made, score depth_filled (of a set, groundtruth_filled)"
+    about = "score depth_filled instead of depth (in a training set groundtruth_filled)"
     option(parser, "--filled", about)
-    about = "the camera's fx, for outliers and edges (default: KITTI's, 721.5377)"
+    about = "focal length fx of the camera, for outliers (default: KITTI's, 721.5377)"
     option(parser, "--focal-px X", about, type=positive, default=721.5377)
     about = "stereo baseline that defines outliers (default: KITTI's, 0.54)"
     option(parser, "--baseline-m X", about, type=positive, default=0.54)

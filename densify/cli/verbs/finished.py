@@ -13,7 +13,7 @@ from densify.cli.options import add_common, add_verb, option
 from densify.cli.screen import Answer
 from densify.config.plugins import EXPORTS
 
-_ONE = "folder of one key, such as densify-out/000120"
+_ONE = "folder of a key, such as densify-out/000120"
 
 
 def add_export(commands: Any) -> None:
@@ -22,18 +22,18 @@ def add_export(commands: Any) -> None:
         commands,
         "export",
         answer_export,
-        "a finished run in other tools' formats, optionally with only the certain, recent pixels",
-        "Nothing is computed again and the run stays as it is. A filled pixel has the age of the "
-        "measured pixel nearest to it.",
+        "write a finished run in the formats of other tools",
+        "Nothing is computed again, and the run does not change. A filled pixel has the age of the "
+        "nearest measured pixel.",
     )
     parser.add_argument("run", metavar="RUN", type=Path, help=_ONE)
-    about = f"{', '.join(EXPORTS)}; see docs/formats.md"
+    about = f"{', '.join(EXPORTS)}: see docs/formats/writing.md"
     option(parser, "--to FORMAT", about, required=True)
-    about = "drop pixels and points less certain, 0 to 1 (default: 0, keep all)"
+    about = "leave out pixels and points of lower confidence, 0 to 1 (default: 0, keep all)"
     option(parser, "--min-confidence C", about, type=float, default=0.0)
-    about = "drop pixels and points measured longer before or after (default: keep all)"
+    about = "leave out what was measured longer before or after the exposure (default: keep all)"
     option(parser, "--max-age-ms MS", about, type=float)
-    option(parser, "--out DIR", "(default: RUN/export/FORMAT)", type=Path)
+    option(parser, "--out DIR", "folder to write into (default: RUN/export/FORMAT)", type=Path)
     add_common(parser, "camera", "overwrite")
 
 
@@ -60,14 +60,13 @@ def add_report(commands: Any) -> None:
         commands,
         "report",
         answer_report,
-        "one self-contained page to look at a run, a comparison or a training set in a browser",
-        "Of a key: the image with every map, depth under the pointer, what a least confidence "
-        "leaves, the cloud in 3-D, scores and costs, in one HTML file that needs "
-        "no network. Files that are missing or damaged are named on it. Of a training set: a table "
-        "of every key with its scores, what was put aside and why. Written to DIR/report.html, and "
-        "compare.html of a comparison.",
+        "make a page for the browser, of a run, a comparison or a training set",
+        "The page of a key shows its maps over the image, the depth under the pointer, the cloud "
+        "in 3-D, scores and costs. It is one HTML file that needs no network. It names files that "
+        "are missing or damaged. The page of a training set is a table of its keys. The file is "
+        "DIR/report.html, or DIR/compare.html for a comparison.",
     )
-    about = f"{_ONE}, one of several, or a training set"
+    about = f"{_ONE}, of several keys, or of a training set"
     parser.add_argument("place", metavar="DIR", type=Path, help=about)
     add_common(parser, "overwrite")
 
@@ -85,13 +84,13 @@ def add_view(commands: Any) -> None:
         commands,
         "view",
         answer_view,
-        "a run, or keys of a drive, in a window: cloud, moving objects, in rerun over time",
-        "Needs a screen, and pip install 'densify[rerun]' or 'densify[open3d]'. densify report "
-        "needs nothing but a browser.",
+        "show a finished run in rerun or open3d",
+        "Needs a screen, and the extra rerun or open3d (pip install 'densify-lidar[rerun]'). "
+        "densify report needs only a browser.",
     )
-    about = f"{_ONE}, or of several of a drive"
+    about = f"{_ONE}, or of several keys of a drive"
     parser.add_argument("place", metavar="DIR", type=Path, help=about)
-    about = "rerun (default) or open3d"
+    about = "the viewer: rerun (default), with sweeps over time, or open3d"
     option(parser, "--with VIEWER", about, choices=("rerun", "open3d"), default="rerun", dest="by")
     add_common(parser, "camera")
 

@@ -35,24 +35,31 @@ def add_flow(commands: Any) -> None:
         commands,
         "flow",
         answer_flow,
-        "scene flow of a recording, or between two point files in one coordinate frame",
-        "Point files: .npy (N,3 or more columns), .npz (array 'points'), .txt and .csv (columns), "
-        ".bin (float32 columns, as KITTI's), .pcd, .ply, .las, .laz. "
-        "The result holds 'residual_flow' (N,3) float32 metres, "
-        "'moving' (N,) bool, 'instance' (N,) int32 (-1 none) and 'lost' (N,) bool, row by row as "
-        "SOURCE. Of a recording, with --all or --keys, the flow of each sweep to the next is "
-        "written: npz: DIR/FRAME_NEXT.npz, flow files as flow.engine=npz:DIR reads them; av2: "
-        "DIR/NAME/STAMP.feather, the files of the Argoverse 2 scene flow challenge (all points, "
-        "without the ego-motion); opensceneflow: DIR/NAME.h5, all sweeps with their flow.",
+        "estimate scene flow of a recording or between two point files",
+        "Two point files in one coordinate frame (.npy, .npz, .txt, .csv, .bin, .pcd, .ply, .las, "
+        ".laz) give one .npz, with a row for each row of SOURCE: 'residual_flow' (N,3) metres, "
+        "'moving' (N,) bool, 'instance' (N,) int32 (-1 none), 'lost' (N,) bool. A recording, with "
+        "--all or --keys, gives the flow of each sweep to the next one. npz writes "
+        "DIR/FRAME_NEXT.npz for --flow npz:DIR. av2 writes DIR/NAME/STAMP.feather of the Argoverse "
+        "2 scene flow challenge. opensceneflow writes DIR/NAME.h5.",
     )
-    parser.add_argument("source", metavar="SOURCE|SPEC", nargs="?", help="points, or a recording")
-    parser.add_argument("target", metavar="TARGET", type=Path, nargs="?", help="points, later")
-    option(parser, "--data SPEC", "the recording as an option")
-    option(parser, "--all", "every sweep of the recording")
-    option(parser, "--keys A:B[:S]", "sweeps A to B-1, every S-th", type=key_range)
+    parser.add_argument(
+        "source", metavar="SOURCE|SPEC", nargs="?", help="earlier points, or a recording"
+    )
+    parser.add_argument("target", metavar="TARGET", type=Path, nargs="?", help="later points")
+    option(parser, "--data SPEC", "the recording, as an option")
+    option(parser, "--all", "take every sweep of the recording")
+    option(parser, "--keys A:B[:S]", "take sweeps A to B-1, every S-th", type=key_range)
     formats = ("npz", "av2", "opensceneflow")
-    parser.add_argument("--format", choices=formats, help="for a recording (default: npz)")
-    option(parser, "--out F.npz|DIR", "(default: densify-out/flow.npz, densify-out)", type=Path)
+    parser.add_argument(
+        "--format", choices=formats, help="form of a recording's flow (default: npz)"
+    )
+    option(
+        parser,
+        "--out F.npz|DIR",
+        "file or folder (default: densify-out/flow.npz, densify-out)",
+        type=Path,
+    )
     add_common(parser, "config", "overwrite")
 
 
@@ -152,15 +159,17 @@ def add_labels(commands: Any) -> None:
         commands,
         "labels",
         answer_labels,
-        "scene flow of every sweep to the next from tracked boxes and poses",
-        "Flow files as flow.engine=npz:DIR and bench flow --truth read them, with 'valid' (N,) "
-        "bool: False in two boxes, just outside one, at the foot of one that moves, in a box that "
-        "the next sweep lacks, and where nobody drew boxes. Poses are the recording's own (--set "
-        "register.source=kiss-icp: estimated).",
+        "make scene flow labels from tracked boxes and poses",
+        "Writes a flow file for each sweep to the next one. Its array 'valid' (N,) bool is False "
+        "for points in two boxes, just outside a box, at the bottom of a moving box, in a box that "
+        "the next sweep lacks, and where nobody drew boxes. Poses are those of the recording; "
+        "--set register.source=kiss-icp estimates them.",
     )
     add_recording(parser)
-    option(parser, "--out DIR", "for the flow files", type=Path, required=True)
-    option(parser, "--keys A:B[:S]", "(default: all sweeps)", type=key_range)
+    option(parser, "--out DIR", "folder for the flow files", type=Path, required=True)
+    option(
+        parser, "--keys A:B[:S]", "take sweeps A to B-1, every S-th (default: all)", type=key_range
+    )
     add_common(parser, "config", "overwrite")
 
 

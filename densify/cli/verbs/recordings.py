@@ -31,7 +31,7 @@ _WIDTH = 100
 
 def add_info(commands: Any) -> None:
     """Add the options of ``info``."""
-    about = "what a recording holds: frames, rate, cameras, stamps, poses"
+    about = "print what a recording holds: frames, rate, cameras, stamps, poses"
     add_recording(add_verb(commands, "info", answer_info, about))
 
 
@@ -51,10 +51,10 @@ def add_doctor(commands: Any) -> None:
         commands,
         "doctor",
         answer_doctor,
-        "what may be wrong with a recording, and what mends it",
-        "Looks at fifteen sweeps and a few images from all over the recording. Each check has a "
-        "verdict (fine, unknown, suspicious, wrong), the number it rests on, and the option or "
-        "line that mends it. Exit code 2 if something is wrong.",
+        "check whether a recording is read correctly, and print remedies",
+        "Reads fifteen sweeps and some images from all over the recording. Each check prints a "
+        "verdict (fine, unknown, suspicious, wrong), its evidence, and the option or the line that "
+        "mends it. The exit code is 2 if something is wrong.",
     )
     add_recording(parser)
     add_common(parser, "config")
@@ -100,13 +100,13 @@ def _facts(diagnosis: Diagnosis) -> dict[str, Any]:
 
 def add_simulate(commands: Any) -> None:
     """Add the options of ``simulate``."""
-    about = "write the built-in street as a recording with exact ground truth"
+    about = "write the simulated street as a recording with exact ground truth"
     parser = add_verb(commands, "simulate", answer_simulate, about)
     add_recording(parser)
-    option(parser, "--out DIR", "folder to make", type=Path, required=True)
-    about = "kitti (a raw drive, default) or folder (numbered sweeps with densify.yaml)"
+    option(parser, "--out DIR", "folder to write into", type=Path, required=True)
+    about = "kitti: a KITTI raw drive (default); folder: numbered sweeps with densify.yaml"
     option(parser, "--format NAME", about, default="kitti")
-    option(parser, "--frames A:B", "frames A to B-1 only (default: all)", type=key_range)
+    option(parser, "--frames A:B", "only frames A to B-1 (default: all)", type=key_range)
     add_common(parser, "camera", "overwrite")
 
 

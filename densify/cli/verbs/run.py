@@ -31,52 +31,57 @@ if TYPE_CHECKING:
 
 def add_run(commands: Any) -> None:
     """Add the options of ``run``."""
-    parser = add_verb(commands, "run", answer_run, "densify one key or several")
-    about = "the frame to densify; may be given several times"
+    parser = add_verb(
+        commands, "run", answer_run, "make dense depth maps of one key frame or several"
+    )
+    about = "number of the frame to densify; may be given several times"
     option(parser, "--key K", about, type=natural, action="append", default=[])
-    about = "frames A to B-1, every S-th, of those that exist; keys whose windows overlap share "
-    option(parser, "--keys A:B[:S]", f"{about}registration and motion", type=key_range)
+    about = "frames A to B-1, every S-th. Overlapping windows share registration and scene flow"
+    option(parser, "--keys A:B[:S]", about, type=key_range)
     _add_key_options(parser)
     add_common(parser, "method")
     about = (
-        "depth images of your own, as of a monocular network: DIR/CAMERA/FRAME.npy, .exr or "
-        ".png (16 bit), or one FRAME.npy of one camera; of any scale, depth or inverse depth. "
-        "Fitted to the measured pixels they complete depth_full/; masks of the sky in "
-        "DIR/sky/CAMERA/FRAME.png"
+        "your own depth images, for example of a monocular network, for pixels without a "
+        "measurement: DIR/CAMERA/FRAME.npy, .exr or .png, of any scale. See docs/outputs.md"
     )
     option(parser, "--prior DIR|FILE", about, type=Path)
 
 
 def add_compare(commands: Any) -> None:
     """Add the options of ``compare``."""
-    about = "methods side by side, on the same registration"
+    about = "compare methods on one key frame: table, picture, JSON"
     parser = add_verb(commands, "compare", answer_compare, about)
-    option(parser, "--key K", "the frame to densify", type=natural, required=True)
+    option(parser, "--key K", "number of the frame to densify", type=natural, required=True)
     _add_key_options(parser)
     about = (
-        "of none (the key sweep), icp (registration only), icp-far (the same of all sweeps "
-        "within accumulate.far_m), icp-visible (registration with our visibility), flow-plain (our "
-        "scene flow without it), paper (the published scene flow), flow (ours); default: "
-        "none,icp,icp-far,paper,flow"
+        "none (single sweep), icp (rigid accumulation), icp-far (icp with sweeps beyond the "
+        "window), icp-visible (icp with visibility), flow-plain (flow without visibility), paper "
+        "(the published scene flow), flow (scene flow). Default: none,icp,icp-far,paper,flow"
     )
     option(parser, "--methods NAME,…", about, type=words)
 
 
 def _add_key_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that ``run`` and ``compare`` share."""
-    parser.epilog = f"Every knob with its default and what it does: {presets()['default']}"
+    parser.epilog = f"Every setting, with its default and its effect: {presets()['default']}"
     add_recording(parser)
     add_common(parser, "window", "camera")
     engines = ", ".join(row.usage for row in ENGINES.built_in)
-    option(parser, "--flow ENGINE", f"flow.engine (default: groups): {engines}")
+    option(parser, "--flow ENGINE", f"scene flow engine (default: groups): {engines}")
     about = (
-        "a page to look at each key in a browser, with the rejected pixels (short for --set "
-        "output.report=true --set output.rejected=true; densify report makes it later)"
+        "write report.html, a page for the browser, with the reasons of rejected points. "
+        "densify report makes it later, without the reasons"
     )
     option(parser, "--report", about)
     add_common(parser, "config")
     out = "densify-out"
-    option(parser, "--out DIR", f"(default: ./{out})", type=Path, default=Path(out))
+    option(
+        parser,
+        "--out DIR",
+        f"folder of the results (default: ./{out})",
+        type=Path,
+        default=Path(out),
+    )
     add_common(parser, "overwrite")
 
 
@@ -88,7 +93,8 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.pipeline import run as pipeline
     from densify.readers import open_sequence
 
-    sequence = open_sequence(recording_of(options))
+    spec = recording_of(options)
+    sequence = open_sequence(spec)
     keys = _keys_of(sequence, options)
     for key in keys:
         check_writable(options.out, key, options.overwrite)
@@ -108,7 +114,7 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
                 result,
                 options.out,
                 config=as_mapping(config),
-                data=recording_of(options),
+                data=spec,
                 overwrite=options.overwrite,
             )
             first = first_of(paths, FIRST_OF_RUN)
@@ -151,7 +157,8 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.readers import open_sequence
 
     check_writable(options.out, options.key, options.overwrite, "compare")
-    sequence, methods = open_sequence(recording_of(options)), options.methods or COMPARED
+    spec, methods = recording_of(options), options.methods or COMPARED
+    sequence = open_sequence(spec)
     with progress_on_stderr() as progress:
         results = pipeline.compare(
             sequence, options.key, options.window, options.cameras, config, progress, methods
@@ -160,7 +167,7 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
         results,
         options.out,
         config=as_mapping(config),
-        data=recording_of(options),
+        data=spec,
         overwrite=options.overwrite,
     )
     if config.output.report:

@@ -22,26 +22,30 @@ from densify.cli.screen import Answer, progress_on_stderr
 
 def add(commands: Any) -> None:
     """Add the options of ``train flow``."""
-    about = "train a network for scene flow; a trained one is the engine network:MODEL"
+    about = "train a network for scene flow"
     parser = add_verb(commands, "train", None, about)
     flow = add_verb(
         parser.add_subparsers(title="trainings", metavar="WHAT", required=True),
         "flow",
         answer,
-        "train a network for scene flow, with labels or without",
-        "SPEC may also be streets[?sensor=NAME], the default: a new street for every clip of 7 "
-        "sweeps. Teachers: objective (the published one, without labels), engine (this package's "
-        "engine makes the labels), truth (where the recording has some: streets).",
+        "train a network for scene flow, with or without labels",
+        "densify run --flow network:MODEL uses the trained network. SPEC may also be "
+        "streets[?sensor=NAME], the default: a new simulated street for every clip of 7 sweeps.",
     )
     add_recording(flow, several=True)
-    option(flow, "--out MODEL", "the model", type=Path, required=True)
+    option(flow, "--out MODEL", "file of the model", type=Path, required=True)
     add_common(flow, "overwrite")
     teachers, devices = ("objective", "engine", "truth"), ("auto", "cpu", "cuda")
-    flow.add_argument("--teacher", choices=teachers, default="objective", help="(objective)")
-    option(flow, "--steps N", "train on N pairs of sweeps", type=natural, required=True)
-    seed = "of the first weights and the choice of sweeps (default: 0)"
+    about = (
+        "objective: the published loss (default); engine: this package's flow; truth: exact flow"
+    )
+    flow.add_argument("--teacher", choices=teachers, default="objective", help=about)
+    option(flow, "--steps N", "number of pairs of sweeps to train on", type=natural, required=True)
+    seed = "seed of the first weights and of the choice of sweeps (default: 0)"
     option(flow, "--seed N", seed, type=natural, default=0)
-    flow.add_argument("--device", choices=devices, default="auto", help="(default: auto)")
+    flow.add_argument(
+        "--device", choices=devices, default="auto", help="device to train on (default: auto)"
+    )
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:

@@ -26,6 +26,7 @@ from densify.geometry.types.recordings import (
     Truth,
 )
 from densify.geometry.types.results import (
+    METHOD_NAMES,
     FullDepth,
     ObjectTrack,
     Prior,

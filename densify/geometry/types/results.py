@@ -14,6 +14,9 @@ from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.types.depth import CameraView, Cloud, DepthMap, Mover
 from densify.geometry.types.sweeps import StretchFlow
 
+METHOD_NAMES = {"none": "single sweep", "icp": "rigid accumulation", "flow": "scene flow"}
+"""The methods' names for people. Other methods have only their own."""
+
 
 @dataclass(frozen=True)
 class ObjectTrack:
@@ -99,20 +102,32 @@ class StageCost:
 
 @dataclass(frozen=True)
 class Result:
-    """One densified key.
+    """One densified key. A map's name is its camera's, or CAMERA/NUMBER with ``project.per=image``.
 
-    frames: of the window. far_frames: sweeps beyond it of which the cloud holds what stands still.
-    far_left_out: sweeps beyond that could not be placed.
-    depth: by name: the camera's, or CAMERA/NUMBER of each image (``project.per=image``). metrics:
-    plain numbers, ready for JSON. baselines: the results of the simpler methods on the same
-    registration, by method. flow: of every sweep to the next one on the way to the key, where
-    asked for (``output.flow``). movers: by instance (``output.movers``). optical_flow: name ->
-    (H,W,2) pixels to the "previous" and the "next" image (``output.optical_flow``). rejected: name
-    -> (H,W) `Reason` of what was left out (``output.rejected``). full: of the maps that a prior was
-    given for. images: name -> (H,W,3) RGB, of the maps whose image there is. warnings: what was
-    assumed or looks wrong, a sentence each. stamp_ns: the key's reference time. views: from where
-    each map looks. truth_m: name -> (H,W) true depth, 0 none, where there is truth. T_key_lidar:
-    (4,4) of every sweep of the window, by frame. tracks: of what moves.
+    Attributes:
+        method: ``flow``, ``icp``, ``none`` or another one of `densify.compare`.
+        key: Absolute frame number.
+        frames: Sweeps of the window.
+        cloud: All points at the key's time.
+        depth: Depth map by name.
+        metrics: Scores, plain numbers, ready for JSON.
+        costs: Seconds and memory of each stage.
+        baselines: Results of the simpler methods on the same registration, by method.
+        flow: Flow of every sweep to the next one towards the key (``output.flow``).
+        movers: Each moving object alone, by instance (``output.movers``).
+        optical_flow: By name (H,W,2) pixels to the "previous" and the "next" image
+            (``output.optical_flow``).
+        rejected: By name (H,W) `Reason` of the points that were left out (``output.rejected``).
+        full: Maps completed with a prior, by name.
+        images: By name (H,W,3) RGB, where there is an image.
+        far_frames: Sweeps beyond the window from which the cloud has static points.
+        far_left_out: Sweeps beyond the window that could not be registered.
+        warnings: What was assumed or looks wrong, a sentence each.
+        stamp_ns: The key's reference time.
+        views: Camera and pose of each map, by name.
+        truth_m: By name (H,W) true depth, 0 none, where there is truth.
+        T_key_lidar: (4,4) of every sweep of the window, by frame.
+        tracks: Path of each moving object.
     """
 
     method: str

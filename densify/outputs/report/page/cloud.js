@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// The cloud in 3-D: colours, from registration to ours, sweep by sweep, movers, points of view.
+// The cloud in 3-D: colours, from rigid accumulation to scene flow, sweep by sweep, movers, points of view.
 
 const NEAR_M = 0.3, FAR_M = 900, FOV = 0.9;
 const COLOURINGS = [["0", "camera"], ["1", "height"], ["2", "source sweep"], ["3", "moving object"], ["4", "confidence"], ["5", "distance moved"]];
@@ -53,10 +53,10 @@ class CloudPane {
     this.lines();
     this.moverTable();
     const shown = cloud.num_points < cloud.num_all
-      ? `${whole(cloud.num_points)} of ${whole(cloud.num_all)} points: what moves, and of the rest those that look apart from the car.`
+      ? `${whole(cloud.num_points)} of ${whole(cloud.num_all)} points: all moving ones, and static ones that are apart in the image.`
       : `All ${whole(cloud.num_all)} points.`;
-    const icp = this.canMorph ? " “Registration only” shows the same points where registration alone puts them." : "";
-    $("cloud-note").textContent = shown + icp + " Drag turns, right button or shift moves, wheel comes nearer. Gray: seen by no camera.";
+    const icp = this.canMorph ? " “Rigid accumulation” shows the same points without scene flow." : "";
+    $("cloud-note").textContent = shown + icp + " Drag turns, right button or shift moves, wheel comes nearer. Gray: observed by no camera.";
     new ResizeObserver(() => this.soon()).observe($("space"));
     this.legend();
     this.soon();

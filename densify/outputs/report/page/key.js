@@ -6,13 +6,13 @@ function facts() {
   const fact = (name, value, small) => list.push(element("div", {}, element("dt", {}, name), element("dd", {}, value, element("small", {}, small || " "))));
   const camera = Object.keys(page.cameras)[0], entry = page.cameras[camera];
   if (entry) fact("pixels with a depth", percent(entry.density.filled, 1), `${percent(entry.density.measured, 1)} measured, ${camera}`);
-  for (const [source, name] of [["depth", "wrong, against the truth"], ["held_out", "wrong, key held out"]]) {
+  for (const [source, name] of [["depth", "outliers, against the truth"], ["held_out", "outliers, key held out"]]) {
     const wrong = (m) => page.methods[m]?.[source]?.[camera]?.measured?.all?.outliers;
-    if (isNumber(wrong(page.method))) fact(name, percent(wrong(page.method)), page.method !== "icp" && isNumber(wrong("icp")) ? `${percent(wrong("icp"))} by registration alone` : "measured pixels");
+    if (isNumber(wrong(page.method))) fact(name, percent(wrong(page.method)), page.method !== "icp" && isNumber(wrong("icp")) ? `${percent(wrong("icp"))} with rigid accumulation` : "measured pixels");
   }
   if (isNumber(scores.ghosts?.all)) {
     const icp = page.methods.icp?.ghosts?.all;
-    fact("ghosts", percent(scores.ghosts.all), isNumber(icp) && page.method !== "icp" ? `${percent(icp)} by registration alone` : "of the accumulated points");
+    fact("ghosts", percent(scores.ghosts.all), isNumber(icp) && page.method !== "icp" ? `${percent(icp)} with rigid accumulation` : "of the accumulated points");
   }
   if (isNumber(scores.num_points)) fact("points", whole(scores.num_points), `${whole(scores.num_moving)} on moving objects`);
   const stages = Array.isArray(page.about.stages) ? page.about.stages : [];

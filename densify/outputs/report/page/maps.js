@@ -3,15 +3,15 @@
 // what a least confidence and a greatest age leave.
 
 const M_PER_STEP = 1 / 256;
-const DECADES = 5; // confidence c: one pixel in 10^(5c) is wrong
+const DECADES = 5; // confidence c: one pixel in 10^(5c) is an outlier
 const BASELINE_M = 0.54, WRONG_PX = 3, WRONG_SHARE = 0.05; // KITTI's rule
-const OTHER_NAMES = {
-  none: "sparse: the key sweep alone",
-  icp: "icp: registration only",
-  "icp-far": "icp-far: and of all sweeps around",
-  depth_full: "ours, completed with the prior",
+const METHOD_NAMES = {
+  none: "single sweep",
+  icp: "rigid accumulation",
+  "icp-far": "rigid accumulation, with sweeps beyond the window",
+  flow: "scene flow",
+  depth_full: "scene flow, completed with the prior",
 };
-const METHOD_NAMES = { flow: "ours" };
 const methodName = (name) => METHOD_NAMES[name] || name;
 
 // A camera's maps, unpacked.
@@ -64,7 +64,7 @@ class CameraMaps {
     const off = Math.abs(most / depth - most / truth);
     return off > WRONG_PX && off > WRONG_SHARE * most / truth;
   }
-  // Density, what confidence expects to be wrong, and against the truth, of measured and filled.
+  // Density, the outliers that confidence expects, and against the truth, of measured and filled.
   statistics(kept) {
     const measuredOf = this.entry.sources.map(([, , measured]) => measured);
     const chance = Array.from({ length: 256 }, (_, level) => 10 ** (-DECADES * (level - 1) / 254));
@@ -92,13 +92,13 @@ class CameraMaps {
   // [[name, text], ...] of what can be looked at.
   layers() {
     const list = [["image", "image"]];
-    for (const method of Object.keys(this.others)) list.push([method, OTHER_NAMES[method] || method]);
+    for (const method of Object.keys(this.others)) list.push([method, methodName(method)]);
     const ours = methodName(page.method);
     list.push(["measured", `${ours}: measured`], ["filled", `${ours}: filled`]);
     if (this.confidence) list.push(["confidence", "confidence"]);
     if (this.oldestMs || this.entry.sources.some(([, age]) => age)) list.push(["age", "age"]);
     if (this.entry.sources.some(([sweep]) => sweep)) list.push(["sweep", "source sweep"]);
-    if (this.reason) list.push(["reason", "what was rejected, and why"]);
+    if (this.reason) list.push(["reason", "rejected points, and why"]);
     if (this.truth) list.push(["truth", "truth"], ["error", "error against the truth"]);
     return this.entry.image ? list : list.slice(1);
   }
@@ -147,7 +147,7 @@ function drawLayer(maps, layer, kept, palette, enlarge) {
   if (layer === "confidence") {
     const table = confidenceScale().table(255, 1 / 254), levels = maps.confidence.map((v, i) => v * kept[i]);
     putEach(levels, table);
-    return { rgba, legend: { title: "confidence c: one pixel in 10^(5c) is wrong", scale: confidenceScale() } };
+    return { rgba, legend: { title: "confidence c: one pixel in 10^(5c) is an outlier", scale: confidenceScale() } };
   }
   if (layer === "age" || layer === "sweep") {
     const mostS = Math.max(...page.sweeps.map((s) => Math.abs(s.since_key_s) || 0), 0.1);
@@ -300,16 +300,16 @@ class ImagePane {
       if (ageMs !== null) rows.push(row("age", `${ageMs} ms${measured ? "" : ", of the nearest measured pixel"}`));
       if (maps.confidence) {
         const c = (maps.confidence[i] - 1) / 254;
-        rows.push(row("confidence", `${c.toFixed(2)}: one in ${whole(10 ** (DECADES * c))} is wrong`));
+        rows.push(row("confidence", `${c.toFixed(2)}: one in ${whole(10 ** (DECADES * c))} is an outlier`));
       }
     }
     if (maps.truth) {
       const truth = maps.truth[i], off = truth && depth ? `, off by ${signed((depth - truth) * M_PER_STEP, 2, "m")}` : "";
-      const wrong = off && maps.isWrong(depth, truth) ? ", wrong by KITTI's rule" : "";
+      const wrong = off && maps.isWrong(depth, truth) ? ", an outlier by KITTI's rule" : "";
       rows.push(row("truth", truth ? `${metres(truth * M_PER_STEP)}${off}${wrong}` : "none"));
     }
     for (const [method, map] of Object.entries(maps.others)) {
-      const name = (OTHER_NAMES[method] || method).split(":")[0];
+      const name = methodName(method);
       rows.push(row(name, map[i] ? metres(map[i] * M_PER_STEP) : "no depth"));
     }
     if (maps.reason && REASONS[maps.reason[i]]) rows.push(row("left out here", REASONS[maps.reason[i]][0]));
@@ -319,8 +319,8 @@ class ImagePane {
     const maps = this.maps, rows = maps.statistics(this.kept), head = ["", "pixels with a depth"];
     $("confidence-out").textContent = confidence.toFixed(2);
     $("age-out").textContent = ageMs === Infinity ? "any" : `${ageMs} ms`;
-    if (maps.confidence) head.push("expected wrong");
-    if (maps.truth) head.push("wrong (truth)", "mean error");
+    if (maps.confidence) head.push("expected outliers");
+    if (maps.truth) head.push("outliers (truth)", "mean error");
     const cells = (r) => {
       const all = [percent(r.density)];
       if (maps.confidence) all.push(percent(r.expected));
@@ -332,7 +332,7 @@ class ImagePane {
       ...rows.map((r) => row(r.product, ...cells(r))),
     );
     const curve = heldOutAt(maps.name, confidence);
-    const held = isNumber(curve) ? `With the key sweep held out, ${percent(curve)} of the measured pixels this certain are wrong.` : "";
+    const held = isNumber(curve) ? `With the key sweep held out, ${percent(curve)} of the measured pixels this certain are outliers.` : "";
     $("kept-note").textContent = held;
     const age = ageMs === Infinity ? "" : ` --max-age-ms ${ageMs}`;
     $("export-command").parentElement.hidden = !page.folder;

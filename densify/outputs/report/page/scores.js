@@ -14,8 +14,8 @@ function scoreTables(camera) {
   }
   const ghosts = Object.entries(page.methods).filter(([, s]) => isNumber(s?.ghosts?.all));
   if (ghosts.length) {
-    const table = element("table", {}, element("caption", {}, "Accumulated points where the key sweep saw through (ghosts), and points"));
-    table.append(headRow("", "ghosts", "of what moves", "of what stands", "points", "on moving objects", "pixels measured", "filled"));
+    const table = element("table", {}, element("caption", {}, "Ghosts: accumulated points at positions that the key sweep saw through"));
+    table.append(headRow("", "ghosts", "of moving points", "of static points", "points", "on moving objects", "pixels measured", "filled"));
     for (const [name, s] of ghosts) {
       const density = s.density?.[camera] || {};
       table.append(methodRow(name, [percent(s.ghosts.all), percent(s.ghosts.moving), percent(s.ghosts.static), whole(s.num_points), whole(s.num_moving), percent(density.measured, 1), percent(density.filled, 1)]));
@@ -35,7 +35,7 @@ function methodRow(name, cells) {
 function scoreTable(title, found, source, product, camera) {
   const table = element("table", {}, element("caption", {}, title));
   const parts = PARTS.filter((part) => found.some(([, s]) => isNumber(s[source][camera][product][part]?.outliers)));
-  table.append(headRow("", ...parts.flatMap((p) => [`${p}: wrong`, "MAE", "RMSE", "coverage"])));
+  table.append(headRow("", ...parts.flatMap((p) => [`${p}: outliers`, "MAE", "RMSE", "coverage"])));
   for (const [name, scores] of found) {
     const cells = parts.flatMap((part) => {
       const s = scores[source][camera][product][part] || {};
@@ -49,7 +49,7 @@ function scoreTable(title, found, source, product, camera) {
 function costs() {
   const stages = page.about.stages;
   if (!Array.isArray(stages) || !stages.length) {
-    $("costs").append(element("p", { class: "small" }, "This folder does not say what the stages took."));
+    $("costs").append(element("p", { class: "small" }, "This folder has no times of the stages."));
     return;
   }
   const most = Math.max(...stages.map((s) => s.seconds || 0), 1e-9);
