@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Opening recordings. `densify.config.plugins` has the table of readers."""
+"""Open recordings. `densify.config.plugins` has the table of readers."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ class ReaderModule(Protocol):
     """The members of a reader's module."""
 
     def open_recording(self, path: Path, scene: str | None) -> LidarSequence:
-        """Open the recording there lazily: only small files are read before a sweep is asked for.
+        """Return the recording at a path, opened lazily: only small files are read at once.
 
-        path: what follows ``READER:``, or a place that the reader recognises. scene: what follows
-        ``#``, None for nothing and for readers without scenes.
-        Raises InputError, which names the place, if there is no such recording.
+        Args:
+            path: The text after ``READER:``, or a place that the reader recognises.
+            scene: The text after ``#``; None without it, and for readers without scenes.
+
+        Raises:
+            InputError: There is no such recording. The message names the place.
         """
         ...
 
@@ -31,9 +34,11 @@ class ReaderModule(Protocol):
 class Spec(NamedTuple):
     """A recording as ``--data`` names it.
 
-    reader: the name of a row of `READERS`, "street" for the built-in one, None where the place
-    tells. place: a path; of the street, preset and options. scene: what follows ``#``, None for no
-    scene.
+    Attributes:
+        reader: Name of a row of `READERS`; "street" for the built-in one; None if the files
+            tell.
+        place: A path. For the street, its preset and options.
+        scene: The text after ``#``, None without it.
     """
 
     reader: str | None
@@ -42,10 +47,10 @@ class Spec(NamedTuple):
 
     @staticmethod
     def parse(text: str | Path) -> Spec:
-        """``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``.
+        """Return the spec of ``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``.
 
-        A path that exists as it stands, ``#`` included, has no scene; nor has one without a reader
-        where nothing lies before the ``#``.
+        An existing path that contains ``#`` has no scene. Neither has a path without a reader if
+        the part before the ``#`` does not exist.
         """
         text = str(text)
         if text == "street" or text.startswith(("street:", "street?")):
@@ -60,11 +65,11 @@ class Spec(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """The place; a leading ``~`` is expanded, as shells do not behind a colon."""
+        """The place as a path; a leading ``~`` is expanded, as shells do not after a colon."""
         return Path(self.place).expanduser()
 
     def absolute(self) -> str:
-        """The same recording, whatever the working directory of the process that opens it."""
+        """Return the spec of the same recording for a process with another working directory."""
         if self.reader == "street":
             return self.place
         reader = "" if self.reader is None else f"{self.reader}:"
@@ -77,12 +82,14 @@ def _exists(place: str) -> bool:
 
 
 def open_sequence(spec: str | Path = "street") -> LidarSequence:
-    """Open a recording.
+    """Return a recording, opened lazily.
 
-    spec: ``READER:PATH[#SCENE]``, or without ``READER:`` where it is guessed from what lies there,
-    or the built-in ``street[:PRESET][?seed=N&sensor=NAME]``.
+    Args:
+        spec: A path, ``READER:PATH[#SCENE]``, or the built-in
+            ``street[:PRESET][?seed=N&sensor=NAME]``. Without ``READER:`` the files tell the reader.
 
-    Raises InputError if there is nothing there or no reader knows it.
+    Raises:
+        InputError: There is nothing there, or no reader knows it.
     """
     parsed = Spec.parse(spec)
     if parsed.reader == "street":
@@ -121,8 +128,10 @@ def _reader_of(parsed: Spec, where: str) -> Plugin:
 
 
 def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:
-    """Return the first recording in a folder or its folders: one of a known form, or else a folder
-    of sweeps."""
+    """Return the first recording in a folder or its subfolders.
+
+    A recording of a known form comes before a plain folder of sweeps.
+    """
     places = [*path.glob("*"), *path.glob("*/*")][:_MOST_PLACES] if path.is_dir() else []
     places = [place for place in sorted(places) if place.exists()]  # links may lead nowhere
     found = (place for reader in readers for place in places if reader.recognises(place))

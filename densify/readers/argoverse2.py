@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Argoverse 2 sensor and lidar logs (Wilson et al., NeurIPS Datasets 2021), as downloaded::
+"""Read Argoverse 2 sensor and lidar logs as downloaded.
+
+Wilson et al., NeurIPS Datasets 2021::
 
     LOG/sensors/lidar/315966265259836000.feather             x y z intensity laser_number offset_ns
     LOG/sensors/cameras/ring_front_center/3159662652….jpg    optional
@@ -8,7 +10,7 @@
     LOG/annotations.feather                                  optional: tracked boxes
 
 Points are in the vehicle's frame (x forward, y left, z up), float16, compensated to the file's
-stamp, the *start* of the sweep; the poses undo that by ``offset_ns``, the firing time. Two scanners
+stamp, the *start* of the sweep. The poses undo that by ``offset_ns``, the firing time. Two scanners
 turn half a revolution apart, the lower one upside down: lasers 0 to 31 are ``up_lidar``, 32 to 63
 ``down_lidar`` (issue 77 of av2-api). Images are undistorted, so k1 to k3 do not apply, and stamped
 at their exposure. Frames and images are numbered from 0 in the order of time.
@@ -40,8 +42,11 @@ _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 
 def open_recording(path: Path, scene: str | None) -> Argoverse2:
-    """See `densify.readers.ReaderModule`. path: a log, or a split or the whole data set with the
-    log's name as the scene."""
+    """See `densify.readers.ReaderModule`.
+
+    Args:
+        path: A log, or a split or the whole data set with the log's name as the scene.
+    """
     if scene is None and (path / _POSES).is_file():
         return Argoverse2(path)
     places = (path, path / "train", path / "val", path / "test")
@@ -56,12 +61,17 @@ def open_recording(path: Path, scene: str | None) -> Argoverse2:
 
 
 class Argoverse2(FileSequence):
-    """A log as a `LidarSequence`; the lidar frame is the vehicle's. A sweep's reference time is its
-    start."""
+    """A log as a `LidarSequence`. The lidar frame is that of the vehicle.
+
+    The reference time of a sweep is its start.
+    """
 
     def __init__(self, log: Path) -> None:
-        """Read poses and calibration. Raises InputError if there are no sweeps, or a table is
-        missing or malformed."""
+        """Read poses and calibration.
+
+        Raises:
+            InputError: If there are no sweeps, or a table is missing or malformed.
+        """
         sweeps = checks.numbered_files(log / "sensors" / "lidar", ".feather")
         if not sweeps:
             raise InputError(
@@ -114,7 +124,11 @@ class Argoverse2(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `LidarSequence`; the test split has none. Raises InputError for a malformed table."""
+        """See `LidarSequence`; the test split has none.
+
+        Raises:
+            InputError: For a malformed table.
+        """
         if self._annotations is None:
             return None
         path, columns = self.where / "annotations.feather", self._annotations
@@ -147,7 +161,7 @@ def _read(
 def _poses(
     columns: dict[str, NDArray[Any]], path: Path, rows: NDArray[np.int64] | None = None
 ) -> Float:
-    """Return the (n,4,4) poses in the table's rows, in all if None."""
+    """Return the (n,4,4) poses in these rows of the table, in all rows for None."""
     table = np.stack([columns[name] for name in _POSE], axis=1)
     rows = np.arange(len(table)) if rows is None else rows
     T = [

@@ -29,10 +29,17 @@ _TYPES = {"s": ("string", "large_string"), "b": ("binary", "large_binary")}
 def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str, NDArray[Any]]:
     """Return columns of a feather file, (N,) each.
 
-    columns: name -> kind: "n" finite numbers, "m" numbers that may be NaN, "i" whole numbers, "s"
-    texts, "b" bytes, "t" truth values, "l" lists of numbers or None, as arrays of objects. what:
-    needs the file, such as "Argoverse 2 recordings" (extra ``argoverse``). Raises InputError if it
-    is missing or damaged, or a column is absent, has gaps or holds something else.
+    Args:
+        path: The file.
+        columns: Name -> kind: "n" finite numbers, "m" numbers that may be NaN, "i" whole
+            numbers, "s" texts, "b" bytes, "t" truth values, "l" lists of numbers or None, as arrays
+            of objects.
+        what: The recordings that need the file, such as "Argoverse 2 recordings", for the
+            message.
+
+    Raises:
+        InputError: The file is missing or damaged, or a column is absent, has gaps or holds
+            another kind.
     """
     needed("pyarrow", "argoverse", what)
     feather = needed("pyarrow.feather", "argoverse", what)
@@ -44,7 +51,8 @@ def read_parquet(
 ) -> dict[str, NDArray[Any]]:
     """Return columns of a parquet file as `read_feather` does (extra ``waymo``).
 
-    where: column -> value in the rows wanted; other row groups are not read.
+    Args:
+        where: Column -> value in the wanted rows. Other row groups are not read.
     """
     parquet = needed("pyarrow.parquet", "waymo", what)
     filters = [(name, "=", value) for name, value in (where or {}).items()]

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Parts that readers share, each checked: files and frames by number, cameras, poses and boxes.
-What is wrong is an InputError that begins with the place."""
+"""Check the parts that readers share: files by number, cameras, poses and boxes.
+
+Each error is an InputError that begins with the place.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,12 @@ _ORTHONORMAL_TOLERANCE = 1e-3  # text files carry seven digits, float32 files as
 
 
 def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
-    """Return the files of a folder that are named by a frame number, by ascending frame. Empty if
-    there is no such folder.
+    """Return the files of a folder that are named by a frame number, by ascending frame.
 
-    suffixes: those accepted, with the dot and in lower case.
+    Without such a folder the result is empty.
+
+    Args:
+        suffixes: Accepted suffixes, with the dot and in lower case.
     """
     if not folder.is_dir():
         return {}
@@ -38,9 +42,14 @@ def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
 
 
 def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
-    """Return the entry of a frame, or raise InputError that names the frames that exist.
+    """Return the entry of a frame.
 
-    what, where: for the message, such as ``"sweep"`` and the recording's folder.
+    Args:
+        what: The kind of entry, for the message, such as ``"sweep"``.
+        where: The recording's folder, for the message.
+
+    Raises:
+        InputError: There is no entry. The message names the existing frames.
     """
     if frame not in entries:
         raise InputError(
@@ -50,7 +59,7 @@ def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
 
 
 def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camera:
-    """Return the camera, or raise InputError that names those that exist."""
+    """Return the camera. Raise InputError, which names the existing cameras, if there is none."""
     if name not in cameras:
         raise InputError(
             f"{where}: no camera {name!r}; cameras that exist: {', '.join(cameras) or 'none'}"
@@ -61,7 +70,9 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
 def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
     """Return (H,W,3) uint8 RGB of an image file's bytes, gray in three equal channels.
 
-    Raises InputError, which names the place, if it is no whole image or not of the camera's size.
+    Raises:
+        InputError: If it is no whole image or not of the camera's size. The message names the
+            place.
     """
     bgr = decode_image(data, where)
     image_size(bgr.shape, camera, where)
@@ -69,7 +80,7 @@ def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.
 
 
 def image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> None:
-    """Raise InputError if an image (H,W,...) is not of the camera's size."""
+    """Raise InputError if an image (H,W,...) has another size than the camera."""
     if shape[:2] != (camera.height_px, camera.width_px):
         raise InputError(
             f"{where}: got an image of {shape[1]} x {shape[0]} px; expected {camera.width_px} x "
@@ -85,10 +96,14 @@ def pinhole(
     where: str,
     **lens: Any,
 ) -> Camera:
-    """Return a camera without skew. Raises InputError, which starts with ``where``, unless the
-    numbers are finite and the focal lengths and the size (width, height) are positive.
+    """Return a camera without skew.
 
-    lens: further arguments of `Camera`, such as its distortion.
+    Args:
+        lens: Further arguments of `Camera`, such as its distortion.
+
+    Raises:
+        InputError: Unless the numbers are finite and the focal lengths and the size (width,
+            height) are positive. The message starts with ``where``.
     """
     fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
@@ -101,9 +116,10 @@ def pinhole(
 
 
 def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str]) -> str:
-    """Return which recording of a place is meant: the one named, or the only one.
+    """Return the scene of a place: the one named, or the only one.
 
-    Raises InputError, which lists them, if that does not tell.
+    Raises:
+        InputError: There are several, or none of that name. The message lists them.
     """
     if scene in names or (scene is None and len(names) == 1):
         return scene or names[0]
@@ -122,8 +138,11 @@ def truth_beside(recording: Path) -> Truth | None:
 
 
 def parse_numbers(text: str, where: str, count: int) -> Float:
-    """Return the (count,) finite numbers of a line or file. Raises InputError that starts with
-    ``where``."""
+    """Return the (count,) finite numbers of a line or file.
+
+    Raises:
+        InputError: The numbers are others. The message starts with ``where``.
+    """
     try:
         values = np.array(text.split(), np.float64)
     except ValueError as error:
@@ -136,8 +155,12 @@ def parse_numbers(text: str, where: str, count: int) -> Float:
 
 
 def rigid(T: Any, where: str) -> Float:
-    """(4,4), (3,4) or their 16 or 12 numbers -> (4,4) float64. Raises InputError, which starts with
-    ``where``, if it is not finite or its upper left is no rotation."""
+    """Return the (4,4) float64 pose of a (4,4) or (3,4) matrix, or of its 16 or 12 numbers.
+
+    Raises:
+        InputError: It is not finite, or its rotation is none. The message starts with
+            ``where``.
+    """
     T = np.asarray(T, np.float64)
     T = T.reshape(-1, 4) if T.size in (12, 16) else T
     if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
@@ -148,8 +171,11 @@ def rigid(T: Any, where: str) -> Float:
 
 
 def rotation(R: Float, where: str) -> Float:
-    """Return the (3,3) matrix. Raises InputError, which starts with ``where``, if it is no
-    rotation."""
+    """Return the (3,3) matrix.
+
+    Raises:
+        InputError: It is no rotation. The message starts with ``where``.
+    """
     error = np.abs(R @ R.T - np.eye(3)).max()
     if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(R) < 0:
         raise InputError(
@@ -160,8 +186,10 @@ def rotation(R: Float, where: str) -> Float:
 
 
 def scanner_axes(T_lidar_scanner: Float) -> Float:
-    """(S,4,4) mounting poses of scanners -> (S,3,3) `Returns.R_scanner_lidar`. A scanner that hangs
-    upside down is turned about its x axis, so that z points upwards."""
+    """Return (S,3,3) `Returns.R_scanner_lidar` of scanners with these (S,4,4) mounting poses.
+
+    An upside-down scanner is turned about its x axis until z points upwards.
+    """
     R = T_lidar_scanner[:, :3, :3]
     upright = np.where(R[:, 2:, 2:] < 0, R * [1.0, -1.0, -1.0], R)
     return np.ascontiguousarray(upright.transpose(0, 2, 1))
@@ -170,9 +198,14 @@ def scanner_axes(T_lidar_scanner: Float) -> Float:
 def quaternion_pose(
     w_x_y_z: Sequence[float] | Float, translation_m: Sequence[float] | Float, where: str
 ) -> Float:
-    """Return the (4,4) pose of a unit quaternion and a translation. Raises InputError, which starts
-    with ``where``, unless there are four and three finite numbers and the quaternion's length is 1
-    to 0.01 (it is made 1 exactly)."""
+    """Return the (4,4) pose of a unit quaternion and a translation.
+
+    The length of the quaternion is made exactly 1.
+
+    Raises:
+        InputError: The numbers are not finite or not four and three, or the length differs from
+            1 by more than 0.01. The message starts with ``where``.
+    """
     from scipy.spatial.transform import Rotation
 
     try:
@@ -194,9 +227,11 @@ def quaternion_pose(
 
 
 def upright_poses(centre_m: Float, heading_rad: Float) -> Float:
-    """Return the (K,4,4) poses of boxes whose z axis is the frame's.
+    """Return the (K,4,4) poses of boxes whose z axis is that of the frame.
 
-    centre_m: (K,3). heading_rad: (K,) of the boxes' fronts, from x towards y.
+    Args:
+        centre_m: (K,3).
+        heading_rad: (K,) direction of the front, from x towards y.
     """
     T = np.tile(np.eye(4), (len(centre_m), 1, 1))
     c, s = np.cos(heading_rad), np.sin(heading_rad)
@@ -212,8 +247,12 @@ def boxes(
     where: str,
     lidar: Int | None = None,
 ) -> Boxes:
-    """Return boxes as they were read. Raises InputError, which starts with ``where``, for a box
-    that has no size or place, or is there twice."""
+    """Return the boxes of a sweep, checked.
+
+    Raises:
+        InputError: A box has no size or position, or is there twice. The message starts with
+            ``where``.
+    """
     bad = np.flatnonzero(~((size_m > 0) & (size_m < np.inf)).all(axis=1))
     if len(bad):
         raise InputError(

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Arrays, images and LAS files, decoded by libraries. Each function checks the sizes that a header
-claims before memory is taken, and turns whatever the library raises into one InputError."""
+"""Decode arrays, images and LAS files by libraries.
+
+Each function checks the sizes that a header claims before it takes memory. Every error of a library
+becomes one InputError.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +30,11 @@ _RECORD_BYTES = 54  # the least that a record of variable length takes
 
 
 def read_array(path: Path) -> NDArray[Any]:
-    """Return the array of a .npy file. Raises InputError if it is missing, too large, damaged, or
-    holds Python objects."""
+    """Return the array of a .npy file.
+
+    Raises:
+        InputError: The file is missing, too large, damaged, or holds Python objects.
+    """
     data = read_bytes(path)
     try:
         return _array(data)
@@ -39,10 +45,14 @@ def read_array(path: Path) -> NDArray[Any]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
 ) -> Arrays:
-    """Return the arrays of a .npz file by name; names: only those of them that it holds.
+    """Return the arrays of a .npz file by name. Members that are no arrays are left out.
 
-    Raises InputError if it is missing or damaged, holds Python objects, or the arrays together have
-    more bytes than that. Members that are no arrays are passed over.
+    Args:
+        names: Only these arrays, as far as the file has them.
+        most_bytes: Limit of all arrays together.
+
+    Raises:
+        InputError: The file is missing or damaged, holds Python objects, or is over the limit.
     """
     data = read_bytes(path)
     try:
@@ -72,15 +82,20 @@ def _array(data: bytes) -> NDArray[Any]:
 
 
 def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
-    """`decode_image` of a file."""
+    """Return `decode_image` of a file."""
     return decode_image(read_bytes(path), path, as_stored)
 
 
 def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDArray[Any]:
-    """Return (H,W,3) uint8 blue, green, red; as_stored: any depth, (H,W) if gray.
+    """Return the pixels of a PNG or JPEG file, (H,W,3) uint8 blue, green, red.
 
-    Raises InputError, which begins with ``where``, if it is no whole PNG or JPEG file, is damaged,
-    or has more than `MOST_PIXELS`.
+    Args:
+        where: The place, for messages.
+        as_stored: Keep the depth of the file; a gray image is (H,W).
+
+    Raises:
+        InputError: It is no whole PNG or JPEG file, or has more than `MOST_PIXELS`. The message
+            begins with ``where``.
     """
     import cv2
 
@@ -105,7 +120,7 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
 
 
 def _checked_format(data: bytes, where: Path | str) -> str:
-    """Return PNG or JPEG. Raises unless it is one of them, not too large, and (PNG) undamaged."""
+    """Return PNG or JPEG. Raise InputError for other, too large or damaged files."""
     from PIL import Image
 
     with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
@@ -115,7 +130,11 @@ def _checked_format(data: bytes, where: Path | str) -> str:
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
-    """Return width and height of an image file. Raises InputError if it is no whole image."""
+    """Return width and height of an image file.
+
+    Raises:
+        InputError: If it is no whole image.
+    """
     height, width = read_image(path).shape[:2]
     return width, height
 
@@ -131,8 +150,11 @@ def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
 
 
 def read_las(path: Path) -> Any:
-    """Return a `laspy.LasData` with all points of a LAS or LAZ file. Raises InputError if it is
-    missing, too large or damaged."""
+    """Return a `laspy.LasData` with all points of a LAS or LAZ file.
+
+    Raises:
+        InputError: The file is missing, too large or damaged.
+    """
     import laspy
 
     data = read_bytes(path)
@@ -151,7 +173,7 @@ def read_las(path: Path) -> Any:
 
 
 def _check_las(data: bytes, path: Path) -> None:
-    """Raise unless the numbers of points, records and chunks that it claims fit into the file."""
+    """Raise InputError unless the claimed numbers of points, records and chunks fit the file."""
     begin, num_records, num_bytes, num_points = _LAS_HEADER.unpack_from(data)
     kind, version = data[104], data[25]
     if version >= 4:

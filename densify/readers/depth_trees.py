@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Pairs of depth maps: files of two folders, and masks beside them, matched by drive, camera and
-frame, whatever layout each side has::
+"""Pair depth maps of two folders, and masks with them, by drive, camera and frame.
+
+Each side has one of these layouts::
 
     <drive>/proj_depth/<product>/image_02/0000000005.png    KITTI's depth trees
     <drive>_sync_<product>_0000000005_image_02.png          KITTI's selected validation images
@@ -37,7 +38,7 @@ _OURS = ("depth", *_FILLED, "confidence")  # no other trees have these
 
 @dataclass(frozen=True)
 class DepthPair:
-    """Files of one image. mask: None where there is none."""
+    """The files of one image. Without a mask, ``mask`` is None."""
 
     predicted: Path
     truth: Path
@@ -46,9 +47,14 @@ class DepthPair:
 
 @dataclass(frozen=True)
 class DepthPairs:
-    """pairs: at least one, ordered by the truth's path. without_truth: predicted files without a
-    partner; without_prediction: truth files without one; without_mask: truth files of pairs without
-    a mask (empty where no masks are given)."""
+    """The pairs of two places, and the files without a partner.
+
+    Attributes:
+        pairs: At least one, ordered by the path of the truth.
+        without_truth: Predicted files without a partner.
+        without_prediction: Truth files without a partner.
+        without_mask: Truth files of pairs without a mask; empty if no masks are given.
+    """
 
     pairs: tuple[DepthPair, ...]
     without_truth: tuple[Path, ...] = ()
@@ -70,11 +76,18 @@ def pair_depth_files(
 ) -> DepthPairs:
     """Pair the PNG files of two places, and masks with them.
 
-    predicted, truth, mask: a file or a folder with everything under it; two files are a pair
-    whatever their names. The drive or camera is compared only if both sides' names say it; files
-    outside a known layout are passed over. Of densify's own maps the measured ones are taken, or
-    the filled ones if ``filled``; of a truth with KITTI's ``groundtruth`` nothing else. Raises
-    InputError if a place is missing, names are ambiguous, or nothing pairs.
+    The drive and the camera are compared only if the names of both sides have them. Files of
+    unknown layout are left out. Of densify's maps the measured ones are taken, or the filled ones.
+    Of a truth with KITTI's ``groundtruth`` nothing else is taken.
+
+    Args:
+        predicted: A file, or a folder with everything below it.
+        truth: The same. Two files are a pair, whatever their names.
+        mask: Masks of moving objects, None for none.
+        filled: Take densify's filled maps.
+
+    Raises:
+        InputError: A place is missing, names are ambiguous, or nothing pairs.
     """
     found = _product(_found(predicted, "PREDICTED"), predicted, filled)
     true = _found(truth, "TRUTH")
@@ -105,7 +118,7 @@ def pair_depth_files(
 
 
 def _found(place: Path, what: str) -> list[_File]:
-    """Return the PNG files of a place by path; plain ones only if there are no others."""
+    """Return the PNG files of a place by path. Plain files count only if there are no others."""
     if place.is_file():
         return [_parsed(place)]
     paths = sorted(place.rglob("*.png"))
@@ -151,7 +164,7 @@ def _product(files: Sequence[_File], place: Path, filled: bool) -> list[_File]:
 def _match(
     left: Sequence[_File], right: Sequence[_File], left_place: Path, right_place: Path
 ) -> dict[Path, Path]:
-    """Return right path -> left path, by frame and by what all the files of both sides say."""
+    """Return right path -> left path, matched by frame and by what all files of both sides name."""
     everything = (*left, *right)
     told = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in everything)]
     here = _keyed(left, ["frame", *told], left_place)

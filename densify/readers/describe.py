@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A recording in a few aligned lines for people."""
+"""Describe a recording in a few aligned lines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOST_NAMED = 3  # sweeps that cannot be used, each with its reason
 
 
 def describe(sequence: LidarSequence) -> str:
-    """Return what `findings` says, a line each."""
+    """Return the `findings` of a recording as text."""
     return in_lines(findings(sequence))
 
 
@@ -26,11 +26,14 @@ def in_lines(lines: Sequence[tuple[str, str]]) -> str:
 
 
 def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
-    """Return frames, rate, points, cameras, stamps, poses and truth of a recording by name, and
-    what its reader had to find out.
+    """Return what a recording holds, as (name, text) pairs.
 
-    Loads the first and the last sweep that can be read and no image. Rates are those of the median
-    time from one sweep or image to the next. Raises InputError if no sweep can be read.
+    They are frames, rate, points, cameras, stamps, poses and truth, and what the reader found out.
+    The first and the last readable sweep are loaded, and no image. A rate is that of the median
+    time between two sweeps or images.
+
+    Raises:
+        InputError: No sweep can be read.
     """
     timeline = Timeline.of(sequence)
     unreadable = dict(timeline.unknown)
@@ -58,7 +61,7 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
 
 
 def _readable(sequence: LidarSequence, frames: Sequence[int], unreadable: dict[int, str]) -> Sweep:
-    """Return the first of these sweeps that can be read; adds those before it to ``unreadable``."""
+    """Return the first of these sweeps that can be read; add the others to ``unreadable``."""
     for frame in (frame for frame in frames if frame not in unreadable):
         try:
             return sequence[frame]

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Scenes in the format of TRI's Dataset Governance Policy (DGP): DDAD (Guizilini et al., CVPR 2020)
-and its relatives::
+"""Read scenes in the Dataset Governance Policy (DGP) format of TRI, such as DDAD.
+
+DDAD: Guizilini et al., CVPR 2020::
 
     ROOT/scene_02/scene_<hash>.json        samples, and the files, poses and stamps of their data
     ROOT/scene_02/calibration/<hash>.json  extrinsics (on the vehicle) and intrinsics, by name
     ROOT/scene_02/point_cloud/LIDAR/<stamp>.npz    ROOT/scene_02/rgb/CAMERA_01/<stamp>.jpg
 
-- A scene is its folder, or its name behind ``#``. Sweeps and each camera's images are numbered from
-  0 in the order of time; a missing file leaves a gap. Each has a pose of its sensor.
-- Stamps are ISO dates. DDAD's are tenths of microseconds taken for microseconds: dates beyond 2200
+- A scene is its folder, or its name behind ``#``. Sweeps and the images of each camera are numbered
+  from 0 in the order of time; a missing file leaves a gap. Each has a pose of its sensor.
+- Stamps are ISO dates. DDAD stores tenths of microseconds as microseconds: dates beyond 2200
   are divided by ten.
-- Points have no times; they are in the frame of the sweep's sensor. DDAD's are put together from
-  several solid-state scanners, in the vehicle's frame on the ground. Where their rays start is not
-  published; scan lines are smoothest from 1.55 m up, so the cameras' mean position is taken.
+- Points have no times. They are in the frame of the sweep's sensor. DDAD merges several
+  solid-state scanners, in the vehicle's frame on the ground. The origin of their rays is not
+  published. Scan lines are smoothest from 1.55 m up, so the cameras' mean position is taken.
 - Images are pinholes without distortion.
 """
 
@@ -38,7 +39,11 @@ _BOGUS_YEAR = 2200
 
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
-    """See `densify.readers.ReaderModule`. path: a scene's folder, or one that holds some."""
+    """See `densify.readers.ReaderModule`.
+
+    Args:
+        path: A scene's folder, or one that holds some.
+    """
     if scene is None and find_scene(path):
         return Dgp(path)
     names = sorted(folder.name for folder in path.glob("*/") if find_scene(folder))
@@ -48,13 +53,16 @@ def open_recording(path: Path, scene: str | None) -> Dgp:
 
 
 def find_scene(folder: Path) -> Path | None:
-    """Return the file that describes the folder's scene, None if there is none."""
+    """Return the file that describes the scene of a folder, None without one."""
     found = [p for p in folder.glob("scene_*.json") if not p.name.startswith("scene_dataset")]
     return min(found, default=None)
 
 
 class _Datum(NamedTuple):
-    """One sweep or image. size_px: of an image. T_world_sensor: (4,4). columns: of a sweep."""
+    """One sweep or image.
+
+    size_px: of an image. T_world_sensor: (4,4). columns: of a sweep.
+    """
 
     path: Path
     stamp_ns: int
@@ -67,8 +75,15 @@ class Dgp(FileSequence):
     """A scene as a `LidarSequence` with poses of its images."""
 
     def __init__(self, path: Path) -> None:
-        """path: the scene's folder. Raises InputError if its description or calibration is missing
-        or malformed, or none of its sweeps is there."""
+        """Read the description and the calibration.
+
+        Args:
+            path: Folder of the scene.
+
+        Raises:
+            InputError: The description or the calibration is missing or malformed, or there are
+                no sweeps.
+        """
         file = find_scene(path)
         if file is None:
             raise InputError(f"{path}: no DGP scene; expected scene_<hash>.json in it")
@@ -125,8 +140,7 @@ _Numbered = dict[str, dict[int, _Datum]]
 
 
 def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
-    """Return the sweeps and images that are there, by sensor and number, and the calibration's
-    file."""
+    """Return the existing sweeps and images, by sensor and number, and the calibration file."""
     content = read_json(file)
     found: dict[str, _Numbered] = {"point_cloud": {}, "image": {}}
     with described_in(file, "a DGP scene with samples and their data"):

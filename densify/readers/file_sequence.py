@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The base of readers of recorded files: a sequence that checks what is asked for and what is read.
+"""Provide the base class of readers of recorded files, which checks requests and contents.
 
-A reader derives from `FileSequence`, says in ``__init__`` what there is, and reads one sweep's
-returns, one image and one pose at a time. Requests for a frame, camera or image that does not exist
-and files that hold no valid returns, an image of another size or no rigid motion are refused here.
+A reader derives from `FileSequence` and says in ``__init__`` what there is. It reads the returns of
+one sweep, one image or one pose at a time. The base class refuses requests for a frame, camera or
+image that does not exist. It also refuses files without valid returns, images of another size, and
+poses that are no rigid motion.
 """
 
 from __future__ import annotations
@@ -25,12 +26,16 @@ from densify.readers import checks
 
 @dataclass(frozen=True)
 class Returns:
-    """The N rows of a sweep's file, each as it was measured, none left out.
+    """The N rows of a sweep's file, each as measured, none left out.
 
-    points: (N,3) metres, lidar frame, each at its own firing time. intensity: (N,) 0 to 1.
-    offset_ns: (N,) int64 since the sweep's reference time, None if unknown. lidar: (N,) which of
-    several scanners fired. scanner_origins: (S,3) metres, R_scanner_lidar: (S,3,3) to each
-    scanner's axes, z along the one it spins about; None where they are the frame's.
+    Attributes:
+        points: (N,3) metres, lidar frame, each at its own firing time.
+        intensity: (N,) 0 to 1.
+        offset_ns: (N,) int64 since the reference time of the sweep, None if unknown.
+        lidar: (N,) number of the scanner that fired.
+        scanner_origins: (S,3) metres; None if rays start at the origin of the frame.
+        R_scanner_lidar: (S,3,3) to the axes of each scanner, which spins about z; None if they
+            are those of the frame.
     """
 
     points: Float
@@ -42,14 +47,16 @@ class Returns:
 
 
 class FileSequence(ABC):
-    """A `LidarSequence` read from files.
+    """A `LidarSequence` that is read from files.
 
-    name: for people and outputs. where: the recording's place, for messages. frames: numbers of the
-    sweeps that exist, ascending. cameras: by name. exposed_ns: of each camera, when its images that
-    exist were exposed, by image number. truth: exact truth where there is some. files: of the
-    sweeps, where each has one of its own. images: PNG or JPEG files by camera and image number;
-    a reader without them overrides `_encoded_image`. A reader sets ``_stamps_ns``, the reference
-    times by frame, or overrides `stamp_ns`.
+    A reader sets ``_stamps_ns``, the reference times by frame, or overrides `stamp_ns`.
+
+    Attributes:
+        name: Name for people and outputs.
+        where: Place of the recording, for messages.
+        frames: Numbers of the existing sweeps, ascending.
+        cameras: The cameras by name.
+        truth: Exact truth, None if there is none.
     """
 
     _stamps_ns: Mapping[int, int] | Sequence[int] | Int
@@ -65,6 +72,14 @@ class FileSequence(ABC):
         files: Mapping[int, Path] | None = None,
         images: Mapping[str, Mapping[int, Path]] | None = None,
     ) -> None:
+        """Take what the reader found.
+
+        Args:
+            exposed_ns: Exposure of each existing image, by camera and image number.
+            files: File of each sweep, if it has one of its own.
+            images: PNG or JPEG files by camera and image number. A reader without them
+                overrides `_encoded_image`.
+        """
         self.name = name
         self.where = where
         self.frames: Sequence[int] = frames
@@ -82,8 +97,10 @@ class FileSequence(ABC):
 
     @abstractmethod
     def _returns(self, frame: int) -> Returns:
-        """Return the rows of an existing sweep. Whatever a malformed file makes it raise becomes an
-        InputError that names the file."""
+        """Return the rows of an existing sweep.
+
+        Any error of a malformed file becomes an InputError that names the file.
+        """
 
     def _checked_returns(self, frame: int) -> tuple[Path, Returns]:
         """Return the file of a sweep, for messages, and its rows."""
@@ -114,10 +131,13 @@ class FileSequence(ABC):
         )
 
     def __getitem__(self, frame: int) -> Sweep:
-        """Return the sweep's valid returns in file order. Rows that are not finite or lie at the
-        frame's origin (many formats pad with zeros) are dropped.
+        """Return the valid returns of a sweep in file order.
 
-        Raises InputError if the frame does not exist, or its file is damaged or holds no returns.
+        Rows that are not finite are dropped, and rows at the origin of the frame, with which many
+        formats pad.
+
+        Raises:
+            InputError: The frame does not exist, or its file is damaged or holds no returns.
         """
         path, returns = self._checked_returns(frame)
         x, y, z = returns.points.T  # by columns: sums over rows of three take several times as long
@@ -152,29 +172,35 @@ class FileSequence(ABC):
         return len(self._checked_returns(frame)[1].points)
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """Return when each image that exists was exposed, by its number."""
+        """Return the exposure time of each existing image, by its number."""
         checks.camera_named(self.cameras, camera, self.where)
         return self._exposed_ns.get(camera, {})
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
-        """Return (H,W,3) RGB. Raises InputError for an unknown camera, a missing or unfit image."""
+        """Return (H,W,3) RGB. Raise InputError for an unknown camera, a missing or unfit image."""
         calibrated = self.check_image(camera, number)
         return self._image(calibrated, number)
 
     def T_world_lidar(self, frame: int) -> Float:
-        """Return the data set's own (4,4) pose at the sweep's reference time. Raises InputError if
-        there is none, or it is no rigid motion."""
+        """Return the (4,4) pose of the data set at the reference time of the sweep.
+
+        Raises:
+            InputError: There is none, or it is no rigid motion.
+        """
         self.check_frame(frame)
         return checks.rigid(self._pose(frame), f"{self.where}: pose of frame {frame}")
 
     def check_frame(self, frame: int) -> None:
-        """Raise InputError, which names the frames that exist, for one that does not."""
+        """Raise InputError, which names the existing frames, for a frame that does not exist."""
         if frame not in self._frames:
             checks.of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
 
     def check_image(self, camera: str, number: int) -> Camera:
-        """Return the camera. Raises InputError, which names those that exist, for a camera or an
-        image that does not."""
+        """Return the camera.
+
+        Raises:
+            InputError: The camera or the image does not exist. The message names those that do.
+        """
         calibrated = checks.camera_named(self.cameras, camera, self.where)
         checks.of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
         return calibrated

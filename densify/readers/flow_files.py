@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""Flow files: scene flow between two sweeps on disk, ours or another method's.
+"""Read flow files: scene flow between two sweeps, of densify or of another method.
 
 ``000119_000120.npz`` holds the flow of the points of sweep 119 to the time of sweep 120::
 
-    residual_flow  (N,3) metres, ego motion removed, in the source's lidar frame, or instead of it
-    total_flow     (N,3) metres with the ego motion, from the source's lidar frame to the target's
+    residual_flow  (N,3) metres, ego-motion removed, in the source's lidar frame, or instead of it
+    total_flow     (N,3) metres with ego-motion, from the source's lidar frame to the target's
     row            (N,) row of each point in the sweep's file; without it N is their number
-    moving         (N,) bool; without it everything with a residual flow of 0.05 m or more
+    moving         (N,) bool; without it points with a residual flow of 0.05 m or more
     object         (N,) moving object, the same number in every file, -1 none; without it none
     valid          (N,) bool, of labels: the point's flow is known; read for scoring alone
     to_reference   (N,3) metres, own motion from the firing to the sweep's reference time, or 0
 
-True flow for scoring is flow files, or Argoverse 2's labels as BucketedSceneFlowEval stores them::
+True flow for scoring is in flow files, or in Argoverse 2's labels as BucketedSceneFlowEval stores
+them::
 
-    DIR/[LOG/]STAMP.feather  flow_tx_m flow_ty_m flow_tz_m without ego motion, in the vehicle's
+    DIR/[LOG/]STAMP.feather  flow_tx_m flow_ty_m flow_tz_m without ego-motion, in the vehicle's
                              frame at the stamp; is_valid; classes_0 in `CATEGORIES`, -1 the
                              background; a row for each of the sweep's file. Named by stamps, or
                              0000000000, 0000000001, …
@@ -60,8 +61,13 @@ def check_argument(argument: str) -> None:
 
 
 def read_step(folder: Path, stretch: Stretch, here: int, there: int) -> FlowField:
-    """Return the flow of sweep number ``here`` to number ``there``. Points that the file does not
-    have are static. Raises InputError for a file that is missing, damaged, or of another form."""
+    """Return the flow of sweep number ``here`` to number ``there``.
+
+    Points without a row in the file are static.
+
+    Raises:
+        InputError: The file is missing, damaged, or of another form.
+    """
     frame, target = stretch.frames[here], stretch.frames[there]
     sweep, T_here_there = stretch.sweeps[here].sweep, stretch.T_target_source(frame, target)
     path = folder / f"{frame:06d}_{target:06d}.npz"
@@ -75,11 +81,16 @@ def read_step(folder: Path, stretch: Stretch, here: int, there: int) -> FlowFiel
 def sweep_columns(
     path: Path, row: NDArray[np.int64], points: NDArray[np.float64], T_here_there: NDArray[Any]
 ) -> dict[str, NDArray[Any]]:
-    """Return a flow file's columns at the (N,) rows of a sweep.
+    """Return the columns of a flow file at the (N,) rows of a sweep.
 
-    row, points: (N,) and (N,3) of the sweep. T_here_there: (4,4) from the target's lidar frame.
-    Returns residual_flow, moving, object and valid, completed where the file lacks one, and
-    to_reference if the file has it; points of other rows have flow 0, object -1 and are not valid.
+    They are residual_flow, moving, object and valid, completed where the file lacks one, and
+    to_reference if the file has it. Points of other rows have flow 0 and object -1, and are not
+    valid.
+
+    Args:
+        row: (N,) rows of the sweep.
+        points: (N,3) points of the sweep, in metres.
+        T_here_there: (4,4) pose of the lidar frame of the target in that of the source.
     """
     arrays = load_flow_file(path)
     num_points = len(next(iter(arrays.values())))
@@ -111,7 +122,11 @@ def sweep_columns(
 
 
 def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays. Raises InputError if the file is missing, damaged, or of another form."""
+    """Return the arrays of a flow file.
+
+    Raises:
+        InputError: The file is missing, damaged, or of another form.
+    """
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
     arrays = read_arrays(path, _KNOWN)
@@ -185,10 +200,12 @@ _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 @dataclass(frozen=True)
 class LabelledFlow:
-    """The truth of a registered sweep's N points.
+    """The true flow of the N points of a registered sweep.
 
-    flow: (N,3) metres to the next sweep, ego motion removed, in the lidar frame. classes: (N,)
-    uint8 as in `densify.scores.challenge`. valid: (N,) bool, its flow is known.
+    Attributes:
+        flow: (N,3) metres to the next sweep, ego-motion removed, lidar frame.
+        classes: (N,) uint8 as in `densify.scores.challenge`.
+        valid: (N,) bool, the flow is known.
     """
 
     flow: Float
@@ -197,10 +214,14 @@ class LabelledFlow:
 
 
 def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
-    """Return the labels of one sweep's flow to the next sweep of the stretch.
+    """Return the labels of the flow of one sweep to the next sweep of the stretch.
 
-    place: as above. name: of the recording, whose folder may lie there. Raises InputError where
-    there are no labels of that sweep, or they are damaged or not its own.
+    Args:
+        place: A folder as described above.
+        name: Name of the recording, whose folder may be in ``place``.
+
+    Raises:
+        InputError: There are no labels of that sweep, or they are damaged or of another sweep.
     """
     if not place.is_dir():
         raise InputError(f"--truth {place}: no such folder; expected true flow in it")
@@ -224,7 +245,10 @@ def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> Label
 
 
 def _read_feather(path: Path, row: NDArray[np.int64]) -> LabelledFlow:
-    """row: (N,) of the sweep's points in its file."""
+    """Return the labels of a feather file.
+
+    row: (N,) of the sweep's points in its file.
+    """
     kinds = {**dict.fromkeys(_FLOW, "m"), "is_valid": "t", "classes_0": "i"}
     columns = read_feather(path, kinds, "Argoverse 2's flow labels")
     flow = np.stack([columns[axis].astype(np.float64) for axis in _FLOW], axis=1)

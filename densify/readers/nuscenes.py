@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""nuScenes (Caesar et al., CVPR 2020), without its devkit::
+"""Read nuScenes (Caesar et al., CVPR 2020) without its devkit.
+
+Layout::
 
     ROOT/v1.0-trainval/{scene,sample,sample_data,ego_pose,calibrated_sensor,sensor}.json
     ROOT/v1.0-trainval/sample_annotation.json    optional: tracked boxes
@@ -7,13 +9,13 @@
 
 A scene is named by ``#scene-0061``. Its sweeps, key frames or not, and each camera's images are
 numbered from 0 in the order of time; a missing file leaves a gap. Images are undistorted, stamped
-at their exposure. All the vehicle's poses of a scene, one a record, give its path.
+at their exposure. The path of the vehicle is made of all its poses in a scene, one for each record.
 
 One HDL-32E at 20 Hz. Points are in the scanner's frame (x right, y forward, z up), compensated to
 the stamp, that of the *last* packet, without times. Rows are columns of 32 rings in the order of
-firing, 46.08 µs apart (HDL-32E manual, 9.3): column c of n fired (c + 1 - n) · 46.08 µs after the
-stamp, by which the compensation is undone. Rows without a return then lie at the origin and are
-left out. The tables have millions of records: only those asked for are parsed.
+firing, 46.08 µs apart (HDL-32E manual, 9.3). Column c of n fired (c + 1 - n) · 46.08 µs after the
+stamp. The compensation is undone with these times. Rows without a return are then at the origin and
+are left out. The tables have millions of records; only the needed ones are parsed.
 """
 
 from __future__ import annotations
@@ -65,7 +67,11 @@ def pose_of(record: Record, where: str) -> Float:
 
 
 def read_table(path: Path) -> dict[str, Record]:
-    """Return all records by token. Raises InputError if the file is missing or no such table."""
+    """Return all records by token.
+
+    Raises:
+        InputError: If the file is missing or no such table.
+    """
     with described_in(path, _EXPECTED):
         return {str(record["token"]): record for record in read_json(_existing(path))}
 
@@ -73,7 +79,8 @@ def read_table(path: Path) -> dict[str, Record]:
 def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Record]:
     """Return the records, by token, whose ``key`` is one of ``wanted``; others are not parsed.
 
-    Raises InputError if the file is missing or cut off, or one of the records is malformed.
+    Raises:
+        InputError: If the file is missing or cut off, or one of the records is malformed.
     """
     pattern = re.compile(rb'"%s"\s*:\s*"([^"]*)"' % key.encode())
     names = frozenset(name.encode() for name in wanted)
@@ -104,7 +111,12 @@ def _existing(path: Path) -> Path:
 
 
 class KeyBox(NamedTuple):
-    """T_world_box: (4,4). size_m: (3,) length, width, height."""
+    """A box of a key frame.
+
+    Attributes:
+        T_world_box: (4,4).
+        size_m: (3,) length, width, height.
+    """
 
     T_world_box: Float
     size_m: Float
@@ -112,11 +124,15 @@ class KeyBox(NamedTuple):
 
 @dataclass(frozen=True)
 class Annotations:
-    """Boxes of a scene's key frames (2 Hz), from ``sample_annotation.json``.
+    """The boxes of a scene's key frames (2 Hz), from ``sample_annotation.json``.
 
-    key_ns: (n,) ascending stamps of the key frames. boxes: per key frame, by the object's token.
-    Between two key frames an object moves straight and turns evenly, as in the devkit. One that
-    only one of them has goes on at its speed without a track: nobody drew where it really is.
+    Between two key frames an object moves straight and turns evenly, as in the devkit. An object
+    that only one of them has continues at its speed without a track, because its real position is
+    unknown.
+
+    Attributes:
+        key_ns: (n,) ascending stamps of the key frames.
+        boxes: Boxes of each key frame, by the token of the object.
     """
 
     where: str
@@ -125,8 +141,14 @@ class Annotations:
 
     @staticmethod
     def read(tables: Path, scene: str) -> Annotations | None:
-        """scene: its token. None without the table, or without a box in the scene. Raises
-        InputError if a record is malformed, or an object is twice in a key frame."""
+        """Return the boxes of a scene. None without the table, or without a box in the scene.
+
+        Args:
+            scene: Token of the scene.
+
+        Raises:
+            InputError: A record is malformed, or an object is twice in a key frame.
+        """
         path = tables / "sample_annotation.json"
         if not path.is_file():
             return None
@@ -178,8 +200,12 @@ class Annotations:
 
 
 def open_recording(path: Path, scene: str | None) -> NuScenes:
-    """See `densify.readers.ReaderModule`. path: the folder that holds the tables, or the one above
-    it, which may hold several versions."""
+    """See `densify.readers.ReaderModule`.
+
+    Args:
+        path: The folder that holds the tables, or the one above it, which may hold several
+            versions.
+    """
     folders = [path] if (path / "sample_data.json").is_file() else []
     folders = folders or sorted(found.parent for found in path.glob("v*/sample_data.json"))
     if not folders:
@@ -200,8 +226,15 @@ def open_recording(path: Path, scene: str | None) -> NuScenes:
 
 @dataclass(frozen=True)
 class Channel:
-    """One sensor of a scene. stamps_ns: of its records, ascending; files: theirs. T_ego_sensor:
-    (4,4) for each. size_px: of its images. intrinsics: of the first record."""
+    """One sensor of a scene.
+
+    Attributes:
+        stamps_ns: Of its records, ascending.
+        files: Of its records.
+        T_ego_sensor: (4,4) for each record.
+        size_px: Of its images.
+        intrinsics: Of the first record.
+    """
 
     stamps_ns: Sequence[int]
     files: Sequence[Path]
@@ -210,14 +243,21 @@ class Channel:
     intrinsics: Any
 
     def on_disk(self) -> dict[int, Path]:
-        """Return the files that are there, by number."""
+        """Return the existing files, by number."""
         return {i: file for i, file in enumerate(self.files) if isfile(file)}
 
 
 @dataclass(frozen=True)
 class Scene:
-    """tables: their folder. token: of the scene. lidars, cameras: by channel, sorted. track: of the
-    vehicle."""
+    """A scene with its sensors.
+
+    Attributes:
+        tables: Folder of the tables.
+        token: Of the scene.
+        lidars: By channel, sorted.
+        cameras: By channel, sorted.
+        track: Path of the vehicle.
+    """
 
     name: str
     tables: Path
@@ -228,7 +268,11 @@ class Scene:
 
     @staticmethod
     def read(tables: Path, token: str, name: str) -> Scene:
-        """Raises InputError if a table is missing or malformed, or the scene has no sweeps."""
+        """Return a scene.
+
+        Raises:
+            InputError: A table is missing or malformed, or the scene has no sweeps.
+        """
         file, poses_file = tables / "sample_data.json", tables / "ego_pose.json"
         with described_in(file, _EXPECTED):
             samples = find_records(tables / "sample.json", "scene_token", {token})
@@ -281,7 +325,11 @@ class NuScenes(FileSequence):
     """A scene of nuScenes as a `LidarSequence`; the lidar frame is the scanner's."""
 
     def __init__(self, scene: Scene) -> None:
-        """Raises InputError if no sweep is on the disk, or a camera is malformed."""
+        """Open a scene.
+
+        Raises:
+            InputError: No sweep is on the disk, or a camera is malformed.
+        """
         self._scene, self._lidar = scene, next(iter(scene.lidars.values()))
         self._T_ego_lidar, track = self._lidar.T_ego_sensor[0], scene.track
         self._stamps_ns = self._lidar.stamps_ns
@@ -316,7 +364,11 @@ class NuScenes(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `LidarSequence`; the test split has none. Raises InputError for a malformed table."""
+        """See `LidarSequence`; the test split has none.
+
+        Raises:
+            InputError: For a malformed table.
+        """
         self.check_frame(frame)
         if self._annotations is None:
             return None

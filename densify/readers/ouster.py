@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Packets of an Ouster scanner: a ``.pcap`` file and the metadata ``.json`` that the sensor gives,
-decoded by the maker's ouster-sdk (densify[ouster]).
+"""Read packets of an Ouster scanner, by the maker's ouster-sdk (extra ``ouster``).
 
-The metadata is the ``.json`` whose name the capture's begins with, the only one beside it, or the
-one named behind ``#``. A sweep is a frame of the sensor, numbered from 0, read when asked for. Its
-stamp is the computer's, of its first packet; the sensor's clock gives the columns' times since
-then. Points are as measured, in the sensor's frame (x forward, y left, z up, origin on its base);
-rays start on the spinning axis. Rows count over the image of returns; of two returns the first is
-taken. There are neither cameras nor poses.
+A recording is a ``.pcap`` file and the metadata ``.json`` of the sensor: the one whose name begins
+the name of the capture, the only one beside it, or the one named behind ``#``.
+
+A sweep is a frame of the sensor, numbered from 0, read on demand. Its stamp is the computer's, of
+its first packet. The sensor's clock gives the times of the columns since then. Points are as
+measured, in the sensor's frame (x forward, y left, z up, origin on its base). Rays start on the
+spinning axis. Rows count over the image of returns. Of two returns the first is taken. There are
+neither cameras nor poses.
 """
 
 from __future__ import annotations
@@ -23,7 +24,12 @@ from densify.readers.file_sequence import FileSequence, Returns
 
 
 def open_recording(path: Path, scene: str | None) -> Ouster:
-    """See `densify.readers.ReaderModule`. path: the capture; scene: its metadata's file name."""
+    """See `densify.readers.ReaderModule`.
+
+    Args:
+        path: The capture.
+        scene: Its metadata's file name.
+    """
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an Ouster capture (.pcap)")
     metadata = find_metadata(path) if scene is None else path.with_name(scene)
@@ -37,7 +43,7 @@ def open_recording(path: Path, scene: str | None) -> Ouster:
 
 
 def find_metadata(path: Path) -> Path | None:
-    """Return the metadata beside a capture, from names alone; None where that does not tell."""
+    """Return the metadata beside a capture, found by names; None if names do not tell."""
     found = sorted(path.parent.glob("*.json"))
     named = [p for p in found if path.stem.startswith(p.stem)]
     if named:
@@ -46,11 +52,15 @@ def find_metadata(path: Path) -> Path | None:
 
 
 class Ouster(FileSequence):
-    """A capture as a `LidarSequence`. A sweep's stamp is when its first packet was captured."""
+    """A capture as a `LidarSequence`. The stamp of a sweep is the capture of its first packet."""
 
     def __init__(self, path: Path, metadata: Path) -> None:
-        """Raises InputError if the file is no capture, the metadata no Ouster's, or they do not
-        belong together."""
+        """Open a capture with its metadata.
+
+        Raises:
+            InputError: The file is no capture, the metadata is not of an Ouster, or they do not
+                belong together.
+        """
         core = needed("ouster.sdk.core", "ouster", "Ouster captures")
         pcap = needed("ouster.sdk.pcap", "ouster", "Ouster captures")
         read_json(metadata)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""PandaSet (Xiao et al., ITSC 2021): one sequence's folder, as downloaded::
+"""Read PandaSet (Xiao et al., ITSC 2021): the folder of one sequence, as downloaded.
+
+Its files::
 
     002/lidar/{00.pkl.gz, ..., poses.json, timestamps.json}
     002/camera/front_camera/{00.jpg, ..., poses.json, timestamps.json, intrinsics.json}
@@ -8,11 +10,11 @@
 - A frame's number is that of its files; its stamp is the end of the sweep. The first scanner (``d``
   0, Pandar64) turns once in a sweep, the second (``d`` 1, PandarGT, forward) runs free of it.
 - Points are in the world, each placed with the vehicle's pose at its own time. Poses are the
-  vehicle's, x right, y forward, z up, 10 Hz; their clock is the points' own to 20 ms.
-- The scanners' places are not published. The Pandar64's is where its rings are sharpest, the
-  PandarGT's where its mirror's swings are smoothest; the same vehicle drove all sequences. The
-  lidar frame is the Pandar64's: x forward, y left, z along its axis.
-- Boxes are in the world. What both scanners see has two, each of one scanner
+  vehicle's, x right, y forward, z up, 10 Hz; their clock agrees with that of the points to 20 ms.
+- The positions of the scanners are not published. The Pandar64 is assumed where its rings are
+  sharpest, the PandarGT where the swings of its mirror are smoothest. The same vehicle drove all
+  sequences. The lidar frame is the Pandar64's: x forward, y left, z along its axis.
+- Boxes are in the world. An object that both scanners observe has two, one for each scanner
   (``cuboids.sensor_id``). ``dimensions`` are width, length, height; ``yaw`` turns the front from
   the world's y (devkit; not tried on real boxes).
 - Cameras are pinholes without distortion, as large as their images. Each image has a pose and a
@@ -66,12 +68,21 @@ def open_recording(path: Path, scene: str | None) -> PandaSet:
 
 
 class PandaSet(FileSequence):
-    """A sequence as a `LidarSequence` with poses of its images. A sweep's stamp is the end of the
-    Pandar64's turn."""
+    """A sequence as a `LidarSequence` with poses of its images.
+
+    The stamp of a sweep is the end of the Pandar64's turn.
+    """
 
     def __init__(self, path: Path) -> None:
-        """path: the sequence's folder. Raises InputError if it holds no sweeps, or poses, stamps or
-        intrinsics are missing or malformed."""
+        """Read poses, stamps and intrinsics.
+
+        Args:
+            path: Folder of the sequence.
+
+        Raises:
+            InputError: There are no sweeps, or poses, stamps or intrinsics are missing or
+                malformed.
+        """
         lidar = path / "lidar"
         found = {file.name.removesuffix(".pkl.gz"): file for file in sorted(lidar.glob("*.pkl.gz"))}
         sweeps = {int(name): file for name, file in found.items() if name.isdecimal()}
@@ -110,8 +121,10 @@ class PandaSet(FileSequence):
         return self._T_world_cam[camera][number]
 
     def _step_m(self, stamp_ns: int) -> float:
-        """Return the distance between the poses around that time. The smaller it is, the better is
-        an interpolated pose."""
+        """Return the distance between the poses around that time.
+
+        The smaller it is, the better is an interpolated pose.
+        """
         after = np.searchsorted(self._track.stamp_ns, stamp_ns)
         if not 0 < after < len(self._track.stamp_ns):
             return np.inf
@@ -145,8 +158,11 @@ class PandaSet(FileSequence):
         return self._track.at(self.stamp_ns(frame))
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `LidarSequence`; None without the frame's file. Raises InputError for a malformed
-        file."""
+        """See `LidarSequence`; None without the frame's file.
+
+        Raises:
+            InputError: For a malformed file.
+        """
         self.check_frame(frame)
         path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"
         if not path.is_file():

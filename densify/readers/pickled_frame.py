@@ -2,8 +2,8 @@
 """Read columns of a pickled pandas data frame without pandas and without running the pickle.
 
 A pickle is a program: it may name any function of any package and call it. Here each name stands
-for a record that only notes what it was called with. Names that a data frame's file does not
-have are refused. The columns are then taken from the notes.
+for a record that only notes the arguments of its calls. Names that the file of a data frame does
+not need are refused. The columns are taken from the notes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _NUMBERS = re.compile(r"[fiu][1248]|b1")
 
 
 class _Record:
-    """Notes how an object of the file is made, and the state set on it."""
+    """Note how an object of the file is made, and the state set on it."""
 
     args: tuple[Any, ...]
     state: Any = None
@@ -57,7 +57,7 @@ _RECORDS: dict[str, type[_Record]] = {
 
 
 class _Unpickler(pickle._Unpickler):
-    """The one in Python, where a damaged file cannot reach past its buffers."""
+    """Unpickle in pure Python, where a damaged file cannot reach past its buffers."""
 
     def find_class(self, module: str, name: str) -> type[_Record]:
         named = f"{module}.{name}"
@@ -67,11 +67,14 @@ class _Unpickler(pickle._Unpickler):
 
 
 def read_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the columns of a gzipped pickle of a data frame of numbers and texts, (N,) each by
-    name. Columns of texts are arrays of objects, each of which the caller must check.
+    """Return the columns of a gzipped pickle of a data frame, (N,) each, by name.
 
-    Raises InputError if the file is missing, damaged, or anything else than such a frame, above all
-    if it names a function that frames do not need. Nothing in the file is run.
+    Columns of texts are arrays of objects, each of which the caller must check. Nothing in the file
+    is run.
+
+    Raises:
+        InputError: The file is missing, damaged, or no data frame of numbers and texts, or it
+            names a function that frames do not need.
     """
     data = read_bytes(path)
     try:
@@ -84,7 +87,7 @@ def read_columns(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _columns(frame: Any) -> dict[str, NDArray[Any]]:
-    """pandas stores columns of one kind together, (C,N), and says which they are."""
+    """Return the columns of a frame. pandas stores columns of one kind together, (C,N)."""
     if not isinstance(frame, _RECORDS["pandas.core.frame.DataFrame"]):
         raise ValueError(f"it holds a {type(frame).__name__}")
     managed = frame.state["_data"].state[-1]["0.14.1"]

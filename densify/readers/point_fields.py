@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The meaning of a point cloud's fields, found by their names, and of times also by their values.
+"""Find the meaning of a point cloud's fields by their names, and of times also by their values.
 
 Velodyne's ``time`` are seconds since the stamp, Ouster's ``t`` nanoseconds, Hesai's and RoboSense's
-``timestamp`` seconds since 1970, Livox's ``offset_time`` nanoseconds. The span of a sweep's times
-tells the unit: units lie a factor of 1000 apart and a sweep takes about one period.
+``timestamp`` seconds since 1970, Livox's ``offset_time`` nanoseconds. The span of the times of a
+sweep tells the unit, because units differ by a factor of 1000 and a sweep takes about one period.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _FULL_SCALES = (1.0, 255.0, 65535.0)
 
 @dataclass(frozen=True)
 class Fields:
-    """Which field plays which part; "" for none."""
+    """The name of the field for each part, "" for none."""
 
     x: str = ""
     y: str = ""
@@ -54,7 +54,7 @@ class Fields:
 
 
 def find_fields(names: Collection[str]) -> Fields:
-    """Find fields by their names, in any case; the first of several that could play a part."""
+    """Return the fields by their names, in any case. Of several for one part, the first counts."""
     lower = {name.lower(): name for name in reversed(list(names))}
     found = {
         part: next((lower[name] for name in known.split() if name in lower), "")
@@ -65,11 +65,14 @@ def find_fields(names: Collection[str]) -> Fields:
 
 @dataclass(frozen=True)
 class PointTimes:
-    """How a field tells when each point was measured.
+    """The meaning of a field of times.
 
-    unit: a key of `UNIT_NS`. absolute: since an epoch, not since the sweep's stamp. other_clock: of
-    absolute times, an epoch that is not the stamps'. reference: which moment of the sweep the stamp
-    is, one of `REFERENCES`; "" where the times say it themselves.
+    Attributes:
+        unit: A key of `UNIT_NS`.
+        absolute: The times count from an epoch, not from the stamp of the sweep.
+        other_clock: Absolute times have another epoch than the stamps.
+        reference: The moment of the sweep at its stamp, one of `REFERENCES`; "" if the times
+            say it.
     """
 
     field: str
@@ -79,7 +82,7 @@ class PointTimes:
     reference: str = ""
 
     def offset_ns(self, values: NDArray[Any], stamp_ns: int) -> Int:
-        """(N,) times of a sweep -> (N,) int64 since its stamp."""
+        """Return (N,) int64 times since the stamp of the sweep, of (N,) values of the field."""
         if not len(values):
             return np.zeros(0, np.int64)
         unit_ns = UNIT_NS[self.unit]
@@ -114,11 +117,18 @@ def find_times(
     absolute: bool | None = None,
     reference: str = "",
 ) -> tuple[PointTimes | None, str]:
-    """Return how a field tells the times of a sweep's points, and what was found in words; None,
-    and why, where it does not tell them.
+    """Return how a field tells the times of points, and the finding in words.
 
-    values: (N,) of one sweep. period_ns: from sweep to sweep. stamp_ns: of the sweep, None if it
-    has none. unit, absolute, reference: what is known already.
+    Without a meaning, return None and the reason.
+
+    Args:
+        values: (N,) of one sweep.
+        field: Name of the field.
+        period_ns: Time from sweep to sweep.
+        stamp_ns: Stamp of the sweep, None without one.
+        unit: The unit, "" if unknown.
+        absolute: As in `PointTimes`, None if unknown.
+        reference: As in `PointTimes`, "" if unknown.
     """
     times = widened(values)
     times = times[np.isfinite(times)]
@@ -149,8 +159,7 @@ def find_times(
 
 
 def full_scale(intensity: NDArray[Any]) -> float:
-    """Return what brings a sweep's intensities to 0 to 1 by division: 1, 255, 65535, or the
-    greatest of them."""
+    """Return the divisor that scales intensities to 0 to 1: 1, 255, 65535, or the maximum."""
     greatest = float(np.nanmax(intensity, initial=0.0))
     return next((scale for scale in _FULL_SCALES if greatest <= scale), greatest)
 
@@ -165,8 +174,10 @@ def scaled(intensity: NDArray[Any], scale: float) -> Float32:
 class PointLayout:
     """The meaning of the fields of a sensor's sweeps, found in one of them.
 
-    times: None where no field tells them; time_words: what was found of them. intensity_scale: what
-    full brightness is.
+    Attributes:
+        times: Meaning of the times, None if no field has them.
+        time_words: The finding about times, in words.
+        intensity_scale: Intensity of full brightness.
     """
 
     fields: Fields
@@ -186,8 +197,13 @@ class PointLayout:
     ) -> PointLayout:
         """Return the layout of a sweep's columns (N,).
 
-        named: fields by the part that they play. intensity_scale: 0 to find it. times: what else is
-        known of them, see `find_times`. Raises InputError without x, y or z.
+        Args:
+            named: Fields by their part.
+            intensity_scale: 0 to find it.
+            times: Known properties of the times, see `find_times`.
+
+        Raises:
+            InputError: There is no x, y or z.
         """
         fields = Fields(**(vars(find_fields(columns)) | dict(named or {})))
         missing = [axis for axis in "xyz" if not getattr(fields, axis)]
@@ -208,8 +224,11 @@ class PointLayout:
     def returns(
         self, columns: Mapping[str, NDArray[Any]], where: Path | str, stamp_ns: int
     ) -> tuple[Returns, Bool]:
-        """Return the rows of a sweep of that stamp, and which of them are valid (N,). Raises
-        InputError if it lacks a field of the first, or a valid point has no time."""
+        """Return the rows of a sweep of that stamp, and a mask (N,) of the valid ones.
+
+        Raises:
+            InputError: A field of the first sweep is missing, or a valid point has no time.
+        """
         missing = [name for name in vars(self.fields).values() if name and name not in columns]
         if missing:
             raise InputError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Files of points: the columns of every format. Nothing in them is run as code."""
+"""Read the columns of point files of every format. Nothing in them is run as code."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ _ROWS_LOOKED_AT = 4000
 class PointTable:
     """The N points of a file.
 
-    columns: by name, (N,) numbers each, as they are stored; `unnamed` names those without names.
-    beside: the other arrays of an .npz file.
+    Attributes:
+        columns: (N,) numbers each, as stored, by name; `unnamed` names those without names.
+        beside: The other arrays of an .npz file.
     """
 
     columns: Columns
@@ -117,8 +118,11 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _are_scanned(points: NDArray[Any]) -> bool:
-    """Return True if (N,3) points lie near those of the rows before, by the median of the steps as
-    a share of the sizes: another number of columns mixes x with y."""
+    """Return True if consecutive (N,3) points are close to each other.
+
+    The median of the steps is compared with the distances. A wrong number of columns mixes x with
+    y.
+    """
     with np.errstate(invalid="ignore"):  # other bytes may be any sort of NaN
         near = np.nan_to_num(points.astype(np.float64), posinf=0, neginf=0)
     step, size = np.abs(np.diff(near, axis=0)).sum(axis=1), np.abs(near).sum(axis=1)
@@ -163,8 +167,10 @@ def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[str], str | None]:
-    """Return the number of lines before the numbers, the column names of the last of them, and the
-    delimiter, None for blanks. Comments before the names are passed over."""
+    """Return the number of header lines, the column names and the delimiter (None for blanks).
+
+    Comments before the names are skipped.
+    """
     for number, line in enumerate(lines, 1):
         text = line.strip().lstrip("#").strip()
         if not text:
@@ -190,9 +196,11 @@ def _are_numbers(words: Sequence[str]) -> bool:
 
 
 def _pcd_header(file: Any) -> list[str]:
-    """Return the lines up to DATA, without comments; the file then stands where the points begin.
+    """Return the lines up to DATA, without comments. The file is then at the first point.
+
     Padding fields with a COUNT of 0 and old headers without COUNT are put in the form that parsers
-    take."""
+    take.
+    """
     lines: list[str] = []
     while len(lines) < 20:
         raw = file.readline(65536)

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Depth images that the user brings, such as a monocular network's, in a folder::
+"""Read depth images that the user brings, such as those of a monocular network.
+
+A folder of them::
 
     DIR/[CAMERA/[data/]]FRAME.npy, .exr or .png    without CAMERA of a single one; or a file alone
-    DIR/sky/[CAMERA/]FRAME.png    optional masks, not 0 where there is sky
+    DIR/sky/[CAMERA/]FRAME.png    optional masks, not 0 for sky
 
 FRAME is the image's number: 120, 000120, 0000000120, 0000000120_depth or _disp. Arrays are (H,W) of
 any number type, with further axes of length 1; EXR files have one channel, or one called Z, Y or
@@ -34,7 +36,12 @@ _SAME_ASPECT = 0.02
 
 @dataclass(frozen=True)
 class PriorFiles:
-    """values, sky: camera -> number of the image -> file."""
+    """The files of priors.
+
+    Attributes:
+        values: Camera -> number of the image -> file.
+        sky: The same of masks.
+    """
 
     place: Path
     values: Mapping[str, Mapping[int, Path]]
@@ -42,8 +49,11 @@ class PriorFiles:
 
     @staticmethod
     def open(place: Path, cameras: Sequence[str]) -> PriorFiles:
-        """Find the files of some cameras in a folder, or one file. Raises InputError if there is
-        nothing, or it is not clear for which of several cameras it is."""
+        """Return the files of some cameras in a folder, or a single file.
+
+        Raises:
+            InputError: There is nothing, or a file could be of several cameras.
+        """
         where, example = f"--prior {place}", "0000000120.npy, .exr or .png"
         if not place.exists():
             raise InputError(f"{where}: no such folder or file; expected DIR/CAMERA/{example}")
@@ -73,8 +83,10 @@ class PriorFiles:
     def prior(self, camera: Camera, number: int) -> Prior | None:
         """Return the prior of an image at the camera's size; None if there is none.
 
-        A prior of another size is resized if its aspect agrees. Raises InputError for files that
-        cannot be read or are something else.
+        A prior of another size is resized if its aspect agrees.
+
+        Raises:
+            InputError: For files that cannot be read or are something else.
         """
         path = self.values[camera.name].get(number)
         if path is None:
@@ -86,7 +98,7 @@ class PriorFiles:
 
 
 def _in(folder: Path) -> dict[int, Path]:
-    """Return number -> file, in the folder or its ``data``; of a file, itself."""
+    """Return number -> file, in the folder or its ``data``. A single file is returned as it is."""
     groups = [sorted(f.iterdir()) for f in (folder, folder / "data") if f.is_dir()]
     for paths in [[folder]] if folder.is_file() else groups:
         found: dict[int, Path] = {}
@@ -108,7 +120,7 @@ def _in(folder: Path) -> dict[int, Path]:
 
 
 def _value(path: Path) -> Float32:
-    """Return (H,W), 0 where there is none."""
+    """Return (H,W) values, 0 for none."""
     read = {".npy": read_array, ".exr": _read_exr, ".png": _read_png}[path.suffix.lower()]
     image = np.asarray(read(path))
     image = image.reshape([n for n in image.shape if n != 1]) if image.ndim > 2 else image
@@ -154,7 +166,7 @@ def _read_png(path: Path) -> NDArray[Any]:
 
 
 def _resized(value: Float32, camera: Camera, path: Path) -> Float32:
-    """Return the values at the camera's size: linear between two of them, none beside none."""
+    """Return the values at the camera's size, linear between two of them, none beside none."""
     if value.shape == (camera.height_px, camera.width_px):
         return value
     known = _at_size((value > 0).astype(np.float32), camera, path)

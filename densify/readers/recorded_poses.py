@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Recorded poses: text files of them (KITTI's 3x4, 4x4, TUM's, tables with a quaternion), and the
-pose of a vehicle at any time.
+"""Read recorded poses from text files, and interpolate the pose of a vehicle at any time.
 
-Many data sets store each sweep as if it had been measured at one moment: ego-motion compensation
-carried every point there. That smears moving objects, hides their times, and bends rings;
-`PoseTrack.as_fired` undoes it.
+The files are KITTI's 3x4, 4x4, TUM's, and tables with a quaternion. Many data sets store each sweep
+compensated, as if it had been measured at one moment. That smears moving objects, hides their
+times, and bends rings. `PoseTrack.as_fired` undoes it.
 """
 
 from __future__ import annotations
@@ -30,7 +29,13 @@ _TURNS = tuple((f"q{a}", f"q_{a}", f"rot_{a}", f"orientation_{a}") for a in "wxy
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """where: the file, for messages. stamp_ns: (n,) int64, ascending. T_world_ego: (n,4,4)."""
+    """The path of a vehicle.
+
+    Attributes:
+        where: The file, for messages.
+        stamp_ns: (n,) int64, ascending.
+        T_world_ego: (n,4,4).
+    """
 
     where: str
     stamp_ns: Int
@@ -46,7 +51,8 @@ class PoseTrack:
     def at(self, time_ns: int) -> Float:
         """Return (4,4) T_world_ego, interpolated between two poses.
 
-        Raises InputError for a time more than 0.2 s before the first pose or after the last.
+        Raises:
+            InputError: For a time more than 0.2 s before the first pose or after the last.
         """
         begin, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
         beyond_ns = max(begin - time_ns, time_ns - end)
@@ -61,17 +67,20 @@ class PoseTrack:
         return poses.interpolate(self.T_world_ego[i], self.T_world_ego[i + 1], fraction)
 
     def as_fired(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Undo ego-motion compensation.
+        """Return (N,3) points in the vehicle frame at their own firing times, compensation undone.
 
-        points: (N,3) metres, vehicle frame at ``stamp_ns``, to which they were compensated.
-        offset_ns: (N,) firing times since then. Returns (N,3) in the vehicle frame at each point's
-        own firing time; rows of zeros, which formats pad with, stay zeros.
+        Rows of zeros, with which formats pad, stay zeros.
+
+        Args:
+            points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``.
+            stamp_ns: Time of that frame.
+            offset_ns: (N,) firing times since then.
         """
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
 
     def compensated(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Inverse of `as_fired`."""
+        """Return (N,3) points in the vehicle frame at ``stamp_ns``, the inverse of `as_fired`."""
         return self._carry(points, stamp_ns, offset_ns, inverse=False)
 
     def _carry(self, points: Float, stamp_ns: int, offset_ns: Int, inverse: bool) -> Float:
@@ -94,9 +103,12 @@ class PoseTrack:
 
 @dataclass(frozen=True)
 class PoseFile:
-    """Poses as they are written, T_world_body if nothing else is known.
+    """Poses as they are written, T_world_body unless more is known.
 
-    form: for people. T: (n,4,4). stamps_ns: when each was, None if the file has no times.
+    Attributes:
+        form: Form of the file, for people.
+        T: (n,4,4).
+        stamps_ns: Their times, None if the file has none.
     """
 
     path: Path
@@ -106,7 +118,14 @@ class PoseFile:
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
-        """unit: of the times, "" finds it out. Raises InputError that names file and line."""
+        """Return the poses of a file.
+
+        Args:
+            unit: Of the times, "" to find it.
+
+        Raises:
+            InputError: The file is malformed. The message names file and line.
+        """
         table = TextTable.read(path, [name for names in _TURNS for name in names])
         width, time = len(table.rows[0]), None
         columns = [i for names in (*_TURNS, *_PLACES) if (i := table.column(names)) is not None]

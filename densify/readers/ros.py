@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""ROS 1 bags and ROS 2 bags (.db3, .mcap), by the rosbags package, without ROS (`densify[ros]`).
+"""Read ROS 1 bags and ROS 2 bags (.db3, .mcap) by the rosbags package, without ROS (extra ``ros``).
 
-``ros:PATH[#points=/topic,/topic&images=/topic,/topic&poses=/topic]``: topics are guessed where one
-fits, and must be named where several do; ``images=none`` and ``poses=none`` leave them out.
+``ros:PATH[#points=/topic,/topic&images=/topic,/topic&poses=/topic]``. A topic is chosen if it is
+the only one that fits, and must be named else. ``images=none`` and ``poses=none`` leave them out.
 
 points: PointCloud2 of any layout, or Livox's CustomMsg, in their header's frame, as fired from its
     origin. Several lidars make one sweep in the frame of the first named: each of its messages
-    takes the others' nearest in time; /tf_static tells where their rays start.
+    takes the others' nearest in time. /tf_static gives the origins of their rays.
 stamps: of the header (of the recording where that is 0): the reference time. Times of points count
     from it, or are absolute (`densify.readers.point_fields`). Sweeps and images are numbered from 0
     in the order of their stamps.
@@ -49,13 +49,22 @@ _USUAL_PERIOD_NS = 100_000_000
 
 
 def open_recording(path: Path, scene: str | None) -> RosBag:
-    """See `densify.readers.ReaderModule`; scene: which topics, see above."""
+    """See `densify.readers.ReaderModule`.
+
+    Args:
+        scene: Which topics, see above.
+    """
     return RosBag(path, scene)
 
 
 class Lidar(NamedTuple):
-    """A lidar's topic. entries: its messages. T_first_lidar: (4,4) to the first lidar's frame.
-    period_ns: median step of its messages."""
+    """The topic of a lidar.
+
+    Attributes:
+        entries: Its messages.
+        T_first_lidar: (4,4) to the frame of the first lidar.
+        period_ns: Median step of its messages.
+    """
 
     topic: str
     frame: str
@@ -66,11 +75,15 @@ class Lidar(NamedTuple):
 
 
 class RosBag(FileSequence):
-    """A bag as a `LidarSequence`; `findings` says what was found."""
+    """A bag as a `LidarSequence`."""
 
     def __init__(self, path: Path, options: str | None = None) -> None:
-        """Read the bag through once, for the stamps of its messages. Raises InputError if it is
-        damaged, or its topics, frames or calibrations do not tell what is needed."""
+        """Read the bag once, for the stamps of its messages.
+
+        Raises:
+            InputError: The bag is damaged, or its topics, frames or calibrations are not
+                sufficient.
+        """
         self._bag = Bag(path)
         self._topics = topics = Topics.choose(self._bag, options)
         self._index = self._bag.index([*topics.points, *topics.images])
@@ -156,7 +169,7 @@ class RosBag(FileSequence):
 
     @cached_property
     def _track_and_words(self) -> tuple[PoseTrack | None, str]:
-        """The first lidar's path, and for a person where it is from."""
+        """Return the path of the first lidar, and its source in words."""
         chosen, lidar = self._topics.poses, self._lidars[0].frame
         if not chosen:
             return None, "none, as asked for"
@@ -201,8 +214,7 @@ class RosBag(FileSequence):
         return Lidar(topic, frame, entries, T, period_ns, layout)
 
     def _camera(self, topic: str) -> Camera:
-        """Return the camera of a topic. Raises InputError if the bag does not tell its calibration
-        or its place."""
+        """Return the camera of a topic. Raise InputError without calibration or mounting."""
         place, places = place_of(topic), [place_of(t) for t in self._topics.images]
         where, info = f"{self._bag.path}: {topic}", f"{place}/camera_info"
         message = next(self._bag.messages(info), None) if info in self._bag.topics else None

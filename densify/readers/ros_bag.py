@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Messages of ROS 1 and ROS 2 bags, by the rosbags package: no ROS is needed.
+"""Read messages of ROS 1 and ROS 2 bags by the rosbags package, without ROS.
 
-A bag is read through once, for the time stamp in the header of every message that matters.
-Messages are then read one at a time.
+A bag is read once, for the time stamp in the header of every message that matters. Messages are
+then read one at a time.
 """
 
 from __future__ import annotations
@@ -47,8 +47,13 @@ _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
 
 
 class Entry(NamedTuple):
-    """Where a message is. stamp_ns: of its header, or when it was recorded if that is 0. log_ns:
-    when it was recorded. turn: which of the topic's messages recorded then."""
+    """The place of a message.
+
+    Attributes:
+        stamp_ns: Of its header, or of its recording if that is 0.
+        log_ns: Time of its recording.
+        turn: Number among the messages of its topic that were recorded at that time.
+    """
 
     stamp_ns: int
     log_ns: int
@@ -56,7 +61,11 @@ class Entry(NamedTuple):
 
 
 class Topic(NamedTuple):
-    """type: such as sensor_msgs/msg/PointCloud2, whichever ROS it is from."""
+    """A topic.
+
+    Attributes:
+        type: Such as sensor_msgs/msg/PointCloud2, for both versions of ROS.
+    """
 
     name: str
     type: str
@@ -64,11 +73,16 @@ class Topic(NamedTuple):
 
 
 class Bag:
-    """path: a .bag, .db3 or .mcap file, a ROS 2 bag's folder, or a folder of .bag files that are
-    parts of one recording. topics: by name."""
+    """A bag.
+
+    Attributes:
+        path: A .bag, .db3 or .mcap file, the folder of a ROS 2 bag, or a folder of .bag files
+            that are parts of one recording.
+        topics: By name.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError if it is no bag, or a damaged one."""
+        """Open a bag. Raise InputError if it is no bag, or a damaged one."""
         self.path = path
         self._files = _bag_files(path)
         self._is_ros2 = not (self._files[0].suffix == ".bag" and self._files[0].is_file())
@@ -88,8 +102,7 @@ class Bag:
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Return every message of these topics, whose types begin with a header, by ascending
-        stamp."""
+        """Return the messages of these topics by ascending stamp."""
         found: dict[str, list[Entry]] = {topic: [] for topic in topics}
         for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
             before = found[topic][-1] if found[topic] else None
@@ -102,7 +115,7 @@ class Bag:
         return {topic: sorted(entries) for topic, entries in found.items()}
 
     def message(self, topic: str, entry: Entry) -> Any:
-        """Raises InputError if it cannot be read."""
+        """Return a message. Raise InputError if it cannot be read."""
         found = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
         if len(found) <= entry.turn:
             raise InputError(f"{self.path}: no message of {topic} at {entry.log_ns} ns any more")
@@ -110,7 +123,7 @@ class Bag:
         return self._decoded(raw, type_, topic)
 
     def messages(self, topic: str) -> Iterator[Any]:
-        """Yield all of a topic, in the order in which they were recorded."""
+        """Yield all messages of a topic, in the order of their recording."""
         for name, _, raw, type_ in self._messages([topic]):
             yield self._decoded(raw, type_, name)
 
@@ -144,8 +157,10 @@ class Bag:
 
 
 def message_types(is_ros2: bool) -> Any:
-    """Return the types of messages as ROS defines them, never as a bag does: rosbags makes code of
-    definitions."""
+    """Return the types of messages as ROS defines them.
+
+    Definitions in a bag are not used, because rosbags makes code of definitions.
+    """
     typesys = needed("rosbags.typesys", "ros", "ROS bags")
     stores = typesys.Stores
     types = typesys.get_typestore(stores.ROS2_JAZZY if is_ros2 else stores.ROS1_NOETIC)
@@ -167,8 +182,10 @@ def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
 
 
 def _bag_files(path: Path) -> list[Path]:
-    """Return what is to be opened: the file, a ROS 2 bag's folder, or the bags in a folder. Raises
-    InputError if there are none."""
+    """Return the files to open: the file, the folder of a ROS 2 bag, or the bags in a folder.
+
+    Raises InputError if there are none.
+    """
     suffixes = (".bag", ".db3", ".mcap")
     if (path.is_file() and path.suffix in suffixes) or (path / "metadata.yaml").is_file():
         return [path]
@@ -197,9 +214,14 @@ def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
 
 @dataclass(frozen=True)
 class Topics:
-    """points: of the lidars; the first one's messages are the sweeps. images: of cameras. poses: a
-    topic, ``tf``, or "" for none. named: what of these the user named; whatever is wrong with it is
-    an error."""
+    """The topics of a bag that are used.
+
+    Attributes:
+        points: Of the lidars. The messages of the first are the sweeps.
+        images: Of the cameras.
+        poses: A topic, ``tf``, or "" for none.
+        named: The topics that the user named; a problem with them is an error.
+    """
 
     points: tuple[str, ...]
     images: tuple[str, ...]
@@ -208,8 +230,15 @@ class Topics:
 
     @staticmethod
     def choose(bag: Bag, options: str | None) -> Topics:
-        """options: what follows ``#``. Raises InputError for topics that do not exist, several that
-        could be the sweeps, and bags without any."""
+        """Return the topics to use.
+
+        Args:
+            options: The text after ``#``.
+
+        Raises:
+            InputError: A topic does not exist, several could be the sweeps, or there are no
+                sweeps.
+        """
         given = dict(parse_qsl(options or "", keep_blank_values=True))
         wrong = [key for key in given if key not in ("points", "images", "poses")]
         if wrong or (options and not given):
@@ -248,7 +277,7 @@ def _only_cloud(bag: Bag) -> str:
 
 
 def _guessed_images(topics: Sequence[str]) -> list[str]:
-    """Return the best of each place: rectified before raw, whole before compressed."""
+    """Return the best topic of each camera: rectified before raw, whole before compressed."""
     best: dict[str, str] = {}
     for topic in sorted(topics, key=lambda t: ("rect" not in t, t.endswith("/compressed"), t)):
         if not _NO_PICTURES.search(topic.lower()):
@@ -257,7 +286,7 @@ def _guessed_images(topics: Sequence[str]) -> list[str]:
 
 
 def place_of(topic: str) -> str:
-    """``/front/image_raw/compressed`` -> ``/front``, which has its calibration too."""
+    """Return the namespace: ``/front/image_raw/compressed`` -> ``/front``, as its calibration."""
     return topic.removesuffix("/compressed").rpartition("/")[0]
 
 

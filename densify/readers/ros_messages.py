@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contents of ROS messages: points of any layout, images of any encoding, calibrations, transforms
-and poses."""
+"""Read the contents of ROS messages: points, images, calibrations, transforms and poses."""
 
 from __future__ import annotations
 
@@ -52,8 +51,13 @@ _FIXED_M = 1e-6  # what moves less, in metres or radians, is fixed
 
 
 def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
-    """Return the fields of a PointCloud2 or Livox's CustomMsg by name, (N,) each as stored. Fields
-    of several numbers are left out. Raises InputError if its layout contradicts itself."""
+    """Return the fields of a PointCloud2 or Livox's CustomMsg by name, (N,) each as stored.
+
+    Fields of several numbers are left out.
+
+    Raises:
+        InputError: The layout contradicts itself.
+    """
     if not hasattr(message, "point_step"):
         rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
         table = np.array(rows, list(_LIVOX.items()))
@@ -89,8 +93,11 @@ def _rows(message: Any, step: int, item_bytes: int, where: str) -> NDArray[np.ui
 
 
 def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
-    """Return the (H,W,3) of an Image or CompressedImage. Raises InputError if its encoding is not
-    known, or it is damaged."""
+    """Return the (H,W,3) of an Image or CompressedImage.
+
+    Raises:
+        InputError: If its encoding is not known, or it is damaged.
+    """
     import cv2
 
     if hasattr(message, "format"):
@@ -116,9 +123,13 @@ def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
 def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, where: str) -> Camera:
     """Return the camera of a CameraInfo, with its binning and region of interest.
 
-    T_optical_lidar: (4,4) to the frame of the message. rectified: the images are rectified: their
-    calibration is P, turned by R; else it is K with D. Raises InputError for a model that is not
-    known or numbers that are no calibration.
+    Args:
+        T_optical_lidar: (4,4) to the frame of the message.
+        rectified: The images are rectified, and the calibration is P, turned by R. Else it is K
+            with D.
+
+    Raises:
+        InputError: The model is unknown, or the numbers are no calibration.
     """
     matrix = {  # ROS 1 writes K, ROS 2 k
         key: np.asarray(getattr(info, key if hasattr(info, key) else key.upper()), np.float64)
@@ -156,8 +167,10 @@ def _lens(named: str, distortion: tuple[float, ...], where: str) -> tuple[str, t
 
 
 def _binned(camera: Camera, info: Any) -> Camera:
-    """Adapt the calibration to an image that is a part of the sensor or has fewer pixels. A pixel
-    of the image is the mean of several, so centres shift by half a pixel."""
+    """Return the camera of an image that is a part of the sensor or has fewer pixels.
+
+    A pixel of the image is the mean of several. Therefore centres shift by half a pixel.
+    """
     roi, by = info.roi, np.array([max(1, info.binning_x), max(1, info.binning_y)])
     size = [roi.width or camera.width_px, roi.height or camera.height_px]
     K = camera.K.copy()
@@ -172,7 +185,12 @@ def _binned(camera: Camera, info: Any) -> Camera:
 
 @dataclass(frozen=True)
 class Transforms:
-    """fixed: T_parent_child by child, with its parent. moving: the same over time."""
+    """The transforms of a bag.
+
+    Attributes:
+        fixed: T_parent_child by child, with its parent.
+        moving: The same over time.
+    """
 
     where: str
     fixed: dict[str, tuple[str, Float]] = field(default_factory=dict)
@@ -180,8 +198,11 @@ class Transforms:
 
     @staticmethod
     def read(bag: Bag) -> Transforms:
-        """Read all of /tf_static and /tf. Frames that never move in /tf are fixed too. Raises
-        InputError for a transform that is no rigid motion."""
+        """Read all of /tf_static and /tf. Frames that never move in /tf are fixed too.
+
+        Raises:
+            InputError: A transform is no rigid motion.
+        """
         found = Transforms(str(bag.path))
         heard: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
         for topic in bag.of_type("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
@@ -204,7 +225,7 @@ class Transforms:
         return found
 
     def between(self, target: str, source: str) -> Float | None:
-        """Return (4,4) T_target_source over fixed frames, None if nothing joins them."""
+        """Return (4,4) T_target_source over fixed frames, None if they are not connected."""
         ways: dict[str, list[tuple[str, Float]]] = defaultdict(list)
         for child, (parent, T) in self.fixed.items():
             ways[child].append((parent, T))
@@ -219,8 +240,10 @@ class Transforms:
         return found.get(target)
 
     def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
-        """Return the path of a frame by /tf, in the nearest moving parent, whose name comes first:
-        ``odom`` rather than ``map``, which jumps where a place is recognised."""
+        """Return the path of a frame by /tf in the nearest moving parent, and the parent's name.
+
+        The nearest parent is ``odom`` rather than ``map``, which jumps at loop closures.
+        """
         T_body_frame, body, passed = np.eye(4), frame, {frame}
         while body in self.fixed and body not in self.moving:
             parent, T = self.fixed[body]
@@ -235,10 +258,13 @@ class Transforms:
 
 
 def recorded_track(bag: Bag, topic: str, transforms: Transforms, lidar: str) -> PoseTrack:
-    """Return the lidar's path by a topic of odometry or poses.
+    """Return the path of the lidar by a topic of odometry or poses.
 
-    Odometry is that of its child frame; a pose without one is the lidar's. Raises InputError if
-    nothing joins that frame to the lidar's, or there are fewer than two poses.
+    Odometry is that of its child frame. A pose without one is that of the lidar.
+
+    Raises:
+        InputError: That frame is not connected to the lidar's, or there are fewer than two
+            poses.
     """
     found, where = dict[int, Float](), f"{bag.path}: {topic}"
     for message in bag.messages(topic):
@@ -261,11 +287,12 @@ def _track(where: str, by_stamp: dict[int, Float]) -> PoseTrack:
 
 
 def plain(frame: str) -> str:
-    """Return a frame's name as ROS 2 writes it."""
+    """Return the name of a frame as ROS 2 writes it."""
     return frame.strip("/")
 
 
 def stamp_of(header: Any) -> int:
+    """Return the stamp of a header in nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 

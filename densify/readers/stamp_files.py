@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Times in the names of files and in text files. Times since 1970 (the years 2000 to 2099) are in
-the unit that their size tells; others are in seconds unless a unit is given."""
+"""Read times in the names of files and in text files.
+
+Times since 1970 (the years 2000 to 2099) tell their unit by their size. Others are in seconds
+unless a unit is given.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +29,12 @@ _MOST_NS = 2**63
 
 
 class Named(NamedTuple):
-    """A file and what its name says. number: None where there is none; stamp_ns: None where it is
-    no time since 1970."""
+    """A file and the number or time in its name.
+
+    Attributes:
+        number: None without one.
+        stamp_ns: None if it is no time since 1970.
+    """
 
     path: Path
     number: int | None
@@ -35,10 +42,13 @@ class Named(NamedTuple):
 
 
 def named(path: Path, unit: str = "") -> Named:
-    """Return what a file's name says: ``0000000120`` and ``cloud_12`` are numbers;
-    ``1317042651.468569638``, ``1317042651_468569638`` and ``1317042651468`` are times since 1970.
+    """Return the number or the time in the name of a file.
 
-    unit: the last number in the name is a time in this unit.
+    ``0000000120`` and ``cloud_12`` are numbers. ``1317042651.468569638``, ``1317042651_468569638``
+    and ``1317042651468`` are times since 1970.
+
+    Args:
+        unit: If given, the last number in the name is a time in this unit.
     """
     words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
     if unit:
@@ -70,8 +80,10 @@ def in_ns(text: str, unit: str) -> int:
 
 
 def date_ns(text: str) -> int:
-    """Return a date and time in UTC as nanoseconds since 1970, every digit kept. Raises ValueError,
-    also for years that 64 bits do not reach, of which numpy makes others."""
+    """Return a date and time in UTC as nanoseconds since 1970, every digit kept.
+
+    Raise ValueError for other texts, and for years beyond 64 bits, which numpy would wrap.
+    """
     day = np.datetime64(text, "D")
     if not np.datetime64("1970-01-01") <= day < np.datetime64("2262-01-01"):
         raise ValueError(f"got {text!r}, expected a year from 1970 to 2261")
@@ -79,7 +91,7 @@ def date_ns(text: str) -> int:
 
 
 def _epoch_unit(text: str) -> str:
-    """Return the unit in which this is a time since 1970, "" if there is none."""
+    """Return the unit in which this is a time since 1970, "" without one."""
     for unit in UNIT_NS:
         try:
             if _EPOCH_NS[0] <= in_ns(text, unit) < _EPOCH_NS[1]:
@@ -90,8 +102,12 @@ def _epoch_unit(text: str) -> str:
 
 
 class TextTable(NamedTuple):
-    """Words of a text file, parted by blanks, commas, semicolons or tabs. names: of the columns, in
-    lower case, where the first line has them. lines: the number of each row."""
+    """Words of a text file, separated by blanks, commas, semicolons or tabs.
+
+    Attributes:
+        names: Of the columns, in lower case, if the first line has them.
+        lines: Number of each row.
+    """
 
     path: Path
     names: list[str]
@@ -100,8 +116,14 @@ class TextTable(NamedTuple):
 
     @staticmethod
     def read(path: Path, known: Collection[str]) -> TextTable:
-        """known: a first line with one of these words names the columns, or one behind a #. Raises
-        InputError if there are no rows, or one has fewer words than the first."""
+        """Return the table of a file.
+
+        Args:
+            known: A first line with one of these words names the columns, or one behind a #.
+
+        Raises:
+            InputError: There are no rows, or a row has fewer words than the first.
+        """
         names: list[str] = []
         lines: list[int] = []
         rows: list[list[str]] = []
@@ -130,9 +152,14 @@ class TextTable(NamedTuple):
         return next((i for i in found if i < len(self.rows[0])), None)
 
     def times_ns(self, column: int, unit: str) -> tuple[tuple[int, ...], str]:
-        """Return the times of a column, dates or numbers of this unit, and the unit. unit: "" for
-        that of times since 1970, or else s. Raises InputError for other words, and for times of an
-        assumed unit in which the usual step is too long."""
+        """Return the times of a column, dates or numbers, and their unit.
+
+        Args:
+            unit: "" for the unit of times since 1970, or else seconds.
+
+        Raises:
+            InputError: A word is no time, or the usual step in an assumed unit is too long.
+        """
         times = [words[column] for words in self.rows]
         dates = "-" in times[0][1:] and ":" in times[0]
         known = unit or _epoch_unit(times[0])
@@ -155,8 +182,12 @@ class TextTable(NamedTuple):
 
 
 class StampFile(NamedTuple):
-    """Times of a text file, line by line. unit: of them. names: the file that each line belongs to,
-    where it says so."""
+    """The times of a text file, line by line.
+
+    Attributes:
+        unit: Of the times.
+        names: File that each line belongs to, if the lines have names.
+    """
 
     path: Path
     stamp_ns: tuple[int, ...]
@@ -165,10 +196,15 @@ class StampFile(NamedTuple):
 
     @staticmethod
     def read(path: Path, unit: str = "") -> StampFile:
-        """Read one time a line, or columns of which one is the time and another may be a file's
-        name; numbers, or dates such as 2011-09-26 13:10:51.158069617.
+        """Return the times of a file: one time a line, or columns with a time and possibly a name.
 
-        unit: see `TextTable.times_ns`. Raises InputError that names file and line.
+        Times are numbers, or dates such as 2011-09-26 13:10:51.158069617.
+
+        Args:
+            unit: See `TextTable.times_ns`.
+
+        Raises:
+            InputError: The file is malformed. The message names file and line.
         """
         table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
         at_time, at_name = table.column(TIME_COLUMNS), table.column(_FILE_COLUMNS)

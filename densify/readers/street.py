@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The built-in street as a recording. Frames are rendered when asked for and kept in the cache.
+"""Provide the built-in street as a recording. Frames are rendered on demand and cached.
 
 ``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``. It lasts 16 seconds: at
-10 Hz frames 0 to 159. The cache lies in the user's cache directory, or in the folder named by the
-environment variable DENSIFY_CACHE_DIR. It can be deleted at any time: a frame rendered again is the
-same, byte for byte.
+10 Hz frames 0 to 159. The cache is in the cache directory of the user, or in the folder named by
+the environment variable DENSIFY_CACHE_DIR. It can be deleted at any time: a frame rendered again is
+the same, byte for byte.
 """
 
 from __future__ import annotations
@@ -37,13 +37,7 @@ _NUMBERS = "expected degrees of tilt from -45 to 45, hz 5, 10, 20, seed a whole 
 
 
 class Street:
-    """The built-in street; members as in `LidarSequence`.
-
-    preset: street, static (nothing else moves), crossing (the ego vehicle stands) or highway.
-    seed: another scene of that kind. sensor: of `densify.street.sensors.SENSORS`. hz: 5, 10 or 20
-    sweeps per second. tilt_deg: pitch of the sensor's mount, nose down; the cameras stay. cameras:
-    of `densify.street.cameras.CAMERAS`. Raises InputError for a value that does not exist.
-    """
+    """The built-in street; members as in `LidarSequence`."""
 
     def __init__(
         self,
@@ -54,6 +48,20 @@ class Street:
         tilt_deg: float = 0.0,
         cameras: tuple[str, ...] = USUAL,
     ) -> None:
+        """Open the street.
+
+        Args:
+            preset: street, static (nothing else moves), crossing (the ego vehicle stands) or
+                highway.
+            seed: Another scene of that kind.
+            sensor: Of `densify.street.sensors.SENSORS`.
+            hz: 5, 10 or 20 sweeps per second.
+            tilt_deg: Pitch of the sensor's mount, nose down; the cameras stay.
+            cameras: Of `densify.street.cameras.CAMERAS`.
+
+        Raises:
+            InputError: A value does not exist.
+        """
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)
         if not (0 <= seed < 10**18 and hz in (5, 10, 20) and abs(tilt_deg) <= 45):
@@ -76,8 +84,11 @@ class Street:
 
     @staticmethod
     def from_spec(spec: str) -> Street:
-        """Parse ``street``, ``street:highway``, ``street:crossing?seed=2&sensor=vlp16`` and so on.
-        Raises InputError for anything else."""
+        """Return the street of ``street``, ``street:crossing?seed=2&sensor=vlp16`` and so on.
+
+        Raises:
+            InputError: The text is something else.
+        """
         head, _, query = spec.partition("?")
         reader, _, preset = head.partition(":")
         if reader != "street":
@@ -106,7 +117,7 @@ class Street:
         )
 
     def keep_nothing(self) -> None:
-        """Leave the cache folder alone from now on: nobody will ask for this street again."""
+        """Stop using the cache folder, because nobody will need this street again."""
         self._cache = None
 
     def stamp_ns(self, frame: int) -> int:
@@ -115,19 +126,19 @@ class Street:
         return self.simulator.stamp_ns(frame)
 
     def returns(self, frame: int) -> Returns:
-        """Return the sweep's returns with the bodies they are from."""
+        """Return the returns of a sweep, with the bodies that they are from."""
         self.check(frame)
         return self._returns(frame)
 
     def prepare(self, frames: Sequence[int], images: Sequence[tuple[str, int]] = ()) -> None:
-        """Render what is not in the cache yet, on all cores."""
+        """Render missing frames into the cache, on all cores."""
         _ = self.simulator.scene.world.triangles  # otherwise each thread might make them
         with ThreadPoolExecutor(num_threads()) as pool:
             list(pool.map(lambda image: self.picture(*image), images))
             list(pool.map(self.returns, frames))
 
     def picture(self, camera: str, number: int) -> Picture:
-        """Return a camera's image with its exact depth and the bodies in it."""
+        """Return the image of a camera with its exact depth and its bodies."""
         stamps_ns = self.image_stamps_ns(camera)
         if number not in stamps_ns:
             raise InputError(
@@ -140,7 +151,7 @@ class Street:
         return self.picture(camera, number).image
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """Return when the camera exposes, by the image's number from 0."""
+        """Return the exposure times of the camera, by image number from 0."""
         _check("camera", camera, self.cameras)
         return self.simulator.image_stamps_ns(camera)
 
@@ -182,23 +193,27 @@ class StreetTruth:
     _street: Street
 
     def sweep(self, frame: int) -> SweepTruth:
-        """Return the truth. Its points are the raw points at the reference time, each moved with
-        its body."""
+        """Return the truth of a sweep.
+
+        Its points are the raw points at the reference time, each moved with its body.
+        """
         returns = self._street.returns(frame)
         points = self._street.simulator.in_bodies(frame, returns)
         return self._street.bodies.sweep(frame, returns.body, returns.instance, points)
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return (N,3), exactly 0 for what is static between the two frames."""
+        """Return (N,3) displacements, exactly 0 for points that are static between the frames."""
         self._street.check(target)
         returns = self._street.returns(frame)
         points = self._street.simulator.in_bodies(frame, returns)
         return self._street.bodies.displacement(frame, target, returns.body, points)
 
     def depth_m(self, camera: str, number: int) -> Float32:
+        """Return (H,W) the exact depth of an image, 0 for none."""
         return self._street.picture(camera, number).depth_m
 
     def moving_mask(self, camera: str, number: int) -> Bool:
+        """Return (H,W) True at moving objects of an image."""
         body = self._street.picture(camera, number).body
         simulator, frames = self._street.simulator, self._street.frames
         since_ns = simulator.image_stamps_ns(camera)[number] - simulator.stamp_ns(0)

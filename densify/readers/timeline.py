@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The times of a recording's sweeps, which sweeps are neighbours, and what a run reads of them.
+"""Know the times of a recording's sweeps, their neighbours, and the part that a run reads.
 
-Neighbours are told by stamps, not by numbers: a drive of which every second file is missing has
-half the rate.
+Neighbours are found by stamps, not by numbers: a drive without every second file has half the rate.
 """
 
 from __future__ import annotations
@@ -25,15 +24,19 @@ _NOMINAL_PERIOD_NS = 100_000_000  # of a recording of one sweep
 
 
 class WindowFrames(NamedTuple):
-    """Sweeps around a key. frames: ascending, with the key. cuts: why there are fewer than asked
-    for, a clause each."""
+    """Sweeps around a key.
+
+    Attributes:
+        frames: Ascending, with the key.
+        cuts: Reasons for a smaller window than asked for, a clause each.
+    """
 
     frames: tuple[int, ...]
     cuts: tuple[str, ...]
 
 
 def runs(frames: Iterable[int]) -> list[range]:
-    """Cut ascending frames where a number is missing."""
+    """Return ascending frames as ranges without missing numbers."""
     found: list[range] = []
     for frame in frames:
         if found and frame == found[-1].stop:
@@ -44,7 +47,7 @@ def runs(frames: Iterable[int]) -> list[range]:
 
 
 def format_frames(frames: Iterable[int]) -> str:
-    """Write frame numbers for people: ``96-135, 140``; long lists are cut in the middle."""
+    """Return frame numbers for people: ``96-135, 140``. Long lists are cut in the middle."""
     texts = [f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs(sorted(frames))]
     if len(texts) > _MOST_RANGES:
         texts = [*texts[: _MOST_RANGES - 1], "...", texts[-1]]
@@ -68,9 +71,15 @@ def check_key(key: int) -> None:
 
 @dataclass(frozen=True)
 class Timeline:
-    """name: of the recording. frames: (n,) of all its sweeps, ascending. stamp_ns: (n,) int64
-    reference times. unknown: frame -> why its stamp is not known, or out of order among those of
-    most others; its row in ``stamp_ns`` is then interpolated."""
+    """The reference times of a recording.
+
+    Attributes:
+        name: Of the recording.
+        frames: (n,) of all its sweeps, ascending.
+        stamp_ns: (n,) int64 reference times.
+        unknown: Frame -> reason for which its stamp is unknown or out of order. Its row in
+            ``stamp_ns`` is interpolated.
+    """
 
     name: str
     frames: tuple[int, ...]
@@ -79,7 +88,7 @@ class Timeline:
 
     @staticmethod
     def of(sequence: LidarSequence) -> Timeline:
-        """Read the stamps, no sweeps."""
+        """Return the timeline of a recording, by its stamps alone."""
         frames, unknown = tuple(sequence.frames), {}
         stamps_ns = np.zeros(len(frames), np.int64)
         for row, frame in enumerate(frames):
@@ -109,7 +118,7 @@ class Timeline:
         return max(1, int(np.median(np.diff(self.stamp_ns))))
 
     def num_in(self, duration_s: float) -> int:
-        """Return the number of sweeps that usually follow in that time; half a sweep counts."""
+        """Return the usual number of sweeps in that time; half a sweep counts."""
         return int(duration_s * 1e9 / self.period_ns + 0.5)
 
     @cached_property
@@ -127,8 +136,11 @@ class Timeline:
         return [self.frames[row] for row in np.flatnonzero(inside)]
 
     def runs(self, frames: Collection[int]) -> list[list[int]]:
-        """Return the frames, ascending, parted where a sweep between them is missing from
-        ``frames`` or there is a hole in time (more than three usual periods)."""
+        """Return the frames, ascending, in series without gaps.
+
+        A gap is a sweep that is missing from ``frames``, or a hole in time of more than three usual
+        periods.
+        """
         runs: list[list[int]] = []
         for row in sorted(self.row[f] for f in frames):
             if runs and runs[-1][-1] == row - 1 and not self._hole_before(row):
@@ -155,10 +167,16 @@ class Timeline:
     def window(
         self, key: int, window: int, left_out: Mapping[int, str] | None = None
     ) -> WindowFrames:
-        """Return the key and ``window`` existing sweeps on each side of it. A side ends early at
-        the end of the recording, at a hole in time, and at a sweep that is left out.
+        """Return the key and ``window`` existing sweeps on each side of it.
 
-        left_out: frame -> why it cannot be used. Raises InputError if the key does not exist.
+        A side ends early at the end of the recording, at a hole in time, and at a sweep that is
+        left out.
+
+        Args:
+            left_out: Frame -> reason for which it cannot be used.
+
+        Raises:
+            InputError: The key does not exist.
         """
         check_window(window)
         if key not in self.row:
@@ -173,8 +191,10 @@ class Timeline:
     def _side(
         self, key: int, step: int, window: int, left_out: Mapping[int, str]
     ) -> tuple[list[int], str]:
-        """Return the frames on one side of the key, outwards, and why there are fewer than
-        ``window``, "" if there are not."""
+        """Return the frames on one side of the key, outwards.
+
+        Also return the reason for which there are fewer than ``window``, "" for none.
+        """
         side = [self.frames[row] for row in self._next_to(key, step, window)]
         for n, frame in enumerate(side):
             if frame in left_out:
@@ -196,8 +216,10 @@ class Timeline:
 
 
 def _out_of_order(stamps_ns: Int) -> list[int]:
-    """Return the rows, ascending, that are not part of the longest series of ascending stamps; none
-    if those are half of all or more."""
+    """Return the rows, ascending, outside the longest series of ascending stamps.
+
+    The result is empty if they are half of all rows or more.
+    """
     if np.all(np.diff(stamps_ns) > 0):
         return []
     best: list[int] = []  # the row of the lowest stamp at which a series of each length ends
@@ -216,15 +238,20 @@ def _out_of_order(stamps_ns: Int) -> list[int]:
 
 
 def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) -> Sweep:
-    """Return a sweep of the returns `in_range`, without times if it is not to be deskewed. Raises
-    InputError if it cannot be read."""
+    """Return a sweep of the returns `in_range`, without times if it is not to be deskewed.
+
+    Raises:
+        InputError: The sweep cannot be read.
+    """
     sweep = in_range(sequence[frame], settings)
     return sweep if settings.deskew else replace(sweep, offset_ns=None)
 
 
 def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
-    """Return the sweep without the own vehicle's returns and those too far to trust, both measured
-    from the scanner."""
+    """Return the sweep without returns of the own vehicle and without very far returns.
+
+    Both are measured from the scanner.
+    """
     origins_m = sweep.scanner_origins
     x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T
     range_m = np.sqrt(x * x + y * y + z * z)
@@ -232,8 +259,13 @@ def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
-    """Return the cameras of these names; if None all with images, or all where none has any.
-    Raises InputError naming those that exist."""
+    """Return the cameras of these names.
+
+    For None return all with images, or all cameras if none has images.
+
+    Raises:
+        InputError: A camera does not exist. The message names those that do.
+    """
     if isinstance(names, str) or not isinstance(names, Iterable | None):
         one = [*sequence.cameras][:1]
         raise InputError(f"cameras: got {names!r}, expected a list of names, such as {one}")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Exact truth beside a recording: the motion of every body, and the body of every point.
+"""Read and write exact truth beside a recording: the motion of bodies, and the body of each point.
 
-Layout of a ``truth/`` folder, frames numbered as the recording's files are::
+Layout of a ``truth/`` folder, with the frame numbers of the recording::
 
     bodies.npz             T_world_lidar (F,4,4) the scanner at the reference time of frames 0..F-1,
                            T_world_body (F,B,4,4) every body then (body 0 is the static world),
@@ -29,19 +29,27 @@ _BODIES = ("T_world_lidar", "T_world_body", "moving")
 
 
 def write_bodies(folder: Path, bodies: Bodies) -> None:
-    """folder: the ``truth`` folder, made if need be."""
+    """Write the poses of bodies.
+
+    Args:
+        folder: The ``truth`` folder, made if needed.
+    """
     _save(folder / "bodies.npz", **{name: getattr(bodies, name) for name in _BODIES})
 
 
 def write_points(
     folder: Path, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], point: Float
 ) -> None:
-    """Write the body of each point of a sweep; point: (N,3) in its body's frame."""
+    """Write the body of each point of a sweep.
+
+    Args:
+        point: (N,3) in the frame of its body.
+    """
     _save(_points_path(folder, frame), body=body, instance=instance, point=point)
 
 
 def write_depth(folder: Path, camera: str, frame: int, depth_m: Float32, moving: Bool) -> None:
-    """Write a camera's depth and a mask of what moves in it, (H,W) each."""
+    """Write the depth of a camera and a mask of moving objects, (H,W) each."""
     _save(_depth_path(folder, camera, frame), depth_m=depth_m, moving=moving)
 
 
@@ -62,23 +70,27 @@ class FileTruth:
     """`Truth` from a truth folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises InputError if the folder's bodies.npz is missing or damaged."""
+        """Open a truth folder. Raise InputError if its bodies.npz is missing or damaged."""
         self._folder = folder
         self.bodies = Bodies(*_load(folder / "bodies.npz", *_BODIES))
 
     def sweep(self, frame: int) -> SweepTruth:
+        """Return the truth of a sweep."""
         body, instance, point = self._points(frame)
         return self.bodies.sweep(frame, body, instance, point)
 
     def displacement(self, frame: int, target: int) -> Float:
+        """Return (N,3) true displacements."""
         body, _, point = self._points(frame)
         return self.bodies.displacement(frame, target, body, point)
 
     def depth_m(self, camera: str, frame: int) -> Float32:
+        """Return (H,W) the exact depth of an image, 0 for none."""
         depth_m: Float32 = _load(_depth_path(self._folder, camera, frame), "depth_m")[0]
         return depth_m
 
     def moving_mask(self, camera: str, frame: int) -> Bool:
+        """Return (H,W) True at moving objects of an image."""
         moving: Bool = _load(_depth_path(self._folder, camera, frame), "moving")[0]
         return moving
 

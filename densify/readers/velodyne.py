@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Packets of a Velodyne scanner: a ``.pcap`` file, decoded by velodyne-decoder (densify[velodyne]).
-The packets do not tell the model reliably, so it is named: ``velodyne:FILE.pcap#HDL-32E``.
+"""Read packets of a Velodyne scanner, a ``.pcap`` file, by velodyne-decoder.
 
-A sweep is a turn that begins and ends straight behind, to a packet, numbered from 0, decoded when
-asked for; turns cut off at the file's ends are left out. Its stamp is the computer's, of its last
-packet; ``offset_ns`` is from the packets' clock and the model's firing order. Points are as
+It needs the extra ``velodyne``. The packets do not tell the model reliably: name it, as in
+``velodyne:FILE.pcap#HDL-32E``.
+
+A sweep is a turn that begins and ends straight behind, to a packet, numbered from 0, decoded on
+demand. Turns cut off at the ends of the file are left out. The stamp is the computer's, of the last
+packet. ``offset_ns`` is from the packets' clock and the firing order of the model. Points are as
 measured, in the scanner's frame: x forward (azimuth 0), y left, z up. There are neither cameras nor
 poses.
 """
@@ -48,7 +50,12 @@ _PCAP = {  # magic number -> byte order, nanoseconds per unit of the fraction
 
 
 def open_recording(path: Path, scene: str | None) -> Velodyne:
-    """See `densify.readers.ReaderModule`. path: the capture; scene: the model."""
+    """See `densify.readers.ReaderModule`.
+
+    Args:
+        path: The capture.
+        scene: The model.
+    """
     if scene not in MODELS:
         got = "no model" if scene is None else f"the model {scene}"
         raise InputError(
@@ -59,11 +66,17 @@ def open_recording(path: Path, scene: str | None) -> Velodyne:
 
 
 class Velodyne(FileSequence):
-    """A capture as a `LidarSequence`. A sweep's stamp is when its last packet was captured."""
+    """A capture as a `LidarSequence`. The stamp of a sweep is the capture of its last packet."""
 
     def __init__(self, path: Path, model: str) -> None:
-        """model: a row of `MODELS`. Raises InputError if the file is no capture, or holds less than
-        one turn."""
+        """Open a capture.
+
+        Args:
+            model: A row of `MODELS`.
+
+        Raises:
+            InputError: The file is no capture, or holds less than one turn.
+        """
         self._library = needed("velodyne_decoder", "velodyne", "Velodyne captures")
         self._model = getattr(self._library.Model, MODELS[model])
         self._begin, self._captured_ns, azimuth = _find_packets(path)
@@ -99,8 +112,11 @@ class Velodyne(FileSequence):
 
 
 def _find_packets(path: Path) -> tuple[Int, Int, Int]:
-    """Return of the (P,) packets of returns where the payload begins, when it was captured (ns),
-    and the azimuth of the first firing (hundredths of a degree)."""
+    """Return the (P,) packets of returns.
+
+    Returns of each the position of its payload, its capture time (ns), and the azimuth of its first
+    firing (hundredths of a degree).
+    """
     found = []
     with open_file(path) as file:
         magic = file.read(24)[:4]

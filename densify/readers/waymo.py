@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Waymo Open Dataset, perception, version 2 (Sun et al., CVPR 2020), read without TensorFlow::
+"""Read the Waymo Open Dataset, perception, version 2, without TensorFlow.
+
+Sun et al., CVPR 2020::
 
     ROOT/{lidar,lidar_calibration,vehicle_pose}/CONTEXT.parquet
     ROOT/{camera_image,camera_calibration,lidar_box}/CONTEXT.parquet    optional
@@ -14,7 +16,7 @@ up) *when fired*: not compensated. TOP's columns are spread over the frame's per
 ``frame_timestamp_micros``; the others are taken as measured at the frame's pose. Intensity has no
 bound, so its tanh is used.
 
-``vehicle_pose`` belongs to the middle of the spin: it is that of the FRONT image (issue 464 of
+``vehicle_pose`` belongs to the middle of the spin. It is that of the FRONT image (issue 464 of
 waymo-open-dataset), so the stamp is that image's ``pose_timestamp``, or half a period after the
 frame's stamp without images. Cameras have lenses (k1 k2 p1 p2 k3) and shutters that usually run
 sideways; an image's pose is carried to the middle of its exposure. Pixel 0 of the calibration is
@@ -60,24 +62,30 @@ _LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 
 @dataclass(frozen=True)
 class Components:
-    """The tables of one segment. root: folder of the split."""
+    """The tables of one segment, in ``root``, the folder of the split."""
 
     root: Path
     context: str
 
     def file(self, component: str) -> Path:
+        """Return the path of a component."""
         return self.root / component / f"{self.context}.parquet"
 
     def read(
         self, component: str, columns: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """See `densify.readers.arrow_columns.read_parquet`."""
+        """Return columns of a component, see `densify.readers.arrow_columns.read_parquet`."""
         return read_parquet(self.file(component), columns, "Waymo recordings", where)
 
 
 class Laser(NamedTuple):
-    """T_vehicle_laser: (4,4). inclinations_rad: from the lowest beam up, or None for beams spread
-    evenly between ``bounds_rad``."""
+    """A lidar.
+
+    Attributes:
+        T_vehicle_laser: (4,4).
+        inclinations_rad: From the lowest beam up, or None for beams spread evenly between
+            ``bounds_rad``.
+    """
 
     T_vehicle_laser: Float
     inclinations_rad: Float | None
@@ -98,8 +106,13 @@ class Laser(NamedTuple):
 
 
 class Image(NamedTuple):
-    """pose_ns: time of T_world_vehicle (4,4). exposed_ns: of its middle. readout_s: from the first
-    row or column to the last."""
+    """The times and the pose of an image.
+
+    Attributes:
+        pose_ns: Time of T_world_vehicle (4,4).
+        exposed_ns: Exposure of its middle.
+        readout_s: From the first row or column to the last.
+    """
 
     pose_ns: int
     exposed_ns: int
@@ -126,8 +139,13 @@ def read_lasers(parts: Components) -> dict[int, Laser]:
 
 
 def read_boxes(parts: Components) -> dict[int, Boxes]:
-    """Return the boxes by the frame's stamp in µs, in the vehicle's frame at its pose. Frames
-    without boxes are not there. Raises InputError if the component is malformed."""
+    """Return the boxes by the frame's stamp in µs, in the vehicle's frame at its pose.
+
+    Frames without boxes are absent.
+
+    Raises:
+        InputError: The component is malformed.
+    """
     numbers = (*BOX_CENTRE, *BOX_SIZE, BOX_HEADING)
     rows = parts.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
     centre_m, size_m = (
@@ -146,7 +164,8 @@ def read_boxes(parts: Components) -> dict[int, Boxes]:
 def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]]:
     """Return times and poses of the images, without pixels, by camera and frame number.
 
-    starts_us: (n,) stamps of the frames.
+    Args:
+        starts_us: (n,) stamps of the frames.
     """
     head = "[CameraImageComponent]"
     pose, shutter = f"{head}.pose.transform", f"{head}.rolling_shutter_params"
@@ -203,7 +222,11 @@ def _whole_us(seconds: float) -> int:
 
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
-    """See `densify.readers.ReaderModule`. path: the folder of a split."""
+    """See `densify.readers.ReaderModule`.
+
+    Args:
+        path: The folder of a split.
+    """
     files = sorted((path / "lidar").glob("*.parquet"))
     if not files:
         raise InputError(
@@ -214,12 +237,17 @@ def open_recording(path: Path, scene: str | None) -> Waymo:
 
 
 class Waymo(FileSequence):
-    """A segment as a `LidarSequence`; the lidar frame is the vehicle's. A sweep's stamp is about
-    the middle of the spin, the time of the recorded pose."""
+    """A segment as a `LidarSequence`. The lidar frame is that of the vehicle.
+
+    The stamp of a sweep is about the middle of the spin, the time of the recorded pose.
+    """
 
     def __init__(self, root: Path, context: str) -> None:
-        """Read stamps, poses and calibration. Raises InputError if a component is missing or
-        malformed."""
+        """Read stamps, poses and calibration.
+
+        Raises:
+            InputError: If a component is missing or malformed.
+        """
         parts = self._parts = Components(root, context)
         self._starts_us = np.unique(parts.read("lidar", {STAMP: "i"})[STAMP])
         if not len(self._starts_us):
@@ -250,7 +278,11 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `LidarSequence`; the test split has none. Raises InputError if they are malformed."""
+        """See `LidarSequence`; the test split has none.
+
+        Raises:
+            InputError: If they are malformed.
+        """
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))
 
@@ -316,7 +348,7 @@ class Waymo(FileSequence):
 
     @cached_property
     def _T_world_vehicle(self) -> dict[int, Float]:
-        """Poses of the vehicle by frame."""
+        """The poses of the vehicle by frame."""
         name = "[VehiclePoseComponent].world_from_vehicle.transform"
         rows, where = (
             self._parts.read("vehicle_pose", {STAMP: "i", name: "l"}),

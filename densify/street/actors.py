@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Vehicles, cyclists and walkers: their meshes and how their parts hang together.
+"""Make the meshes of vehicles, cyclists and pedestrians, and join their parts.
 
-Vehicle meshes have their origin on the ground midway between the axles, x forward, z up.
+The origin of a vehicle mesh is on the ground midway between the axles, x forward, z up.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from densify.street.world import Body
 
 WHEELBASE_M = {"car": 2.6, "truck": 3.4, "trailer": 8.0, "cyclist": 1.05, "walker": 0.2}
 DURATION_S = 16
-SPAN_S = (-1.0, DURATION_S + 1.0)  # in which poses are asked for
+SPAN_S = (-1.0, DURATION_S + 1.0)  # times with poses
 _KINGPIN_M = -1.2
-_EDGE_M = 0.78  # from here up, cars lose rays as about their panes
+_EDGE_M = 0.78  # height from which a car loses rays as its windows do
 _PAINTS: tuple[Tint, ...] = (
     (0.92, 0.92, 0.92), (0.62, 0.64, 0.66), (0.14, 0.14, 0.16), (0.62, 0.10, 0.09),
     (0.12, 0.24, 0.52), (0.30, 0.33, 0.36), (0.20, 0.36, 0.30), (0.78, 0.66, 0.36),
@@ -34,7 +34,11 @@ _PAINTS: tuple[Tint, ...] = (
 
 @dataclass(frozen=True)
 class Actor:
-    """One object: its bodies and which of them count for collisions."""
+    """An object of the street.
+
+    Attributes:
+        bodies: Its rigid parts. The first `num_solid` of them count for collisions.
+    """
 
     name: str
     bodies: tuple[Body, ...]
@@ -42,16 +46,18 @@ class Actor:
 
 
 def any_paint(rng: np.random.Generator) -> Tint:
+    """Return a random colour of car paint."""
     return _PAINTS[int(rng.integers(len(_PAINTS)))]
 
 
 def any_cloth(rng: np.random.Generator) -> Tint:
+    """Return a random colour of clothes."""
     r, g, b = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.2, 0.8), rng.uniform(0.25, 0.85))
     return (r, g, b)
 
 
 def _wheels(xs: Sequence[float], y: float, radius: float, width: float) -> list[Mesh]:
-    """Tyres and rims on both sides of axles at ``xs``."""
+    """Return the tyres and rims on both sides of the axles at ``xs``."""
     kinds = ((0.0, 1.0, Material.RUBBER, 16), (0.01, 0.6, Material.METAL, 12))
     return [
         tube((x, s * y - width / 2 - out, radius), (x, s * y + width / 2 + out, radius),
@@ -61,12 +67,12 @@ def _wheels(xs: Sequence[float], y: float, radius: float, width: float) -> list[
 
 
 def _panels(low: Float, high: Float) -> Float:
-    """(K,3) points along a lower and an upper line -> (K-1,4,3) quads between them."""
+    """Return (K-1,4,3) quads between a lower and an upper line of (K,3) points."""
     return np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
 
 
 def _both_sides(left: Float, material: Material, tint: Tint = WHITE) -> Mesh:
-    """(K,4,3) quads on the left and their mirror images on the right."""
+    """Return (2K,4,3) quads: those on the left, and their mirror images on the right."""
     right = left * [1.0, -1.0, 1.0]
     return Mesh.quads(np.concatenate([left, right]), material, tint)
 
@@ -74,7 +80,7 @@ def _both_sides(left: Float, material: Material, tint: Tint = WHITE) -> Mesh:
 def _across(
     profile: Sequence[tuple[float, float, float]], material: Material, tint: Tint = WHITE
 ) -> Mesh:
-    """A sheet across the car through (x, z, half width) lines."""
+    """Return a sheet across the car through the lines (x, z, half width)."""
     left = np.array(profile)[:, [0, 2, 1]]
     right = left * [1.0, -1.0, 1.0]
     corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)
@@ -82,14 +88,14 @@ def _across(
 
 
 def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
-    """A saloon or estate, 4.2 to 4.7 m long: shell, glass with an interior behind it, wheels."""
+    """Return a saloon or estate, 4.2 to 4.7 m long: shell, glass, interior and wheels."""
     estate = bool(rng.random() < 0.4)
     front, rear = 2.15 + rng.uniform(0.0, 0.2), -2.05 - rng.uniform(0.0, 0.2)
     wide, roof, belt = 0.88, 1.44 + rng.uniform(-0.03, 0.16) * estate, 0.92
     top = 0.64  # half width of the roof
     cowl, screen, rear_roof = 1.05, 0.35, rear + (0.45 if estate else 0.95)
     deck = rear + (0.08 if estate else 0.45)
-    # side panels between the sill, the upper edge of what is painted like doors, and the shoulder
+    # side panels between the sill, the upper edge of the painted part, and the shoulder
     shoulder = np.array(
         [
             (rear, wide, 0.62),
@@ -164,11 +170,12 @@ def _lights(front: float, rear: float, wide: float) -> list[Mesh]:
 
 
 def car(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
+    """Return a parked or driving car."""
     return Actor("car", (Body(car_mesh(any_paint(rng), rng), motion, instance),))
 
 
 def truck(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
-    """A 16 m articulated truck: the trailer follows the tractor through turns."""
+    """Return a 16 m articulated truck. The trailer follows the tractor through turns."""
     paint, tarpaulin = any_paint(rng), any_cloth(rng)
     half, trailer_half = WHEELBASE_M["truck"] / 2, WHEELBASE_M["trailer"] / 2
     front, back = half + 1.3, -trailer_half - 3.7
@@ -202,7 +209,7 @@ def truck(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
 
 
 def _leg(length: float, radius: float, cloth: Tint) -> Mesh:
-    """Hangs from its hinge at the origin."""
+    """Return a leg or an arm that hangs from its hinge at the origin."""
     return Mesh.join(
         [
             tube((0, 0, 0.02), (0, 0, -length), (radius, radius * 0.6), Material.CLOTH, cloth),
@@ -231,7 +238,7 @@ def _upper_body(hip_m: float, cloth: Tint, hair: Tint) -> list[Mesh]:
 
 
 def walker(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
-    """A pedestrian: a trunk with two legs and two arms that swing in step."""
+    """Return a pedestrian: a trunk with two legs and two arms that swing in step."""
     hip, cloth, trousers = 0.90 + rng.uniform(-0.06, 0.05), any_cloth(rng), any_cloth(rng)
     hair = (0.25 * rng.random(), 0.18 * rng.random(), 0.1 * rng.random())
     swing, stride = 0.50, 1.45
@@ -246,7 +253,7 @@ def walker(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
 
 
 def cyclist(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
-    """A bicycle with its rider, whose legs pedal."""
+    """Return a bicycle with a rider whose legs pedal."""
     half, paint, cloth = WHEELBASE_M["cyclist"] / 2, any_cloth(rng), any_cloth(rng)
     parts = []
     for x in (-half, half):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The vehicle's cameras: their lenses, how they sit, and when they expose."""
+"""Render the images of the vehicle's cameras, with their lenses and exposures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from densify.street.materials import (
 from densify.street.motion import Driving, poses_at
 from densify.street.world import PASSES, STOPS, Hits, Optics, Rays, World
 
-# how KITTI's cameras sit: axes turned, a little off true, below and before the scanner
+# mount of KITTI's cameras: axes turned, slightly misaligned, below and in front of the scanner
 _AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 _TILT = Rotation.from_rotvec([0.008, -0.012, 0.007]).as_matrix()
 T_RECTIFIED_LIDAR = np.eye(4)
@@ -33,21 +33,25 @@ T_RECTIFIED_LIDAR[:3, 3] = [-0.004, -0.076, -0.272]
 FOCAL_PX, CENTRE_PX = 721.5, (609.5, 172.75)
 # metres to the right of the rectified origin
 _LEFT, _RIGHT = -0.06, 0.48
-T_FISHEYE_LIDAR = np.array(  # on the left of the roof, looking to the left
+T_FISHEYE_LIDAR = np.array(  # on the left of the roof, facing left
     [[1.0, 0.0, 0.0, 0.3], [0.0, 0.0, -1.0, -0.2], [0.0, 1.0, 0.0, -0.6], [0.0, 0.0, 0.0, 1.0]]
 )
 
 
 class Shutter(NamedTuple):
-    """delay_ns: of the first image after frame 0's reference time. period_ns: from image to image,
-    None for one with each sweep."""
+    """The times at which a camera exposes.
+
+    Attributes:
+        delay_ns: Time of the first image after frame 0's reference time.
+        period_ns: Time from image to image; None for one image with each sweep.
+    """
 
     delay_ns: int
     period_ns: int | None = None
 
 
 def _pinhole(name: str, right_m: float, share: float = 1.0, row_time_s: float = 0.0) -> Camera:
-    """share: of KITTI's resolution."""
+    """Return a pinhole camera with ``share`` of KITTI's resolution."""
     T_cam_lidar = T_RECTIFIED_LIDAR.copy()
     T_cam_lidar[0, 3] -= right_m
     f, (u, v) = FOCAL_PX * share, ((c + 0.5) * share - 0.5 for c in CENTRE_PX)
@@ -82,13 +86,15 @@ USUAL = ("image_02", "image_03")
 
 
 def T_level_lidar(tilt_deg: float) -> Float:
-    """(4,4) from the lidar frame of a tilted mount to that of a level one."""
+    """Return (4,4) the pose of the lidar frame of a tilted mount in that of a level mount."""
     return inverse(T_ego_lidar()) @ T_ego_lidar(tilt_deg)
 
 
 def cameras_beside(tilt_deg: float, names: tuple[str, ...] = USUAL) -> dict[str, Camera]:
-    """The cameras, which stay where they are on the vehicle, in the lidar frame of a tilted
-    mount."""
+    """Return the cameras in the lidar frame of a tilted mount.
+
+    The cameras themselves stay where they are on the vehicle.
+    """
     T = T_level_lidar(tilt_deg)
     return {n: replace(CAMERAS[n], T_cam_lidar=CAMERAS[n].T_cam_lidar @ T) for n in names}
 
@@ -99,9 +105,14 @@ _SUN = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
 
 @dataclass(frozen=True)
 class Picture:
-    """One exposure; (H,W) everywhere. image: (H,W,3) uint8 RGB. depth_m: float32 of the nearest
-    surface, glass included, as the camera's ``measure`` says, 0 where there is none within 120 m or
-    the lens sees nothing. body: int32 index of the body seen, -1 sky."""
+    """One exposure of (H,W) pixels.
+
+    Attributes:
+        image: (H,W,3) uint8 RGB.
+        depth_m: (H,W) float32 depth of the nearest surface, glass included, by the camera's
+            ``measure``. 0 where there is no surface within 120 m, or where the lens has no view.
+        body: (H,W) int32 index of the body in view, -1 for sky.
+    """
 
     image: NDArray[np.uint8]
     depth_m: Float32
@@ -109,7 +120,12 @@ class Picture:
 
 
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
-    """Every row at its own time. camera: beside a level mount. time_s: of the middle row."""
+    """Return the picture of a camera, each row exposed at its own time.
+
+    Args:
+        camera: The camera in the lidar frame of a level mount.
+        time_s: Exposure of the middle row, in seconds from frame 0.
+    """
     h, w = camera.height_px, camera.width_px
     v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)
     ray = rays(camera, np.column_stack([u, v]))
@@ -135,7 +151,12 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
 
 
 def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Float) -> Rays:
-    """(N,3) camera frame and (N,) rows below the middle, ascending."""
+    """Return rays in the world, each at the time of its row.
+
+    Args:
+        ray: (N,3) directions in the camera frame.
+        row: (N,) rows below the middle row, ascending.
+    """
     time = time_s + row * camera.row_time_s
     poses, T_ego_cam = poses_at(ego, time), T_ego_lidar() @ inverse(camera.T_cam_lidar)
     origin = poses.apply(np.broadcast_to(T_ego_cam[:3, 3], ray.shape))
@@ -143,13 +164,13 @@ def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Floa
 
 
 def through_glass(world: World) -> Optics:
-    """Light passes the glass of vehicles and nothing else."""
+    """Return how light meets surfaces: it passes the glass of vehicles and nothing else."""
     is_glass = world.triangles.material == Material.GLASS
     return lambda met: np.where(is_glass[met.triangle], PASSES, STOPS)
 
 
 def _colours(world: World, rays: Rays, hits: Hits) -> Float:
-    """(N,3) linear light: sun with shadows, sky light from above, haze."""
+    """Return (N,3) linear light: sun with shadows, light of the sky, haze."""
     colour = _sky(rays.direction)
     rows = np.flatnonzero(hits.triangle >= 0)
     triangle, direction, normal = hits.triangle[rows], rays.direction[rows], hits.normal[rows]
@@ -179,7 +200,10 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
 
 
 def _sky(direction: Float) -> Float:
-    """(N,3) directions -> (N,3) linear colour: paler towards the horizon, a few soft clouds."""
+    """Return (N,3) linear colours of the sky in (N,3) directions.
+
+    The sky is paler towards the horizon and has a few soft clouds.
+    """
     up = np.clip(direction[:, 2], 0.0, 1.0)[:, None]
     blue = np.array([0.72, 0.80, 0.88]) * (1 - up) ** 3 + np.array([0.20, 0.38, 0.72]) * (
         1 - (1 - up) ** 3

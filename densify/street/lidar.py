@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""One sweep of a sensor through the world: what comes back, where and when, and which rays pass or
-are lost.
+"""Simulate one sweep: the returns of each ray, and the rays that pass or are lost.
 
-Cars lose whole panes and dark doors. The shares are those of 207 moving cars of KITTI's stereo
-benchmark (Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015) in sweeps of an
-HDL-64E, by angle of incidence, brightness of the car and part. The source's upper part is the
-window band with its pillars and the roof; the tables here are of paint and glass by themselves.
-They were fitted until cars in a sweep have the source's shares (``tests/test_street_returns.py``).
-Doors let fewer rays pass than the source has from behind them, which are errors of calibration.
+Cars lose whole car windows and dark doors. The shares are those of 207 moving cars of KITTI's
+stereo benchmark (Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015) in
+sweeps of an HDL-64E. They depend on the angle of incidence, the brightness of the car and the part.
+The upper part of the source is the window band with its pillars and the roof. The tables here are
+of paint and glass alone. They are fitted such that cars in a sweep have the shares of the source
+(``tests/test_street_returns.py``). Fewer rays pass through doors than in the source, where they are
+errors of calibration.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _PASSES = 0.01 * np.array(
         [(8, 22, 29, 7, 54), (40, 20, 20, 16, 30), (34, 37, 32, 24, 25)],
     ]
 )
-_PATCH_M = 0.7  # in which most rays share their fate: a pane, half a door
+_PATCH_M = 0.7  # size of a patch that loses its rays together: a car window, half a door
 # Share of pulses that are lost elsewhere, by range: gaps in the rings of KITTI's drives 0013 and
 # 0002 (HDL-64E) between returns of one surface. Beyond 35 m the ground loses more than measured.
 _RANGE_M = (5.0, 14.0, 27.0, 45.0, 75.0, 110.0)
@@ -60,7 +60,11 @@ _GOLDEN = 0.6180339887498949
 
 
 def laser(world: World, luck: Float) -> Optics:
-    """Return what rays of a lidar do. luck: (N,) random number of each ray in [0, 1)."""
+    """Return how rays of a lidar meet surfaces.
+
+    Args:
+        luck: (N,) random number of each ray in [0, 1).
+    """
     surfaces = world.triangles
 
     def optics(met: Meeting) -> Int:
@@ -87,8 +91,13 @@ def laser(world: World, luck: Float) -> Optics:
 
 
 def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
-    """(N,) materials, (N,3) tints, (N,) metres -> (N,) share of pulses that are lost, beside what
-    vehicles absorb."""
+    """Return (N,) share of pulses that are lost, beside those that vehicles absorb.
+
+    Args:
+        material: (N,) materials.
+        tint: (N,3) factors on their colours.
+        range_m: (N,) distances in metres.
+    """
     ground, dark, other = (
         np.interp(range_m, _RANGE_M, lost) for lost in (_GROUND_LOST, _DARK_LOST, _OTHER_LOST)
     )
@@ -103,7 +112,9 @@ def _of_vehicle(material: Int) -> Bool:
 def patches(place: Float, owner: Int) -> Float:
     """Return (N,) numbers, evenly spread from 0 to 1, that vary smoothly over a surface.
 
-    place: (N,3) metres. owner: (N,) each has numbers of its own.
+    Args:
+        place: (N,3) positions in metres.
+        owner: (N,) objects. Each object has numbers of its own.
     """
     cell = np.floor(place / _PATCH_M).astype(np.int64)
     share = place / _PATCH_M - cell
@@ -120,7 +131,7 @@ def patches(place: Float, owner: Int) -> Float:
 
 
 def _between(rows: Float, incidence_deg: Float) -> Float:
-    """(N,5) table rows, (N,) degrees -> (N,) read between the table's angles."""
+    """Return (N,) values of (N,5) table rows at (N,) degrees, interpolated."""
     at = np.interp(incidence_deg, _INCIDENCE_DEG, np.arange(len(_INCIDENCE_DEG)))
     low, n = np.minimum(at.astype(int), len(_INCIDENCE_DEG) - 2), np.arange(len(at))
     return rows[n, low] + (at - low) * (rows[n, low + 1] - rows[n, low])
@@ -128,9 +139,9 @@ def _between(rows: Float, incidence_deg: Float) -> Float:
 
 LIDAR_HEIGHT_M = 1.73
 _MIN_RANGE_M = 1.0
-_SPOT_RAD = 1.05e-3  # of a beam's spot, along each axis from its centre to the outer rays
+_SPOT_RAD = 1.05e-3  # half the spot of a beam, along each axis
 _SPOT = np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # its rays, left and up
-_FLAT_M = 0.10  # off the plane through the centre's echo: an edge
+_FLAT_M = 0.10  # distance to the plane of the central echo from which a spot is at an edge
 _MERGE_M = 2.0  # echoes closer than this can melt into one
 _MELT_PROBABILITY = 0.2
 
@@ -139,9 +150,13 @@ _MELT_PROBABILITY = 0.2
 class Returns:
     """The N returns of a sweep in the order of time.
 
-    points: (N,3) float32, lidar axes, each at its own firing time. intensity: (N,) 0 to 1.
-    offset_ns: (N,) int64 from the reference time. lidar: (N,) scanner. body: (N,) index of the
-    body met. instance: (N,) object met, -1 none.
+    Attributes:
+        points: (N,3) float32 metres, lidar axes, each at its own firing time.
+        intensity: (N,) 0 to 1.
+        offset_ns: (N,) int64 from the reference time.
+        lidar: (N,) number of the scanner.
+        body: (N,) index of the body hit.
+        instance: (N,) number of the object hit, -1 for none.
     """
 
     points: Float32
@@ -153,9 +168,10 @@ class Returns:
 
 
 def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
-    """(4,4) the lidar frame, which is the mount's.
+    """Return (4,4) the pose of the lidar frame, which is that of the mount, on the vehicle.
 
-    tilt_deg: by how much the mount is pitched about the frame's origin, nose down.
+    Args:
+        tilt_deg: Pitch of the mount about the origin of the frame, nose down.
     """
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("y", tilt_deg, degrees=True).as_matrix()
@@ -167,8 +183,12 @@ def scan(
     world: World, ego: Driving, sensor: Sensor, time_s: float, rng: np.random.Generator,
     period_ns: int = 100_000_000, tilt_deg: float = 0.0,
 ) -> Returns:  # fmt: skip
-    """The sweep whose reference time is ``time_s``, seconds from frame 0, from a mount that is
-    tilted as in `T_ego_lidar`. period_ns: from sweep to sweep."""
+    """Return one sweep from a mount that is tilted as in `T_ego_lidar`.
+
+    Args:
+        time_s: Reference time of the sweep, in seconds from frame 0.
+        period_ns: Time from sweep to sweep.
+    """
     T = T_ego_lidar(tilt_deg)
     fired = firings(sensor, time_s, period_ns)
     n = len(fired.offset_ns)
@@ -207,13 +227,13 @@ def scan(
 
 
 def at_offsets(time_s: float, offset_ns: Int) -> Float:
-    """(N,) seconds at so many nanoseconds from a reference time."""
+    """Return (N,) seconds at these offsets in nanoseconds from a reference time."""
     times: Float = np.asarray(time_s + offset_ns * 1e-9, dtype=np.float64)
     return times
 
 
 def _spot(direction: Float) -> list[Float]:
-    """(N,3) beams -> the rays of each beam's spot: its centre, then four around it."""
+    """Return five rays for each of (N,3) beams: the centre of its spot, then four around it."""
     level = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
     level /= lengths(level)
     upward = across(direction, level)
@@ -222,21 +242,24 @@ def _spot(direction: Float) -> list[Float]:
 
 
 def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Hits, Bool]:
-    """Return the echo of each spot: range (N,), the surface it is from, and edges (N,).
+    """Return the echo of each spot: range (N,), the surface that it is from, and edges (N,).
 
-    echoes: of the rays of all spots. spot: (N,S,3) their directions, the centre's first.
-    On one plane the centre counts. At an edge each part of the spot is as likely to be the
-    strongest echo, and now and then two that lie close together melt into one between them.
+    On one plane the centre ray counts. At an edge each part of the spot is equally likely to be the
+    strongest echo. Two echoes close together sometimes merge into one between them.
+
+    Args:
+        echoes: Hits of the rays of all spots.
+        spot: (N,S,3) directions of the rays, the centre first.
     """
     n, num = spot.shape[:2]
     rows = np.arange(n)
     range_m = echoes.range_m.reshape(n, num)
     slant = np.einsum("ni,nsi->ns", echoes.normal[::num], spot)
-    with np.errstate(divide="ignore", invalid="ignore"):  # nothing met is infinitely far
+    with np.errstate(divide="ignore", invalid="ignore"):  # a ray without a hit has infinite range
         off_plane = np.abs(range_m - (range_m * slant)[:, :1] / slant)
     some = np.isfinite(range_m)
     edge = some.any(axis=1) & ~(off_plane < _FLAT_M).all(axis=1)
-    # one of the rays that met something, each as likely
+    # any of the rays with a hit, all equally likely
     pick = np.argmax(rng.random((num, n)) * some.T, axis=0)
     pick = np.where(edge, pick, 0)
     chosen = range_m[rows, pick]

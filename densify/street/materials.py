@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The materials of surfaces: colour and texture for cameras, reflectivity for lasers, and how
-often a ray goes through."""
+"""Define the materials of surfaces: colour, texture, reflectivity, and how often rays pass."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ from densify.geometry.types import Float, Int
 
 
 class Material(IntEnum):
-    """colour: of the surface. reflectivity: at 905 nm. gloss: share of the sky that it mirrors."""
+    """A material: colour, reflectivity at 905 nm, and the share of the sky that it mirrors."""
 
     def __new__(
         cls, colour: tuple[float, float, float], reflectivity: float, gloss: float = 0.0
@@ -32,7 +31,7 @@ class Material(IntEnum):
     BRICK = (0.56, 0.27, 0.20), 0.42
     PLASTER = (0.80, 0.76, 0.66), 0.60
     ROOF = (0.42, 0.20, 0.15), 0.30
-    PANE = (0.16, 0.20, 0.25), 0.08, 0.25  # of a house: dark, nothing passes
+    PANE = (0.16, 0.20, 0.25), 0.08, 0.25  # window of a house: dark, no ray passes
     WOOD = (0.45, 0.33, 0.21), 0.45
     METAL = (0.52, 0.54, 0.56), 0.55
     BARK = (0.30, 0.23, 0.17), 0.35
@@ -45,7 +44,7 @@ class Material(IntEnum):
     LAMP = (0.95, 0.93, 0.85), 0.90
     UPHOLSTERY = (0.16, 0.15, 0.15), 0.20
     CONCRETE = (0.62, 0.61, 0.58), 0.45
-    FRAME = (0.90, 0.90, 0.90), 0.55, 0.06  # bodywork around and above panes
+    FRAME = (0.90, 0.90, 0.90), 0.55, 0.06  # bodywork around and above car windows
 
 
 _ROWS: Float = np.array([m.row for m in Material])
@@ -53,7 +52,7 @@ COLOUR, (REFLECTIVITY, GLOSS) = _ROWS[:, :3], _ROWS[:, 3:].T
 
 
 def noise(i: Int, j: Int) -> Float:
-    """(N,) integers each -> (N,) repeatable random numbers in [0, 1)."""
+    """Return (N,) repeatable random numbers in [0, 1), a number for each (N,) integers."""
     h = i.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     h ^= j.astype(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F)
     h ^= h >> np.uint64(29)
@@ -63,7 +62,7 @@ def noise(i: Int, j: Int) -> Float:
 
 
 def smooth_noise(uv: Float, cell_m: float) -> Float:
-    """(N,2) -> (N,) in [0, 1), smooth over cells of that size."""
+    """Return (N,) numbers in [0, 1) at (N,2) positions, smooth over cells of that size."""
     x, y = uv.T / cell_m
     i, j = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     x, y = x - i, y - j
@@ -75,7 +74,7 @@ def smooth_noise(uv: Float, cell_m: float) -> Float:
 
 
 def _rough(fine_m: float, coarse_m: float, contrast: float) -> Callable[[Float], Float]:
-    """A texture of grains and blotches."""
+    """Return a texture of grains and blotches."""
 
     def texture(at: Float) -> Float:
         grain = noise(*np.floor(at.T / fine_m).astype(np.int64))
@@ -88,7 +87,11 @@ def _rough(fine_m: float, coarse_m: float, contrast: float) -> Callable[[Float],
 def _laid(
     length_m: float, height_m: float, joint_m: float, joint: float
 ) -> Callable[[Float], Float]:
-    """A texture of bricks laid in courses. joint: brightness between them."""
+    """Return a texture of bricks laid in courses.
+
+    Args:
+        joint: Brightness between the bricks.
+    """
 
     def texture(at: Float) -> Float:
         row = np.floor(at[:, 1] / height_m)
@@ -117,9 +120,13 @@ _TEXTURES = {
 
 
 def shade_factor(material: Int, uv: Float) -> Float:
-    """(N,) materials, (N,2) metres on the surface -> (N,) brightness of the texture there, about 1.
+    """Return (N,) brightness of the texture, around 1.
 
-    Textures stick to their body, since uv are coordinates on it.
+    Textures stick to their body, because uv are coordinates on its surface.
+
+    Args:
+        material: (N,) materials.
+        uv: (N,2) metres on the surface.
     """
     factor = np.ones(len(material))
     for kind, texture in _TEXTURES.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triangle meshes with a material on each triangle, and the solids they are built from."""
+"""Build triangle meshes, with a material for each triangle, from simple solids."""
 
 from __future__ import annotations
 
@@ -31,8 +31,16 @@ _HALVES = np.array([0, 1, 2, 0, 2, 3])  # the triangles of a quad
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices: (V,3) metres. triangles: (T,3). uv: (V,2) metres on the surface. material: (T,).
-    tint: (T,3) factors on the material's colour. instance: (T,) int32, -1 none."""
+    """A mesh of V vertices and T triangles.
+
+    Attributes:
+        vertices: (V,3) metres.
+        triangles: (T,3) indices of vertices.
+        uv: (V,2) metres on the surface.
+        material: (T,) materials.
+        tint: (T,3) factors on the colour of the material.
+        instance: (T,) int32 numbers of objects, -1 for none.
+    """
 
     vertices: Float
     triangles: NDArray[np.int64]
@@ -43,6 +51,7 @@ class Mesh:
 
     @staticmethod
     def join(meshes: Sequence[Mesh]) -> Mesh:
+        """Return one mesh of several."""
         meshes = [m for m in meshes if len(m.triangles)]
         starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
         columns = {
@@ -53,8 +62,12 @@ class Mesh:
 
     @staticmethod
     def quads(corners: Float, material: Material, tint: Tint | Float = WHITE) -> Mesh:
-        """(K,4,3) corners in order round each quad; uv are metres along its first side and away
-        from it."""
+        """Return a mesh of (K,4,3) quads.
+
+        Args:
+            corners: In order around each quad. uv are metres along the first side and away from
+                it.
+        """
         k = len(corners)
         side, away = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
         along = side / np.maximum(lengths(side), 1e-9)
@@ -70,29 +83,30 @@ class Mesh:
         )
 
     def posed(self, T_a_mesh: Float) -> Mesh:
-        """(4,4) rigid motion of all vertices."""
+        """Return the mesh moved by the (4,4) rigid motion."""
         return replace(self, vertices=self.vertices @ T_a_mesh[:3, :3].T + T_a_mesh[:3, 3])
 
     def of_instance(self, instance: int) -> Mesh:
+        """Return the mesh with another number of its object."""
         return replace(self, instance=np.full(len(self.triangles), instance, np.int32))
 
     @cached_property
     def bounds(self) -> tuple[Float, Float]:
-        """Lowest and highest corner, (3,) each."""
+        """Return the lowest and the highest corner, (3,) each."""
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
 
 def box(
     low: Sequence[float], high: Sequence[float], material: Material, tint: Tint = WHITE
 ) -> Mesh:
-    """An upright box between two corners."""
+    """Return an upright box between two corners."""
     return boxes([(low, high)], material, tint)
 
 
 def boxes(
     spans: Sequence[tuple[Sequence[float], Sequence[float]]], material: Material, tint: Tint = WHITE
 ) -> Mesh:
-    """Upright boxes, each between its lowest and its highest corner."""
+    """Return upright boxes, each between its lowest and its highest corner."""
     span = np.array(spans, float).reshape(-1, 2, 3)
     faces = np.where(_IS_HIGH, span[:, None, None, 1], span[:, None, None, 0])
     return Mesh.quads(faces.reshape(-1, 4, 3), material, tint)
@@ -105,7 +119,7 @@ def frustum(
     tint: Tint = WHITE,
     taper: tuple[float, float] = (1.0, 1.0),
 ) -> Mesh:
-    """A box whose top is scaled by ``taper`` in x and y about its own middle."""
+    """Return a box whose top is scaled by ``taper`` in x and y about its own centre."""
     a, b = np.asarray(low, float), np.asarray(high, float)
     middle, half = (a + b)[:2] / 2, (b - a)[:2] / 2
     ring = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
@@ -125,7 +139,7 @@ def tube(
     tint: Tint = WHITE,
     num_sides: int = 8,
 ) -> Mesh:
-    """A closed cylinder or cone (radius at start and end) between two points."""
+    """Return a closed cylinder or cone between two points, with a radius at each end."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     radii = radius_m if isinstance(radius_m, tuple) else (radius_m, radius_m)
     axis = (b - a) / np.linalg.norm(b - a)
@@ -143,7 +157,7 @@ def tube(
 
 
 def across(a: Float, b: Float) -> Float:
-    """(...,3) each -> (...,3) their cross products; quicker than np.cross."""
+    """Return (...,3) cross products of (...,3) vectors; faster than np.cross."""
     product = np.empty(a.shape)
     for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         np.subtract(a[..., i] * b[..., j], a[..., j] * b[..., i], out=product[..., axis])
@@ -151,7 +165,7 @@ def across(a: Float, b: Float) -> Float:
 
 
 def lengths(vectors: Float) -> Float:
-    """(N,3) -> (N,1); quicker than np.linalg.norm."""
+    """Return (N,1) lengths of (N,3) vectors; faster than np.linalg.norm."""
     squared = vectors * vectors
     return np.sqrt(squared[:, :1] + squared[:, 1:2] + squared[:, 2:])
 
@@ -159,7 +173,7 @@ def lengths(vectors: Float) -> Float:
 def ball(
     centre: Sequence[float], radius_m: Sequence[float], material: Material, tint: Tint = WHITE
 ) -> Mesh:
-    """An ellipsoid with radii along x, y, z."""
+    """Return an ellipsoid with radii along x, y and z."""
     la, lo = np.meshgrid(
         np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 11), indexing="ij"
     )
@@ -170,7 +184,7 @@ def ball(
 
 
 def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint = WHITE) -> Mesh:
-    """(K,3) -> a square leaf (a bunch of them) at each centre, turned at random."""
+    """Return a square leaf (a bunch of leaves) at each of (K,3) centres, turned at random."""
     k = len(centres)
     u = rng.normal(size=(k, 3))
     u /= lengths(u)

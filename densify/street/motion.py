@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Analytic poses of bodies at any time, and the rectangles they cover on the ground."""
+"""Compute the poses of bodies at any time, and the rectangles that they cover on the ground."""
 
 from __future__ import annotations
 
@@ -17,52 +17,59 @@ from densify.street.terrain import Curve, Speed, Terrain, left_of
 
 
 class Poses(NamedTuple):
-    """N poses ``T_world_body``. rotation: (N,3,3). position: (N,3) metres."""
+    """N poses ``T_world_body``.
+
+    Attributes:
+        rotation: (N,3,3).
+        position: (N,3) metres.
+    """
 
     rotation: Float
     position: Float
 
     def apply(self, points: Float) -> Float:
-        """(N,3) body -> (N,3) world, row by row."""
+        """Return (N,3) body-frame points in the world, row by row."""
         return self.turn(points) + self.position
 
     def undo(self, points: Float) -> Float:
-        """(N,3) world -> (N,3) body, row by row."""
+        """Return (N,3) world points in the body frames, row by row."""
         return self.unturn(points - self.position)
 
     def turn(self, directions: Float) -> Float:
-        """(N,3) body -> (N,3) world axes."""
+        """Return (N,3) body-frame directions in world axes."""
         return np.einsum("nij,nj->ni", self.rotation, directions)
 
     def unturn(self, directions: Float) -> Float:
-        """(N,3) world -> (N,3) body axes."""
+        """Return (N,3) world directions in body axes."""
         return np.einsum("nji,nj->ni", self.rotation, directions)
 
     def rows(self, rows: Int) -> Poses:
-        """Some of them, in that order, as often as asked for."""
+        """Return the poses of these rows, in the order of the index."""
         return Poses(self.rotation[rows], self.position[rows])
 
     def matrix(self, row: int = 0) -> Float:
-        """(4,4) ``T_world_body`` of one row."""
+        """Return the (4,4) ``T_world_body`` of one row."""
         T_world_body = np.eye(4)
         T_world_body[:3, :3], T_world_body[:3, 3] = self.rotation[row], self.position[row]
         return T_world_body
 
 
 def upright(xyz: Sequence[float], heading: float) -> Poses:
-    """One pose: at a place (3,), x turned from the world's by ``heading`` (rad)."""
+    """Return one pose at a (3,) position, turned about z by ``heading`` in rad."""
     turn = Rotation.from_euler("z", heading).as_matrix()
     return Poses(turn[None], np.asarray(xyz, float)[None])
 
 
 class Trajectory(Protocol):
+    """The pose of a body at any time."""
+
     def poses(self, times_s: Float) -> Poses:
-        """(N,) seconds since the sequence's time zero -> N poses."""
+        """Return N poses at (N,) seconds since the time zero of the sequence."""
         ...
 
 
 def poses_at(trajectory: Trajectory, times_s: Float) -> Poses:
-    """(N,) seconds -> N poses, worked out once for equal times in a row."""
+    """Return N poses at (N,) seconds. Poses for equal times in a row are computed once."""
     new = np.diff(times_s, prepend=np.nan) != 0
     if new.all():
         return trajectory.poses(times_s)
@@ -70,20 +77,27 @@ def poses_at(trajectory: Trajectory, times_s: Float) -> Poses:
 
 
 class Still:
-    """The world itself."""
+    """The trajectory of the world itself."""
 
     def poses(self, times_s: Float) -> Poses:
+        """Return N identity poses."""
         n = len(times_s)
         return Poses(np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3)))
 
 
 @dataclass(frozen=True)
 class Driving:
-    """Follows a curve on the ground with both axles, as a car does.
+    """Follow a curve on the ground with both axles, as a car does.
 
-    curve, speed: the way, and how fast along it. station_m: arc length at time ``at_s``.
-    wheelbase_m: of the two points that touch the curve; the origin is midway, x forward, z up.
-    lift_m: stations (N,) -> heights (N,) above the ground. upright: vertical whatever the slope.
+    The origin is midway between the axles, x forward, z up.
+
+    Attributes:
+        curve: Path of the car.
+        speed: Speed along the path.
+        station_m: Arc length at time ``at_s``.
+        wheelbase_m: Distance of the two points that touch the curve.
+        lift_m: Function of (N,) stations to (N,) heights above the ground.
+        upright: Stay vertical on every slope.
     """
 
     curve: Curve
@@ -96,11 +110,12 @@ class Driving:
     upright: bool = False
 
     def station(self, times_s: Float) -> Float:
-        """(N,) seconds -> (N,) arc length."""
+        """Return (N,) arc lengths at (N,) seconds."""
         travelled = self.speed.distance(times_s) - self.speed.distance(np.array([self.at_s]))
         return self.station_m + travelled
 
     def poses(self, times_s: Float) -> Poses:
+        """Return N poses at (N,) seconds."""
         station = self.station(times_s)
         half = self.wheelbase_m / 2
         rear, front = self.curve(station - half), self.curve(station + half)
@@ -111,7 +126,7 @@ class Driving:
 def on_ground(
     terrain: Terrain, rear: Float, front: Float, lift_m: Float, upright: bool = False
 ) -> Poses:
-    """Poses of bodies that touch the ground at two points, (N,2) each."""
+    """Return poses of bodies that touch the ground at two points, (N,2) each."""
     a = np.column_stack([rear, terrain.height(rear) + lift_m])
     b = np.column_stack([front, terrain.height(front) + lift_m])
     middle = (a + b) / 2
@@ -124,12 +139,17 @@ def on_ground(
 
 
 class Towed:
-    """A trailer: its axle follows the kingpin of what pulls it (a tractrix)."""
+    """A trailer. Its axle follows the kingpin of the tractor (a tractrix)."""
 
     def __init__(
         self, tractor: Driving, kingpin_m: float, wheelbase_m: float, first_s: float, last_s: float
     ) -> None:
-        """kingpin_m: along the tractor's x. wheelbase_m: from the kingpin back to the axle."""
+        """Build the trailer.
+
+        Args:
+            kingpin_m: Position of the kingpin along the x axis of the tractor.
+            wheelbase_m: Distance from the kingpin back to the axle.
+        """
         self._tractor, self._kingpin_m = tractor, kingpin_m
         times = np.arange(first_s, last_s, 0.01)
         pin = self._pin(times)
@@ -145,17 +165,20 @@ class Towed:
         return (tractor.position + tractor.rotation[:, :, 0] * self._kingpin_m)[:, :2]
 
     def poses(self, times_s: Float) -> Poses:
-        """Origin: the ground below the middle between axle and kingpin."""
+        """Return N poses at (N,) seconds. The origin is below the middle of the wheelbase."""
         lift = np.zeros(len(times_s))
         return on_ground(self._tractor.terrain, self._axle(times_s), self._pin(times_s), lift)
 
 
 @dataclass(frozen=True)
 class Limb:
-    """Swings about a horizontal hinge of the body it hangs on, in step with the way walked.
+    """Swing about a horizontal hinge of the parent body, in step with the distance walked.
 
-    hinge_m: (3,) in the parent's frame; the limb's origin. swing: rad. stride_m: way of one full
-    swing. phase: rad.
+    Attributes:
+        hinge_m: (3,) the hinge in the frame of the parent; origin of the limb.
+        swing: Amplitude in rad.
+        stride_m: Distance walked in one full swing.
+        phase: In rad.
     """
 
     parent: Driving
@@ -165,6 +188,7 @@ class Limb:
     phase: float
 
     def poses(self, times_s: Float) -> Poses:
+        """Return N poses at (N,) seconds."""
         parent = self.parent.poses(times_s)
         walked = self.parent.station(times_s)
         angle = self.swing * np.sin(2 * np.pi * walked / self.stride_m + self.phase)
@@ -174,8 +198,13 @@ class Limb:
 
 
 class Rectangles(NamedTuple):
-    """Any number of rectangles. centre: (...,2). forward: (...,2) of length 1. half_m: (...,2)
-    half length and half width."""
+    """Any number of rectangles on the ground.
+
+    Attributes:
+        centre: (...,2) metres.
+        forward: (...,2) unit vectors.
+        half_m: (...,2) half length and half width.
+    """
 
     centre: Float
     forward: Float
@@ -183,7 +212,7 @@ class Rectangles(NamedTuple):
 
     @staticmethod
     def of(mesh: Mesh, poses: Poses, slack_m: float = 0.0) -> Rectangles:
-        """(N,) rectangles, that of a mesh at N poses."""
+        """Return (N,) rectangles of a mesh at N poses."""
         low, high = mesh.bounds
         n = len(poses.position)
         middle = np.append((low + high)[:2] / 2, 0.0)
@@ -194,15 +223,16 @@ class Rectangles(NamedTuple):
 
     @staticmethod
     def joined(parts: Sequence[Rectangles]) -> Rectangles:
-        """All of them, along the first axis."""
+        """Return all rectangles, along the first axis."""
         return Rectangles(*(np.concatenate(c) for c in zip(*parts, strict=True)))
 
     def rows(self, rows: Int | slice) -> Rectangles:
+        """Return the rectangles of these rows."""
         return Rectangles(*(column[rows] for column in self))
 
 
 def overlap(a: Rectangles, b: Rectangles) -> Bool:
-    """Which of them touch, shapes broadcast against each other (separating axes)."""
+    """Return True where two rectangles touch, by separating axes. Shapes are broadcast."""
     away = b.centre - a.centre
     apart = np.zeros(away.shape[:-1], bool)
     for p, q in ((a, b), (b, a)):
@@ -214,6 +244,6 @@ def overlap(a: Rectangles, b: Rectangles) -> Bool:
 
 
 def _dot(a: Float, b: Float) -> Float:
-    """Inner product of (...,2) vectors; quicker than a sum over two."""
+    """Return inner products of (...,2) vectors; faster than a sum over two."""
     product: Float = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
     return product

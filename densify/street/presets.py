@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The scenes. ``street`` and ``static``: a street in town with a bend, a side road and its traffic;
-``crossing``: the ego vehicle stands at a crossroads; ``highway``: it drives 25 m/s, others 30."""
+"""Build the scenes.
+
+``street`` and ``static``: a street in town with a bend, a side road and traffic. ``crossing``: the
+ego vehicle stands at a crossroads. ``highway``: the ego vehicle drives 25 m/s, others 30 m/s.
+"""
 
 from __future__ import annotations
 
@@ -111,7 +114,7 @@ def _people_street(
         np.interp(traffic.ego.station(np.array([MEETING_S]))[0], slow.curve.knots_m, main.knots_m)
     )
     fast, oncoming = Lane(main, _FAST_M), Lane(main, _ONCOMING_M, forward=False)
-    # the car in front brakes; another overtakes; cars come the other way before a turning truck
+    # a braking car in front, an overtaking car, oncoming cars, a turning truck
     brake = Speed((-1, 8.6), (4, 7.6), (8, 7.8), (10.2, 9.6), (11.0, 9.6), (13.0, 4.6), (14.5, 4.6),
                   (17, 5.5))  # fmt: skip
     drive(car, slow, here + 20.0, brake, 1.0)
@@ -138,7 +141,7 @@ def _people_street(
 
 
 def _turning(main: Curve, side: Curve) -> tuple[Lane, float]:
-    """The way from the oncoming lane into the side road on its right, and where it turns."""
+    """Return the path from the oncoming lane into the side road, and its turning point."""
     oncoming = Lane(main, _ONCOMING_M, forward=False).curve
     knots = np.arange(0.0, oncoming.length_m, 0.5)
     xy = oncoming(knots)
@@ -159,7 +162,7 @@ _CROSS_X_M = 17.0
 
 
 def crossing(rng: np.random.Generator) -> Scene:
-    """The ego vehicle stands at a crossroads; others cross before it."""
+    """Build the crossroads. The ego vehicle stands, and others cross before it."""
     main = Curve(np.column_stack([np.arange(-150.0, 200.5, 0.5), np.zeros(701)]))
     across = Curve(np.column_stack([np.full(801, _CROSS_X_M), np.arange(-200.0, 200.5, 0.5)]))
     roads = (Road(main, 5.6, 5.6), Road(across, 6.0, 6.0))
@@ -221,7 +224,7 @@ def _people_crossing(
 
 
 def zebra(ground: Ground, road: Road, station_m: float) -> Mesh:
-    """A crossing for walkers, 3 m deep, over the whole road."""
+    """Return a pedestrian crossing, 3 m deep, over the whole road."""
     offsets = np.arange(-road.right_m + 0.5, road.left_m - 0.3, 1.0)
     span = [(station_m - 1.5, station_m + 1.5)]
     return Mesh.join([strip(ground, road.curve, float(o), 0.5, span) for o in offsets])
@@ -232,7 +235,7 @@ _MEDIAN_M = 1.6
 
 
 def highway(rng: np.random.Generator) -> Scene:
-    """Three lanes each way; the ego vehicle drives 25 m/s, others come with 30 m/s."""
+    """Build three lanes each way. The ego vehicle drives 25 m/s, oncoming cars 30 m/s."""
     start_m = 240.0
     bend, phase = jitter(rng, 0.4) / 1100.0, rng.uniform(0, 2 * np.pi)
 
@@ -272,6 +275,7 @@ def highway(rng: np.random.Generator) -> Scene:
 
 @cache
 def guard_rail(length_m: float) -> Mesh:
+    """Return a guard rail of this length along x."""
     half = length_m / 2 + 0.02
     post = box((-0.05, -0.05, -0.3), (0.05, 0.05, 0.72), Material.METAL)
     beams = [frustum((-half, -0.08, z), (half, 0.0, z + 0.13), Material.METAL, (1.15, 1.15, 1.15),
@@ -281,6 +285,7 @@ def guard_rail(length_m: float) -> Mesh:
 
 @cache
 def noise_barrier(length_m: float) -> Mesh:
+    """Return a noise barrier of this length along x."""
     half = length_m / 2
     slab = box((-half, -0.08, -0.8), (half, 0.08, 3.2), Material.CONCRETE, (0.9, 0.95, 0.85))
     post = box((-half - 0.1, -0.16, -0.8), (-half + 0.1, 0.16, 3.4), Material.METAL)

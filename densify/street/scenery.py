@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Everything along a road that stands still: houses, walls, hedges, trees, poles, parked cars."""
+"""Place the static objects along a road: houses, walls, hedges, trees, poles, parked cars."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Panel = Callable[[float], Mesh]
 
 
 class Scenery:
-    """Collects what is put on the ground, as one mesh and as footprints nobody may drive over."""
+    """Collect the static objects, as one mesh and as footprints that nobody may drive over."""
 
     def __init__(self, ground: Ground, rng: np.random.Generator) -> None:
         self.ground = ground
@@ -35,7 +35,11 @@ class Scenery:
         self._num_parked = 0
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
-        """Stand a mesh (origin on the ground) somewhere. solid: the part one can run into."""
+        """Stand a mesh, whose origin is on the ground, at a position.
+
+        Args:
+            solid: Part of the mesh that others can collide with.
+        """
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
         self._stand(mesh, upright((*xy, z), heading), solid or mesh)
 
@@ -44,7 +48,7 @@ class Scenery:
         self.footprints.append(Rectangles.of(solid, pose))
 
     def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
-        """Return True if the mesh would be clear of the carriageway and of all else."""
+        """Return True if the mesh is clear of the carriageway and of all other objects."""
         place = Rectangles.of(mesh, upright((*xy, 0.0), heading), 0.3)
         if self.footprints:
             self.footprints = [Rectangles.joined(self.footprints)]
@@ -57,11 +61,12 @@ class Scenery:
     def put_if_free(
         self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float, solid: Mesh | None = None
     ) -> None:
+        """Put the mesh where nothing else is, or leave it out."""
         if self.is_free(solid or mesh, xy, heading, kerb_gap_m):
             self.put(mesh, xy, heading, solid)
 
     def park(self, xy: Float, forward: Float) -> None:
-        """A parked car; it leans with the slope as one that drives."""
+        """Park a car. It leans with the slope as a driving car does."""
         mesh = car_mesh(any_paint(self.rng), self.rng).of_instance(FIRST_PARKED + self._num_parked)
         self._num_parked += 1
         half = forward * WHEELBASE_M["car"] / 2
@@ -69,7 +74,7 @@ class Scenery:
         self._stand(mesh, pose, mesh)
 
     def row(self, panel: Panel, start: Float, end: Float, kerb_gap_m: float) -> None:
-        """A fence, wall or hedge from start to end, panel by panel, each at its own height."""
+        """Put a fence, wall or hedge from start to end, panel by panel, each at its own height."""
         length = float(np.linalg.norm(end - start))
         count = max(1, round(length / _PANEL_M))
         heading = float(np.arctan2(*(end - start)[::-1]))
@@ -79,7 +84,7 @@ class Scenery:
 
 
 def house(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
-    """Front along x, facing -y. Walls with windows and a door, a gable roof."""
+    """Return a house with its front along x, facing -y: walls, windows, door and gable roof."""
     storeys = int(rng.integers(2, 4))
     height = 2.8 * storeys + 0.4
     wall = Material.BRICK if rng.random() < 0.55 else Material.PLASTER
@@ -120,7 +125,7 @@ def _windows(w: float, d: float, storeys: int) -> list[Mesh]:
 
 
 def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
-    """A whole tree, and its trunk alone."""
+    """Return a whole tree, and its trunk alone."""
     height, spread = rng.uniform(5.5, 9.0), rng.uniform(1.5, 2.5)
     crown = max(2.3, 0.34 * height)
     thick = 0.02 * height + 0.03
@@ -147,10 +152,12 @@ def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
 
 
 def hedge(rng: np.random.Generator, height_m: float) -> Panel:
+    """Return a function that makes hedges of a given length."""
+
     def panel(length_m: float) -> Mesh:
         half = np.array([length_m / 2, 0.35, height_m / 2])
         centres = rng.uniform(-1, 1, (int(75 * length_m * height_m), 3))
-        # leaves are dense on the outside, a few twigs within
+        # dense leaves outside, a few twigs inside
         face = rng.integers(0, 3, len(centres))
         push = rng.random(len(centres)) < 0.75
         side = np.sign(centres[np.arange(len(centres)), face])
@@ -164,6 +171,8 @@ def hedge(rng: np.random.Generator, height_m: float) -> Panel:
 
 
 def wall(height_m: float, material: Material) -> Panel:
+    """Return a function that makes walls of a given length."""
+
     @cache
     def panel(length_m: float) -> Mesh:
         half = length_m / 2 + 0.02
@@ -174,6 +183,8 @@ def wall(height_m: float, material: Material) -> Panel:
 
 
 def picket_fence(height_m: float, tint: tuple[float, float, float]) -> Panel:
+    """Return a function that makes fences of a given length."""
+
     @cache
     def panel(length_m: float) -> Mesh:
         half = length_m / 2
@@ -189,14 +200,14 @@ def picket_fence(height_m: float, tint: tuple[float, float, float]) -> Panel:
 
 @cache
 def lamp_post() -> Mesh:
-    """The arm reaches out along -y."""
+    """Return a lamp post whose arm reaches out along -y."""
     pole = tube((0, 0, -0.3), (0, 0, 7.0), (0.09, 0.05), Material.METAL)
     arm = tube((0, 0, 6.9), (0, -1.6, 7.2), 0.04, Material.METAL)
     return Mesh.join([pole, arm, box((-0.12, -2.1, 7.12), (0.12, -1.5, 7.24), Material.METAL)])
 
 
 def sign_post(rng: np.random.Generator) -> Mesh:
-    """Faces -x."""
+    """Return a sign post that faces -x."""
     tint = [(0.25, 0.4, 1.0), (1.0, 0.25, 0.2), (1.0, 0.9, 0.3)][int(rng.integers(3))]
     pole = tube((0, 0, -0.3), (0, 0, 2.9), 0.035, Material.METAL)
     return Mesh.join([pole, box((-0.06, -0.32, 2.2), (-0.04, 0.32, 2.84), Material.PAINT, tint)])
@@ -204,6 +215,7 @@ def sign_post(rng: np.random.Generator) -> Mesh:
 
 @cache
 def litter_bin() -> Mesh:
+    """Return a litter bin."""
     return tube((0, 0, 0.0), (0, 0, 0.9), (0.22, 0.25), Material.METAL, (0.45, 0.6, 0.45), 10)
 
 
@@ -217,7 +229,7 @@ class Side:
     end_m: float
 
     def at(self, station_m: float, beyond_kerb_m: float) -> Float:
-        """(2,) point so far outside the kerb abreast of the station."""
+        """Return the (2,) point ``beyond_kerb_m`` outside the kerb, abreast of the station."""
         s = np.array([station_m])
         edge = self.road.left_m if self.side > 0 else self.road.right_m
         normal = self.road.curve.normal(s)[0] * self.side
@@ -225,17 +237,17 @@ class Side:
         return point
 
     def heading(self, station_m: float) -> float:
-        """Such that a mesh's +y points away from the road."""
+        """Return the heading with which the +y axis of a mesh points away from the road."""
         return float(np.arctan2(*-self.forward(station_m)[::-1]))
 
     def forward(self, station_m: float) -> Float:
-        """(2,) direction of the traffic on this side, which keeps to the right."""
+        """Return the (2,) direction of the traffic on this side. Traffic keeps to the right."""
         tangent: Float = self.road.curve.tangent(np.array([station_m]))[0] * -self.side
         return tangent
 
 
 def line_with_plots(scenery: Scenery, side: Side) -> None:
-    """Houses behind front gardens, each closed off by a hedge, a wall or a fence."""
+    """Put houses behind front gardens, each closed off by a hedge, a wall or a fence."""
     rng, pavement_m = scenery.rng, scenery.ground.pavement_m
     station = side.begin_m
     while station < side.end_m - 8:
@@ -278,7 +290,7 @@ def _close_off(
 
 
 def furnish(scenery: Scenery, side: Side, spacing_m: float, trees: bool) -> None:
-    """Lamp posts, trees, signs and bins along the kerb."""
+    """Put lamp posts, trees, signs and bins along the kerb."""
     rng = scenery.rng
     for station in np.arange(side.begin_m + rng.uniform(2, 8), side.end_m, spacing_m):
         heading = side.heading(station)
@@ -297,7 +309,11 @@ def furnish(scenery: Scenery, side: Side, spacing_m: float, trees: bool) -> None
 
 
 def park_cars(scenery: Scenery, side: Side, share: float, keep_free: Spans) -> None:
-    """Cars along the kerb. share: of the places taken."""
+    """Park cars along the kerb.
+
+    Args:
+        share: Share of the parking places that are taken.
+    """
     rng = scenery.rng
     station = side.begin_m + 4.0
     while station < side.end_m - 4.0:
@@ -313,7 +329,7 @@ def park_cars(scenery: Scenery, side: Side, share: float, keep_free: Spans) -> N
 def mark_lanes(
     ground: Ground, road: Road, dashed: Sequence[float], solid: Sequence[float], spans: Spans
 ) -> Mesh:
-    """Lines at the given offsets to the left of the centreline, only within the spans."""
+    """Paint lines at these offsets to the left of the centreline, only within the spans."""
     dashes = [(s, s + 3.0) for a, b in spans for s in np.arange(a, b - 3.0, 9.0)]
     parts = [strip(ground, road.curve, offset, 0.12, dashes) for offset in dashed]
     parts += [strip(ground, road.curve, offset, 0.12, spans) for offset in solid]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The sensors: which scanners they are made of, and every pulse of a sweep.
+"""Define the sensors: their scanners, and every pulse of a sweep.
 
-A pattern has ``num_pulses(period_s)``, the pulses in a sweep, and ``directions(slots)``, (N,3) unit
-vectors in the axes of the scanner.
+A pattern has ``num_pulses(period_s)``, the number of pulses in a sweep, and ``directions(slots)``,
+(N,3) unit vectors in the axes of the scanner.
 """
 
 from __future__ import annotations
@@ -17,9 +17,14 @@ from densify.geometry.types import Float, Int
 
 
 class Slots(NamedTuple):
-    """The N pulses of a sweep in the order of time. number: (N,) int64 from 0. share: (N,) when
-    each fires, in periods from the reference time, -0.5 to 0.5. time_s: (N,) the same in seconds
-    since frame 0, for patterns that run on from sweep to sweep."""
+    """The N pulses of a sweep in the order of time.
+
+    Attributes:
+        number: (N,) int64 from 0.
+        share: (N,) firing time in periods from the reference time, -0.5 to 0.5.
+        time_s: (N,) firing time in seconds since frame 0, for patterns that continue from sweep
+            to sweep.
+    """
 
     number: Int
     share: Float
@@ -28,12 +33,16 @@ class Slots(NamedTuple):
 
 @dataclass(frozen=True)
 class Spinning:
-    """Turns clockwise seen from above, once in a sweep, and faces forward at the reference time.
+    """A scanner that spins clockwise, as viewed from above, once a sweep.
 
-    elevation_deg: of the beams in the order they fire. Beams fire one after the other, never two
-    at once, so every pulse has an azimuth of its own. columns_per_s: firings of each beam; at
-    20 Hz a revolution has half the columns that it has at 10 Hz. phase: turns by which it is ahead
-    of a scanner that faces forward at the reference time.
+    It faces forward at the reference time. Beams fire one after another, never two at once. Every
+    pulse has an azimuth of its own.
+
+    Attributes:
+        elevation_deg: Of the beams in firing order.
+        columns_per_s: Firings of each beam. At 20 Hz a revolution has half the columns that it
+            has at 10 Hz.
+        phase: Turns by which it is ahead of a scanner that faces forward at the reference time.
     """
 
     elevation_deg: tuple[float, ...]
@@ -41,9 +50,11 @@ class Spinning:
     phase: float = 0.0
 
     def num_pulses(self, period_s: float) -> int:
+        """Return the number of pulses in a sweep."""
         return int(self.columns_per_s * period_s + 1e-6) * len(self.elevation_deg)
 
     def directions(self, slots: Slots) -> Float:
+        """Return (N,3) unit vectors in the axes of the scanner."""
         azimuth = -2 * np.pi * (slots.share + self.phase)
         beam = slots.number % len(self.elevation_deg)
         return _pointing(azimuth, np.radians(self.elevation_deg)[beam])
@@ -51,21 +62,26 @@ class Spinning:
 
 @dataclass(frozen=True)
 class _Steady:
-    """pulses_per_s: evenly spaced in time."""
+    """A pattern of ``pulses_per_s`` pulses evenly spaced in time."""
 
     pulses_per_s: int
 
     def num_pulses(self, period_s: float) -> int:
+        """Return the number of pulses in a sweep."""
         return int(self.pulses_per_s * period_s + 1e-6)
 
 
 @dataclass(frozen=True)
 class Raster(_Steady):
-    """A fast mirror swings from side to side while a slow one goes from top to bottom, once in a
-    sweep. No two pulses of a sweep share an elevation.
+    """A scanner that covers a rectangle, line by line, once a sweep.
 
-    width_deg, height_deg: the field of view, its middle straight ahead. lines_per_s: swings, each
-    to one side.
+    A fast mirror swings from side to side, a slow one goes from top to bottom. No two pulses of a
+    sweep have the same elevation.
+
+    Attributes:
+        width_deg: Width of the field of view, with its centre straight ahead.
+        height_deg: Its height.
+        lines_per_s: Swings of the fast mirror, each to one side.
     """
 
     width_deg: float
@@ -73,6 +89,7 @@ class Raster(_Steady):
     lines_per_s: int
 
     def directions(self, slots: Slots) -> Float:
+        """Return (N,3) unit vectors in the axes of the scanner."""
         line = slots.number * (self.lines_per_s / self.pulses_per_s)
         across = 1 - np.abs(line % 2 - 1)  # 0 to 1 and back
         azimuth = np.radians(self.width_deg) * (0.5 - across)
@@ -81,17 +98,22 @@ class Raster(_Steady):
 
 @dataclass(frozen=True)
 class Rosette(_Steady):
-    """Two prisms of equal power that turn at different rates draw a rose around the forward axis,
-    which goes on from sweep to sweep and does not repeat (as in Livox's scanners).
+    """A scanner with two prisms of equal power that turn at different rates.
 
-    width_deg: of the round field of view. turns_per_s: of the two prisms; their difference is how
-    often a petal is drawn, their sum how fast petals turn.
+    It draws a rose around the forward axis. The rose continues from sweep to sweep and does not
+    repeat, as in Livox's scanners.
+
+    Attributes:
+        width_deg: Diameter of the round field of view.
+        turns_per_s: Of the two prisms. Petals are drawn at their difference and turn at their
+            sum.
     """
 
     width_deg: float
     turns_per_s: tuple[float, float]
 
     def directions(self, slots: Slots) -> Float:
+        """Return (N,3) unit vectors in the axes of the scanner."""
         one, other = (np.pi * rate * slots.time_s for rate in self.turns_per_s)
         off_axis = np.radians(self.width_deg / 2) * np.cos(one - other)
         roll, flat = one + other, np.sin(off_axis)
@@ -99,7 +121,7 @@ class Rosette(_Steady):
 
 
 def _pointing(azimuth: Float, elevation: Float) -> Float:
-    """(N,) rad each -> (N,3) unit vectors."""
+    """Return (N,3) unit vectors of azimuths and elevations, (N,) rad each."""
     flat = np.cos(elevation)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
 
@@ -108,8 +130,10 @@ def _pointing(azimuth: Float, elevation: Float) -> Float:
 class Scanner:
     """One scanner of a sensor.
 
-    max_range_m, range_sigma_m: reach, and noise along the ray. origin_m: where its rays start,
-    lidar frame.
+    Attributes:
+        max_range_m: Greatest range.
+        range_sigma_m: Standard deviation of the noise along the ray.
+        origin_m: (3,) origin of its rays, lidar frame.
     """
 
     pattern: Spinning | Raster | Rosette
@@ -131,12 +155,12 @@ class Sensor:
 
     @property
     def origins_m(self) -> Float:
-        """(S,3) where the rays of each scanner start, lidar frame."""
+        """Return (S,3) origins of the rays of each scanner, lidar frame."""
         return self.each("origin_m")
 
     @property
     def azimuth_tells_time(self) -> bool:
-        """Return True if a single scanner spins about the lidar frame's origin."""
+        """Return True if a single scanner spins about the origin of the lidar frame."""
         first = self.scanners[0]
         spins = isinstance(first.pattern, Spinning)
         return len(self.scanners) == 1 and spins and not any(first.origin_m)
@@ -147,7 +171,7 @@ def _beams(*parts: NDArray[Any]) -> tuple[float, ...]:
 
 
 def _widening(first_deg: float, last_deg: float, num: int) -> Float:
-    """(num,) beams from next to ``first_deg`` to ``last_deg``, ever farther apart."""
+    """Return (num,) elevations from next to ``first_deg`` to ``last_deg``, with growing steps."""
     return first_deg + (last_deg - first_deg) * (np.arange(1, num + 1) / num) ** 1.5
 
 
@@ -214,8 +238,10 @@ SENSORS: dict[str, Sensor] = {
 class Firings:
     """The N pulses of a sweep in the order of time.
 
-    direction: (N,3) unit vectors, lidar axes. offset_ns: (N,) int64 from the reference time.
-    lidar: (N,) uint8 index of the scanner.
+    Attributes:
+        direction: (N,3) unit vectors, lidar axes.
+        offset_ns: (N,) int64 from the reference time.
+        lidar: (N,) uint8 index of the scanner.
     """
 
     direction: Float
@@ -224,9 +250,12 @@ class Firings:
 
 
 def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
-    """All pulses of the sweep that lasts ``period_ns`` around ``time_s``, seconds from frame 0.
+    """Return all pulses of the sweep that lasts ``period_ns`` around ``time_s``.
 
-    Each scanner's pulses are evenly spaced in time.
+    The pulses of each scanner are evenly spaced in time.
+
+    Args:
+        time_s: Reference time of the sweep, in seconds from frame 0.
     """
     parts = []
     for index, scanner in enumerate(sensor.scanners):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Makes the frames of one scene: sweeps, pictures and the exact motion of every body.
+"""Make the frames of a scene: sweeps, pictures and the exact motion of every body.
 
-Time runs in seconds from frame 0's reference time here, in absolute nanoseconds outside.
+Times are in seconds from frame 0's reference time here, and in absolute nanoseconds outside.
 """
 
 from __future__ import annotations
@@ -32,22 +32,32 @@ PRESETS = {"street": street, "static": static_street, "crossing": crossing, "hig
 def build_scene(preset: str, seed: int) -> Scene:
     """Return the scene of a preset and seed, always the same one.
 
-    Building takes 1 to 2 s; the last two scenes are shared by all sensors and rates.
+    Building takes 1 to 2 s. All sensors and rates share the last two scenes.
     """
     return PRESETS[preset](np.random.default_rng([seed, 0]))
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """Poses at the reference times of F frames. T_world_lidar: (F,4,4). T_world_body: (F,B,4,4),
-    body 0 the static world. moving: (F,B)."""
+    """Poses of B bodies at the reference times of F frames.
+
+    Attributes:
+        T_world_lidar: (F,4,4).
+        T_world_body: (F,B,4,4). Body 0 is the static world.
+        moving: (F,B) bool.
+    """
 
     T_world_lidar: Float
     T_world_body: Float
     moving: Bool
 
     def place(self, frame: int, body: NDArray[np.int32], points: Float) -> Float:
-        """(N,) bodies, (N,3) points in their frames -> (N,3) world, at that frame."""
+        """Return (N,3) world positions, at that frame, of points that are fixed to bodies.
+
+        Args:
+            body: (N,) index of the body of each point.
+            points: (N,3) in the frames of their bodies.
+        """
         T_world_body = self.T_world_body[frame][body]
         placed: Float = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points)
         return placed + T_world_body[:, :3, 3]
@@ -55,7 +65,7 @@ class Bodies:
     def sweep(
         self, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], points: Float
     ) -> SweepTruth:
-        """Truth of a sweep whose points belong to those bodies."""
+        """Return the truth of a sweep whose points belong to these bodies."""
         T_world_lidar = self.T_world_lidar[frame]
         away = self.place(frame, body, points) - T_world_lidar[:3, 3]
         return SweepTruth(
@@ -65,13 +75,16 @@ class Bodies:
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
     ) -> Float:
-        """(N,3) as `densify.geometry.types.Truth.displacement`; exactly 0 in the static world."""
+        """Return (N,3) displacements as in `densify.geometry.types.Truth.displacement`.
+
+        They are exactly 0 in the static world.
+        """
         self.check(target)
         there, here = (self.place(f, body, points) for f in (target, frame))
         return (there - here) @ self.T_world_lidar[frame][:3, :3]
 
     def check(self, frame: int) -> None:
-        """Raises InputError for a frame without poses."""
+        """Raise InputError for a frame without poses."""
         if not 0 <= frame < len(self.moving):
             raise InputError(
                 f"truth of frame {frame}: not there; poses are known of frames 0 to "
@@ -86,11 +99,12 @@ _MOVING_M, _MOVING_S = 0.05, 0.5
 
 @dataclass(frozen=True)
 class Simulator:
-    """Everything that is random follows from these and the frame's number.
+    """A scene with a sensor. These fields and the frame number determine everything random.
 
-    hz: sweeps per second, such as 5, 10 or 20, whose period is a whole number of nanoseconds. What
-    the scene is like at a time does not depend on it. tilt_deg: as in
-    `densify.street.lidar.T_ego_lidar`.
+    Attributes:
+        hz: Sweeps per second, such as 5, 10 or 20. The period is a whole number of nanoseconds.
+            The scene at a given time does not depend on it.
+        tilt_deg: As in `densify.street.lidar.T_ego_lidar`.
     """
 
     preset: str
@@ -106,45 +120,53 @@ class Simulator:
 
     @property
     def num_frames(self) -> int:
+        """The number of frames."""
         return DURATION_S * self.hz
 
     def stamp_ns(self, frame: int) -> int:
-        """Reference time of a frame's sweep."""
+        """Return the reference time of a frame's sweep."""
         return EPOCH_NS + frame * self.period_ns
 
     @cached_property
     def scene(self) -> Scene:
+        """The scene."""
         return build_scene(self.preset, self.seed)
 
     def returns(self, frame: int) -> Returns:
+        """Return the sweep of a frame."""
         rng = np.random.default_rng([self.seed, 1, frame])
         time_s = seconds(self.stamp_ns(frame))
         ego, world = self.scene.ego, self.scene.world
         return scan(world, ego, self.sensor, time_s, rng, self.period_ns, self.tilt_deg)
 
     def image_stamps_ns(self, camera: str) -> dict[int, int]:
-        """When a camera exposes (its middle row), by the image's number."""
+        """Return the exposure time (middle row) of each image of a camera, by its number."""
         delay_ns, own_period_ns = SHUTTERS[camera]
         period_ns = own_period_ns or self.period_ns
         first_ns = EPOCH_NS + delay_ns
         return {n: first_ns + n * period_ns for n in range(DURATION_S * 10**9 // period_ns)}
 
     def picture(self, camera: str, number: int) -> Picture:
+        """Return an image of a camera, by its number."""
         time_s = seconds(self.image_stamps_ns(camera)[number])
         return expose(self.scene.world, self.scene.ego, CAMERAS[camera], time_s)
 
     def T_world_lidar_at(self, time_ns: int) -> Float:
-        """(4,4) pose of the lidar frame at any time."""
+        """Return (4,4) the pose of the lidar frame at any time."""
         T_world_ego = self.scene.ego.poses(np.array([seconds(time_ns)])).matrix()
         return T_world_ego @ T_ego_lidar(self.tilt_deg)
 
     @cached_property
     def bodies(self) -> Bodies:
-        """Where every body is at every frame's reference time."""
+        """The poses of all bodies at every frame's reference time."""
         return self.bodies_at([self.stamp_ns(frame) for frame in range(self.num_frames)])
 
     def bodies_at(self, stamps_ns: Sequence[int], which: Sequence[int] | None = None) -> Bodies:
-        """Where every body, or each of ``which``, is at these times. which: all of an object's."""
+        """Return the poses of all bodies at these times.
+
+        Args:
+            which: Bodies to return, all bodies of an object together; None for all.
+        """
         times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
         if which is not None:
@@ -161,10 +183,10 @@ class Simulator:
         )
 
     def in_bodies(self, frame: int, returns: Returns) -> Float:
-        """(N,3) the measured points in the frame of the body each belongs to.
+        """Return (N,3) measured points in the frames of the bodies that they belong to.
 
-        A raw point is taken to the world by the scanner's pose at its own firing time and to its
-        body by the body's pose at that time.
+        A raw point is moved to the world by the pose of the scanner at its firing time. From there
+        it is moved to its body by the pose of the body at the same time.
         """
         times = at_offsets(seconds(self.stamp_ns(frame)), returns.offset_ns)
         points = transform(T_ego_lidar(self.tilt_deg), returns.points.astype(np.float64))
@@ -177,11 +199,12 @@ class Simulator:
 
 
 def seconds(time_ns: int) -> float:
+    """Return nanoseconds since frame 0 as seconds."""
     return (time_ns - EPOCH_NS) * 1e-9
 
 
 def _moving(bodies: Sequence[Body], times_s: Float) -> Bool:
-    """(F,B) whether the body is part of an object that moves around that time."""
+    """Return (F,B) True where the body is part of an object that moves around that time."""
 
     def places(shift_s: float) -> Float:
         return np.stack([b.trajectory.poses(times_s + shift_s).position for b in bodies], axis=1)

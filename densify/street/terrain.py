@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The ground: a smooth hilly surface, the roads on it, and their mesh with real kerbs.
+"""Build the ground: a smooth hilly surface, the roads on it, and a mesh with real kerbs.
 
-Its height is one function of the position, so that everything agrees on it. The carriageway is the
-union of the roads' strips with rounded corners, given as a signed distance; the ground's triangles
-are cut along its zero line, where the kerb stands upright.
+The height is a function of the position alone. The carriageway is the union of the strips of the
+roads with rounded corners, given as a signed distance. The triangles of the ground are cut along
+its zero line, at the upright kerb.
 """
 
 from __future__ import annotations
@@ -25,13 +25,17 @@ Spans = Sequence[tuple[float, float]]
 
 
 class Curve:
-    """A smooth planar curve through points, parametrised by arc length from 0 to ``length_m``.
+    """A smooth planar curve through points, with an arc length from 0 to ``length_m``.
 
-    Beyond its ends it goes on straight.
+    It continues straight beyond its ends.
     """
 
     def __init__(self, xy: Float) -> None:
-        """xy: (N,2) metres, neighbours about half a metre apart."""
+        """Build the curve.
+
+        Args:
+            xy: (N,2) metres, neighbours about half a metre apart.
+        """
         chord_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
         self.length_m = float(chord_m[-1])
         self.knots_m: Float = chord_m
@@ -39,32 +43,37 @@ class Curve:
         self._slope = self._spline.derivative()
 
     def __call__(self, station_m: Float) -> Float:
-        """(N,) arc length -> (N,2)."""
+        """Return (N,2) points at (N,) arc lengths."""
         return self.with_tangent(station_m)[0]
 
     def with_tangent(self, station_m: Float) -> tuple[Float, Float]:
-        """(N,) arc length -> the curve (N,2) and its `tangent` there."""
+        """Return the points (N,2) of the curve at (N,) arc lengths, and its `tangent` there."""
         inside = np.clip(station_m, 0.0, self.length_m)
         tangent = self.tangent(inside)
         return self._spline(inside) + (station_m - inside)[..., None] * tangent, tangent
 
     def tangent(self, station_m: Float) -> Float:
-        """(N,) -> (N,2) unit direction of travel."""
+        """Return (N,2) unit directions of travel."""
         slope = self._slope(np.clip(station_m, 0.0, self.length_m))
-        squared = slope * slope  # quicker than np.linalg.norm
+        squared = slope * slope  # faster than np.linalg.norm
         unit: Float = slope / np.sqrt(squared[..., :1] + squared[..., 1:])
         return unit
 
     def normal(self, station_m: Float) -> Float:
-        """(N,) -> (N,2) unit vector to the left of the direction of travel."""
+        """Return (N,2) unit vectors to the left of the direction of travel."""
         return left_of(self.tangent(station_m))
 
     @staticmethod
     def bending(
         length_m: float, curvature: Callable[[Float], Float], origin_m: float = 0.0
     ) -> Curve:
-        """The curve of that length whose curvature (1/m, positive to the left) is given as a
-        function of the arc length; it passes the origin with heading +x at ``origin_m``."""
+        """Return a curve of this length with a given curvature.
+
+        It passes the origin with heading +x at ``origin_m``.
+
+        Args:
+            curvature: Function of the arc length; 1/m, positive to the left.
+        """
         step = 0.05
         station = np.arange(0.0, length_m + step, step)
         heading = np.concatenate([[0.0], np.cumsum(curvature(station[:-1] + step / 2) * step)])
@@ -78,17 +87,21 @@ class Curve:
 
 
 def left_of(forward: Float) -> Float:
-    """(...,2) -> (...,2) turned by a right angle."""
+    """Return (...,2) vectors turned to the left by a right angle."""
     return np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
 
 
 class Lane:
-    """A path along a road: the road's centreline shifted sideways, possibly driven backwards."""
+    """A path along a road: its centreline shifted sideways, possibly driven backwards."""
 
     def __init__(
         self, road: Curve, offset_m: float | Callable[[Float], Float], forward: bool = True
     ) -> None:
-        """offset_m: metres to the left of the road's own direction, constant or by station."""
+        """Build the lane.
+
+        Args:
+            offset_m: Metres to the left of the road's own direction, constant or by station.
+        """
         stations = road.knots_m
         offset = offset_m(stations) if callable(offset_m) else np.full(len(stations), offset_m)
         xy = road(stations) + road.normal(stations) * offset[:, None]
@@ -97,12 +110,12 @@ class Lane:
         self._stations = stations
 
     def at(self, station_m: float) -> float:
-        """Arc length on this lane abreast of the road's station."""
+        """Return the arc length on this lane abreast of the road's station."""
         return float(np.interp(station_m, self._stations, self._abreast_m))
 
 
 def polyline(corners: Sequence[Float | tuple[float, float]], radius_m: float) -> Float:
-    """(N,2) points every half metre along straight lines whose corners are rounded with arcs."""
+    """Return (N,2) points, half a metre apart, along straight lines with rounded corners."""
     pieces = [np.asarray(corners[0], float)[None]]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
         a, b, c = (np.asarray(p, float) for p in (before, corner, after))
@@ -130,7 +143,7 @@ class Speed:
         self._travelled = np.concatenate([[0.0], np.cumsum(steps)])
 
     def distance(self, times_s: Float) -> Float:
-        """(N,) -> (N,) metres travelled since the first knot (negative before it)."""
+        """Return (N,) metres travelled since the first knot, negative before it."""
         i = np.clip(np.searchsorted(self._t, times_s, side="right") - 1, 0, len(self._t) - 1)
         after = np.minimum(i + 1, len(self._t) - 1)
         span = np.where(after > i, self._t[after] - self._t[i], 1.0)
@@ -146,9 +159,12 @@ _COARSE_M = 8.0  # cells of the ground far from roads
 
 @dataclass(frozen=True)
 class Terrain:
-    """Height of the bare ground, a sum of waves: ``sum a sin(k·xy + phase)``.
+    """Height of the bare ground as a sum of W waves, ``sum a sin(k·xy + phase)``.
 
-    wave: (W,2) rad/m. amplitude_m: (W,). phase: (W,).
+    Attributes:
+        wave: (W,2) wave vectors k in rad/m.
+        amplitude_m: (W,) amplitudes a.
+        phase: (W,) in rad.
     """
 
     wave: Float
@@ -157,7 +173,7 @@ class Terrain:
 
     @staticmethod
     def hilly(rng: np.random.Generator, max_slope: float, scale_m: float = 1.0) -> Terrain:
-        """Three waves in random directions; nowhere steeper than ``max_slope``."""
+        """Return three waves in random directions, nowhere steeper than ``max_slope``."""
         length_m = np.array([95.0, 150.0, 240.0]) * scale_m
         angle = rng.uniform(0, 2 * np.pi, 3)
         wave = (2 * np.pi / length_m)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -165,19 +181,19 @@ class Terrain:
         return Terrain(wave, share / np.linalg.norm(wave, axis=1), rng.uniform(0, 2 * np.pi, 3))
 
     def height(self, xy: Float) -> Float:
-        """(N,2) -> (N,) metres."""
+        """Return (N,) heights in metres at (N,2) positions."""
         z: Float = np.sin(xy @ self.wave.T + self.phase) @ self.amplitude_m
         return z
 
     def slope(self, xy: Float) -> Float:
-        """(N,2) -> (N,2) gradient of the height."""
+        """Return (N,2) gradients of the height at (N,2) positions."""
         gradient: Float = (np.cos(xy @ self.wave.T + self.phase) * self.amplitude_m) @ self.wave
         return gradient
 
 
 @dataclass(frozen=True)
 class Road:
-    """A strip ``left_m`` and ``right_m`` wide on the two sides of its centreline."""
+    """A strip of ``left_m`` and ``right_m`` on the two sides of its centreline."""
 
     curve: Curve
     left_m: float
@@ -189,7 +205,7 @@ class Road:
         return stations, cKDTree(self.curve(stations))
 
     def coordinates(self, xy: Float) -> tuple[Float, Float]:
-        """(N,2) -> station along the road (N,), offset to its left (N,), metres."""
+        """Return the station along the road (N,) and the offset to its left (N,), in metres."""
         stations, tree = self._samples
         station = stations[tree.query(xy)[1]]
         for _ in range(3):  # from the nearest sample to the foot of the perpendicular
@@ -199,7 +215,7 @@ class Road:
         return station, away[:, 1] * tangent[:, 0] - away[:, 0] * tangent[:, 1]
 
     def distance(self, xy: Float) -> Float:
-        """(N,2) -> (N,) signed metres to the strip's edge, negative on the road."""
+        """Return (N,) signed metres to the edge of the strip, negative on the road."""
         station, offset = self.coordinates(xy)
         across = np.maximum(offset - self.left_m, -self.right_m - offset)
         return np.maximum(across, np.maximum(-station, station - self.curve.length_m))
@@ -207,7 +223,11 @@ class Road:
 
 @dataclass(frozen=True)
 class Ground:
-    """Terrain with roads on it. kerb_m: how much all that is not road stands higher."""
+    """Terrain with roads on it.
+
+    Attributes:
+        kerb_m: Height of the kerb: everything beside the roads is higher by this.
+    """
 
     terrain: Terrain
     roads: tuple[Road, ...]
@@ -215,7 +235,7 @@ class Ground:
     pavement_m: float
 
     def distance(self, xy: Float) -> Float:
-        """(N,2) -> (N,) signed metres to the kerb, negative on the carriageway."""
+        """Return (N,) signed metres to the kerb, negative on the carriageway."""
         distance = self.roads[0].distance(xy)
         for road in self.roads[1:]:
             other = road.distance(xy)
@@ -226,12 +246,15 @@ class Ground:
         return distance
 
     def height(self, xy: Float) -> Float:
-        """(N,2) -> (N,) metres of the surface one stands on."""
+        """Return (N,) heights in metres of the surface, kerbs included."""
         return self.terrain.height(xy) + self.kerb_m * (self.distance(xy) > 0)
 
     def mesh(self, margin_m: float, cell_m: float, far_m: float = 200.0) -> Mesh:
-        """Fine triangles up to ``margin_m`` from the roads, coarse ones (sunk where the fine ones
-        cover them) up to ``far_m`` around."""
+        """Return fine triangles near the roads and coarse ones beyond.
+
+        Fine triangles reach ``margin_m`` from the roads, coarse ones ``far_m``. Coarse triangles
+        are sunk where fine ones cover them.
+        """
         centre = np.concatenate([r.curve(r.curve.knots_m) for r in self.roads])
         low, high = centre.min(axis=0) - margin_m - 4, centre.max(axis=0) + margin_m + 4
         corners, quads = _grid(low, high, cell_m)
@@ -243,7 +266,7 @@ class Ground:
         )
 
     def _near(self, xy: Float, distance: Float, triangles: Float) -> Mesh:
-        """Triangles cut at the carriageway's edge, the kerb's upright faces between the halves."""
+        """Return triangles cut at the edge of the carriageway, and the upright kerb."""
         pieces: list[tuple[Float, int]] = []  # (K,3,2) corners, side
         edges: list[Float] = []  # (K,2,2), the road on the left
         negative = distance[triangles] < 0
@@ -267,7 +290,7 @@ class Ground:
         return Mesh.join(meshes)
 
     def _flat(self, corners: Float, side: int) -> Mesh:
-        """(K,3,2) triangles of the road (side 0) or of what lies beside it (side 1)."""
+        """Return the mesh of (K,3,2) triangles of the road (side 0) or beside it (side 1)."""
         flat = corners.reshape(-1, 2)
         k = len(corners)
         beside = self.distance(corners.mean(axis=1)) < self.pavement_m if side else np.zeros(k)
@@ -282,7 +305,7 @@ class Ground:
         )
 
     def _upright(self, edges: Float) -> Mesh:
-        """(K,2,2) -> kerb faces."""
+        """Return the faces of the kerb above (K,2,2) lines on the ground."""
         z = self.terrain.height(edges.reshape(-1, 2)).reshape(-1, 2, 1)
         low = np.concatenate([edges, z], axis=2)
         high = low + [0.0, 0.0, self.kerb_m]
@@ -297,7 +320,7 @@ class Ground:
 
 
 def _grid(low: Float, high: Float, cell_m: float) -> tuple[Float, Float]:
-    """Corners (N,2) of a regular grid and its cells (M,4), anticlockwise."""
+    """Return the corners (N,2) of a regular grid and its cells (M,4), anticlockwise."""
     nx, ny = (int(np.ceil(v)) + 1 for v in (high - low) / cell_m)
     x, y = np.meshgrid(low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny))
     i = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
@@ -305,7 +328,7 @@ def _grid(low: Float, high: Float, cell_m: float) -> tuple[Float, Float]:
 
 
 def strip(ground: Ground, curve: Curve, offset_m: float, width_m: float, spans: Spans) -> Mesh:
-    """Paint on the road: a band along the curve, only over the given spans of stations."""
+    """Return paint on the road: a band along the curve, over the given spans of stations."""
     meshes = []
     for begin, end in spans:
         stations = np.linspace(begin, end, max(2, int((end - begin) / 1.0) + 1))

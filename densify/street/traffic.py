@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The traffic of every scene: a cast put on lanes so that it meets around the ego vehicle
-after 12 seconds and touches nothing at any time.
+"""Put the traffic of every scene on its lanes.
 
-Time zero is frame 0's, whatever the rate of the sweeps. Traffic that would touch anything is drawn
-again.
+Actors meet around the ego vehicle after 12 seconds, and touch nothing at any time. An actor that
+would touch anything is drawn again. Time zero is frame 0's, at every rate of sweeps.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from densify.street.scenery import Scenery
 from densify.street.terrain import Curve, Ground, Lane, Speed
 from densify.street.world import Body, World
 
-MEETING_S = 12.0  # when the cast is around the ego vehicle
+MEETING_S = 12.0  # time at which the actors are around the ego vehicle
 _TRIES = 40
-_NEAR_M = 25.0  # no two centres of things that touch are farther apart
+_NEAR_M = 25.0  # greatest distance of the centres of two objects that touch
 EGO_BOX = box((-2.1, -0.95, 0.2), (2.4, 0.95, 1.5), Material.BODYWORK)
 
 Maker = Callable[[Driving, int, np.random.Generator], Actor]
@@ -33,7 +32,11 @@ Recipe = Callable[[np.random.Generator], Actor]
 
 @dataclass(frozen=True)
 class Scene:
-    """A world and who moves in it. footprints: of the scenery that stands in the way."""
+    """A world and its moving actors.
+
+    Attributes:
+        footprints: Rectangles of the static objects that traffic must not touch.
+    """
 
     world: World
     ground: Ground
@@ -43,14 +46,14 @@ class Scene:
 
 
 def tracks(actor: Actor, times_s: Float) -> list[Rectangles]:
-    """(T,) rectangles of each solid body of an actor; swinging limbs get room."""
+    """Return (T,) rectangles of each solid body of an actor, with room for swinging limbs."""
     slack_m = 0.3 if len(actor.bodies) > actor.num_solid else 0.1
     solid = actor.bodies[: actor.num_solid]
     return [Rectangles.of(b.mesh, b.trajectory.poses(times_s), slack_m) for b in solid]
 
 
 class Traffic:
-    """Adds actors that touch nothing and nobody at any time."""
+    """Add actors that touch nothing at any time."""
 
     def __init__(self, ego: Driving, scenery: Scenery, rng: np.random.Generator) -> None:
         self.ground, self.ego = scenery.ground, ego
@@ -61,7 +64,11 @@ class Traffic:
         self._moving = _one(Rectangles.of(EGO_BOX, ego.poses(self._times), 0.2))
 
     def add(self, recipe: Recipe) -> None:
-        """recipe: draws an actor; drawn again until one fits, and left out if none does."""
+        """Add an actor, or none if none of the draws fits.
+
+        Args:
+            recipe: Draws an actor. It is called again until an actor fits.
+        """
         for _ in range(_TRIES):
             actor = recipe(self._rng)
             new = tracks(actor, self._times)
@@ -82,7 +89,9 @@ class Traffic:
     ) -> None:
         """Put a vehicle on a lane, abreast of a station of the road at the meeting time.
 
-        speed: a number stands for about so many m/s."""
+        Args:
+            speed: A speed profile, or a number of m/s around which one is drawn.
+        """
 
         def recipe(rng: np.random.Generator) -> Actor:
             at = lane.at(station_m + rng.uniform(-slack_m, slack_m))
@@ -99,8 +108,10 @@ class Traffic:
         self, road: Curve, offset_m: tuple[float, float], forward: bool, station_m: float,
         slack_m: float = 4.0,
     ) -> None:  # fmt: skip
-        """Put a walker along a road or another line, somewhere between two offsets to its left; on
-        and off the kerb where the way leads over it."""
+        """Put a pedestrian along a road or another line, between two offsets to its left.
+
+        The pedestrian steps on and off the kerb where the path crosses it.
+        """
         ground = self.ground
 
         def recipe(rng: np.random.Generator) -> Actor:
@@ -123,7 +134,7 @@ def _one(track: Rectangles) -> Rectangles:
 
 
 def assemble(scenery: Scenery, parts: Sequence[Mesh], traffic: Traffic) -> Scene:
-    """All that stands in one body, and the bodies of all that moves."""
+    """Return the world: all static objects in one body, and the bodies of all actors."""
     static = Body(Mesh.join([*parts, *scenery.meshes]), Still())
     bodies = [static, *(body for actor in traffic.actors for body in actor.bodies)]
     footprints = Rectangles.joined(scenery.footprints)
@@ -132,5 +143,5 @@ def assemble(scenery: Scenery, parts: Sequence[Mesh], traffic: Traffic) -> Scene
 
 
 def jitter(rng: np.random.Generator, share: float = 0.15) -> float:
-    """A factor about 1."""
+    """Return a random factor around 1."""
     return float(rng.uniform(1 - share, 1 + share))

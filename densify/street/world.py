@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Rigid bodies that move, and rays cast among them, each at its own time.
+"""Cast rays among moving rigid bodies, each ray at its own time.
 
-Rays are taken into each body's frame by the body's pose at the ray's own time, so that a body that
-moves while a sweep is taken is distorted exactly as in reality. This module is the only one that
-imports Embree.
+Rays are moved into the frame of each body by the body's pose at the ray's time. A body that moves
+during a sweep is therefore distorted as in reality. This module is the only one that imports
+Embree.
 """
 
 from __future__ import annotations
@@ -20,14 +20,19 @@ from densify.geometry.types import Bool, Float, Int
 from densify.street.mesh import Mesh, across, lengths
 from densify.street.motion import Still, Trajectory, poses_at
 
-_STEP_M = 2e-3  # from a surface passed to where the ray goes on
-_MAX_LAYERS = 8  # of glass and leaves that one ray passes
+_STEP_M = 2e-3  # from a surface that a ray passes to its next origin
+_MAX_LAYERS = 8  # most layers of glass and leaves that one ray passes
 
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid thing. mesh: in the body's frame. instance: the object it is part of, -1 none
-    (then the triangles' own instance holds)."""
+    """A rigid body.
+
+    Attributes:
+        mesh: In the frame of the body.
+        instance: Number of the object that it is part of. -1: the triangles have instances of
+            their own.
+    """
 
     mesh: Mesh
     trajectory: Trajectory
@@ -35,7 +40,13 @@ class Body:
 
 
 class Rays(NamedTuple):
-    """N rays. origin, direction: (N,3) world, direction of length 1. time_s: (N,)."""
+    """N rays.
+
+    Attributes:
+        origin: (N,3) world.
+        direction: (N,3) unit vectors, world.
+        time_s: (N,).
+    """
 
     origin: Float
     direction: Float
@@ -43,10 +54,16 @@ class Rays(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """The hits of N rays. range_m: (N,), inf where nothing. triangle: (N,) index over all bodies'
-    triangles, -1 nothing. barycentric: (N,2) as in ``(1-u-v) a + u b + v c``. normal: (N,3) of
-    that triangle, world axes, either side. absorbed: (N,) True where the ray ends there and does
-    not come back; its range is inf."""
+    """The hits of N rays.
+
+    Attributes:
+        range_m: (N,), inf without a hit.
+        triangle: (N,) index over the triangles of all bodies, -1 without a hit.
+        barycentric: (N,2) u and v, as in ``(1-u-v) a + u b + v c``.
+        normal: (N,3) of the triangle, world axes, to either side.
+        absorbed: (N,) True where the ray ends at a surface and does not come back. Its range is
+            inf.
+    """
 
     range_m: Float
     triangle: Int
@@ -56,9 +73,16 @@ class Hits(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """K rays that meet a surface. ray: (K,) their numbers. triangle: (K,). place: (K,3) in the
-    body's frame. cosine: (K,) of the angle of incidence. inside: (K,) True where the last surface
-    that the ray passed was of the same object. layer: how many surfaces the rays have passed."""
+    """K rays that meet a surface.
+
+    Attributes:
+        ray: (K,) numbers of the rays.
+        triangle: (K,) numbers of the triangles.
+        place: (K,3) position in the frame of the body.
+        cosine: (K,) of the angle of incidence.
+        inside: (K,) True where the last surface that the ray passed was of the same object.
+        layer: Number of surfaces that the rays have passed.
+    """
 
     ray: Int
     triangle: Int
@@ -74,10 +98,14 @@ Optics = Callable[[Meeting], Int]
 
 
 class Triangles:
-    """Those of all bodies in a row: ``body[k]``, ``material[k]``, ``instance[k]``, ``corner[k]``,
-    ``normal[k]``, ``uv[k]`` and ``tint[k]`` belong to triangle k; those of no area are left out.
+    """The triangles of all bodies in a row, without triangles of no area.
 
-    first: of each body. scenes: each body's as the ray caster has them, in single precision.
+    ``body[k]``, ``material[k]``, ``instance[k]``, ``corner[k]``, ``normal[k]``, ``uv[k]`` and
+    ``tint[k]`` belong to triangle k.
+
+    Attributes:
+        first: Number of the first triangle of each body.
+        scenes: The scene of each body in the ray caster, in single precision.
     """
 
     def __init__(self, bodies: Sequence[Body]) -> None:
@@ -100,22 +128,29 @@ class Triangles:
 
 
 class World:
-    """All bodies; body 0 stands still. seed: of what is random about their surfaces."""
+    """All bodies. Body 0 is static.
+
+    Attributes:
+        seed: Of everything random about their surfaces.
+    """
 
     def __init__(self, bodies: Sequence[Body], seed: int = 0) -> None:
         self.bodies, self.seed = tuple(bodies), seed
 
     @cached_property
     def triangles(self) -> Triangles:
-        """Made when first asked for: poses need none, and they take a third of the time that a
-        scene takes."""
+        """The triangles of all bodies, made when first needed.
+
+        Poses need none, and making them takes a third of the time of a scene.
+        """
         return Triangles(self.bodies)
 
     def cast(self, rays: Rays, optics: Optics, num_together: int = 1, spread: float = 0.0) -> Hits:
-        """The first surface that each ray does not pass.
+        """Return the first surface that each ray does not pass.
 
-        num_together: rays in a row that share origin and time and differ from the first of them by
-        at most ``spread`` rad.
+        Args:
+            num_together: Number of rays in a row that share origin and time and differ from the
+                first of them by at most ``spread`` rad.
         """
         every = np.arange(len(rays.time_s))
         best = self._cast_body(0, rays.origin, rays.direction, every, optics)
@@ -137,8 +172,10 @@ class World:
         return best
 
     def _near(self, rays: Rays, spread: float) -> Iterator[tuple[int, Int]]:
-        """The rays that may meet each body but the first: those that pass, or begin in, a ball that
-        holds it at all of their times."""
+        """Yield each body but the first, with the rays that may meet it.
+
+        These rays pass, or begin in, a ball that holds the body at all of their times.
+        """
         ends_s = np.array([rays.time_s.min(), rays.time_s.max()])
         origin, direction = rays.origin.T.copy(), rays.direction.T.copy()
         for index, body in enumerate(self.bodies[1:], start=1):
@@ -156,8 +193,16 @@ class World:
     def _cast_body(
         self, index: int, origin: Float, direction: Float, number: Int, optics: Optics
     ) -> Hits:
-        """origin, direction: in the body's frame. number: (N,) of the rays. Distances are to the
-        triangle's plane, in double precision, also where a ray is absorbed."""
+        """Return the hits of rays with one body.
+
+        Distances are to the plane of the triangle, in double precision, also where a ray is
+        absorbed.
+
+        Args:
+            origin: (N,3) in the frame of the body.
+            direction: (N,3) in the frame of the body.
+            number: (N,) numbers of the rays.
+        """
         surfaces, first, n = self.triangles, self.triangles.first[index], len(origin)
         hits = Hits(
             np.full(n, np.inf), np.full(n, -1), np.zeros((n, 2)), np.zeros((n, 3)),
@@ -191,14 +236,17 @@ class World:
 
 @cache
 def _device() -> Any:
-    """One for all scenes: each of them would open its own, and Embree fails after a thousand."""
+    """Return the one Embree device of all scenes.
+
+    With a device for each scene, Embree fails after a thousand.
+    """
     from embreex.rtcore import EmbreeDevice
 
     return EmbreeDevice()
 
 
 def _raycasting_scene(corners: Float) -> Any:
-    """corners: (T,3,3) of triangles."""
+    """Return the ray caster's scene of (T,3,3) corners of triangles."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -208,7 +256,7 @@ def _raycasting_scene(corners: Float) -> Any:
 
 
 def _first_hit(scene: Any, origin: Float, direction: Float) -> tuple[NDArray[np.int64], Float]:
-    """(N,3), (N,3) -> index of the first triangle met (N,), -1 none, and where on it (N,2)."""
+    """Return the index of the first triangle hit (N,), -1 for none, and the place on it (N,2)."""
     found = scene.run(
         origin.astype(np.float32), direction.astype(np.float32), query="INTERSECT", output=True
     )

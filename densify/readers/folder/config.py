@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""``densify.yaml`` beside a recording of no known form: what its files do not say themselves. Every
-key may be left out; `densify.readers.folder.reader` says what is then found or assumed. Whatever is
-wrong is named by file, line and key."""
+"""Read ``densify.yaml`` beside a recording of no known form.
+
+It says what the files do not say themselves. Every key is optional; `densify.readers.folder.reader`
+says what is then found or assumed. An error names file, line and key.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,7 @@ def _names(value: Any) -> tuple[str, ...]:
 
 
 def _axes(value: Any) -> Float:
-    """(3,3) of three names such as [z, -x, -y]: where the lidar's x, y and z are in the file."""
+    """Return (3,3) of three names such as [z, -x, -y]: the file's axes for the lidar's x, y, z."""
     R = np.array([_AXES[name] for name in _names(value)])
     if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3)):
         raise ValueError
@@ -125,17 +127,24 @@ _CHECKS: dict[str, Check] = {
 
 @dataclass(frozen=True)
 class SweepFiles:
-    """Section ``sweeps``.
+    """Section ``sweeps``. An empty text or 0 means: found by itself.
 
-    files: folder of the sweeps, "" to look for it. columns: of files without names. scale_m:
-    metres of a unit of the points. axes: (3,3) turns (or mirrors) stored points to the lidar's
-    frame, x forward, y left, z up; None leaves them. intensity, time, lidar: which column
-    plays that part, "" to find it by its name. intensity_scale: what is full brightness, 0
-    to find it. time_unit, time_is, reference: see `densify.readers.point_fields.find_times`.
-    stamps: ``names`` (of the files) or a file with one time for each sweep, "" to look for them;
-    stamps_unit: theirs. rate_hz: of sweeps without stamps, 0 for 10 Hz.
-    compensated: the points were carried to the stamp by the vehicle's motion. scanner_origins:
-    (S,3) metres, None where rays start at 0 0 0.
+    Attributes:
+        files: Folder of the sweeps.
+        columns: Of files without names.
+        scale_m: Metres of a unit of the points.
+        axes: (3,3) turns (or mirrors) stored points to the lidar frame, x forward, y left, z
+            up; None leaves them.
+        intensity: Name of the column.
+        time: Name of the column.
+        lidar: Name of the column.
+        intensity_scale: Value of full brightness.
+        time_unit: See `densify.readers.point_fields.find_times`; time_is and reference too.
+        stamps: ``names`` (of the files), or a file with one time for each sweep.
+        stamps_unit: Unit of the stamps.
+        rate_hz: Rate of sweeps without stamps; 0 for 10 Hz.
+        compensated: The points are compensated to the stamp by the vehicle's motion.
+        scanner_origins: (S,3) metres, None if rays start at 0 0 0.
     """
 
     files: str = ""
@@ -158,8 +167,13 @@ class SweepFiles:
 
 @dataclass(frozen=True)
 class Poses:
-    """Section ``poses``. file: "" to look for it. T_frame_lidar: (4,4) the lidar in the frame whose
-    poses these are. inverse: the file has T_lidar_world, not T_world_lidar."""
+    """Section ``poses``.
+
+    Attributes:
+        file: The file, "" to search for it.
+        T_frame_lidar: (4,4) pose of the lidar in the frame whose poses these are.
+        inverse: The file has T_lidar_world, not T_world_lidar.
+    """
 
     file: str = ""
     stamps_unit: str = ""
@@ -169,10 +183,17 @@ class Poses:
 
 @dataclass(frozen=True)
 class CameraFiles:
-    """One of the section ``cameras``. size: width, height in pixels. K: (3,3). T_cam_lidar: (4,4).
-    files: folder of its images. stamps: ``names``, ``sweeps`` (an image is exposed when the sweep
-    of its number is stamped), or a file, "" to look for them. clock_offset_s: is added to the
-    stamps, to bring them to the sweeps' clock."""
+    """One camera of the section ``cameras``.
+
+    Attributes:
+        size: Width and height in pixels.
+        K: (3,3).
+        T_cam_lidar: (4,4).
+        files: Folder of its images.
+        stamps: ``names``, ``sweeps`` (an image is exposed at the stamp of the sweep of its
+            number), or a file; "" to search for them.
+        clock_offset_s: Added to the stamps, to bring them to the clock of the sweeps.
+    """
 
     size: tuple[int, int]
     K: Float
@@ -188,7 +209,10 @@ class CameraFiles:
 
 
 class _File(NamedTuple):
-    """lines: of all keys by their dotted names."""
+    """A file that is read, with the line of each key.
+
+    lines: by the dotted names of the keys.
+    """
 
     path: Path
     lines: Mapping[str, int]
@@ -202,8 +226,10 @@ class _File(NamedTuple):
         return self.error(key, f"got {shown}, expected {expected}")
 
     def mapping(self, key: str, value: Any, known: Collection[str] | None) -> dict[str, Any]:
-        """Return the mapping that is the value of a key, empty for None. known: the keys that it
-        may have, None for any."""
+        """Return the mapping that is the value of a key, empty for None.
+
+        known: the keys that it may have, None for any.
+        """
         value = {} if value is None else value
         if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
             raise self.unfit(key, value, "a mapping of keys to values")
@@ -235,7 +261,12 @@ class _File(NamedTuple):
 
 @dataclass(frozen=True)
 class FolderConfig:
-    """path: of the file, None where there is none. cameras: each with its files, by name."""
+    """The contents of densify.yaml.
+
+    Attributes:
+        path: The file, None if there is none.
+        cameras: Each with its files, by name.
+    """
 
     path: Path | None = None
     sweeps: SweepFiles = SweepFiles()
@@ -244,7 +275,11 @@ class FolderConfig:
 
     @staticmethod
     def read(folder: Path) -> FolderConfig:
-        """Raises InputError that names file, line and key of whatever is wrong."""
+        """Return the configuration of a folder.
+
+        Raises:
+            InputError: Anything is wrong. The message names file, line and key.
+        """
         path = folder / NAME
         if not path.is_file():
             return FolderConfig()

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Any folder of sweeps: numbered files of points, and beside them whatever there is of stamps,
-poses and images. `densify.readers.folder.config` says what they cannot: a small ``densify.yaml``.
+"""Read any folder of sweeps: numbered files of points, with stamps, poses and images beside them.
 
-points: in the lidar's frame, as fired. With ``compensated`` they were carried to the stamp; that is
-    undone where points have times and poses have stamps, else the times are left out.
+What the files do not say stands in a small ``densify.yaml``, see `densify.readers.folder.config`.
+
+points: in the lidar's frame, as fired. With ``compensated`` they are compensated to the stamp. That
+    is undone if points have times and poses have stamps; else the times are left out.
 numbers and stamps: as the names say, or from 0 in the order of time where names are times
     (``1317042651.468569638.pcd``). Times come from names, a file such as ``timestamps.txt``, or the
-    rate. The stamp is the reference time; points' times are since it, or absolute on its clock, in
-    the unit in which a sweep takes about a period.
+    rate. The stamp is the reference time. Times of points count from it, or are absolute on its
+    clock, in the unit in which a sweep takes about a period.
 poses: KITTI's 3x4, 4x4, TUM, or tables with quaternions: interpolated by their stamps, or without
     stamps one for each sweep or number.
 images: need a calibration; stamped by names, a file, or the sweeps of the same numbers.
@@ -51,15 +52,24 @@ _NUM_TRIED = 5  # sweeps, until one can be read
 
 @dataclass(frozen=True)
 class SweepColumns:
-    """series: the files. settings: what densify.yaml says; config: its path."""
+    """The columns of a series of sweeps.
+
+    Attributes:
+        series: The files.
+        settings: Section ``sweeps`` of densify.yaml.
+        config: Path of densify.yaml.
+    """
 
     series: Series
     settings: SweepFiles
     config: Path | None
 
     def returns(self, frame: int, stamp_ns: int) -> Returns:
-        """Return the rows of a sweep. Raises InputError if the file is damaged or lacks
-        columns of the first."""
+        """Return the rows of a sweep.
+
+        Raises:
+            InputError: The file is damaged, or lacks columns of the first.
+        """
         path = self.series.paths[frame]
         columns = self._columns(path)
         found, valid = self.layout.returns(columns, path, stamp_ns)
@@ -72,7 +82,7 @@ class SweepColumns:
 
     @cached_property
     def layout(self) -> PointLayout:
-        """Find the meaning of the columns in the first sweep that can be read."""
+        """The meaning of the columns, found in the first sweep that can be read."""
         frame, columns = self._sample
         path, known = self.series.paths[frame], self.settings
         named = {
@@ -98,14 +108,14 @@ class SweepColumns:
 
     @cached_property
     def period_ns(self) -> int:
-        """Return the time from sweep to sweep: by their stamps, or else their rate."""
+        """The time from sweep to sweep, by their stamps or else their rate."""
         stamps_ns = list((self.series.stamps_ns or {}).values())
         if len(stamps_ns) > 1:
             return max(1, int(np.median(np.diff(stamps_ns))))
         return round(1e9 / (self.settings.rate_hz or _ASSUMED_HZ))
 
     def unused(self) -> list[str]:
-        """Return the columns that play no part, with their ranges, for people."""
+        """Return the unused columns, with their ranges, for people."""
         return [
             f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
             for name, column in self._sample[1].items()
@@ -114,7 +124,7 @@ class SweepColumns:
 
     @cached_property
     def _sample(self) -> tuple[int, Columns]:
-        """Read the first sweep that can be read: its number and columns."""
+        """The number and the columns of the first sweep that can be read."""
         errors = []
         for number, path in list(self.series.paths.items())[:_NUM_TRIED]:
             try:
@@ -149,8 +159,12 @@ class Folder(FileSequence):
     """A folder of sweeps as a `LidarSequence`; `findings` says what was found."""
 
     def __init__(self, path: Path | str) -> None:
-        """Reads names, densify.yaml, stamps and poses at once, sweeps and images on demand. Raises
-        InputError if there are no sweeps, or what is beside them is malformed or contradicts."""
+        """Read names, densify.yaml, stamps and poses. Sweeps and images are read on demand.
+
+        Raises:
+            InputError: There are no sweeps, or the other files are malformed or contradict each
+                other.
+        """
         folder = Path(path)
         self._config = FolderConfig.read(folder)
         known, cameras = self._config.sweeps, self._config.cameras
@@ -228,7 +242,7 @@ class Folder(FileSequence):
         return super()._pose(frame)
 
     def _read_poses(self) -> None:
-        """Read the lidar's path where the poses have stamps, else its pose by frame."""
+        """Read the path of the lidar if the poses have stamps, else its pose by frame."""
         known, frames = self._config.poses, self.frames
         self._poses: PoseFile | None = None
         self._track: PoseTrack | None = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The series of files in a plain folder: sweeps, their stamps, poses, and images."""
+"""Find the files of a plain folder: sweeps, their stamps, poses, and images."""
 
 from __future__ import annotations
 
@@ -27,8 +27,13 @@ _POSE_FILES = [
 
 @dataclass(frozen=True)
 class Series:
-    """Files of sweeps or images in the order of time. paths: by number. stamps_ns: by number, None
-    if neither names nor a file tell. told_by: which, for people."""
+    """Files of sweeps or images in the order of time.
+
+    Attributes:
+        paths: By number.
+        stamps_ns: By number, None if neither names nor a file tell.
+        told_by: The source of the stamps, for people.
+    """
 
     paths: Mapping[int, Path]
     stamps_ns: Mapping[int, int] | None
@@ -36,10 +41,13 @@ class Series:
 
 
 def find_sweeps(folder: Path, files: str) -> list[Path]:
-    """Return the numbered files of points, of the surest suffix.
+    """Return the numbered files of points, of the most certain suffix.
 
-    files: the folder they are in, "" to look in this one and two folders down. Raises InputError if
-    there are none, or several folders of them.
+    Args:
+        files: Their folder, "" to search in this one and two folders down.
+
+    Raises:
+        InputError: There are none, or several folders have some.
     """
     if files:
         existing(folder, files, "sweeps: {files: ...}", is_folder=True)
@@ -64,24 +72,29 @@ def find_sweeps(folder: Path, files: str) -> list[Path]:
 
 
 def find_images(folder: Path) -> dict[str, list[Path]]:
-    """Return the folders with images, this one and those two folders down, and their images."""
+    """Return the folders with images, this one and two folders down, and their images."""
     found = {str(p.relative_to(folder)): images_in(p) for p in _folders(folder)}
     return {name: images for name, images in found.items() if images}
 
 
 def images_in(folder: Path) -> list[Path]:
+    """Return the images of a folder."""
     return sorted(_files(folder, _IMAGE_SUFFIXES))
 
 
 def find_pose_file(folder: Path, name: str) -> Path | None:
-    """Return the file that is named, or one of a usual name; None if there is none."""
+    """Return the pose file of this name, or one of a usual name; None without one."""
     if name:
         return existing(folder, name, "poses: {file: ...}")
     return next((folder / n for n in _POSE_FILES if (folder / n).is_file()), None)
 
 
 def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path:
-    """Return what densify.yaml names under a key. Raises InputError if it is not there."""
+    """Return the path that densify.yaml names under a key.
+
+    Raises:
+        InputError: It does not exist.
+    """
     path = folder / name
     if not (path.is_dir() if is_folder else path.is_file()):
         what = "folder" if is_folder else "file"
@@ -92,12 +105,18 @@ def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path
 def in_time(
     root: Path, paths: Sequence[Path], stamps: str, unit: str, shared: bool = True
 ) -> Series:
-    """Put files in the order of time.
+    """Return files in the order of time.
 
-    stamps: ``names``; ``sweeps``, which means none of their own; the name of a file, below the root
-    or beside the files; "" to look for one, in the root too only if ``shared``. Files whose names
-    are times are numbered from 0, others as their names say. Raises InputError if a name or a line
-    is missing, two files have one number, or the stamps do not ascend.
+    Files whose names are times are numbered from 0, others as their names say.
+
+    Args:
+        stamps: ``names``; ``sweeps``, for none of their own; the name of a file, below the root
+            or beside the files; "" to search for one.
+        shared: Search in the root too.
+
+    Raises:
+        InputError: A name or a line is missing, two files have one number, or the stamps do not
+            ascend.
     """
     by_names = stamps == "names"
     names = [named(path, unit if by_names else "") for path in paths]
@@ -144,8 +163,7 @@ def _numbered(names: Sequence[Named]) -> dict[int, Named]:
 
 
 def _matched(file: StampFile, paths: Mapping[int, Path]) -> dict[int, int]:
-    """Return the time of each file: by its name, or its row in the order of numbers, or its
-    number."""
+    """Return the time of each file: by name, by row in the order of numbers, or by number."""
     if file.names is not None:
         by_name = {Path(n).stem: ns for n, ns in zip(file.names, file.stamp_ns, strict=True)}
         missing = [path for path in paths.values() if path.stem not in by_name]
@@ -173,7 +191,7 @@ def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | Non
 
 
 def _folders(root: Path) -> Iterator[Path]:
-    """Yield the folder and those below it, by name; links to folders are not followed."""
+    """Yield the folder and those below it, by name, without links to folders."""
     for place, folders, _ in os.walk(root):
         folders[:] = sorted(f for f in folders if f[0] != "." and f not in _NO_SWEEPS)
         if len(Path(place).relative_to(root).parts) == _DEPTH:
@@ -182,7 +200,7 @@ def _folders(root: Path) -> Iterator[Path]:
 
 
 def _files(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
-    """Yield visible files of these suffixes; links to nowhere and to themselves are none."""
+    """Yield visible files of these suffixes, without broken links."""
     for path in folder.iterdir() if folder.is_dir() else ():
         if path.name[0] != "." and path.suffix.lower() in suffixes and os.path.isfile(path):
             yield path

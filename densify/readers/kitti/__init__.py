@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""KITTI and its relatives: raw drives, odometry, tracking, KITTI-360."""
+"""Read KITTI and its relatives: raw drives, odometry, tracking, KITTI-360."""

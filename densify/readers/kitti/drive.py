@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The parts that KITTI's layouts share: sweeps of the HDL-64E, images, stamps, calibration, and
-poses by GPS and inertial unit (oxts)."""
+"""Read the parts that KITTI's layouts share.
+
+These are sweeps of the HDL-64E, images, stamps, calibration, and poses by GPS and inertial unit
+(oxts).
+"""
 
 from __future__ import annotations
 
@@ -28,15 +31,20 @@ _STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
 
 
 class Drive(FileSequence):
-    """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped as it faces forward."""
+    """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped when it faces forward."""
 
     revolution_ns: int = NOMINAL_PERIOD_NS
 
     def __init__(
         self, name: str, where: Path, sweeps: Path, truth: Path, images: Mapping[str, Path]
     ) -> None:
-        """sweeps: folder of the .bin files. truth: folder that may hold exact truth. images:
-        folders by camera. Raises InputError if there are no sweeps."""
+        """Raise InputError if there are no sweeps.
+
+        Args:
+            sweeps: Folder of the .bin files.
+            truth: Folder that may hold exact truth.
+            images: Folders by camera.
+        """
         files = checks.numbered_files(sweeps, ".bin")
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
@@ -69,15 +77,22 @@ def read_points(path: Path) -> tuple[Float, np.ndarray]:
 
 
 def turned_ns(points: Float, revolution_ns: int) -> Int:
-    """Return when each of (N,3) raw points was fired, since the scanner faced forward:
-    ``-azimuth / 2π`` of the revolution."""
+    """Return the firing times (N,) of (N,3) raw points since the scanner faced forward.
+
+    They are ``-azimuth / 2π`` of the revolution.
+    """
     revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     return np.rint(revolution * revolution_ns).astype(np.int64)
 
 
 def read_stamps(path: Path) -> dict[int, int]:
     """Return the stamps (ns) of a timestamps file by line from 0, which is the frame's number.
-    Lines that are no stamps are left out. Raises InputError if none is one."""
+
+    Lines that are no stamps are left out.
+
+    Raises:
+        InputError: No line is a stamp.
+    """
     lines = [line.strip() for line in read_text(path).splitlines()]
     stamps_ns = {}
     for frame, line in enumerate(lines):
@@ -102,8 +117,13 @@ def usual_period_ns(stamps_ns: Iterable[int]) -> int:
 
 
 def parse_oxts(text: str, where: str) -> Float:
-    """Return the (30,) numbers of an oxts record: latitude and longitude (deg), altitude (m), roll,
-    pitch, yaw (rad), ... Raises InputError, which starts with ``where``."""
+    """Return the (30,) numbers of an oxts record.
+
+    They begin with latitude and longitude (deg), altitude (m), roll, pitch and yaw (rad).
+
+    Raises:
+        InputError: The record is malformed. The message starts with ``where``.
+    """
     values = checks.parse_numbers(text, where, 30)
     if abs(values[0]) >= 90:
         raise InputError(f"{where}: got a latitude of {values[0]:g} deg, expected -90 to 90")
@@ -111,10 +131,13 @@ def parse_oxts(text: str, where: str) -> Float:
 
 
 def T_mercator_imu(oxts: Float, first: Float) -> Float:
-    """Return the (4,4) pose on the Mercator plane (east, north, up), as the devkit's
-    convertOxtsToPose.
+    """Return the (4,4) pose on the Mercator plane (east, north, up).
 
-    oxts, first: (30,) the record, and the first one of the drive, whose latitude gives the scale.
+    It is that of the devkit's convertOxtsToPose.
+
+    Args:
+        oxts: (30,) the record.
+        first: (30,) the first record of the drive, whose latitude gives the scale.
     """
     lat_deg, lon_deg, alt_m, roll, pitch, yaw = oxts[:6]
     scale_m = _EARTH_RADIUS_M * np.cos(np.deg2rad(first[0]))
@@ -128,14 +151,17 @@ def T_mercator_imu(oxts: Float, first: Float) -> Float:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibration file of lines ``KEY: numbers``, with or without the colon. Malformed entries
-    raise InputError when asked for, naming file and key."""
+    """A calibration file of lines ``KEY: numbers``, with or without the colon.
+
+    A malformed entry raises InputError, with file and key, when it is used.
+    """
 
     path: Path
     entries: Mapping[str, str]
 
     @staticmethod
     def read(path: Path) -> Calibration:
+        """Return the entries of a file."""
         if not path.is_file():
             raise InputError(
                 f"{path}: missing; expected KITTI's calibration there (it is a download of its own)"
@@ -144,19 +170,20 @@ class Calibration:
         return Calibration(path, {found[1]: found[2] for found in matches if found})
 
     def numbers(self, key: str, *shape: int) -> Float:
+        """Return the numbers of a key in this shape."""
         if key not in self.entries:
             raise InputError(f"{self.path}: no key {key}; got {', '.join(self.entries)}")
         where = f"{self.path}: {key}"
         return checks.parse_numbers(self.entries[key], where, int(np.prod(shape))).reshape(shape)
 
     def rotation(self, key: str) -> Float:
-        """Return (4,4) of the key's (3,3) rotation."""
+        """Return (4,4) of the (3,3) rotation of a key."""
         T = np.eye(4)
         T[:3, :3] = checks.rotation(self.numbers(key, 3, 3), f"{self.path}: {key}")
         return T
 
     def motion(self, key: str) -> Float:
-        """Return (4,4) of the twelve numbers of a key, the upper rows."""
+        """Return (4,4) of the twelve numbers of a key, its upper rows."""
         return checks.rigid(self.numbers(key, 3, 4), f"{self.path}: {key}")
 
     def pose(self) -> Float:
@@ -175,7 +202,8 @@ class Calibration:
     ) -> Camera:
         """Return the camera of a projection matrix.
 
-        T_rect_lidar: (4,4) to the rectified camera 0, from which P = K [I | t] moves by t.
+        Args:
+            T_rect_lidar: (4,4) to the rectified camera 0, from which P = K [I | t] moves by t.
         """
         P = self.numbers(key, 3, 4)
         onto, T_cam_rect = P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), np.eye(4)

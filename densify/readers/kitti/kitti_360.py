@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""KITTI-360 (Liao, Xie, Geiger, PAMI 2022), as downloaded; its drives are scenes::
+"""Read KITTI-360 (Liao, Xie, Geiger, PAMI 2022) as downloaded.
+
+Its drives are scenes::
 
     data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/{data/0000000000.bin, timestamps.txt}
     data_2d_raw/2013_05_28_drive_0000_sync/image_00/{data_rect/0000000000.png, timestamps.txt}
@@ -12,7 +14,7 @@
 - Points are the HDL-64E's, as measured; their times follow from the azimuth and the usual period.
 - image_00 and image_01 are rectified; image_02 and image_03 are fisheyes to the sides by Mei's
   model, used up to 90 degrees off the axis.
-- Poses are the vehicle's (inertial unit's); where it stood there are none: they are interpolated.
+- Poses are the vehicle's (inertial unit's). There are none where it stood; they are interpolated.
 """
 
 from __future__ import annotations
@@ -40,8 +42,12 @@ _HALF_VIEW_DEG = 90.0
 
 
 def open_recording(path: Path, scene: str | None) -> Kitti360:
-    """See `densify.readers.ReaderModule`. path: the folder that holds data_3d_raw/; scene: a drive
-    such as ``2013_05_28_drive_0000_sync``."""
+    """See `densify.readers.ReaderModule`.
+
+    Args:
+        path: The folder that holds data_3d_raw/.
+        scene: A drive such as ``2013_05_28_drive_0000_sync``.
+    """
     names = sorted(p.parent.name for p in (path / "data_3d_raw").glob("*/velodyne_points"))
     if not names:
         raise InputError(
@@ -54,8 +60,15 @@ class Kitti360(Drive):
     """A drive as a `LidarSequence`."""
 
     def __init__(self, path: Path, drive: str) -> None:
-        """path: the folder that holds data_3d_raw/. Raises InputError if the drive holds no sweeps,
-        or stamps, or the calibration of cameras with images, are missing or malformed."""
+        """Read stamps, poses and calibration of a drive.
+
+        Args:
+            path: The folder that holds data_3d_raw/.
+
+        Raises:
+            InputError: The drive holds no sweeps, or its stamps or the calibration of cameras
+                with images are missing or malformed.
+        """
         velodyne = path / "data_3d_raw" / drive / "velodyne_points"
         around = path / "data_2d_raw" / drive
         images = {name: around / name / folder for name, folder in _FOLDERS.items()}
@@ -72,7 +85,7 @@ class Kitti360(Drive):
         }
 
     def stamp_ns(self, frame: int) -> int:
-        """When the scanner faced forward."""
+        """Return the time at which the scanner faced forward."""
         self.check_frame(frame)
         return checks.of_frame(self._recorded_ns, frame, "stamp", self._stamp_file)
 
@@ -83,7 +96,7 @@ class Kitti360(Drive):
 
     @cached_property
     def _track(self) -> PoseTrack:
-        """The vehicle's, at the stamps of the sweeps of the same number."""
+        """The path of the vehicle, at the stamps of the sweeps of the same number."""
         T_world_pose = {}
         for number, line in enumerate(read_text(self._pose_file).splitlines(), 1):
             where = f"{self._pose_file}: line {number}"
@@ -99,7 +112,7 @@ class Kitti360(Drive):
 
 
 def _T_pose_lidar(folder: Path) -> Float:
-    """(4,4); the scanner is known from camera 0, which is known from the vehicle."""
+    """Return (4,4) the scanner in the vehicle's frame, by way of camera 0."""
     path = folder / "calib_cam_to_velo.txt"
     where = f"{path}: the transform from camera 0 to the scanner"
     T_lidar_cam = checks.rigid(checks.parse_numbers(read_text(path), where, 12), where)
@@ -120,7 +133,7 @@ def _camera(folder: Path, name: str) -> Camera:
 
 
 def _fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
-    """OpenCV writes ``%YAML:1.0`` where YAML has ``%YAML 1.0``."""
+    """Return a fisheye camera. OpenCV writes ``%YAML:1.0`` where YAML has ``%YAML 1.0``."""
     given, _ = parse_yaml(read_text(path).replace("%YAML:1.0", "", 1), path)
     with described_in(path, "image_width, image_height, xi, k1 k2 p1 p2, gamma1 gamma2 u0 v0"):
         lens, onto = given["distortion_parameters"], given["projection_parameters"]

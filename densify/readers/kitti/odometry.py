@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""KITTI odometry (Geiger, Lenz, Urtasun, CVPR 2012) and SemanticKITTI (Behley et al., ICCV 2019),
-which has the same sequences::
+"""Read KITTI odometry (Geiger, Lenz, Urtasun, CVPR 2012) and SemanticKITTI.
+
+SemanticKITTI (Behley et al., ICCV 2019) has the same sequences::
 
     dataset/sequences/00/velodyne/000000.bin   image_2/000000.png   calib.txt   times.txt
     dataset/poses/00.txt   or SemanticKITTI's  dataset/sequences/00/poses.txt
@@ -8,8 +9,8 @@ which has the same sequences::
 - Frames are file numbers. ``times.txt`` has seconds since the first, when camera and scanner faced
   forward; without it frame k is at k times 100 ms.
 - Points are the HDL-64E's, compensated to that time, without times. With poses the compensation is
-  undone in a few rounds: a point's time follows from the azimuth at which it was fired, and that
-  from its time. Without poses ``offset_ns`` is None.
+  undone in a few rounds: the time of a point follows from its azimuth at firing, which depends on
+  its time. Without poses ``offset_ns`` is None.
 - Images are rectified, as large as the first. ``calib.txt`` has their projections and ``Tr``,
   camera 0 from the scanner. Poses are camera 0's, T_first_now: the scanner's are Tr⁻¹ P Tr.
 """
@@ -44,8 +45,12 @@ _NUM_ROUNDS = 3  # the azimuth changes by degrees at most
 
 
 def open_recording(path: Path, scene: str | None) -> KittiOdometry:
-    """See `densify.readers.ReaderModule`. path: a sequence's folder, or one that holds some, or
-    ``sequences/`` with some; scene: a sequence's number such as ``00``."""
+    """See `densify.readers.ReaderModule`.
+
+    Args:
+        path: A sequence's folder, or one that holds some, or ``sequences/`` with some.
+        scene: A sequence's number such as ``00``.
+    """
     if (path / "velodyne").is_dir() and scene is None:
         return KittiOdometry(path)
     folder = path / "sequences" if (path / "sequences").is_dir() else path
@@ -62,8 +67,15 @@ class KittiOdometry(Drive):
     """A sequence as a `LidarSequence`."""
 
     def __init__(self, path: Path) -> None:
-        """path: the sequence's folder. Raises InputError if it holds no sweeps, or times, or the
-        calibration where there are images, are missing or malformed."""
+        """Read times, poses and calibration of a sequence.
+
+        Args:
+            path: Folder of the sequence.
+
+        Raises:
+            InputError: There are no sweeps, or times or the calibration of existing images are
+                missing or malformed.
+        """
         images = {p.name: p for p in sorted(path.glob("image_[0-3]"))}
         super().__init__(path.resolve().name, path, path / "velodyne", path, images)
         self._times = path / "times.txt"
@@ -84,7 +96,7 @@ class KittiOdometry(Drive):
         }
 
     def stamp_ns(self, frame: int) -> int:
-        """When the scanner faced forward, since the first frame."""
+        """Return the time at which the scanner faced forward, since the first frame."""
         self.check_frame(frame)
         return self._time_ns(frame)
 
@@ -105,7 +117,7 @@ class KittiOdometry(Drive):
         return Returns(points, intensity, offset_ns)
 
     def _track_around(self, frame: int) -> PoseTrack | None:
-        """The scanner's, from the poses of the frame and of those beside it; None without two."""
+        """Return the scanner's path around a frame, from the poses beside it; None without two."""
         path, lines = self._pose_lines
         near = [f for f in (frame - 1, frame, frame + 1) if f in lines]
         if len(near) < 2:
@@ -143,7 +155,7 @@ class KittiOdometry(Drive):
 
 
 def _read_times_ns(path: Path) -> dict[int, int]:
-    """Stamps by line, from 0. Raises InputError if one is no number or not after the last."""
+    """Return stamps by line, from 0. Raise InputError if a line is no number or does not ascend."""
     times_ns = StampFile.read(path, "s").stamp_ns
     for number, (before, now) in enumerate(pairwise(times_ns), 2):
         if now <= before:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""KITTI raw drives (Geiger, Lenz, Stiller, Urtasun, "Vision meets Robotics: The KITTI Dataset",
-IJRR 2013), as downloaded: the drive's folder, with the calibration files in its parent. Frame
-numbers are file numbers and files may be missing; line ``frame`` (from 0) of each timestamp file
-belongs to ``frame``.
+"""Read KITTI raw drives as downloaded: a folder, with the calibration files in its parent.
+
+Geiger, Lenz, Stiller, Urtasun, "Vision meets Robotics: The KITTI Dataset", IJRR 2013. Frame numbers
+are file numbers, and files may be missing. Line ``frame`` (from 0) of each timestamp file belongs
+to ``frame``.
 """
 
 from __future__ import annotations
@@ -43,17 +44,20 @@ def open_recording(path: Path, scene: str | None) -> KittiRaw:
 class KittiRaw(Drive):
     """A KITTI raw drive as a `LidarSequence`.
 
-    A sweep's stamp is the middle of the revolution (``velodyne_points/timestamps.txt``, or k times
-    100 ms); a point's time follows from its azimuth and ``timestamps_start.txt``, ``..._end.txt``,
-    without which ``offset_ns`` is None. Poses come from ``oxts/``; the world is the inertial unit's
-    frame at the first oxts file.
+    The stamp of a sweep is the middle of the revolution (``velodyne_points/timestamps.txt``, or k
+    times 100 ms). The time of a point follows from its azimuth and ``timestamps_start.txt``,
+    ``..._end.txt``; without these files ``offset_ns`` is None. Poses come from ``oxts/``. The world
+    is the frame of the inertial unit at the first oxts file.
     """
 
     def __init__(self, path: Path | str) -> None:
         """Read calibration and stamps; everything else is read on demand.
 
-        path: the drive's folder, ``.../2011_09_26/2011_09_26_drive_0013_sync``. Raises InputError
-        if it holds no sweeps, or calibration or stamps are malformed.
+        Args:
+            path: The drive's folder, ``.../2011_09_26/2011_09_26_drive_0013_sync``.
+
+        Raises:
+            InputError: If it holds no sweeps, or calibration or stamps are malformed.
         """
         drive = Path(path)
         velodyne = drive / "velodyne_points"
@@ -81,7 +85,11 @@ class KittiRaw(Drive):
         ]
 
     def stamp_ns(self, frame: int) -> int:
-        """Return a sweep's reference time. Raises InputError for a frame without a stamp."""
+        """Return a sweep's reference time.
+
+        Raises:
+            InputError: For a frame without a stamp.
+        """
         return self._recorded_ns("", frame) if self._recorded else frame * NOMINAL_PERIOD_NS
 
     def _recorded_ns(self, kind: str, frame: int) -> int:
@@ -102,8 +110,11 @@ class KittiRaw(Drive):
         return Returns(points, intensity, offset_ns)
 
     def _exposures_ns(self, camera: str) -> dict[int, int]:
-        """Return when the images that exist were exposed: the recorded stamp less
-        `KITTI_TRIGGER_LATENCY_NS`, or the sweep's reference time where none is recorded."""
+        """Return the exposure times of the existing images.
+
+        They are the recorded stamps less `KITTI_TRIGGER_LATENCY_NS`, or the reference time of the
+        sweep if no stamp is recorded.
+        """
         path, numbers = self.where / camera / "timestamps.txt", self._image_files[camera]
         exposed_ns = self._recorded.get("", {f: f * NOMINAL_PERIOD_NS for f in numbers})
         if path.exists():
@@ -112,9 +123,11 @@ class KittiRaw(Drive):
         return {frame: exposed_ns[frame] for frame in numbers if frame in exposed_ns}
 
     def _pose(self, frame: int) -> Float:
-        """Return the pose by GPS and inertial unit. An oxts record is up to 20 ms away from the
-        sweep of its number, 0.3 m at 15 m/s: the pose is interpolated between the records around
-        the sweep."""
+        """Return the pose by GPS and inertial unit.
+
+        An oxts record is up to 20 ms away from the sweep of its number, which is 0.3 m at 15 m/s.
+        Therefore the pose is interpolated between the records around the sweep.
+        """
         if not self._oxts:
             return super()._pose(frame)
         checks.of_frame(self._oxts, frame, "oxts record", self.where)
@@ -152,11 +165,10 @@ def _camera_folders(drive: Path) -> list[str]:
 
 
 def _read_cameras(drive: Path) -> dict[str, Camera]:
-    """Return the cameras that have a folder in the drive and a rectified calibration in its parent;
-    of a drive without image folders all that are calibrated, if any.
+    """Return the cameras with a folder in the drive and a rectified calibration in its parent.
 
-    ``T_cam_lidar`` is camera 0's rectification after ``calib_velo_to_cam``, moved by the camera's
-    offset in ``P_rect``.
+    Of a drive without image folders all calibrated cameras are returned. ``T_cam_lidar`` is camera
+    0's rectification after ``calib_velo_to_cam``, moved by the camera's offset in ``P_rect``.
     """
     folder, names = drive.resolve().parent, _camera_folders(drive)
     files = [folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"]

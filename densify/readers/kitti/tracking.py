@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""KITTI tracking (Geiger, Lenz, Urtasun, CVPR 2012): the folder ``training`` or ``testing``, whose
-sequences are scenes::
+"""Read KITTI tracking (Geiger, Lenz, Urtasun, CVPR 2012).
+
+The place is the folder ``training`` or ``testing``, whose sequences are scenes::
 
     velodyne/0000/000000.bin   image_02/0000/000000.png   calib/0000.txt   oxts/0000.txt
     label_02/0000.txt    optional: tracked boxes, a line for each object and frame
@@ -12,7 +13,7 @@ sequences are scenes::
 - A label line is ``frame track type truncated occluded alpha left top right bottom height width
   length x y z rotation_y [score]``: x y z of the middle of the box's bottom in the rectified camera
   0, rotation_y about y, 0 where the front is along x, at the time at which the scanner faced it.
-  Only what image_02 shows is labelled; in ``DontCare`` rectangles there may be more.
+  Only objects in view of image_02 are labelled; ``DontCare`` rectangles may hold more.
 """
 
 from __future__ import annotations
@@ -44,8 +45,12 @@ _T_CAM_UPRIGHT = np.array(  # from x right, y forward, z up
 
 
 def open_recording(path: Path, scene: str | None) -> KittiTracking:
-    """See `densify.readers.ReaderModule`. path: the folder that holds velodyne/; scene: a sequence
-    such as ``0000``."""
+    """See `densify.readers.ReaderModule`.
+
+    Args:
+        path: The folder that holds velodyne/.
+        scene: A sequence such as ``0000``.
+    """
     names = sorted(p.name for p in (path / "velodyne").glob("*") if p.is_dir())
     if not names:
         raise InputError(f"{path}: no KITTI tracking; expected folders such as velodyne/0000 in it")
@@ -53,12 +58,22 @@ def open_recording(path: Path, scene: str | None) -> KittiTracking:
 
 
 class KittiTracking(Drive):
-    """A sequence as a `LidarSequence`, stamped as the scanner faced forward, at the nominal
-    rate."""
+    """A sequence as a `LidarSequence`, at the nominal rate.
+
+    The stamp of a sweep is the time at which the scanner faced forward.
+    """
 
     def __init__(self, path: Path, scene: str) -> None:
-        """path: the folder that holds velodyne/. scene: the sequence. Raises InputError if it holds
-        no sweeps, or the calibration where there are images is missing or malformed."""
+        """Read the calibration of a sequence.
+
+        Args:
+            path: The folder that holds velodyne/.
+            scene: The sequence.
+
+        Raises:
+            InputError: There are no sweeps, or the calibration of existing images is missing or
+                malformed.
+        """
         images = {folder.name: folder / scene for folder in sorted(path.glob("image_0[0-3]"))}
         name = f"{path.resolve().name}/{scene}"
         super().__init__(name, path, path / "velodyne" / scene, path, images)
@@ -86,8 +101,13 @@ class KittiTracking(Drive):
         return T_world_imu @ poses.inverse(T_lidar_imu)
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `LidarSequence`; ``testing`` has none. Without images the smallest size of KITTI's is
-        assumed. Raises InputError for labels or a calibration that are missing or malformed."""
+        """See `LidarSequence`; ``testing`` has none.
+
+        Without images the smallest size of KITTI's is assumed.
+
+        Raises:
+            InputError: For labels or a calibration that are missing or malformed.
+        """
         self.check_frame(frame)
         path = self.where / "label_02" / self._scene_file
         if not path.is_file():
@@ -113,7 +133,7 @@ class KittiTracking(Drive):
 
     @cached_property
     def _T_rect_lidar(self) -> Float:
-        """(4,4) the rectified camera 0 from the scanner."""
+        """The (4,4) pose of the scanner in the rectified camera 0."""
         return self._calibration.rotation("R_rect") @ self._calibration.motion("Tr_velo_cam")
 
     def _camera(self, name: str, size_px: tuple[int, int]) -> Camera:
@@ -121,8 +141,11 @@ class KittiTracking(Drive):
 
 
 def read_labels(path: Path) -> tuple[Float, Bool]:
-    """Return the (n,16) numbers of the lines, without the type, and an (n,) mask of the
-    ``DontCare`` rectangles. Raises InputError for a malformed line."""
+    """Return the (n,16) numbers of the lines, without the type, and an (n,) mask of ``DontCare``.
+
+    Raises:
+        InputError: A line is malformed.
+    """
     rows, is_area = [], []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
