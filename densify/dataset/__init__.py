@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""A training set of every key of whole recordings."""
+"""Make a training set of every key of whole recordings."""

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Calls done in this process, or by a standard executor: several processes of this machine, or the
-workers of a Dask scheduler.
+"""Do calls in this process, in several processes of this machine, or on a Dask scheduler.
 
 This module imports nothing heavy: a worker process loads it before it knows its number of threads.
 """
@@ -48,17 +47,23 @@ def call_all(
     log: Path | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[Item, Any]]:
-    """Call ``call(item)`` for every item and yield each with its outcome as soon as it is over.
+    """Call ``call(item)`` for every item, and yield each item with its outcome when it is done.
 
-    call: a function of a module. groups: none empty, of hashable and picklable items; the first of
-    a group is over before the others begin, which then find what they share in the cache.
-    num_workers: processes; 1 is this one. log: the file to which other processes append their log.
-    scheduler: address of a Dask scheduler whose workers are used instead.
+    An item whose process dies is tried once more, alone. Then its outcome is a ComputationError.
+    InputError and ComputationError of ``call`` are raised. Any other error becomes the outcome of
+    the item, as a ComputationError.
 
-    An item whose process dies is tried once more, alone; then its outcome is a ComputationError.
-    InputError and ComputationError of ``call`` are raised, any other error is the item's outcome as
-    a ComputationError. Raises ComputationError if the workers cannot begin or the scheduler is
-    lost, InputError if it is not reached.
+    Args:
+        call: A function of a module.
+        groups: None empty, of hashable and picklable items. The first item of a group is done
+            before the others begin, which then find shared results in the cache.
+        num_workers: Number of processes; 1 is this one.
+        log: The file to which other processes append their log.
+        scheduler: Address of a Dask scheduler whose workers are used instead.
+
+    Raises:
+        ComputationError: The workers cannot begin, or the scheduler is lost.
+        InputError: The scheduler is not reached.
     """
     if num_workers == 1 and scheduler is None:
         for group in groups:
@@ -84,8 +89,11 @@ def call_all(
 
 @contextmanager
 def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
-    """Append what this process, or one thread of it, logs below ``densify`` to a file. Raises
-    OutputError if it cannot be written."""
+    """Append the log below ``densify`` of this process, or of one thread of it, to a file.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
     try:
         handler = logging.FileHandler(path, encoding="utf-8")
     except OSError as error:
@@ -121,8 +129,10 @@ def _call_logged(call: Callable[[Item], Any], log: Path | None, item: Item) -> A
 def _until_a_death(
     call: Callable[[Item], Any], waiting: deque[Item], workers: _Workers
 ) -> Iterator[tuple[Item, Any]]:
-    """Call what waits until nothing does or a process dies, which costs all that are at work: their
-    outcome is a BrokenExecutor."""
+    """Call the waiting items until none is left or a process dies.
+
+    A death costs all items at work: their outcome is a BrokenExecutor.
+    """
     running: dict[Future[Any], Item] = {}
     with workers as (executor, num_at_once):
         is_broken = False
@@ -141,7 +151,7 @@ def _until_a_death(
 
 
 def _outcome(result: Callable[[], Any]) -> Any:
-    """Return a call's value, the BrokenExecutor, or an error that costs this item alone."""
+    """Return the value of a call, the BrokenExecutor, or an error of this item alone."""
     try:
         return result()
     except BrokenExecutor as error:
@@ -154,7 +164,7 @@ def _outcome(result: Callable[[], Any]) -> Any:
 
 @contextmanager
 def _open_pool(num_workers: int) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """Open processes of this machine, which end with the block, whatever they are at."""
+    """Open processes of this machine, which end with the block, finished or not."""
     spawn, before = multiprocessing.get_context("spawn"), multiprocessing.active_children()
     environment = share_of_cores(num_workers)
     with ProcessPoolExecutor(num_workers, spawn, _begin, (environment,)) as pool:
@@ -201,7 +211,7 @@ def _open_dask(scheduler: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
 
 
 def _begin(environment: dict[str, str]) -> None:
-    """Begin a worker process."""
+    """Set up a worker process."""
     os.environ.update(environment)
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the command ends its workers

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One key of a training set: made by any process, written, and described by its record."""
+"""Make one key of a training set in any process, write it, and describe it by its record."""
 
 from __future__ import annotations
 
@@ -34,9 +34,12 @@ _log = logging.getLogger("densify")
 class Job:
     """A recording of a set, as every process opens it.
 
-    drive, data, folder, cameras: as `densify.dataset.plan.Drive`, the cameras' names. out: the
-    set's folder. run: another text for each run, because files may change between runs while
-    workers live on. version: of the densify that gives the job.
+    Attributes:
+        drive: As in `densify.dataset.plan.Drive`; data, folder and cameras too.
+        out: Folder of the set.
+        run: Another text for each run, because files may change between runs while workers live
+            on.
+        version: Version of the densify that gives the job.
     """
 
     drive: str
@@ -50,7 +53,7 @@ class Job:
 
 
 def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
-    """Make and write one key. Raises OutputError if it cannot be written, which holds for all."""
+    """Make and write one key. Raise OutputError, which stops the set, if it cannot be written."""
     job, key = job_and_key
     start_s = time.perf_counter()
     try:
@@ -96,8 +99,11 @@ def _made(job: Job, key: int) -> KeyRecord:
 
 
 def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scores of a manifest: ``num_points``, ``num_moving``, ``ghost``, and by camera
-    ``density``, ``density_filled``, ``outliers`` and ``mae_m`` of the key held out."""
+    """Return the scores of a manifest.
+
+    They are ``num_points``, ``num_moving``, ``ghost``, and by camera ``density``,
+    ``density_filled``, ``outliers`` and ``mae_m`` of the key held out.
+    """
     held_out = metrics["held_out"] or {}
     errors = {name: scores["measured"]["all"] for name, scores in held_out.items()}
     return {

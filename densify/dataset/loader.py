@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A training set of `densify dataset --layout kitti-depth`, read back as a torch dataset. Images
-come from the recordings it was made of."""
+"""Read a training set of `densify dataset --layout kitti-depth` as a torch dataset.
+
+Images come from the recordings of the set.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +96,11 @@ class DepthDataset(Dataset[dict[str, Any]]):
         return len(self._samples)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """Return the sample; see the class. Raises InputError for what is missing or damaged."""
+        """Return a sample, see the class.
+
+        Raises:
+            InputError: For missing or damaged files.
+        """
         name, camera_name, frame = self._samples[index]
         drive = self._drives[name]
         camera, K = drive.cameras[camera_name], drive.cameras[camera_name].K.copy()
@@ -175,7 +181,7 @@ def _map_path(drive: Drive, kind: str, camera: str, frame: int) -> str:
 
 
 def _of_size(camera: Camera, where: str, image: NDArray[Any]) -> NDArray[Any]:
-    """Return the image. Raises InputError unless it has the camera's size."""
+    """Return the image. Raise InputError if its size is not that of the camera."""
     height_px, width_px = image.shape[:2]
     if (height_px, width_px) != (camera.height_px, camera.width_px):
         raise InputError(

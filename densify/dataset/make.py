@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make a training set: plan it, see what is finished, make the rest, record every key."""
+"""Make a training set: plan it, find the finished keys, make the others, record every key."""
 
 from __future__ import annotations
 
@@ -50,8 +50,13 @@ Block = tuple[Drive, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class Summary:
-    """How far a set is, or a shard's part of it. records: of keys that were ever tried. num_keys:
-    that are wanted. num_made: in this run, within ``seconds``."""
+    """The state of a set, or of the part of a shard.
+
+    Attributes:
+        records: Of keys that were ever tried.
+        num_keys: Number of wanted keys.
+        num_made: Number of keys made in this run, within ``seconds``.
+    """
 
     records: Mapping[Key, KeyRecord]
     num_keys: int
@@ -59,14 +64,16 @@ class Summary:
     seconds: float = 0.0
 
     def count(self, status: str) -> int:
+        """Return the number of keys of this status."""
         return sum(record.status == status for record in self.records.values())
 
     @property
     def num_left(self) -> int:
+        """The number of keys that are still to be made."""
         return self.num_keys - len(self.records)
 
     def mean(self, score: str) -> float | None:
-        """Return the mean over the keys that are done, and their cameras."""
+        """Return the mean of a score over the finished keys and their cameras."""
         values: list[Any] = []
         for record in self.records.values():
             value = record.scores.get(score) if record.status == "done" else None
@@ -153,7 +160,11 @@ def make_dataset(
 
 
 def status(out: Path) -> Summary:
-    """Return how far a set is, finished or not. Raises InputError if ``out`` holds none."""
+    """Return how far a set is, finished or not.
+
+    Raises:
+        InputError: If ``out`` holds none.
+    """
     table = read_plan(out)
     if table is None:
         raise InputError(f"--status {out}: no dataset.json in it; expected a set's folder")
@@ -163,14 +174,16 @@ def status(out: Path) -> Summary:
 
 
 def damaged(out: Path) -> list[str]:
-    """Return the files of finished keys, relative to ``out``, that are missing or hold something
-    else than was written, by the hashes in the manifest."""
+    """Return the files of finished keys, relative to ``out``, that are missing or changed.
+
+    A file is changed if its hash is not that of the manifest.
+    """
     records = read_manifests(out).values()
     return [name for r in records if r.status != "failed" for name in damaged_files(r, out)]
 
 
 def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[Drive]) -> int:
-    """Return the number wanted; if None, as many as cores, free memory and keys suffice for."""
+    """Return the wanted number; for None as many as cores, free memory and keys allow."""
     if wanted is not None:
         if wanted < 1:
             raise InputError(f"--workers {wanted}: expected 1 or more processes")
@@ -182,7 +195,7 @@ def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[Drive]) 
 
 
 def _free_bytes() -> float:
-    """Return the memory that the system has free, in a container its limit if that is less."""
+    """Return the free memory of the system, or the limit of a container if that is less."""
     found = []
     with suppress(OSError, ValueError, TypeError):
         table = Path("/proc/meminfo").read_text()
@@ -192,7 +205,7 @@ def _free_bytes() -> float:
 
 
 def _blocks(drives: Sequence[Drive], shard: tuple[int, int] | None) -> list[Block]:
-    """Return the blocks of all drives, or the neighbouring ones of a shard."""
+    """Return the blocks of all drives, or the consecutive ones of a shard."""
     i, n = shard or (1, 1)
     blocks = [(drive, keys) for drive in drives for keys in drive.blocks]
     return blocks[len(blocks) * (i - 1) // n : len(blocks) * i // n]
@@ -201,7 +214,7 @@ def _blocks(drives: Sequence[Drive], shard: tuple[int, int] | None) -> list[Bloc
 def _jobs(
     blocks: Sequence[Block], done: Collection[Key], recipe: Recipe, out: Path, num_workers: int
 ) -> list[list[tuple[Job, int]]]:
-    """Return the keys to make, in groups: the first key of a block makes what all of them share."""
+    """Return the keys to make, in groups. The first key of a block makes what all of them share."""
     run, groups = uuid4().hex, []
     for drive, keys in blocks:
         cameras, place = tuple(drive.cameras), out.absolute()
@@ -220,8 +233,11 @@ def _record(
     num_keys: int,
     report: Callable[[Summary], None] | None,
 ) -> Summary:
-    """Record and report every key. made: of `call_all`. records: those before, to which the new
-    ones are added. If it ends early, it tells what is kept; a full disk is a ComputationError."""
+    """Record and report every key.
+
+    If it ends early, it says what is kept; a full disk is a ComputationError. made: of `call_all`.
+    records: earlier ones, to which the new ones are added.
+    """
     start_s = time.monotonic()
     summary = Summary(records, num_keys)
     try:

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""The record of what was made: ``OUT/manifest.jsonl``, or ``OUT/manifest-2of4.jsonl`` of the second
-of four shards, one JSON line per key::
+"""Record the keys of a set, one JSON line for each.
+
+The file is ``OUT/manifest.jsonl``, or ``OUT/manifest-2of4.jsonl`` of the second of four shards::
 
     drive, key       the recording's name and the frame number
     status, reason   done, aside (made, but not good enough to be in the set) or failed, and why
     frames           of the sweeps it was made of
     files            path relative to OUT, with slashes -> bytes, sha256
-    scores           numbers; null where nothing can be said
+    scores           numbers; null if unknown
     seconds          of computing
-    warnings         sentences about what was assumed or looks wrong
+    warnings         sentences about assumptions and suspicions
 
-A line is on the disk before the next is begun: a killed writer damages at most the last, whose key
-is made again. A later line of a key replaces an earlier one.
+A line is on the disk before the next one begins. A killed writer damages at most the last line,
+whose key is made again. A later line of a key replaces an earlier one.
 """
 
 from __future__ import annotations
@@ -54,10 +55,11 @@ class KeyRecord:
 
     @property
     def name(self) -> Key:
+        """The drive and the key."""
         return self.drive, self.key
 
     def to_line(self) -> bytes:
-        """Return one line of JSON with its end; the same record gives the same bytes."""
+        """Return one line of JSON with its end. The same record gives the same bytes."""
         files = {
             name: {"bytes": file.num_bytes, "sha256": file.sha256}
             for name, file in sorted(self.files.items())
@@ -67,7 +69,7 @@ class KeyRecord:
 
     @staticmethod
     def from_line(line: bytes) -> KeyRecord:
-        """Read a line, without fields of later versions. Raises ValueError if it is damaged."""
+        """Return the record of a line, without later fields. Raise ValueError for damage."""
         try:
             fields = parse_json(line, "a line")
             files = fields["files"].items()
@@ -89,9 +91,11 @@ class KeyRecord:
 def read_manifests(root: Path) -> dict[Key, KeyRecord]:
     """Return the records of all manifests in a folder, ordered by drive and key.
 
-    Of several lines of a key in one file the last one counts; between the files of shards one that
-    is done, else one put aside. Warns of damaged lines before the last. Raises InputError if a
-    manifest cannot be read.
+    Of several lines of a key in one file the last one counts. Of several shards a finished one
+    counts, else one put aside. Damaged lines before the last give a warning.
+
+    Raises:
+        InputError: A manifest cannot be read.
     """
     rank = _STATUSES.index
     records: dict[Key, KeyRecord] = {}
@@ -103,9 +107,10 @@ def read_manifests(root: Path) -> dict[Key, KeyRecord]:
 
 
 def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> list[str]:
-    """Return the record's files, relative to ``root``, that are missing or hold something else.
+    """Return the record's files, relative to ``root``, that are missing or changed.
 
-    by_content: compare their hashes too, else their sizes alone.
+    Args:
+        by_content: Compare the hashes too, else the sizes alone.
     """
     damaged = []
     for name, file in record.files.items():
@@ -123,7 +128,8 @@ def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> lis
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
     """Return the keys that need not be made again: done or put aside, with all their files.
 
-    verify: compare the files' contents with the recorded hashes too, else only their sizes.
+    Args:
+        verify: Compare the hashes of files too, else only their sizes.
     """
     return {
         r.name
@@ -136,13 +142,21 @@ def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> 
 class Manifest:
     """The manifest of one run, or of one shard, while it is written; a context manager.
 
-    root: the folder of the set, made if it is not there. shard: (k, n) for the k-th of n, from 1.
     One process at a time has it open, by a hidden lock file that stays. On opening and closing the
-    lines are put in order: one per key, by drive and key. Raises InputError if another process has
-    it open or it cannot be read, OutputError if it cannot be written.
+    lines are put in order: one per key, by drive and key.
     """
 
     def __init__(self, root: Path, shard: tuple[int, int] | None = None) -> None:
+        """Prepare a manifest.
+
+        Args:
+            root: Folder of the set, made if needed.
+            shard: (k, n) for the k-th of n, from 1.
+
+        Raises:
+            InputError: Another process has it open, or it cannot be read.
+            OutputError: It cannot be written.
+        """
         stem = "manifest" if shard is None else f"manifest-{shard[0]}of{shard[1]}"
         self.path = root / f"{stem}.jsonl"
         try:
@@ -166,8 +180,11 @@ class Manifest:
         os.close(self._lock)
 
     def append(self, record: KeyRecord) -> None:
-        """Add a key's record, or replace it. It is on the disk when this returns. Raises
-        OutputError if it cannot be written."""
+        """Add or replace the record of a key. It is on the disk when this returns.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
         try:
             with self.path.open("ab") as file:
                 file.write(record.to_line())
@@ -189,7 +206,7 @@ class Manifest:
 
 
 def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
-    """Return the last record of each key with its line; {} if there is no such file."""
+    """Return the last record of each key with its line, {} without a file."""
     lines = read_bytes(path).split(b"\n") if path.exists() else [b""]
     records, damaged = {}, []
     for number, line in enumerate(lines, start=1):
@@ -212,7 +229,7 @@ def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
 
 
 def _lock(lock: int, root: Path) -> None:
-    """Take the lock, which goes with the process however that ends."""
+    """Take the lock, which ends with the process in any case."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:

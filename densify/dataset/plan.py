@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""The plan of a training set: which keys of which recordings, and how they are made.
+"""Plan a training set: the keys of the recordings, and how they are made.
 
-``OUT/dataset.json`` holds it, so that a later run goes on with the same set:
+``OUT/dataset.json`` holds the plan, with which a later run continues the set:
 
     schema_version, densify (version)
     layout, method, window, cameras, gate, config    of every key
-    drives    name -> data (what ``--data`` says), folder (of the tree, in OUT), frames (planned
+    drives    name -> data (text of ``--data``), folder (of the tree, in OUT), frames (planned
               keys, as [first, last] runs), cameras (name -> width_px, height_px, K, T_cam_lidar,
               distortion, model, max_angle_deg, row_time_s, column_time_s)
 """
@@ -47,7 +47,7 @@ _CAMERA = [f.name for f in fields(Camera) if f.name != "name"]
 
 @dataclass(frozen=True)
 class Gate(Section):
-    """``--set dataset.NAME=VALUE``: limits of the scores beyond which a key is put aside.
+    """Limits of the scores beyond which a key is put aside: ``--set dataset.NAME=VALUE``.
 
     None is no limit. The scores need no ground truth.
 
@@ -66,7 +66,7 @@ class Gate(Section):
     split: str = one_of("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
-        """Return why a key with these `scores` is put aside; None if it is not."""
+        """Return why a key with these `scores` is put aside, None for a good key."""
         ghost, outliers = scores["ghost"], scores["outliers"]
         if self.min_sweeps is not None and num_sweeps < self.min_sweeps:
             return f"{num_sweeps} sweeps, expected at least {self.min_sweeps}"
@@ -118,9 +118,12 @@ class Recipe:
 class Drive:
     """A recording of a set.
 
-    name: as a folder's. data: what ``--data`` takes, with an absolute path. folder: of its files,
-    relative to the set's. cameras: those wanted. blocks: its keys, ascending, those together that
-    share the steps of the pipeline.
+    Attributes:
+        name: Name of its folder.
+        data: Text of ``--data``, with an absolute path.
+        folder: Folder of its files, relative to the set.
+        cameras: The wanted cameras.
+        blocks: Its keys, ascending. Keys of a block share steps of the pipeline.
     """
 
     name: str
@@ -131,15 +134,22 @@ class Drive:
 
     @property
     def keys(self) -> tuple[int, ...]:
+        """All keys, ascending."""
         return tuple(chain.from_iterable(self.blocks))
 
 
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]:
     """Open every recording and choose its keys.
 
-    data: what ``--data`` takes. keys: all if None, else of the frames ``start`` to ``stop`` - 1 by
-    ``step`` those that exist, of every recording. Raises InputError for recordings that cannot be
-    opened, have equal names, no such camera, or none of the keys.
+    Args:
+        data: Recordings, as ``--data`` takes them.
+        keys: None for all, else the existing frames ``start`` to ``stop`` - 1 by ``step``, of
+            every recording.
+        recipe: How keys are made.
+
+    Raises:
+        InputError: A recording cannot be opened, two have equal names, or there is no such
+            camera or key.
     """
     drives: dict[str, Drive] = {}
     for spec in data:
@@ -180,7 +190,7 @@ def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, 
 
 
 def check_place(out: Path) -> None:
-    """Raise InputError if anything but a set, or the beginnings of one, is there."""
+    """Raise InputError if the folder holds anything but a set, or the beginning of one."""
     begun = (".", "manifest")  # files of a run before there is a dataset.json
     names = [path.name for path in out.iterdir()] if out.is_dir() else []
     if read_plan(out) is None and not all(name.startswith(begun) for name in names):
@@ -188,9 +198,11 @@ def check_place(out: Path) -> None:
 
 
 def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
-    """Begin a set, or widen one made the same way.
+    """Begin a set, or extend one that is made the same way.
 
-    Raises InputError if another set is there, OutputError if it cannot be written.
+    Raises:
+        InputError: Another set is there.
+        OutputError: It cannot be written.
     """
     table = _table(recipe, drives)
     before = read_plan(out)
@@ -203,7 +215,11 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
-    """Return dataset.json; None if there is none. Raises InputError for a damaged one."""
+    """Return dataset.json, None if there is none.
+
+    Raises:
+        InputError: For a damaged one.
+    """
     path = out / _FILE
     if not path.is_file():
         return None
@@ -224,7 +240,7 @@ def read_plan(out: Path) -> dict[str, Any] | None:
 
 
 def drives_of(table: Mapping[str, Any]) -> dict[str, Drive]:
-    """Return the recordings of what `read_plan` gave, by name, each as one block."""
+    """Return the recordings in the result of `read_plan`, by name, each as one block."""
     found = {}
     for name, drive in table["drives"].items():
         cameras = {n: _camera(n, camera) for n, camera in drive["cameras"].items()}

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Pages in their places: ``report.html`` of a run or a training set, ``compare.html`` of a
-comparison. The page of a training set is one table."""
+"""Write pages: ``report.html`` of a run or a training set, ``compare.html`` of a comparison.
+
+The page of a training set is one table.
+"""
 
 from __future__ import annotations
 
@@ -42,12 +44,17 @@ def write_comparison_page(folder: Path) -> Path:
 
 
 def write_report(place: Path, overwrite: bool = False) -> list[Path]:
-    """Make the page or pages of what lies in a folder; return them: ``report.html`` of a run or a
-    set, ``compare.html`` of a comparison, beside their files.
+    """Make the pages of a folder and return them.
 
-    place: a key's folder, the folder above it if it holds no other, or a training set. Raises
-    InputError for a folder that is none of these, one whose main files are damaged, and a page that
-    is there already, OutputError if it cannot be written.
+    They are ``report.html`` of a run or a set, and ``compare.html`` of a comparison, beside their
+    files.
+
+    Args:
+        place: Folder of a key, the folder above it if it holds no other, or a training set.
+
+    Raises:
+        InputError: The folder is none of these, its main files are damaged, or a page exists.
+        OutputError: A page cannot be written.
     """
     pages = _pages(place)
     for path in pages:
@@ -59,7 +66,7 @@ def write_report(place: Path, overwrite: bool = False) -> list[Path]:
 
 
 def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
-    """Return path -> what makes the page."""
+    """Return path -> function that makes the page."""
     if not place.is_dir():
         raise InputError(
             f"{place}: no such folder; expected what densify run, compare or dataset wrote"
@@ -85,8 +92,10 @@ def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
 
 
 def _set_page(root: Path) -> bytes:
-    """Return the page of a training set: its keys, the failed ones and those with the highest
-    ghost rate first."""
+    """Return the page of a training set.
+
+    Its first keys are the failed ones and those with the highest ghost rate.
+    """
     table, records = read_plan(root) or {}, read_manifests(root)
     counts = Counter[str](record.status for record in records.values())
     counts["to make"] = len(planned_keys(table) - records.keys())
@@ -103,7 +112,7 @@ def _set_page(root: Path) -> bytes:
 
 
 def _badness(record: KeyRecord) -> tuple[Any, ...]:
-    """Return what records are ordered by."""
+    """Return the sort key of a record."""
     ghost = record.scores.get("ghost")
     share = ghost if isinstance(ghost, int | float) else 0.0
     return _STATUSES.index(record.status), -share, record.name

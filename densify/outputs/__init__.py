@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The files of a result, each whole or not there, their exports and the report page."""
+"""Write the files of a result, each whole or absent, their exports and the report page."""
 
 from densify.outputs.cloud_laz import StoredCloud, read_cloud, write_cloud
 from densify.outputs.depth_png import (

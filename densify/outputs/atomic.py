@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Files and folders that appear when they are complete: written in a hidden folder, renamed. The
-folders above them are made. What cannot be written is an OutputError that names the place. And
-values as JSON and YAML can say them."""
+"""Write files and folders that appear when they are complete.
+
+They are written in a hidden folder, then renamed. Missing folders above them are made. A failure to
+write is an OutputError that names the place.
+"""
 
 from __future__ import annotations
 
@@ -24,14 +26,14 @@ LEFT_AFTER_S = 600.0  # no file takes as long to write
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write or replace a file. On any failure the old file stays and nothing is left aside."""
+    """Write or replace a file. On any failure the old file stays, and nothing else is left."""
     with file_aside(path) as aside:
         aside.write_bytes(data)
 
 
 @contextmanager
 def file_aside(path: Path) -> Iterator[Path]:
-    """Yield a place to write a file to, which becomes ``path`` when the block ends well."""
+    """Yield a temporary path, which becomes ``path`` if the block ends without an error."""
     with _hidden_folder(path) as hidden:
         yield hidden / path.name
         os.replace(hidden / path.name, path)
@@ -39,10 +41,13 @@ def file_aside(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
-    """Yield a folder to write into, which becomes ``folder`` when the block ends well. On any
-    exception ``folder`` and the folders above it are as they were before.
+    """Yield a folder to write into, which becomes ``folder`` if the block ends without an error.
 
-    owned: entries of the writer, replaced or removed where ``folder`` exists. Others are kept.
+    On any exception ``folder`` and the folders above it are as they were before.
+
+    Args:
+        owned: Entries of the writer, which are replaced or removed if ``folder`` exists. Others
+            are kept.
     """
     folder = Path(os.path.realpath(folder))
     missing = [place for place in folder.parents if not place.exists()]
@@ -72,9 +77,9 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
 
 
 def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
-    """Remove the hidden folders that killed processes left anywhere under `root`.
+    """Remove the hidden folders that killed processes left anywhere under ``root``.
 
-    A folder younger than `age_s` seconds stays, as another process may be writing there.
+    A folder younger than ``age_s`` seconds stays, because another process may be writing there.
     """
     for folder, names, _ in os.walk(root):  # passes over what others remove meanwhile
         for name in names:
@@ -103,8 +108,10 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Numpy's numbers as Python's, tuples as lists, and None for what JSON cannot say (not finite
-    numbers); for the files that people and other programs read."""
+    """Return a value as JSON and YAML can write it.
+
+    Numpy's numbers become Python's, tuples lists, and numbers that are not finite None.
+    """
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

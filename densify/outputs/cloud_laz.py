@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The accumulated cloud as LAZ (LAS 1.4, point format 7) for CloudCompare, PDAL and QGIS."""
+"""Write the accumulated cloud as LAZ (LAS 1.4, point format 7) for CloudCompare, PDAL and QGIS."""
 
 from __future__ import annotations
 
@@ -38,11 +38,19 @@ _STANDARD_DIMENSIONS = {"intensity", "gps_time", "red", "green", "blue"}
 
 @dataclass(frozen=True)
 class StoredCloud:
-    """M points as they were written, key frame, metres, rounded to the millimetre.
+    """M points as they are stored: key frame, metres, rounded to the millimetre.
 
-    frame, instance: (M,) int32. moving, far: (M,) bool. confidence, displaced, intensity: (M,)
-    float32. rgb: (M,3) uint8, 0 where no camera observed the point. displacement: (M,3) float32
-    metres beyond the rigid alignment. gps_time: (M,) seconds, see `write_cloud`.
+    Attributes:
+        frame: (M,) int32 source sweep.
+        instance: (M,) int32 object, -1 for none.
+        moving: (M,) bool.
+        far: (M,) bool.
+        confidence: (M,) float32.
+        displaced: (M,) float32 metres.
+        intensity: (M,) float32.
+        rgb: (M,3) uint8, 0 where no camera observed the point.
+        displacement: (M,3) float32 metres beyond the rigid alignment.
+        gps_time: (M,) seconds, see `write_cloud`.
     """
 
     points: Float
@@ -59,12 +67,12 @@ class StoredCloud:
 
     @property
     def rigid_points(self) -> Float:
-        """(M,3) positions by registration alone."""
+        """The (M,3) positions of rigid accumulation."""
         return self.points - self.displacement
 
     @property
     def stamp_ns(self) -> Int:
-        """(M,) reference time of the sweep that measured the point, to the microsecond."""
+        """The (M,) reference times of the source sweeps, to the microsecond."""
         return np.rint(self.gps_time * 1e6).astype(np.int64) * 1000 + _LAS_EPOCH_NS
 
     def select(self, keep: Bool | Int) -> StoredCloud:
@@ -72,9 +80,12 @@ class StoredCloud:
         return StoredCloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return (M,) columns: x y z displaced_x displaced_y displaced_z red green blue intensity
-        confidence displaced frame instance gps_time moving far. Booleans are uint8. Positions are
-        float32, which keeps the millimetre up to 8 km."""
+        """Return the columns (M,) by name.
+
+        They are x y z displaced_x displaced_y displaced_z red green blue intensity confidence
+        displaced frame instance gps_time moving far. Booleans are uint8. Positions are float32,
+        which keeps the millimetre up to 8 km.
+        """
         names = ("intensity", "confidence", "displaced", "frame", "instance", "gps_time")
         return {
             **dict(zip("xyz", self.points.T.astype(np.float32), strict=True)),
@@ -88,10 +99,17 @@ class StoredCloud:
 def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     """Write a cloud with the extra dimensions of `_EXTRA_DIMENSIONS`.
 
-    stamp_ns: the key's reference time; the header's date is its day. ``gps_time`` is that of the
-    sweep that measured the point, as LAS 1.4 has it: seconds since 1980-01-06 less 10^9, without
-    leap seconds. Coordinates are rounded to 1 mm, intensity and colour widened to 16 bits. The same
-    cloud gives the same bytes. Raises ValueError for coordinates not finite or beyond 2,147 km.
+    ``gps_time`` is that of the source sweep, as LAS 1.4 has it: seconds since 1980-01-06 less 10^9,
+    without leap seconds. Coordinates are rounded to 1 mm, intensity and colour widened to 16 bits.
+    The same cloud gives the same bytes.
+
+    Args:
+        path: The file.
+        cloud: The cloud.
+        stamp_ns: Reference time of the key. The date in the header is its day.
+
+    Raises:
+        ValueError: A coordinate is not finite or beyond 2,147 km.
     """
     import laspy
 
@@ -123,7 +141,11 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
 
 
 def read_cloud(path: Path) -> StoredCloud:
-    """Read what `write_cloud` wrote. Raises InputError for any other file."""
+    """Return a cloud that `write_cloud` wrote.
+
+    Raises:
+        InputError: For any other file.
+    """
     las = read_las(path)
     known = {*_STANDARD_DIMENSIONS, *(name for name, _, _ in _EXTRA_DIMENSIONS)}
     if missing := known - set(las.point_format.dimension_names):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Depth, confidence, age, optical flow and pictures as PNG and JPEG.
+"""Read and write depth, confidence, age, optical flow and pictures as PNG and JPEG.
 
 Depth is in the format of KITTI's depth completion benchmark (Uhrig et al., "Sparsity Invariant
 CNNs", 3DV 2017): 16 bit, one channel, ``value / 256`` metres, 0 = none.
@@ -35,22 +35,33 @@ def encode_png(image: NDArray[np.uint16] | NDArray[np.uint8]) -> bytes:
 
 
 def encode_jpeg(picture: Picture, quality: int = 92) -> bytes:
-    """Return the JPEG of an RGB picture. quality: 0 to 100; lower is smaller, with blocks."""
+    """Return the JPEG of an RGB picture.
+
+    Args:
+        quality: 0 to 100. A lower one is smaller, with blocks.
+    """
     bgr = np.ascontiguousarray(picture[:, :, ::-1])
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def map_path(folder: Path, kind: str, name: str, suffix: str = ".png") -> Path:
-    """Return ``folder/kind/name.png``. A map of one image of several (``project.per=image``) is
-    named ``CAMERA/NUMBER``."""
+    """Return ``folder/kind/name.png``.
+
+    With ``project.per=image`` the name of a map is ``CAMERA/NUMBER``.
+    """
     return folder / kind / f"{name}{suffix}"
 
 
 def write_depth_png(path: Path, depth_m: Float32) -> None:
     """Write ``rint(256 * depth_m)``.
 
-    depth_m: (H,W) metres, 0 none. Depths beyond 65535/256 = 256 m and below half a step, 2 mm,
-        become 0, none. Raises ValueError for depths that are negative or not finite.
+    Depths beyond 65535/256 = 256 m and below half a step, 2 mm, become 0, none.
+
+    Args:
+        depth_m: (H,W) metres, 0 none.
+
+    Raises:
+        ValueError: A depth is negative or not finite.
     """
     write_file(path, encode_png(_quantised(depth_m)))
 
@@ -58,7 +69,9 @@ def write_depth_png(path: Path, depth_m: Float32) -> None:
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
     """Write `stored_confidence` as 8 bit, 0 where `write_depth_png` has no depth.
 
-    confidence: (H,W), 0 to 1. depth_m: (H,W) metres, the depth it belongs to.
+    Args:
+        confidence: (H,W), 0 to 1.
+        depth_m: (H,W) metres, the depth it belongs to.
     """
     levels = np.zeros(depth_m.shape, np.uint8)
     has_depth = _quantised(depth_m) > 0
@@ -69,7 +82,9 @@ def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> N
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
     """Write `stored_age` as 16 bit, 0 where `write_depth_png` has no depth.
 
-    age_s: (H,W) seconds, 0 or more wherever there is depth. depth_m: (H,W) metres.
+    Args:
+        age_s: (H,W) seconds, 0 or more wherever there is depth.
+        depth_m: (H,W) metres.
     """
     steps = np.zeros(depth_m.shape, np.uint16)
     has_depth = _quantised(depth_m) > 0
@@ -90,10 +105,14 @@ def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
 
 
 def write_flow_png(path: Path, flow_px: Float32) -> None:
-    """Write optical flow in the format of KITTI's flow benchmark (Menze and Geiger, CVPR 2015):
-    16 bit, red and green ``rint(64 * flow) + 2^15`` to the right and down, blue 1 where known.
+    """Write optical flow in the format of KITTI's flow benchmark (Menze and Geiger, CVPR 2015).
 
-    flow_px: (H,W,2) pixels, NaN where unknown. Flow beyond 512 pixels is written as unknown.
+    It has 16 bit: red and green are ``rint(64 * flow) + 2^15`` to the right and down, blue is 1
+    where known.
+
+    Args:
+        flow_px: (H,W,2) pixels, NaN where unknown. Flow beyond 512 pixels is written as
+            unknown.
     """
     levels = np.rint(_STEPS_PER_PX * flow_px.astype(np.float64)) + 2**15
     known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)
@@ -108,13 +127,23 @@ def metres(stored: NDArray[np.uint16]) -> Float32:
 
 
 def read_depth_png(path: Path) -> Float32:
-    """Return (H,W) metres, 0 none. Raises InputError for anything but a 16-bit gray PNG."""
+    """Return (H,W) metres, 0 none.
+
+    Raises:
+        InputError: For all but a 16-bit gray PNG.
+    """
     return metres(read_stored(path, np.uint16, "a depth map"))
 
 
 def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -> NDArray[Any]:
-    """Return (H,W) of a map as it is stored. Raises InputError for anything but a whole gray PNG
-    of that many bits. what: the map, for the message."""
+    """Return (H,W) of a map as it is stored.
+
+    Args:
+        what: Name of the map, for the message.
+
+    Raises:
+        InputError: It is no whole gray PNG of this depth.
+    """
     image = read_image(path, as_stored=True)
     if image.dtype != kind or image.ndim != 2:
         got = f"{image.dtype} of shape {image.shape}"
@@ -124,8 +153,11 @@ def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -
 
 
 def read_mask_png(path: Path) -> Bool:
-    """Return (H,W), True where any colour is not 0; transparency is ignored. Raises InputError if
-    it is no image."""
+    """Return (H,W), True where any colour is not 0. Transparency is ignored.
+
+    Raises:
+        InputError: It is no image.
+    """
     image = read_image(path, as_stored=True)
     colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
     mask: Bool = colours > 0

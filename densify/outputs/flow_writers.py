@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Scene flow as files: of a key, and of a whole recording in the forms that other programs take.
+"""Write scene flow of a key, and of a whole recording in the forms of other programs.
 
-NAME is the recording's::
+NAME is that of the recording::
 
     npz            OUT/000119_000120.npz: flow files, see `densify.readers.flow_files`
     av2            OUT/NAME/STAMP.feather, of the Argoverse 2 scene flow challenge of 2024: is_valid
@@ -12,7 +12,7 @@ NAME is the recording's::
                    ground_mask (all False), row (N,) in the sweep's file; with the ego-motion, where
                    known: flow (N,3), flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
 
-The challenge takes every fifth sweep, zipped as NAME/0000000000.feather, NAME/0000000005.feather…
+The challenge takes every fifth sweep, zipped as NAME/0000000000.feather, NAME/0000000005.feather….
 """
 
 from __future__ import annotations
@@ -56,16 +56,21 @@ def write_flow_npz(folder: Path, flow: StretchFlow) -> list[Path]:
 
 
 def _total_flow(flow: StretchFlow, frame: int, target: int) -> np.ndarray:
-    """Return (N,3) metres, from each point to its position at the target's time in the target's
-    frame; the ego-motion is included."""
+    """Return (N,3) metres from each point to its position at the target's time, with ego-motion.
+
+    The position is in the frame of the target.
+    """
     points, field = flow.stretch[frame].sweep.points, flow.steps[frame, target]
     T = flow.stretch.T_target_source(target, frame)
     return poses.transform(T, points + field.total) - points
 
 
 def flow_npz(field: FlowField, **beside: Any) -> bytes:
-    """Return a file with ``residual_flow`` float32, ``moving``, ``instance`` (-1 none), ``lost``,
-    ``to_reference`` float32 if it is known, and the arrays given beside."""
+    """Return a file of a flow field.
+
+    It has ``residual_flow`` float32, ``moving``, ``instance`` (-1 none), ``lost``, ``to_reference``
+    float32 if it is known, and the arrays in ``beside``.
+    """
     arrays: dict[str, Any] = {"residual_flow": field.displacement}
     arrays |= {name: getattr(field, name) for name in ("moving", "instance", "lost")} | beside
     if field.to_reference is not None:
@@ -78,7 +83,7 @@ def flow_npz(field: FlowField, **beside: Any) -> bytes:
 
 
 def _add_sweep(file: Any, frame: int, flow: StretchFlow) -> None:
-    """Add a sweep to an open file, with its flow to the next one where that is known."""
+    """Add a sweep to an open file, with its flow to the next one if known."""
     registered = flow.stretch[frame]
     sweep = registered.sweep
     arrays = {
@@ -105,11 +110,14 @@ def _add_sweep(file: Any, frame: int, flow: StretchFlow) -> None:
 def flow_writer(
     form: str, sequence: LidarSequence, out: Path, frames: Sequence[int], overwrite: bool
 ) -> Iterator[FlowWriter]:
-    """Yield a writer for these sweeps. Each file appears when it is complete, opensceneflow's with
-    all sweeps in it.
+    """Yield a writer for these sweeps. Each file appears when it is complete.
 
-    form: npz, av2 or opensceneflow. Raises InputError for a missing package and for files that are
-    there and not to be overwritten, OutputError if nothing can be written.
+    Args:
+        form: npz, av2 or opensceneflow, whose file has all sweeps.
+
+    Raises:
+        InputError: A package is missing, or a file exists and must not be overwritten.
+        OutputError: Nothing can be written.
     """
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)
     following = dict(zip(sequence.frames[:-1], sequence.frames[1:], strict=True))
@@ -145,7 +153,7 @@ def flow_writer(
 
 
 def _write_feather(path: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> None:
-    """Rows without a valid return are static, as the ground is."""
+    """Write the flow of one sweep. Rows without a valid return are static."""
     arrow, feather = (needed(m, "argoverse", "") for m in ("pyarrow", "pyarrow.feather"))
     num_rows = sequence.num_rows(frame) if hasattr(sequence, "num_rows") else len(sequence[frame])
     residual = np.zeros((num_rows, 3), np.float16)

@@ -71,8 +71,12 @@ _PACKAGES = (
 
 @dataclass(frozen=True)
 class Context:
-    """What an output gets beside the result. config: the merged configuration as plain mappings, by
-    section. data: the recording, as the user named it."""
+    """What an output gets beside the result.
+
+    Attributes:
+        config: The merged configuration as plain mappings, by section.
+        data: The recording, as the user named it.
+    """
 
     config: Mapping[str, Any]
     data: str
@@ -81,8 +85,11 @@ class Context:
 def write_depth(result: Result, context: Context, folder: Path) -> None:
     """Write ``depth``, ``depth_filled``, ``confidence`` and ``age``.
 
-    Age is the time between the camera's exposure and the sweep that measured the pixel. A filled
-    pixel has the age of the nearest measured pixel. Raises ValueError for maps without ages.
+    Age is the time between the exposure and the sweep that measured the pixel. A filled pixel has
+    the age of the nearest measured pixel.
+
+    Raises:
+        ValueError: The maps have no ages.
     """
     for camera, depth in result.depth.items():
         if depth.age_s is None:
@@ -95,8 +102,10 @@ def write_depth(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_full(result: Result, context: Context, folder: Path) -> None:
-    """Write ``depth_full``, depth completed with the user's prior, and ``confidence_full``, which
-    is at most 0.2 where the depth is the prior's."""
+    """Write ``depth_full``, depth completed with the user's prior, and ``confidence_full``.
+
+    The confidence is at most 0.2 where the depth is that of the prior.
+    """
     for camera, full in result.full.items():
         write_depth_png(map_path(folder, "depth_full", camera), full.depth_m)
         path = map_path(folder, "confidence_full", camera)
@@ -116,8 +125,11 @@ def write_cloud_laz(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_movers(result: Result, context: Context, folder: Path) -> None:
-    """Write cloud and depth of each object, if they are separated: ``movers/0007/`` for instance 7,
-    ``movers/others/`` for moving points of no object."""
+    """Write cloud and depth of each object, if objects are separated.
+
+    They are in ``movers/0007/`` for instance 7, and in ``movers/others/`` for moving points of no
+    object.
+    """
     for instance, mover in result.movers.items():
         place = folder / "movers" / (f"{instance:04d}" if instance >= 0 else "others")
         for name, maps in mover.depth.items():
@@ -161,8 +173,11 @@ def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
 
 
 def record(result: Result, context: Context) -> dict[str, Any]:
-    """Return how a result was made: data, key, frames, cameras, warnings, configuration, cost of
-    each stage, and versions. A package that goes by another name, as in system builds, has None."""
+    """Return how a result was made.
+
+    The record has data, key, frames, cameras, warnings, configuration, cost of each stage, and
+    versions. A package of unknown version, as in system builds, has None.
+    """
     versions: dict[str, str | None] = {"densify": __version__, "python": platform.python_version()}
     versions["platform"] = platform.platform()
     for package in _PACKAGES:
@@ -233,7 +248,7 @@ def write_scene(result: Result, context: Context, folder: Path) -> None:
 
 
 def _sweeps(result: Result) -> list[dict[str, Any]]:
-    """Return the sweeps of the window and those that the cloud has points of, by frame."""
+    """Return the sweeps of the window and all other sources of the cloud, by frame."""
     frames, rows = np.unique(result.cloud.frame, return_index=True)
     since_s = dict(zip(frames.tolist(), 1e-9 * result.cloud.since_key_ns[rows], strict=True))
     far = {*result.far_frames} - {*result.T_key_lidar}

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Keys as files of a KITTI depth tree (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017), which
-loaders for KITTI depth completion read as it is::
+"""Write keys as files of a KITTI depth tree (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017).
+
+Loaders for KITTI depth completion read it unchanged::
 
     val/2011_09_26_drive_0013_sync/proj_depth/velodyne_raw/image_02/0000000120.png
                                               groundtruth/
@@ -31,7 +32,7 @@ README = "README.txt"
 
 @dataclass(frozen=True)
 class FileRecord:
-    """The expected content of a file. sha256: hexadecimal."""
+    """The expected content of a file, with its hexadecimal ``sha256``."""
 
     num_bytes: int
     sha256: str
@@ -53,18 +54,20 @@ _FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 
 
 def split_of(drive: str) -> Split:
-    """Return "val" for the 13 validation drives of KITTI's depth benchmark, "train" for any other
-    recording, by its name, such as ``2011_09_26_drive_0013_sync``."""
+    """Return the split of a recording by its name, such as ``2011_09_26_drive_0013_sync``.
+
+    It is "val" for the 13 validation drives of KITTI's depth benchmark, "train" for any other.
+    """
     match = _KITTI_DRIVE.fullmatch(drive)
     return "val" if match and match[1] in _VALIDATION else "train"
 
 
 def drive_folder(name: str) -> str:
-    """Return a recording's name as the name of a folder.
+    """Return the name of a recording as the name of a folder.
 
-    A name that can be one, as KITTI's, stays. ``street:street?seed=0&sensor=hdl64`` becomes
-    ``street-street_seed-0_sensor-hdl64``. Another name loses what is neither ASCII letter nor digit
-    and ends in a digest, which keeps it different from others.
+    A valid name, as those of KITTI, is kept. ``street:street?seed=0&sensor=hdl64`` becomes
+    ``street-street_seed-0_sensor-hdl64``. Another name loses all but ASCII letters and digits, and
+    ends in a digest, which keeps it unique.
     """
     folder = name.translate(_PUNCTUATION)
     if _FOLDER_NAME.fullmatch(folder):
@@ -80,11 +83,22 @@ def write_key(
     sparse: Mapping[str, DepthMap],
     dense: Mapping[str, DepthMap],
 ) -> dict[str, FileRecord]:
-    """Write the maps of one key, each file whole or not there.
+    """Write the maps of one key, each file whole or absent.
 
-    folder: of the drive, relative to the tree's root: ``val/2011_09_26_drive_0013_sync``. sparse,
-    dense: camera -> map, of the key sweep alone and of all sweeps. Returns path relative to root ->
-    what the file holds, the same bytes for the same maps. Raises OutputError.
+    The same maps give the same bytes.
+
+    Args:
+        root: Root of the tree.
+        folder: Folder of the drive, relative to the root: ``val/2011_09_26_drive_0013_sync``.
+        frame: The key.
+        sparse: Camera -> map of the single sweep.
+        dense: Camera -> map of all sweeps.
+
+    Returns:
+        The record of each file, by its path relative to the root.
+
+    Raises:
+        OutputError: A file cannot be written.
     """
     paths = []
     for camera, maps in dense.items():
@@ -103,8 +117,14 @@ def write_key(
 def write_readme(root: Path, *, method: str, window: int, settings: Mapping[str, Any]) -> None:
     """Write ``README.txt``, which describes the files beside it and how they were made.
 
-    window: sweeps before and after the key. settings: all others, plain mappings. The text depends
-    on the arguments and densify's version alone. Raises OutputError if it cannot be written.
+    The text depends on the arguments and the version of densify alone.
+
+    Args:
+        window: Number of sweeps before and after the key.
+        settings: All other settings, as plain mappings.
+
+    Raises:
+        OutputError: It cannot be written.
     """
     text = _README.format(
         version=__version__,

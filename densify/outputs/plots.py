@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Pictures by matplotlib: figure.png and compare.png, depth over the camera's image;
-curve.png, outliers over density; the loss of a training."""
+"""Draw pictures by matplotlib: figure.png, compare.png, curve.png, and the loss of a training.
+
+The first two have depth over the camera's image, curve.png has outliers over density.
+"""
 
 from __future__ import annotations
 
@@ -50,8 +52,10 @@ def write_key_figure(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_figure(path: Path, results: Mapping[str, Result]) -> None:
-    """Write the measured depth of each method in the first camera, and the last method's depth
-    completed with a prior, if there is one. Without a camera nothing is written."""
+    """Write the measured depth of each method in the first camera.
+
+    A prior adds the completed depth of the last method. Without a camera nothing is written.
+    """
     method, last = list(results.items())[-1]
     if not last.depth:
         return
@@ -68,13 +72,13 @@ def write_figure(path: Path, results: Mapping[str, Result]) -> None:
 
 
 def _image(result: Result, camera: str) -> Picture:
-    """Return (H,W,3) the camera's image, black where there is none."""
+    """Return (H,W,3) the image of the camera, black without one."""
     shape = (*result.depth[camera].depth_m.shape, 3)
     return result.images.get(camera, np.zeros(shape, np.uint8))
 
 
 def _error(result: Result, camera: str, product: str) -> str:
-    """Return the fraction of outliers, against the truth if there is one, else the held-out key."""
+    """Return the share of outliers, against the truth if there is one, else of the held-out key."""
     for source, against in (("depth", "truth"), ("held_out", "key held out")):
         scores = (result.metrics.get(source) or {}).get(camera, {}).get(product)
         if scores and scores["all"]["outliers"] is not None:
@@ -83,11 +87,14 @@ def _error(result: Result, camera: str, product: str) -> str:
 
 
 def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Figure:
-    """Draw depth maps over an image, from top to bottom in the mapping's order.
+    """Draw depth maps over an image, from top to bottom in the order of the mapping.
 
-    image: (H,W,3) uint8 RGB, drawn in gray.
-    panels: title -> (H,W) depth in metres, 0 none. A depth covers 3 x 3 pixels, and the nearest
-        wins. Near is red, far is blue, logarithmic from 3 to 80 m.
+    A depth covers 3 x 3 pixels, and the nearest wins. Near is red, far is blue, logarithmic from 3
+    to 80 m.
+
+    Args:
+        image: (H,W,3) uint8 RGB, drawn in gray.
+        panels: Title -> (H,W) depth in metres, 0 none.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
@@ -128,10 +135,13 @@ def write_curve(result: Result, context: Context, folder: Path) -> None:
 
 
 def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
-    """Draw the fraction of outliers over the density, for each least confidence.
+    """Draw the share of outliers over the density, for each least confidence.
 
-    curves: camera -> method -> curve. Each camera has its own axes, two in a row. A thin line is of
-        measured pixels, a thick line of filled pixels too.
+    Each camera has its own axes, two in a row. A thin line is of measured pixels, a thick line of
+    measured and filled ones.
+
+    Args:
+        curves: Camera -> method -> curve.
     """
     from matplotlib.figure import Figure
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A key's scene.json and movers.json (`densify.outputs.key_outputs`), read and checked."""
+"""Read and check a key's scene.json and movers.json (`densify.outputs.key_outputs`)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,13 @@ from densify.readers import checks
 
 @dataclass(frozen=True)
 class SceneFile:
-    """table: the whole file. views: map -> its camera and pose. T_key_lidar: frame -> (4,4), sweeps
-    of the window."""
+    """The content of scene.json.
+
+    Attributes:
+        table: The whole file.
+        views: Map -> its camera and pose.
+        T_key_lidar: Frame -> (4,4) of sweeps of the window.
+    """
 
     table: Mapping[str, Any]
     views: Mapping[str, CameraView]
@@ -28,7 +33,11 @@ class SceneFile:
 
 
 def read_scene(path: Path) -> SceneFile:
-    """Read scene.json. Raises InputError if it is missing or damaged."""
+    """Read scene.json.
+
+    Raises:
+        InputError: If it is missing or damaged.
+    """
     with damage_named(path):
         table = read_json(path)
         poses = {sweep["frame"]: sweep["T_key_lidar"] for sweep in table["sweeps"]}
@@ -40,8 +49,11 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def read_tracks(path: Path) -> list[ObjectTrack]:
-    """Read movers.json. Raises InputError if it is missing or damaged, or an object has no pose at
-    the key."""
+    """Return the tracks of movers.json.
+
+    Raises:
+        InputError: It is missing or damaged, or an object has no pose at the key.
+    """
     with damage_named(path):
         table = read_json(path)
         tracks = [_track(entry) for entry in table["objects"]]
@@ -52,7 +64,7 @@ def read_tracks(path: Path) -> list[ObjectTrack]:
 
 @contextmanager
 def damage_named(path: Path) -> Iterator[None]:
-    """Raise InputError, which names the file, for content that is not as expected."""
+    """Raise InputError, which names the file, for unexpected content within the block."""
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Write frames of the built-in street, with exact truth, as a KITTI raw drive or a plain folder::
+"""Write frames of the built-in street, with exact truth, as a KITTI raw drive or a plain folder.
+
+The files::
 
     OUT/2026_06_12/calib_cam_to_cam.txt calib_velo_to_cam.txt calib_imu_to_velo.txt
     OUT/2026_06_12/2026_06_12_drive_0001_sync/
@@ -11,8 +13,8 @@
     OUT/street/sweeps/000000.bin, ...  float32 x y z intensity time lidar, s since the stamp
     OUT/street/images/CAMERA/1781258406000000000.png, ...  named by their times in ns
 
-A timestamps file of KITTI's has a line per frame of the street; the folder's truth is numbered from
-0. ``truth/`` is described in `densify.readers.truth_files`.
+A timestamps file of KITTI's has a line per frame of the street. The truth of the folder is numbered
+from 0. ``truth/`` is described in `densify.readers.truth_files`.
 """
 
 from __future__ import annotations
@@ -63,10 +65,15 @@ def write_street(
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write frames of a street and return the place that ``--data`` opens, complete or not there.
+    """Write frames of a street and return the path that ``--data`` opens, complete or absent.
 
-    format: of `FORMATS`. cameras: None for all of the street. Raises InputError for a format, frame
-    or camera that does not exist or fit, and for a place that exists, unless ``overwrite`` is set.
+    Args:
+        format: A form of `FORMATS`.
+        cameras: None for all cameras of the street.
+        overwrite: Replace an existing recording.
+
+    Raises:
+        InputError: The format, a frame or a camera does not exist or fit, or the place exists.
     """
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
@@ -91,7 +98,12 @@ def write_street(
 
 @dataclass(frozen=True)
 class Excerpt:
-    """Frames of a street. frames: ascending. cameras: names."""
+    """Frames of a street.
+
+    Attributes:
+        frames: Ascending.
+        cameras: Names.
+    """
 
     street: Street
     frames: tuple[int, ...]
@@ -101,7 +113,14 @@ class Excerpt:
     def of(
         cls, street: Street, frames: Sequence[int], cameras: Sequence[str] | None = None
     ) -> Excerpt:
-        """cameras: None for all of the street. Raises InputError for what does not exist."""
+        """Return an excerpt.
+
+        Args:
+            cameras: None for all of the street.
+
+        Raises:
+            InputError: A frame or a camera does not exist.
+        """
         names = tuple(street.cameras if cameras is None else cameras)
         for name in names:
             checks.camera_named(street.cameras, name, Path(street.name))
@@ -114,8 +133,11 @@ class Excerpt:
         return cls(street, tuple(sorted(frames)), names)
 
     def image_numbers(self, camera: str) -> list[int]:
-        """The images exposed from half a period before the first stamp to half a period after the
-        last stamp."""
+        """Return the numbers of images around these frames.
+
+        They are exposed from half a period before the first stamp to half a period after the last
+        one.
+        """
         half_ns = self.street.simulator.period_ns // 2
         begin_ns = self.street.stamp_ns(self.frames[0]) - half_ns
         end_ns = self.street.stamp_ns(self.frames[-1]) + half_ns
@@ -123,16 +145,16 @@ class Excerpt:
         return [n for n, ns in exposed_ns.items() if begin_ns <= ns < end_ns]
 
     def png_image(self, camera: str, number: int) -> bytes:
-        """Bytes of a PNG file."""
+        """Return the bytes of a PNG file."""
         return encode_png(self.street.image(camera, number)[:, :, ::-1])
 
     def T_world_ego(self, stamp_ns: Int, T_lidar_ego: Float | None = None) -> Float:
-        """(n,) times -> (n,4,4) true poses of the scanner, or of a frame fixed to it."""
+        """Return (n,4,4) true poses of the scanner, or of a frame fixed to it, at (n,) times."""
         T_world_lidar = [self.street.simulator.T_world_lidar_at(int(t)) for t in stamp_ns]
         return np.stack(T_world_lidar) @ (np.eye(4) if T_lidar_ego is None else T_lidar_ego)
 
     def poses(self, T_lidar_ego: Float | None = None) -> PoseTrack:
-        """The true path of the scanner, or of a frame fixed to it, every 5 ms."""
+        """Return the true path of the scanner, or of a frame fixed to it, every 5 ms."""
         first_ns, last_ns = (self.street.stamp_ns(f) for f in (self.frames[0], self.frames[-1]))
         stamp_ns = np.arange(first_ns - _MARGIN_NS, last_ns + _MARGIN_NS + 1, _POSE_STEP_NS)
         return PoseTrack(self.street.name, stamp_ns, self.T_world_ego(stamp_ns, T_lidar_ego))
@@ -152,7 +174,10 @@ def _numbered(frames: Sequence[int], progress: Progress) -> Iterator[tuple[int, 
 
 
 def _write_truth(folder: Path, excerpt: Excerpt, bodies: Bodies, renumbered: bool) -> None:
-    """bodies: poses at the stamp of each sweep. renumbered: files are numbered from 0."""
+    """Write the truth folder.
+
+    bodies: poses at the stamp of each sweep. renumbered: files are numbered from 0.
+    """
     street = excerpt.street
     write_bodies(folder, bodies)
     for number, frame in enumerate(excerpt.frames):
@@ -200,7 +225,7 @@ def _seconds(time_ns: int) -> str:
 
 
 def config_text(excerpt: Excerpt) -> str:
-    """The densify.yaml of the excerpt."""
+    """Return the densify.yaml of the excerpt."""
     sensor = excerpt.street.simulator.sensor
     columns = ["x", "y", "z", "intensity", "time", "lidar"]
     cameras = {}
@@ -262,13 +287,15 @@ def _write_kitti(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
 
 
 def numbers(values: Float) -> str:
-    """A line of KITTI's text files, with every digit."""
+    """Return a line of KITTI's text files, with every digit."""
     return " ".join(repr(float(v)) for v in np.ravel(values))
 
 
 def projections(key: str) -> str:
-    """Lines of the keys of cameras 0 to 3, such as ``P{}``: K [I | t], with t from the rectified
-    camera 0."""
+    """Return the lines of the keys of cameras 0 to 3, such as ``P{}``.
+
+    A line is K [I | t], with t from the rectified camera 0.
+    """
     lines = ""
     for number in range(4):  # 0 and 1 are the gray cameras beside them
         camera = CAMERAS[f"image_0{2 + number % 2}"]
@@ -278,28 +305,33 @@ def projections(key: str) -> str:
 
 
 def stamp_lines(stamps_ns: Int) -> str:
-    """A timestamps file."""
+    """Return a timestamps file."""
     texts = stamps_ns.astype("datetime64[ns]").astype(str)
     return "".join(text.replace("T", " ") + "\n" for text in texts)
 
 
 def sweep_data(street: Street, frame: int, points: Float | Float32 | None = None) -> bytes:
-    """A sweep's file. points: (N,3), None for the points as fired."""
+    """Return the file of a sweep.
+
+    Args:
+        points: (N,3), None for the points as fired.
+    """
     returns = street.returns(frame)
     columns = [returns.points if points is None else points, returns.intensity]
     return np.column_stack(columns).astype("<f4").tobytes()
 
 
 def T_lidar_imu(tilt_deg: float) -> Float:
-    """(4,4) from the inertial unit to the scanner, whose mount is tilted."""
+    """Return (4,4) the inertial unit in the frame of the scanner, whose mount is tilted."""
     return poses.inverse(T_level_lidar(tilt_deg)) @ T_LEVEL_IMU
 
 
 def oxts_line(street: Street, frame: int, first: int) -> str:
-    """An oxts record of the true pose; its velocities, accelerations and turn rates are 0.
+    """Return an oxts record of the true pose. Velocities, accelerations and turn rates are 0.
 
-    first: the frame at the fixed latitude, which is the first frame written: readers take the scale
-    of the Mercator projection from the first record.
+    Args:
+        first: The first frame written, at the fixed latitude. Readers take the scale of the
+            Mercator projection from the first record.
     """
     T_lidar = T_lidar_imu(street.simulator.tilt_deg)
     here, start = (

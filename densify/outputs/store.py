@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The files of one key, ``OUT/000120/...``: results of ``run`` and tables of ``compare``, whole or
-not at all."""
+"""Write the files of one key, ``OUT/000120/...``, whole or not at all.
+
+They are results of ``run`` and tables of ``compare``.
+"""
 
 from __future__ import annotations
 
@@ -45,10 +47,13 @@ def check_writable(
     overwrite: bool = False,
     verb: Literal["run", "compare"] = "run",
 ) -> None:
-    """Raise InputError if a result could not be written. Nothing is touched.
+    """Raise InputError if a result cannot be written. Nothing is changed.
 
-    out: the folder of ``--out``, which need not exist. Causes are files of ``verb`` that are there
-    and not to be overwritten, and a place without permission.
+    The reasons are existing files of ``verb`` that must not be overwritten, and missing
+    permissions.
+
+    Args:
+        out: The folder of ``--out``, which need not exist.
     """
     owned = _RUN if verb == "run" else _COMPARISON
     _check_place(_key_folder(out, key), owned, out, overwrite)
@@ -56,10 +61,14 @@ def check_writable(
 
 @contextmanager
 def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
-    """Yield a folder to write into that becomes ``folder`` if the block ends well.
+    """Yield a folder to write into, which becomes ``folder`` if the block ends without an error.
 
-    owned: entries that are written, see `staged_folder`. out: what ``--out`` says, for messages.
-    Raises InputError as `check_writable`.
+    Args:
+        owned: Entries that are written, see `staged_folder`.
+        out: The text of ``--out``, for messages.
+
+    Raises:
+        InputError: As in `check_writable`.
     """
     _check_place(folder, owned, out, overwrite)
     with staged_folder(folder, owned) as staging:
@@ -97,9 +106,17 @@ def write_result(
 ) -> list[Path]:
     """Write one densified key as ``out/KEY/``, and return the files written.
 
-    config: the merged configuration, as plain mappings. data: the recording, as the user named it.
-    overwrite: replace an earlier result. Whatever else lies in the folder is kept. Raises
-    InputError if the place cannot be written to, or holds a result already.
+    Other files in the folder are kept.
+
+    Args:
+        result: The key.
+        out: The folder above.
+        config: The merged configuration, as plain mappings.
+        data: The recording, as the user named it.
+        overwrite: Replace an earlier result.
+
+    Raises:
+        InputError: The place cannot be written to, or holds a result.
     """
     context = Context(config, data)
     with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:
@@ -116,10 +133,13 @@ def write_comparison(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write methods side by side as ``out/KEY/compare.json`` and ``compare.png``, and in
-    ``compare/`` the last method's maps, cloud and scene. Returns the files written.
+    """Write methods side by side, and return the files written.
 
-    results: method -> result, of one key. The rest as `write_result`.
+    They are ``out/KEY/compare.json`` and ``compare.png``, and in ``compare/`` the maps, cloud and
+    scene of the last method.
+
+    Args:
+        results: Method -> result, of one key. The rest as in `write_result`.
     """
     last = list(results.values())[-1]
     key, context = last.key, Context(config, data)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The cost of each stage of the pipeline, and the progress of the stages."""
+"""Measure the cost of each stage of the pipeline, and report progress."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ _PER_MB = 1024 * 1024 if sys.platform == "darwin" else 1024  # of getrusage(2)
 
 
 class Watch:
-    """Measures stages, which may be at work in several threads; their seconds are added up.
+    """Measure stages, which may run in several threads. Their seconds are added up.
 
-    A stage that asks for another one waits meanwhile: its seconds count for the inner one only.
+    A stage that calls another one waits: those seconds count for the inner one only.
     """
 
     def __init__(self, progress: Progress | None = None) -> None:
-        """progress: called as (stage, done, total), by one thread at a time."""
+        """Begin to measure.
+
+        Args:
+            progress: Is called with (stage, done, total), by one thread at a time.
+        """
         self._progress = progress
         self._seconds: dict[str, float] = {}
         self._peak_mb: dict[str, float] = {}
@@ -47,7 +51,7 @@ class Watch:
         self._report(name, 1)
 
     def costs(self) -> tuple[StageCost, ...]:
-        """Return the costs so far; a stage that worked several times is counted once, in sum."""
+        """Return the costs so far. Several runs of a stage are added up."""
         return tuple(StageCost(n, self._seconds[n], peak) for n, peak in self._peak_mb.items())
 
     def _report(self, name: str, done: int) -> None:

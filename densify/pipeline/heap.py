@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How the C library keeps memory for arrays."""
+"""Set how the C library keeps memory for arrays."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ _MOST_OF_OLDER_BYTES = 2**25  # older releases refuse a larger threshold of mmap
 
 
 def keep_freed_memory() -> None:
-    """Have all threads of this process share one heap, and what one array gives back taken by the
-    next one, large ones too. Otherwise each thread has a heap of its own, and the system takes and
-    clears the pages of every large array anew. Call before threads are started; does nothing where
-    the C library is not glibc.
+    """Let all threads of this process share one heap, which keeps freed memory of large arrays.
+
+    Otherwise each thread has a heap of its own, and the system takes and clears the pages of every
+    large array anew. Call this before threads are started. It does nothing if the C library is not
+    glibc.
     """
     with suppress(OSError, AttributeError, TypeError):  # another library, or none by that name
         mallopt = ctypes.CDLL(None).mallopt

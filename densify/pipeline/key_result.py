@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The methods of accumulation, and one method's result for a key: see the cloud, project, fill,
-score."""
+"""Compute the result of one method for a key: visibility, projection, fill, scores."""
 
 from __future__ import annotations
 
@@ -25,10 +24,13 @@ from densify.scores.cloud_scores import ghost_scores
 class Method(NamedTuple):
     """One method.
 
-    all_sweeps: of the window; else the key sweep alone. engine: of scene flow (``flow.engine``),
-    "" for the configured one, None for rigid accumulation. visible: occluded and doubtful points
-    are rejected; else each pixel shows its nearest point. far: with static surfaces beyond the
-    window (``accumulate.far_m``).
+    Attributes:
+        all_sweeps: Use all sweeps of the window, else the key sweep alone.
+        engine: Engine of scene flow (``flow.engine``), "" for the configured one, None for
+            rigid accumulation.
+        visible: Reject occluded and unsupported points. Else each pixel shows its nearest
+            point.
+        far: Add static surfaces beyond the window (``accumulate.far_m``).
     """
 
     all_sweeps: bool
@@ -56,7 +58,11 @@ COMPARED = ("none", "icp", "icp-far", "paper", "flow")
 
 
 def with_baselines(method: str) -> tuple[str, ...]:
-    """Return a method of `RUN` behind the simpler ones. Raises InputError for another one."""
+    """Return a method of `RUN` after the simpler ones.
+
+    Raises:
+        InputError: For another one.
+    """
     if method not in RUN:
         raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
     return RUN[: RUN.index(method) + 1]
@@ -70,9 +76,14 @@ def looks_around(methods: Sequence[str]) -> bool:
 class KeyScene(NamedTuple):
     """The inputs that all methods of a key share.
 
-    stretch: the key's window. beyond: None where nothing is known or wanted. key_image: range image
-    of the key sweep. views: of the maps. images: (H,W,3) RGB of the maps that are coloured. truth:
-    depth and what moves, by map. held_out: the key sweep as the truth of what is made without it.
+    Attributes:
+        stretch: Window of the key.
+        beyond: Static surfaces beyond the window; None if unknown or unwanted.
+        key_image: Range image of the key sweep.
+        views: Views of the maps.
+        images: (H,W,3) RGB of the coloured maps.
+        truth: True depth and moving pixels, by map.
+        held_out: The key sweep as the truth of a map made without it.
     """
 
     settings: Config
@@ -90,7 +101,8 @@ class KeyScene(NamedTuple):
 def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
     """Return the result of one method, without its baselines.
 
-    moment: the points at the key's moment, as the method accumulates them.
+    Args:
+        moment: The points at the key's time, as the method accumulates them.
     """
     method, output = METHODS[name], scene.settings.output
     views, watch, stretch = scene.views, scene.watch, scene.stretch
@@ -140,7 +152,7 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
 
 
 def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
-    """Return the static surfaces beyond the window as the cameras see them."""
+    """Return the static surfaces beyond the window in the views of the cameras."""
     if not method.far or scene.beyond is None:
         return None
     with scene.watch.stage("far"):
@@ -150,7 +162,7 @@ def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
 def _add_ages(
     scene: KeyScene, method: Method, depth: Mapping[str, DepthMap]
 ) -> dict[str, DepthMap]:
-    """Add to each pixel the time between the exposure and its sweep."""
+    """Return the maps with the time between exposure and source sweep of each pixel."""
     stamps_ns = {s.frame: s.sweep.stamp_ns for s in scene.stretch.sweeps}
     if method.far and scene.beyond is not None:
         far = scene.beyond.standing
@@ -165,7 +177,7 @@ def _add_ages(
 def _metrics(
     scene: KeyScene, cloud: Cloud, depth: Mapping[str, DepthMap], visible: bool
 ) -> dict[str, Any]:
-    """Return the scores that need no truth, and those against it where there is some."""
+    """Return the scores without truth, and those against the truth if there is one."""
     metrics: dict[str, Any] = {
         "num_points": len(cloud),
         "num_moving": int(cloud.moving.sum()),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A result completed with the depth images that the user brings."""
+"""Complete a result with depth images that the user brings."""
 
 from __future__ import annotations
 
@@ -27,10 +27,15 @@ def complete_with_prior(
     truth: Mapping[str, tuple[Float32, Bool]],
     kind: str,
 ) -> Result:
-    """Return the result with ``full`` and its scores; a prior that does not fit gets a warning.
+    """Return the result with ``full`` and its scores. A prior that does not fit gets a warning.
 
-    shots: of the maps, by name. truth: true depth and what moves, (H,W) each, where known. kind:
-    ``prior.kind``. Raises InputError if there is no prior of any map.
+    Args:
+        shots: Of the maps, by name.
+        truth: True depth and moving pixels, (H,W) each, if known.
+        kind: The setting ``prior.kind``.
+
+    Raises:
+        InputError: There is no prior of any map.
     """
     full, metrics = {}, copy.deepcopy(dict(result.metrics))
     for name, prior in _read(files, shots, result.key).items():
@@ -56,7 +61,7 @@ def complete_with_prior(
 
 
 def _read(files: PriorFiles, shots: Mapping[str, Shot], key: int) -> dict[str, Prior]:
-    """Return the priors by the maps' names: of their images, or of the key where there is none."""
+    """Return the priors by the names of the maps: of their images, or else of the key."""
     found, lacking = {}, []
     for name, shot in shots.items():
         number = key if shot.number is None else shot.number

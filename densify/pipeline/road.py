@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The road before and behind a window: static surfaces that sweeps beyond the window measured."""
+"""Find static surfaces that sweeps beyond the window measured, along the road."""
 
 from __future__ import annotations
 
@@ -46,8 +46,9 @@ _View = tuple[Camera, Float]
 class _Passed(NamedTuple):
     """A sweep along the road.
 
-    registered: its points that a camera may see; raw, unless it is known. sample: (N,3) some of
-    its points, deskewed. travel_m: since the first sweep of the window. known: of the window.
+    registered: its points in view of a camera, raw unless the sweep is known. sample: (N,3) some of
+    its points, deskewed. travel_m: since the first sweep of the window. known: it is part of the
+    window.
     """
 
     registered: RegisteredSweep
@@ -58,7 +59,12 @@ class _Passed(NamedTuple):
 
 @dataclass(frozen=True)
 class Road:
-    """far_m: travel before and behind a window. cameras: points that none can see are dropped."""
+    """The road around a window.
+
+    Attributes:
+        far_m: Travel before and after the window.
+        cameras: Points out of view of all cameras are dropped.
+    """
 
     timeline: Timeline
     sweeps: Sweeps
@@ -67,15 +73,16 @@ class Road:
     far_m: float
 
     def frames(self, near: Sequence[int]) -> list[int]:
-        """Return the sweeps that may be read for these neighbouring frames."""
+        """Return the sweeps that may be read for these frames of a window."""
         num = int(_MOST_S * 1e9 / self.timeline.period_ns)
         return [*self.timeline.before(near[0], num), *near, *self.timeline.after(near[-1], num)]
 
     def find_standing(self, near: Stretch, keys: Sequence[int], with_near: bool) -> StandingWorld:
         """Return the static surfaces along the road, in the world of ``near``.
 
-        near: registered, deskewed sweeps, those of the keys among them. with_near: use their
-        points too.
+        Args:
+            near: Registered, deskewed sweeps, those of the keys among them.
+            with_near: Use their points too.
         """
         sensors, views = Sensors.of(near.sweeps), self._views(near, keys)
         with ThreadPoolExecutor(2) as pool:
@@ -95,7 +102,7 @@ class Road:
         return replace(far.joined(parts), left_out=tuple(sorted(left_out)))
 
     def _beyond(self, near: Stretch, views: Sequence[_View], side: int) -> list[_Passed]:
-        """Return sweeps before (-1) or behind (1) those near, the nearest first."""
+        """Return sweeps before (-1) or after (1) those of the window, the nearest first."""
         last = near.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
         begin_m = 0.0 if side < 0 else _travel_m(near)[-1]
         found, last_m, travel_m = list[_Passed](), 0.0, 0.0
@@ -112,7 +119,7 @@ class Road:
         return found
 
     def _views(self, near: Stretch, keys: Sequence[int]) -> list[_View]:
-        """Return the views of the cameras at the keys; keys close to each other share one."""
+        """Return the views of the cameras at the keys. Keys close to each other share one."""
         chosen: list[Float] = []
         for key in keys:
             T_world_lidar = near[key].T_world_lidar
@@ -137,7 +144,7 @@ class Road:
         return follow_road(known, frames, stamp_ns, read, prepare, self.far_m, _STEP_M)
 
     def _most_sweeps(self, near: Stretch) -> int:
-        """Return how many sweeps on each side may be needed, at half the window's speed."""
+        """Return the greatest number of sweeps on each side, at half the speed of the window."""
         first, last = near.sweeps[0], near.sweeps[-1]
         most_s, step_ns = _MOST_S, last.sweep.stamp_ns - first.sweep.stamp_ns
         if step_ns > 0:
@@ -149,7 +156,7 @@ class Road:
     def _recorded(
         self, known: RegisteredSweep, frames: Sequence[int]
     ) -> Iterator[tuple[Sweep, Float, Float]]:
-        """Yield the same by the recording's own poses."""
+        """Yield the same as `_sweeps_beyond`, by the recording's own poses."""
         travel_m, last_m, last, last_ns = 0.0, 0.0, known.T_world_lidar, known.sweep.stamp_ns
         try:
             T_world_recorded = last @ poses.inverse(self._pose(known.frame))
@@ -185,7 +192,7 @@ def _travel_m(near: Stretch) -> Float:
 
 
 def _within(near: Stretch, views: Sequence[_View]) -> list[_Passed]:
-    """Return registered sweeps at some distance from each other."""
+    """Return registered sweeps of the window at some distance from each other."""
     found, last_m = list[_Passed](), -np.inf
     for s, at_m in zip(near.sweeps, _travel_m(near).tolist(), strict=True):
         if at_m - last_m >= _LEAST_STEP_M:
@@ -196,7 +203,7 @@ def _within(near: Stretch, views: Sequence[_View]) -> list[_Passed]:
 
 
 def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], frozenset[int]]:
-    """Return the same with poses that agree, and the frames that cannot be used."""
+    """Return the sweeps with consistent poses, and the frames that cannot be used."""
     frames = tuple(p.registered.frame for p in passed)
     found = relax_poses(
         [p.sample for p in passed],
@@ -215,7 +222,7 @@ def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], f
 
 
 def _in_view(sweep: Sweep, T_world_lidar: Float, views: Sequence[_View]) -> Bool:
-    """Return (N,) the returns of a raw sweep that one of the views may show."""
+    """Return (N,) True for returns of a raw sweep that a view may show."""
     keep = np.zeros(len(sweep), bool)
     rows = np.flatnonzero(far.in_reach(sweep))
     points = sweep.points[rows].astype(np.float32)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The pipeline in order. `densify` is the whole of it for one key::
+"""Run the pipeline.
+
+`densify` is all of it for one key::
 
     register and deskew the window     recording.window
     accumulate rigidly, or with flow   recording.moment   (free space, ground, motion)
@@ -8,7 +10,7 @@
     complete with a prior              densify.pipeline.prior
     warn                               densify.pipeline.warnings
 
-`run`, `run_keys`, `compare` and `flow_steps` check what they are given, then call it.
+`run`, `run_keys`, `compare` and `flow_steps` check their arguments, then call it.
 """
 
 from __future__ import annotations
@@ -99,11 +101,14 @@ def run_keys(
 ) -> Iterator[tuple[int, Result | ComputationError | InputError]]:
     """Densify several keys, ascending, and yield each with its result or its error.
 
-    Keys whose windows overlap share registration, ground and motion. Motion is then followed over
-    all their sweeps, which may make a key a little better than by itself.
+    Keys whose windows overlap share registration, ground and motion. Objects are then followed over
+    all their sweeps, which can make a key slightly better than alone.
 
-    cache: keeps on disk what is shared. The rest as `run`. Raises InputError at once for what no
-    key could be made with.
+    Args:
+        cache: Keeps shared results on disk. The other arguments as in `run`.
+
+    Raises:
+        InputError: At once, if no key can be made.
     """
     methods, watch = with_baselines(method), Watch(progress)
     recording = _open(sequence, keys, window, methods, cameras, config, cache, watch)
@@ -162,10 +167,14 @@ def flow_steps(
 ) -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
     """Yield sweeps of a whole recording with their flow to the next sweep, or with their error.
 
-    A sweep that none follows (the last one, or before a hole in time) has no step.
+    The last sweep, and one before a hole in time, have no step.
 
-    frames: ascending. cache: keeps the results of steps. Raises InputError at once for what nothing
-    can be made with.
+    Args:
+        frames: Ascending.
+        cache: Keeps the results of steps.
+
+    Raises:
+        InputError: At once, if nothing can be made.
     """
     recording = _open(sequence, None, 1, ["flow"], None, config, cache, None)
 
@@ -189,9 +198,15 @@ def densify(
 ) -> dict[str, Result]:
     """Return the results of one key by method, each with those before as its baselines.
 
-    methods: of `METHODS`. with_images: colour the cloud, and compare depth with the truth where
-    there is some; the maps are the same either way. priors: complete the maps of the last method.
-    Errors as `run`.
+    Args:
+        methods: Of `METHODS`.
+        with_images: Colour the cloud, and compare depth with the truth if there is one. The
+            maps are the same either way.
+        priors: Complete the maps of the last method.
+
+    Raises:
+        InputError: As in `run`.
+        ComputationError: As in `run`.
     """
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
     stretch = recording.window(key)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The raw sweeps of a recording, read on demand, and the blocks that they are cut into: keys that
-share registration and motion."""
+"""Read the raw sweeps of a recording on demand, and cut them into blocks.
+
+The keys of a block share registration and motion.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ AROUND_S = 1.0  # what moves is looked for at least this far around a block of a
 
 
 class Sweeps:
-    """Reads sweeps, without the own vehicle's returns."""
+    """Read sweeps, without returns of the own vehicle."""
 
     def __init__(
         self,
@@ -34,39 +36,46 @@ class Sweeps:
         run: str | None,
         watch: Watch,
     ) -> None:
-        """num_kept: sweeps that stay in memory. cache: on disk, if any. run: the same text for
-        all processes between which no sweep changes; None for this object alone."""
+        """Prepare to read.
+
+        Args:
+            num_kept: Number of sweeps that stay in memory.
+            cache: On disk, None for none.
+            run: A text that is the same for all processes of a run, in which no sweep changes;
+                None for this object alone.
+        """
         self._sequence, self._timeline, self._settings = sequence, timeline, settings
         self._cache, self._run, self._watch = cache, run or uuid4().hex, watch
         self.read = lru_cache(maxsize=num_kept)(self._read)
         self.content = lru_cache(maxsize=None)(self._content)
 
     def prepare(self, frames: Sequence[int]) -> None:
-        """Let a recording that makes its sweeps make these side by side."""
+        """Let a recording that renders its sweeps render these in parallel."""
         if hasattr(self._sequence, "prepare"):
             with self._watch.stage("read"):
                 self._sequence.prepare(frames)
 
     def recorded_pose(self, frame: int) -> Float | None:
-        """Return the recording's own ``T_world_lidar`` (4,4), None where it is not used.
+        """Return the recording's own ``T_world_lidar`` (4,4), None if it is not used.
 
-        Raises InputError if there is none.
+        Raises:
+            InputError: There is none.
         """
         if self._settings.source != "dataset":
             return None
         return self._sequence.T_world_lidar(frame)
 
     def _read(self, frame: int) -> Sweep:
-        """Raises InputError if the sweep cannot be read."""
+        """Return a sweep. Raise InputError if it cannot be read."""
         if frame in self._timeline.unknown:
             raise InputError(self._timeline.unknown[frame])
         with self._watch.stage("read"):
             return read_sweep(self._sequence, frame, self._settings)
 
     def _content(self, frame: int) -> str:
-        """Return a digest of a sweep and its recorded pose, or why they cannot be read.
+        """Return a digest of a sweep and its recorded pose, or the reason of a failure.
 
-        All processes of a run look it up in the cache; only the first has to read the sweep.
+        All processes of a run find it in the cache. Only the first one has to read the sweep.
         """
 
         def find() -> str:
@@ -83,15 +92,17 @@ class Sweeps:
 class Cut:
     """Blocks, ascending in time, which may overlap.
 
-    blocks: the frames of each: the windows of its keys, and what is between and around them.
-    number_of: key -> its block.
+    Attributes:
+        blocks: The frames of each: the windows of its keys, and the sweeps between and around
+            them.
+        number_of: Key -> its block.
     """
 
     blocks: tuple[tuple[int, ...], ...]
     number_of: Mapping[int, int]
 
     def number_near(self, frame: int) -> int:
-        """Return the block of a frame, or of the last key before it."""
+        """Return the block of a frame, or that of the last key before it."""
         keys = sorted(self.number_of)
         return self.number_of[keys[max(0, bisect_right(keys, frame) - 1)]]
 
@@ -103,7 +114,7 @@ class Cut:
     def whole(timeline: Timeline, window: int) -> Cut:
         """Cut all sweeps, as keys, into blocks of `BLOCK_S`, counted from time 0.
 
-        The same sweeps make the same maps, whatever keys are asked for.
+        The same sweeps give the same maps, for any choice of keys.
         """
         check_window(window)
         groups: dict[int, list[int]] = {}
@@ -118,8 +129,10 @@ class Cut:
     ) -> Cut:
         """Take the windows of a few keys, and ``beyond_s`` around them, and nothing else.
 
-        Windows that overlap are one block, unless its keys are more than `BLOCK_S` apart. Raises
-        InputError if a key does not exist.
+        Overlapping windows are one block, unless its keys are more than `BLOCK_S` apart.
+
+        Raises:
+            InputError: A key does not exist.
         """
         for key in keys:
             check_key(key)

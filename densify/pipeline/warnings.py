@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Warnings about a result: what was assumed for it, or looks wrong, a sentence each."""
+"""Warn about a result: assumptions and suspicions, a sentence each."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ def add_warnings(
 ) -> dict[str, Result]:
     """Return the results of a key's methods, by name, with `Result.warnings`.
 
-    shots: of the maps, by name.
+    Args:
+        shots: Of the maps, by name.
     """
     sequence, stretch = recording.sequence, recording.window(key)
     cameras = {shot.camera.name for shot in shots.values()}

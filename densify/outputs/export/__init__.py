@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A finished run in other tools' formats, optionally with only the certain and recent pixels.
+"""Write a finished run in the formats of other tools.
 
-`config.plugins.EXPORTS` has the forms. export.yaml lies beside the files: run, to, min_confidence,
-max_age_ms (null for any age), density (camera -> measured, filled -> before, after: shares of the
-pixels), num_points (before, after), version.
+`config.plugins.EXPORTS` has the forms. The record export.yaml is beside the files: run, to,
+min_confidence, max_age_ms (null for any age), density (camera -> measured, filled -> before, after:
+shares of the pixels), num_points (before, after), version.
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ _RECORD = "export.yaml"
 
 @dataclass(frozen=True)
 class Export:
-    """The files written, and what the thresholds left.
+    """The written files, and what the thresholds left.
 
-    density: camera -> ``measured`` and ``filled``, fractions of the pixels, of forms with maps.
-    num_points: of forms with the cloud.
+    Attributes:
+        density: Camera -> ``measured`` and ``filled``, shares of the pixels, for forms with
+            maps.
+        num_points: For forms with the cloud.
     """
 
     paths: list[Path]
@@ -52,14 +54,19 @@ def export_run(
 ) -> Export:
     """Write a finished run in another form. Nothing is computed again.
 
-    run: the folder of one key, or of several for forms of drives. to: of
-    `densify.config.plugins.EXPORTS`. out: ``RUN/export/FORM`` if None. min_confidence: 0 to 1;
-    max_age_ms: from the exposure, or the key, to the sweep that measured a pixel or point (a filled
-    one has the age of the nearest measured), None for any: what is beyond is left out. cameras: all
-    if None. overwrite: replace an earlier export.
+    Args:
+        run: Folder of one key, or of several for forms of drives.
+        to: A form of `densify.config.plugins.EXPORTS`.
+        out: Folder to write into; None for ``RUN/export/FORM``.
+        min_confidence: 0 to 1. Pixels and points below are left out.
+        max_age_ms: Greatest time between the exposure, or the key, and the sweep that measured
+            a pixel or point; None for any. A filled pixel has the age of the nearest measured one.
+        cameras: Names; None for all.
+        overwrite: Replace an earlier export.
 
-    Raises InputError for thresholds out of range, files that are missing, damaged or inconsistent,
-    a form that cannot hold the run, and an ``out`` that holds an export or a run.
+    Raises:
+        InputError: A threshold is out of range, a file is missing, damaged or inconsistent, the
+            form cannot hold the run, or ``out`` holds an export or a run.
     """
     if not 0 <= min_confidence <= 1:
         raise InputError(f"--min-confidence {min_confidence}: expected a number from 0 to 1")
@@ -87,7 +94,7 @@ def export_run(
 
 
 def facts(export: Export) -> dict[str, Any]:
-    """Return density and num_points as plain mappings, without those that are not known."""
+    """Return density and num_points as plain mappings, without unknown ones."""
     density = {
         camera: {product: kept._asdict() for product, kept in products.items()}
         for camera, products in export.density.items()

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Images with cameras and points: COLMAP's text model (https://colmap.github.io/format.html), what
-Gaussian splatting starts from, and nerfstudio's folder (``ns-train depth-nerfacto --data DIR``).
+"""Write images with cameras and points, for COLMAP, Gaussian splatting and nerfstudio.
 
-The world is the key frame, the centre of the upper left pixel is (0.5, 0.5), and lenses are
-OpenCV's. COLMAP's poses are world to camera. nerfstudio's are camera to world with OpenGL's axes: x
-right, y up, the camera looks along -z; its depth is in millimetres.
+COLMAP's text model: https://colmap.github.io/format.html. nerfstudio's folder: ``ns-train
+depth-nerfacto --data DIR``.
+
+The world is the key frame. The centre of the upper left pixel is (0.5, 0.5). Lenses are OpenCV's.
+COLMAP's poses are world to camera. nerfstudio's are camera to world with OpenGL's axes: x right, y
+up, the camera looks along -z. Its depth is in millimetres.
 """
 
 from __future__ import annotations
@@ -33,17 +35,22 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_colmap(run: FinishedRun, folder: Path) -> None:
-    """Write ``images/`` and ``sparse/0/`` with cameras.txt, images.txt and points3D.txt, the points
-    that a camera observed. Raises InputError for lenses that COLMAP has no model of."""
+    """Write ``images/`` and ``sparse/0/`` with cameras.txt, images.txt and points3D.txt.
+
+    The points are those that a camera observed.
+
+    Raises:
+        InputError: COLMAP has no model of the lens.
+    """
     _write_model(run, _observed(run.cloud()), folder)
 
 
 def write_splats(run: FinishedRun, folder: Path) -> None:
-    """Write what 3-D Gaussian splatting (Kerbl et al., SIGGRAPH 2023) starts from: a COLMAP model
-    of the static world, also as points3D.ply, and each moving object in its own frame.
+    """Write the input of 3-D Gaussian splatting (Kerbl et al., SIGGRAPH 2023).
 
-    ``movers/0003.ply`` has all points of object 3, ``movers/others.ply`` moving points without a
-    track, in the key frame. ``tracks.json`` is the run's movers.json.
+    It is a COLMAP model of the static world, also as points3D.ply, and each moving object in its
+    own frame. ``movers/0003.ply`` has all points of object 3, ``movers/others.ply`` moving points
+    without a track, in the key frame. ``tracks.json`` is the movers.json of the run.
     """
     whole = run.cloud()
     static = _observed(whole.select(~whole.moving))
@@ -68,11 +75,14 @@ def write_splats(run: FinishedRun, folder: Path) -> None:
 
 
 def write_nerfstudio(run: FinishedRun, folder: Path) -> None:
-    """Write ``transforms.json``, ``images/``, ``depth/CAMERA.npy`` (measured, float32 millimetres,
-    0 none) and ``cloud.ply``, the points that a camera observed.
+    """Write ``transforms.json``, ``images/``, ``depth/CAMERA.npy`` and ``cloud.ply``.
 
-    Raises InputError for maps of ranges, lenses other than OpenCV's with k1 k2 k3 p1 p2, and
-    fisheyes together with others.
+    Depth is the measured one, float32 millimetres, 0 none. The cloud has the points that a camera
+    observed.
+
+    Raises:
+        InputError: The maps hold ranges, a lens is not OpenCV's with k1 k2 k3 p1 p2, or
+            fisheyes are together with other cameras.
     """
     views = _write_images(run, folder)
     fisheyes = {view.camera.model == "fisheye" for view in views.values()}
@@ -122,8 +132,10 @@ def _frame(run: FinishedRun, name: str, view: CameraView) -> dict[str, Any]:
 
 
 def _write_images(run: FinishedRun, folder: Path) -> Mapping[str, CameraView]:
-    """Write the images of the run's maps as ``images/CAMERA.jpg``, and return camera and pose of
-    each. Raises InputError if there is none."""
+    """Write the images of the run's maps as ``images/CAMERA.jpg``; return their cameras and poses.
+
+    Raises InputError if there is none.
+    """
     views = {}
     for name in run.cameras:
         if (data := run.jpeg(name)) is not None:
@@ -138,10 +150,10 @@ def _write_images(run: FinishedRun, folder: Path) -> Mapping[str, CameraView]:
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
-    """Return fx, fy, cx, cy in pixels and the lens: k1 k2 p1 p2 and as many of k3 k4 k5 k6 as it
-    has, or k1 to k4 of a fisheye.
+    """Return fx, fy, cx, cy in pixels and the coefficients of the lens.
 
-    Raises InputError for a lens that OpenCV's eight coefficients cannot describe.
+    They are k1 k2 p1 p2 and the existing ones of k3 k4 k5 k6, or k1 to k4 of a fisheye. Raises
+    InputError for a lens that OpenCV's eight coefficients cannot describe.
     """
     names = _FISHEYE_LENS if camera.model == "fisheye" else _LENS
     lens, K = list(camera.distortion), camera.K

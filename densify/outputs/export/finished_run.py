@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A finished run's folder, read with thresholds on confidence and age; and finished runs over time,
-for viewers with a time line."""
+"""Read the folders of finished runs, with thresholds on confidence and age."""
 
 from __future__ import annotations
 
@@ -37,18 +36,21 @@ _UNOBSERVED = np.array([140, 140, 140], np.uint8)
 
 
 class Kept(NamedTuple):
-    """A fraction of the pixels with a depth, or a number of points, and what thresholds left."""
+    """A share of the pixels with a depth, or a number of points, before and after thresholds."""
 
     before: float
     after: float
 
 
 class FinishedRun:
-    """One key's folder. Its files are read when they are asked for; each may raise InputError.
+    """The folder of one key. Its files are read on demand; each may raise InputError.
 
-    key: its frame. stamp_ns: its reference time. data: the recording. density: camera ->
-    ``measured``, ``filled`` of the maps that were read. num_points: of the clouds that were read,
-    None before the first.
+    Attributes:
+        key: Frame number.
+        stamp_ns: Reference time of the key.
+        data: The recording.
+        density: Camera -> ``measured``, ``filled``, of the maps that were read.
+        num_points: Of the clouds that were read, None before the first.
     """
 
     def __init__(
@@ -58,8 +60,11 @@ class FinishedRun:
         max_age_ms: float | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
-        """Arguments as `densify.outputs.export.export_run`. Raises InputError if the folder holds
-        no run."""
+        """Open a folder; arguments as `densify.outputs.export.export_run`.
+
+        Raises:
+            InputError: The folder holds no run.
+        """
         path = folder / "run.yaml"
         if not path.is_file():
             raise InputError(
@@ -89,6 +94,7 @@ class FinishedRun:
 
     @cached_property
     def scene(self) -> SceneFile:
+        """The scene of the run."""
         return read_scene(self.folder / "scene" / "scene.json")
 
     @cached_property
@@ -102,7 +108,7 @@ class FinishedRun:
         return read_tracks(self.folder / "movers.json")
 
     def measure(self, camera: str) -> str:
-        """Return ``z`` or ``range``, what the depth of a map is."""
+        """Return the measure of a map's depth, ``z`` or ``range``."""
         path = self.folder / "metrics.json"
         with damage_named(path):
             return str(read_json(path)["measure"][camera])
@@ -122,8 +128,10 @@ class FinishedRun:
         return data
 
     def maps(self, camera: str) -> dict[str, NDArray[Any]]:
-        """Return kind -> (H,W) as stored (`densify.outputs.depth_png`), 0 where a pixel is left
-        out: depth, depth_filled, confidence and age."""
+        """Return kind -> (H,W) as stored (`densify.outputs.depth_png`).
+
+        The kinds are depth, depth_filled, confidence and age. A pixel that is left out is 0.
+        """
         maps: dict[str, NDArray[Any]] = {}
         for kind, dtype in _KINDS.items():
             path = map_path(self.folder, kind, camera)
@@ -141,11 +149,11 @@ class FinishedRun:
         return {kind: stored * keep for kind, stored in maps.items()}
 
     def cloud(self) -> StoredCloud:
-        """Return the accumulated points that are left."""
+        """Return the accumulated points within the thresholds."""
         return self._select(read_cloud(self.folder / "cloud.laz"))
 
     def mover_clouds(self) -> list[StoredCloud]:
-        """Return the points that are left of separated objects (``output.movers=separate``)."""
+        """Return the points within the thresholds of separated objects (``movers=separate``)."""
         paths = sorted(self.folder.glob("movers/*/cloud.laz"))
         return [self._select(read_cloud(path)) for path in paths]
 
@@ -180,8 +188,10 @@ def finished_runs(
 
 
 class ShownSweep(NamedTuple):
-    """A sweep as it was measured: its points where registration places them (``rigid_points``).
-    stamp_ns: its reference time."""
+    """A sweep as it was measured, at the poses of registration (``rigid_points``).
+
+    stamp_ns is its reference time.
+    """
 
     frame: int
     stamp_ns: int
@@ -190,8 +200,13 @@ class ShownSweep(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """A camera. stamp_ns: of its exposure. maps_m: "depth" and "depth_filled", (H,W) float32, 0
-    none. is_pinhole: without distortion, with depth along the axis."""
+    """An image of a camera.
+
+    Attributes:
+        stamp_ns: Its exposure.
+        maps_m: "depth" and "depth_filled", (H,W) float32, 0 none.
+        is_pinhole: The camera has no distortion, and depth is along its axis.
+    """
 
     name: str
     view: CameraView
@@ -202,8 +217,13 @@ class Shot(NamedTuple):
 
 
 class Timeline(NamedTuple):
-    """A key. T_world_key: (4,4), the world is the first key's frame. cloud: at the key's time.
-    sweeps: one or more, by time."""
+    """A key with its sweeps.
+
+    Attributes:
+        T_world_key: (4,4). The world is the frame of the first key.
+        cloud: At the key's time.
+        sweeps: One or more, by time.
+    """
 
     run: FinishedRun
     T_world_key: Float
@@ -215,8 +235,12 @@ class Timeline(NamedTuple):
 def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
     """Yield one key with all sweeps of its window, or several keys with their own sweeps.
 
-    runs: ascending by key. Raises InputError where the windows of two consecutive keys have no
-    sweep in common that is one of the keys, because their relative pose is then unknown.
+    Args:
+        runs: Ascending by key.
+
+    Raises:
+        InputError: The windows of two consecutive keys share no key sweep. Their relative pose
+            is then unknown.
     """
     T_world_key = np.eye(4)
     for before, run in zip([None, *runs], runs, strict=False):

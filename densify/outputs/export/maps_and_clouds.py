@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Forms of maps (npy, exr, kitti) and of the cloud (ply, pcd)."""
+"""Write forms of maps (npy, exr, kitti) and of the cloud (ply, pcd)."""
 
 from __future__ import annotations
 
@@ -25,14 +25,21 @@ _PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 
 
 def write_npy(run: FinishedRun, folder: Path) -> None:
-    """Write (H,W) float32 arrays: ``depth`` and ``depth_filled`` in metres, 0 none, and
-    ``confidence``, 0 to 1, with a file for each camera."""
+    """Write (H,W) float32 arrays, one file for each camera.
+
+    They are ``depth`` and ``depth_filled`` in metres, 0 none, and ``confidence``, 0 to 1.
+    """
     _write_maps(run, folder, ".npy", lambda path, _, values: np.save(path, values))
 
 
 def write_exr(run: FinishedRun, folder: Path) -> None:
-    """Write the same as OpenEXR files of one 32-bit channel, ``Z`` of depth and ``Y`` of
-    confidence, without loss. Raises InputError without OpenEXR."""
+    """Write the same maps as OpenEXR files of one 32-bit channel, without loss.
+
+    The channel is ``Z`` for depth and ``Y`` for confidence.
+
+    Raises:
+        InputError: OpenEXR is not installed.
+    """
     library = needed("OpenEXR", "exr", "EXR files")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
 
@@ -57,12 +64,13 @@ def _write_maps(
 
 
 def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write the tree of KITTI depth completion (`densify.outputs.kitti_tree`):
-    ``SPLIT/DRIVE/proj_depth/KIND/CAMERA/0000000120.png``, and beside proj_depth the image
-    ``CAMERA/data/0000000120.png`` and ``intrinsics/CAMERA/0000000120.txt``, K row by row.
+    """Write the tree of KITTI depth completion (`densify.outputs.kitti_tree`).
 
-    KIND is groundtruth (measured), groundtruth_filled, confidence, and velodyne_raw, the key sweep
-    alone, where the run has it. Recordings that the benchmark lacks are in train.
+    Maps are ``SPLIT/DRIVE/proj_depth/KIND/CAMERA/0000000120.png``. Beside proj_depth are the image
+    ``CAMERA/data/0000000120.png`` and K, row by row, in ``intrinsics/CAMERA/0000000120.txt``.
+
+    KIND is groundtruth (measured), groundtruth_filled, confidence, and velodyne_raw, the single
+    sweep, if the run has it. Recordings that the benchmark lacks are in train.
     """
     for run in runs:
         name = run.data.rstrip("/").rpartition("/")[2]
@@ -98,7 +106,8 @@ def write_ply(run: FinishedRun, folder: Path) -> None:
 def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write vertices as PLY (Turk, 1994), binary, little-endian.
 
-    columns: (N,) float32, float64, int32 or uint8 each.
+    Args:
+        columns: (N,) float32, float64, int32 or uint8 each.
     """
     rows = table(columns)
     rows = rows.astype(rows.dtype.newbyteorder("<"), copy=False)
@@ -115,8 +124,10 @@ def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 
 def write_pcd(run: FinishedRun, folder: Path) -> None:
-    """Write ``cloud.pcd``, PCD 0.7 of the Point Cloud Library, binary, with the same columns. The
-    colour is the column ``rgb``, three bytes packed into a float."""
+    """Write ``cloud.pcd``, PCD 0.7 of the Point Cloud Library, binary, with the same columns.
+
+    The colour is the column ``rgb``, three bytes packed into a float.
+    """
     from pypcd4 import Encoding, PointCloud
 
     columns = run.cloud().columns()

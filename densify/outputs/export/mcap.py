@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""One key or a drive as MCAP in Foxglove's schemas (extra ``mcap``), for Foxglove, Lichtblick
-and others.
+"""Write one key or a drive as MCAP in Foxglove's schemas (extra ``mcap``).
 
-Topics::
+Foxglove and Lichtblick show it. Topics::
 
     /tf                FrameTransform: world -> key, key -> vehicle and each camera
     /cloud, /sweep     PointCloud: the accumulated cloud at the key's time; each sweep as measured
@@ -32,8 +31,11 @@ _NS = 10**9
 
 
 def write_mcap(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``recording.mcap``. Same runs, same bytes. Raises InputError without foxglove-sdk, and
-    as `timelines`."""
+    """Write ``recording.mcap``. The same runs give the same bytes.
+
+    Raises:
+        InputError: foxglove-sdk is not installed, or as in `timelines`.
+    """
     foxglove = needed("foxglove", "mcap", "MCAP files")
     context, channels = foxglove.Context(), {}
     options = foxglove.mcap.MCAPWriteOptions(compression_threads=0)
@@ -82,7 +84,7 @@ def _of_shot(m: Any, shot: Shot) -> Iterator[tuple[str, Any]]:
 
 
 def _lens(camera: Camera) -> tuple[str, list[float]] | None:
-    """Return ROS's name of the lens and its coefficients; None if it has none."""
+    """Return ROS's name of the lens and its coefficients, None for a pinhole."""
     lens = [*camera.distortion]
     if camera.model == "fisheye":
         return "kannala_brandt", lens
@@ -109,7 +111,7 @@ def _cloud(m: Any, stamp_ns: int, points: Any, rgb: Any, beside: dict[str, NDArr
 
 
 def _boxes(m: Any, stamp_ns: int, tracks: Sequence[ObjectTrack], frame: int) -> Any:
-    """Return the boxes of that sweep, in place of all before."""
+    """Return the boxes at that sweep, which replace all earlier ones."""
     stamp, entities = _stamp(m, stamp_ns), []
     for track, i in [(t, t.frames.index(frame)) for t in tracks if frame in t.frames]:
         pose, size = _pose(m, track.T_key_object[i]), _vector(m, track.size_m)
@@ -123,7 +125,7 @@ def _boxes(m: Any, stamp_ns: int, tracks: Sequence[ObjectTrack], frame: int) -> 
 
 
 def _transform(m: Any, stamp_ns: int, parent: str, child: str, T: Float) -> Any:
-    """T: (4,4) from child to parent."""
+    """Return the transform of a (4,4) pose T from child to parent."""
     frames = {"parent_frame_id": parent, "child_frame_id": child}
     placed = {"translation": _vector(m, T[:3, 3]), "rotation": _quaternion(m, T)}
     return m.FrameTransform(timestamp=_stamp(m, stamp_ns), **frames, **placed)

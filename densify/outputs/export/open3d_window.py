@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Finished runs in open3d's own viewer (https://www.open3d.org, ``densify[open3d]``)."""
+"""Show finished runs in open3d's own viewer (https://www.open3d.org, extra ``open3d``)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from densify.outputs.export.finished_run import FinishedRun, colours, timelines
 
 
 def show(runs: Sequence[FinishedRun]) -> None:
-    """Show static and moving points and the objects' boxes, with a time line over several keys.
-    Returns when the window is closed. Raises InputError without open3d or a screen."""
+    """Show static and moving points and the boxes of objects, with a time line over several keys.
+
+    It returns when the window is closed.
+
+    Raises:
+        InputError: There is no open3d or no screen.
+    """
     o3d, shown = needed("open3d", "open3d", "Windows with the cloud"), []
     for at, line in enumerate(timelines(runs)):
         cloud, key = line.cloud, line.run.key

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One key or a drive for rerun's viewer (https://rerun.io, extra ``rerun``).
+"""Write one key or a drive for rerun's viewer (https://rerun.io, extra ``rerun``).
 
 By ``time`` (the recording's clock as UNIX time) and ``frame`` there are in ``world/key``::
 
@@ -28,15 +28,18 @@ _POINT, _SWEEP_POINT = -1.5, -2.5  # radii in points of the screen, as rerun wri
 
 
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``recording.rrd``. rerun numbers its chunks by the clock, so bytes differ. Raises
-    InputError without rerun, and as `timelines`."""
+    """Write ``recording.rrd``. rerun numbers its chunks by the clock, so bytes differ.
+
+    Raises:
+        InputError: rerun is not installed, or as in `timelines`.
+    """
     with _stream(runs) as stream:
         stream.save(folder / "recording.rrd")
         _log(stream, runs)
 
 
 def show(runs: Sequence[FinishedRun]) -> None:
-    """Show the same in rerun's viewer, which stays open. Raises InputError as `write_rrd`."""
+    """Show the same in rerun's viewer, which stays open. Raise InputError as `write_rrd`."""
     with _stream(runs) as stream:
         stream.spawn()
         _log(stream, runs)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The page about one key: data, script and style in a single file that opens from disk."""
+"""Make the page of one key: data, script and style in a single file that opens from disk."""

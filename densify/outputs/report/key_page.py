@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The page of one key, of the files of a run or a comparison as far as they are there and whole."""
+"""Make the page of one key from those files of a run or a comparison that are whole."""
 
 from __future__ import annotations
 
@@ -41,11 +41,12 @@ _MAPS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
 
 @dataclass
 class KeyFiles:
-    """One key's files. What cannot be read is noted in ``missing``, a sentence each.
+    """The files of one key. ``missing`` names each file that cannot be read, a sentence each.
 
-    maps: the folder of depth maps, cloud and scene.
-    about: content of run.yaml, or what compare.json says of the same.
-    methods: method -> its scores, the last one that of the maps.
+    Attributes:
+        maps: Folder of depth maps, cloud and scene.
+        about: Content of run.yaml, or the same facts of compare.json.
+        methods: Method -> its scores. The last one is that of the maps.
     """
 
     maps: Path
@@ -55,7 +56,11 @@ class KeyFiles:
 
     @staticmethod
     def of_run(folder: Path) -> KeyFiles:
-        """Raises InputError if run.yaml is missing or damaged."""
+        """Return the files of a run.
+
+        Raises:
+            InputError: If run.yaml is missing or damaged.
+        """
         files = KeyFiles(folder, _mapping(read_yaml(folder / "run.yaml")[0]), {})
         metrics = _mapping(files.read(read_json, "metrics.json"))
         method = str(files.about.get("method", "run"))
@@ -64,7 +69,7 @@ class KeyFiles:
 
     @staticmethod
     def of_comparison(folder: Path) -> KeyFiles:
-        """Raises InputError if compare.json is missing or damaged."""
+        """Return the files of a comparison. Raise InputError for a bad compare.json."""
         about = _mapping(read_json(folder / "compare.json"))
         methods = {str(m): _mapping(s) for m, s in _mapping(about.get("methods")).items()}
         if not methods:
@@ -72,8 +77,11 @@ class KeyFiles:
         return KeyFiles(folder / "compare", about, methods)
 
     def read(self, read: Callable[[Path], T], name: str, optional: bool = False) -> T | None:
-        """Return the content of a file, None if it is damaged or missing. optional: files may be
-        missing without a note."""
+        """Return the content of a file, None if it is damaged or missing.
+
+        Args:
+            optional: The file may be missing without a note.
+        """
         path = self.maps / name
         if optional and not path.is_file():
             return None
@@ -84,8 +92,11 @@ class KeyFiles:
             return None
 
     def camera(self, name: str) -> dict[str, NDArray[Any]]:
-        """Return kind -> (H,W) as stored: maps of the run and of its scene, and by method the
-        measured depth of the baselines."""
+        """Return kind -> (H,W) as stored.
+
+        The kinds are maps of the run and of its scene, and the measured depth of each baseline, by
+        method.
+        """
         maps: dict[str, NDArray[Any]] = {}
         of_methods = {f"scene/{method}": np.uint16 for method in self.methods}
         for place, bits in {**_MAPS, **of_methods}.items():
@@ -99,7 +110,7 @@ class KeyFiles:
         return maps
 
     def image(self, name: str) -> bytes | None:
-        """Return the JPEG of a map's image, None if there is none."""
+        """Return the JPEG of a map's image, None without one."""
 
         def jpeg(path: Path) -> bytes:
             decode_image(data := read_bytes(path), path)
@@ -109,12 +120,12 @@ class KeyFiles:
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:
-    """Return a mapping from a file, an empty one for anything else."""
+    """Return a mapping from a file, an empty one for other content."""
     return value if isinstance(value, dict) else {}
 
 
 def write_report(result: Result, context: Context, folder: Path) -> None:
-    """Write ``report.html`` of the files of the other outputs, where ``output.report`` asks."""
+    """Write ``report.html`` from the files of the other outputs, if ``output.report`` is set."""
     if context.config.get("output", {}).get("report"):
         page = key_page(KeyFiles.of_run(folder), f"{result.key:06d}")
         write_file(folder / "report.html", page)
@@ -123,9 +134,14 @@ def write_report(result: Result, context: Context, folder: Path) -> None:
 def key_page(files: KeyFiles, folder: str) -> bytes:
     """Return the page.
 
-    files: of the key. folder: of a run, as the user names it; "" of a comparison. Points that are
-    too many are thinned, and the page says it. Raises InputError if there is neither a depth map
-    nor a cloud.
+    Too many points are thinned out, and the page says it.
+
+    Args:
+        files: Files of the key.
+        folder: Folder of a run, as the user names it; "" of a comparison.
+
+    Raises:
+        InputError: There is neither a depth map nor a cloud.
     """
     scene = files.read(read_scene, "scene/scene.json", optional=True)
     views, sweeps = (scene.table["views"], scene.table["sweeps"]) if scene else ({}, [])

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""One HTML file with data, script and style that opens from disk and loads nothing else.
+"""Write one HTML file with data, script and style that opens from disk and loads nothing else.
 
-The page is written on WebGL2 and the browser's own inflate: a copy of three.js would be 700 kB for
-points and lines. Content of files of others is JSON, which the script sets as text. The page's
-policy (CSP) allows its one script, by its hash, and no request.
+The page uses WebGL2 and the browser's own inflate, because a copy of three.js would be 700 kB for
+points and lines. Content of other files is JSON, which the script sets as text. The page's policy
+(CSP) allows its one script, by its hash, and no request.
 """
 
 from __future__ import annotations
@@ -46,20 +46,23 @@ _NEAR_M, _MOVING_WEIGHT = 4.0, 100.0
 
 
 class Blobs:
-    """Packed arrays of a page: bytes by significance, deflate, base64, unpacked by
-    ``page/unpack.js``. Browsers decode 16-bit PNG to 8 bits, which loses depth.
+    """Packed arrays of a page: bytes by significance, deflate, base64.
 
-    texts: name -> base64.
+    ``page/unpack.js`` unpacks them. 16-bit PNG would lose depth, because browsers decode it to 8
+    bits.
+
+    Attributes:
+        texts: Name -> base64.
     """
 
     def __init__(self) -> None:
         self.texts: dict[str, str] = {}
 
     def add(self, array: NDArray[Any]) -> dict[str, Any]:
-        """Pack whole numbers (N,) or (H,W), 0 or more and below 2^32, in 8, 16 or 32 bits, and
-        return what the page needs to unpack them.
+        """Pack whole numbers (N,) or (H,W) and return the description that the page needs.
 
-        Values are stored as they are or as differences along the last axis, whichever is smaller.
+        Numbers are 0 or more and below 2^32. They are packed in 8, 16 or 32 bits, as they are or as
+        differences along the last axis, whichever is smaller.
         """
         array = array.astype(np.min_scalar_type(int(array.max(initial=0))))
         steps = np.diff(array, axis=-1, prepend=array.dtype.type(0))
@@ -73,7 +76,7 @@ class Blobs:
         }
 
     def add_file(self, data: bytes, mime: str) -> dict[str, Any]:
-        """Keep an image file as it is."""
+        """Add an image file as it is."""
         return {"blob": self._keep(data), "mime": mime}
 
     def _keep(self, data: bytes) -> str:
@@ -94,11 +97,14 @@ def packed_camera(
     jpeg: bytes | None,
     focal_px: float | None,
 ) -> dict[str, Any]:
-    """Return a camera's entry of the page.
+    """Return the entry of a camera.
 
-    maps: kind -> (H,W) as stored, see `outputs.report.key_page.KeyFiles.camera`. jpeg: its image.
-    Measured, source sweep and age are one map: ``source`` numbers the rows of ``sources``, which
+    Measured, source sweep and age are one map. Its pixels are numbers of rows of ``sources``, which
     are [row of the sweep + 1, age in ms + 1, measured 0 or 1], 0 where unknown.
+
+    Args:
+        maps: Kind -> (H,W) as stored, see `outputs.report.key_page.KeyFiles.camera`.
+        jpeg: The image.
     """
     nothing = np.zeros_like(next(iter(maps.values())), np.uint16)
     depth, filled, sweep, age = (
@@ -124,12 +130,15 @@ def packed_camera(
 def packed_cloud(
     blobs: Blobs, cloud: StoredCloud, frames: Sequence[int], instances: Sequence[int]
 ) -> dict[str, Any]:
-    """Return the cloud's entry of the page: the points of `thinned`, moving ones first. Positions
-    are 16-bit numbers in a box.
+    """Return the entry of the cloud: the points of `thinned`, moving ones first.
 
-    frames: the sweeps that ``sweep`` numbers. instances: the tracked objects; ``mover`` is 0 of
-    static points, 1 of moving points without a track, 2 and up of these. ``displaced``, metres
-    beyond the rigid alignment, is of moving points alone, in ``displaced_step_m`` plus 32768.
+    Positions are 16-bit numbers in a box. ``mover`` is 0 for static points, 1 for moving points
+    without a track, 2 and up for tracked objects. ``displaced``, metres beyond the rigid alignment,
+    is of moving points alone, in ``displaced_step_m`` plus 32768.
+
+    Args:
+        frames: The sweeps that ``sweep`` numbers.
+        instances: The tracked objects.
     """
     rows = thinned(cloud.points, cloud.moving, _MOST_POINTS)
     chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])
@@ -158,10 +167,14 @@ def packed_cloud(
 
 
 def thinned(points: Float, moving: Bool, most: int) -> Int:
-    """Return rows (K,) of at most so many points, ascending, chosen at random with a fixed seed.
+    """Return (K,) rows of at most ``most`` points, ascending, chosen at random with a fixed seed.
 
-    points: (N,3) key frame. moving: (N,). A point counts by its squared distance, which makes the
-    rest about as dense in angle everywhere, and moving points count more.
+    A point counts by its squared distance, and moving points count more. The result is about
+    equally dense in angle everywhere.
+
+    Args:
+        points: (N,3) key frame.
+        moving: (N,) bool.
     """
     if len(points) <= most:
         return np.arange(len(points))
@@ -180,7 +193,7 @@ def _colours(cloud: StoredCloud) -> NDArray[np.uint8]:
 
 
 def _numbers(values: NDArray[np.int32], known: Sequence[int]) -> Int:
-    """Return the place of each value (N,) in a list, 0 for others."""
+    """Return the position of each value (N,) in a list, 0 for others."""
     number_of = {value: number for number, value in enumerate(known)}
     return np.array([number_of.get(value, 0) for value in values.tolist()], np.int64)
 
@@ -188,8 +201,10 @@ def _numbers(values: NDArray[np.int32], known: Sequence[int]) -> Int:
 def page_file(title: str, data: Mapping[str, Any], blobs: Blobs) -> bytes:
     """Return a whole page.
 
-    title: any text.
-    data: plain numbers, texts, lists and mappings, ``page`` in the script.
+    Args:
+        title: Any text.
+        data: Plain numbers, texts, lists and mappings, ``page`` in the script.
+        blobs: The packed arrays.
     """
     script, style = "\n".join(map(_source, _SCRIPTS)), _source("page.css")
     policy = (
@@ -221,7 +236,7 @@ def _hash(text: str) -> str:
 
 
 def _json(value: Mapping[str, Any]) -> str:
-    """Return JSON that cannot end the script element it is in."""
+    """Return JSON that cannot end its script element."""
     text = json.dumps(plain(value), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return re.sub("[<>&\u2028]", lambda match: f"\\u{ord(match[0]):04x}", text)
 
