@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The command line: a thin shell over the Python API.
+"""Run the command line, a thin shell over the Python API.
 
-Results and paths go to stdout, progress and log to stderr. Only this package prints. Modules that
-load numpy and heavier things are imported by the verb that needs them: help answers at once.
+Results and paths go to stdout, progress and log to stderr. Only this package prints. A verb imports
+numpy and heavier modules when it runs. Therefore help answers at once.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
-    0: done. 1: a ComputationError, or an unforeseen error, whose traceback is written to a file.
-    2: an InputError, an error of the system, or (by argparse, which exits) a bad argument.
-    130: interrupted.
+    0: done. 1: a ComputationError, or an unforeseen error, whose traceback is written to a file. 2:
+    an InputError, an error of the system, or (by argparse, which exits) a bad argument. 130:
+    interrupted.
     """
     with screen() as shown:
         try:
@@ -99,7 +99,7 @@ def _run(arguments: Sequence[str] | None, shown: Screen) -> None:
 
 
 def _let_go_of(stream: TextIO) -> None:
-    """Keep the interpreter from flushing once more into what cannot be written."""
+    """Redirect a broken stream, which the interpreter would flush once more."""
     try:
         stream.flush()
     except OSError:

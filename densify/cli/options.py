@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Options that several verbs have, and how their values are read."""
+"""Define options of several verbs, and read their values."""
 
 from __future__ import annotations
 
@@ -32,8 +32,15 @@ def add_verb(
     about: str,
     epilog: str = "",
 ) -> argparse.ArgumentParser:
-    """Add a verb to the command line and return its parser; ``verb`` is called with its options,
-    None for a verb that has others below it."""
+    """Add a verb to the command line and return its parser.
+
+    Args:
+        commands: The subparsers.
+        name: Name of the verb.
+        verb: Is called with the options; None for a verb with verbs of its own.
+        about: A line for the front page.
+        epilog: More about it.
+    """
     description = f"{about[0].upper()}{about[1:]}."
     parser: argparse.ArgumentParser = commands.add_parser(
         name, help=about, description=description, epilog=epilog or None
@@ -45,7 +52,12 @@ def add_verb(
 
 
 def option(parser: argparse.ArgumentParser, usage: str, about: str, **more: Any) -> None:
-    """Add an option. usage: ``--name METAVAR``, or ``--name`` alone for one without a value."""
+    """Add an option.
+
+    Args:
+        usage: ``--name METAVAR``, or ``--name`` alone for one without a value.
+        about: Help.
+    """
     name, _, metavar = usage.partition(" ")
     kind: dict[str, Any] = {"metavar": metavar} if metavar else {"action": "store_true"}
     parser.add_argument(name, help=about, **kind, **more)
@@ -66,8 +78,10 @@ def add_recording(parser: argparse.ArgumentParser, several: bool = False) -> Non
 
 
 def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add those of the options that several verbs have: window, method, camera, config (with
-    ``--set``), overwrite."""
+    """Add some of the options that several verbs have.
+
+    Their names are window, method, camera, config (with ``--set``) and overwrite.
+    """
     if "window" in names:
         about = (
             "number of sweeps on each side of the key (default: 5). More sweeps are denser and "
@@ -93,8 +107,10 @@ def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
 
 
 def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
-    """Return the specs of the recordings that a command names. Without any, log that the simulator
-    is used and return ``default``."""
+    """Return the specs of the recordings that a command names.
+
+    Without any, log that the simulator is used, and return ``default``.
+    """
     given = options.recording or []
     specs = [*([given] if isinstance(given, str) else given), *options.data]
     if not specs:
@@ -111,7 +127,7 @@ def recording_of(options: argparse.Namespace) -> str:
 
 
 def config_of(options: argparse.Namespace) -> Config:
-    """Return the configuration that ``--config``, ``--set``, ``--flow`` and ``--report`` make."""
+    """Return the settings of ``--config``, ``--set``, ``--flow`` and ``--report``."""
     short = []
     if getattr(options, "flow", None) is not None:
         short.append(f"flow.engine={options.flow}")
@@ -136,7 +152,11 @@ def check_new_file(path: Path, overwrite: bool, suffix: str = "") -> None:
 
 
 def sliced(sequence: LidarSequence, keys: range | None) -> list[int]:
-    """Return the frames of ``--keys``, all for None. Raises InputError if there is none."""
+    """Return the frames of ``--keys``, all for None.
+
+    Raises:
+        InputError: There is none.
+    """
     from densify.readers.timeline import format_frames
 
     there = [frame for frame in sequence.frames if keys is None or frame in keys]
@@ -172,7 +192,11 @@ def words(text: str) -> list[str]:
 
 
 def key_range(text: str, other: str = "") -> range:
-    """Read ``A:B[:S]``. other: what is accepted too, for the message."""
+    """Read ``A:B[:S]``.
+
+    Args:
+        other: Other accepted text, for the message.
+    """
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
         first, end, step = (*map(int, numbers), 1)[:3]
@@ -184,7 +208,7 @@ def key_range(text: str, other: str = "") -> range:
 
 
 def all_or_range(text: str) -> range | None:
-    """Read ``all``, which is None, or ``A:B[:S]``."""
+    """Read ``all`` as None, or ``A:B[:S]``."""
     return None if text == "all" else key_range(text, "all, or ")
 
 

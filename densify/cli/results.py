@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Summaries of results, comparisons and exports, for people and (``*_facts``) for programs.
+"""Summarise results, comparisons and exports, for people and (``*_facts``) for programs.
 
-Read from `Result.metrics`: ``density`` and ``ghosts``, ``held_out`` by camera (scores of the map
+They read `Result.metrics`: ``density`` and ``ghosts``, ``held_out`` by camera (scores of the map
 made without the key sweep against its returns) and ``depth`` by camera (scores against exact
 truth).
 """
@@ -75,8 +75,7 @@ def summary(result: Result) -> str:
 
 
 def _beside_icp(result: Result, *path: str) -> str:
-    """Return a share as text, "" for none, and in brackets that of rigid accumulation where it was
-    made."""
+    """Return a share as text, with that of rigid accumulation in brackets; "" for none."""
     share = look_up(result.metrics, *path)
     rigid = result.baselines.get("icp")
     by_icp = look_up(rigid.metrics, *path) if rigid is not None else None

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Answers on stdout, with tables of text; log lines, the one error, and where that is a terminal a
-progress bar on stderr."""
+"""Print answers on stdout; log lines, the one error, and a progress bar on stderr.
+
+The progress bar is shown only on a terminal.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +27,11 @@ if TYPE_CHECKING:
 class Answer:
     """The answer of a verb.
 
-    text: for people.
-    facts: for programs (``--json``); lists of several answers are joined.
-    files: the files written.
-    first: the files to open first, each with what it shows.
+    Attributes:
+        text: For people.
+        facts: For programs (``--json``). Lists of several answers are joined.
+        files: Written files.
+        first: Files to open first, each with its content.
     """
 
     text: str = ""
@@ -49,7 +52,8 @@ class Answer:
 def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> dict[Path, str]:
     """Return the files to open first, at most one of each kind.
 
-    kinds: pattern of the end of a path -> what the file shows; the first kinds come first.
+    Args:
+        kinds: Pattern of the end of a path -> content. The first kinds come first.
     """
     first: dict[Path, str] = {}
     for pattern, what in kinds.items():
@@ -60,8 +64,7 @@ def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> 
 
 
 def numbers_table(columns: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a table with a column for each mapping and a row for each number in any of them, named
-    by its path."""
+    """Return a table with a column for each mapping and a row for each number, by its path."""
     flat = {title: dict(_numbers(numbers, "")) for title, numbers in columns.items()}
     names = dict.fromkeys(name for numbers in flat.values() for name in numbers)
     body = [[name, *(_cell(column.get(name)) for column in flat.values())] for name in names]
@@ -92,7 +95,11 @@ def aligned(rows: Sequence[Sequence[str]], side: str = ">") -> str:
 
 
 def written(value: float | None, form: str) -> str:
-    """Return the number as text, "-" for None. form: a format, and after a blank a unit."""
+    """Return the number as text, "-" for None.
+
+    Args:
+        form: A format, and after a blank a unit.
+    """
     if value is None:
         return "-"
     number, _, unit = form.partition(" ")
@@ -105,7 +112,7 @@ def percent(value: float | None, digits: int = 2) -> str:
 
 
 def look_up(metrics: Mapping[str, Any], *path: str) -> Any:
-    """Return ``metrics[a][b]...``, None where a step of the path is missing."""
+    """Return ``metrics[a][b]...``, None if a step of the path is missing."""
     value: Any = metrics
     for step in path:
         value = value.get(step) if isinstance(value, Mapping) else None
@@ -118,8 +125,10 @@ _SCHEMA = 1
 
 
 class Screen(logging.Handler):
-    """Shows what one command says: text, or one JSON object at the end. As a handler of the log it
-    prints one line per record, above a progress bar if there is one."""
+    """The output of one command: text, or one JSON object at the end.
+
+    As a handler of the log it prints one line per record, above the progress bar.
+    """
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -146,7 +155,7 @@ class Screen(logging.Handler):
             sys.stdout.flush()
 
     def end(self, exit_code: int, error: str | None = None) -> int:
-        """Say what went wrong, print the JSON object if asked for, and return the exit code."""
+        """Print the error and the JSON object, if there are any, and return the exit code."""
         if error is not None:
             logging.getLogger("densify").error("%s", error)
         if self._json:
@@ -169,8 +178,11 @@ class Screen(logging.Handler):
 
 @contextmanager
 def screen() -> Iterator[Screen]:
-    """Send the package's log to a new screen; that of ``densify.progress`` only on a terminal,
-    unless its level is set. Warnings of numpy and others, for developers, are debug messages."""
+    """Send the package's log to a new screen.
+
+    ``densify.progress`` is shown only on a terminal, unless its level is set. Warnings of numpy and
+    others, for developers, are debug messages.
+    """
     log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
     before, shown = (log.level, log.propagate, progress.level), Screen()
     log.addHandler(shown)
@@ -216,7 +228,8 @@ def _above_bars() -> AbstractContextManager[None]:
 def tell_doubts(doubts: Iterable[tuple[str, str, int]], most: int = 20) -> None:
     """Log each warning once with its keys, the most frequent first.
 
-    doubts: (warning, recording or "", key).
+    Args:
+        doubts: (warning, recording or "", key).
     """
     from densify.readers.timeline import format_frames
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Where things are: poses, camera models, what a sweep saw in every direction, the ground."""
+"""Provide poses, camera models, nearest neighbours and the types that stages hand on."""

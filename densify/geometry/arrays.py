@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names of the array types used everywhere, and tables of columns."""
+"""Name the array types used everywhere, and make tables of columns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Bool = NDArray[np.bool_]
 
 
 def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """(M,) structured, a field for each of the (M,) columns, without gaps between them."""
+    """Return an (M,) structured array with a field for each of the (M,) columns, without gaps."""
     rows = np.empty(
         len(next(iter(columns.values()))), [(name, c.dtype) for name, c in columns.items()]
     )

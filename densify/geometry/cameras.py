@@ -37,19 +37,24 @@ _CONVERGED = np.sqrt(np.finfo(float).eps)  # the next step of Newton's method is
 
 
 def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
-    """Project points into a camera's image.
+    """Return the projection of points into the image of a camera.
 
-    points_cam: (N,3) metres, camera frame (x right, y down, z forward).
+    A distortion polynomial is fitted inside the image only. Beyond the angle at which the distorted
+    radius stops growing it folds points back into the image. These points count as invisible, and
+    so do points more than the camera's ``max_angle_deg`` off its axis.
 
-    Returns (N,2) image coordinates u, v in pixels (a pixel's centre is an integer; NaN where a
-    point has none) and (N,) bool: not too near (z, or range where the lens sees more than a half
-    space, over 0.1 m), inside the lens's valid field of view and on one of the image's pixels after
-    ``rint``.
+    Args:
+        camera: The camera.
+        points_cam: (N,3) metres, camera frame (x right, y down, z forward).
 
-    A distortion polynomial is only fitted inside the image. Beyond the angle where the distorted
-    radius stops growing it folds points back in, so those count as unseen, as do points more than
-    the camera's ``max_angle_deg`` off its axis. Raises InputError for an unknown model or other
-    coefficients than it has.
+    Returns:
+        uv: (N,2) image coordinates in pixels. An integer is the centre of a pixel. NaN for a
+            point without one.
+        visible: (N,) bool: not too near (z, or range for more than a half space, over 0.1 m),
+            in the valid field of view of the lens, and on a pixel of the image after ``rint``.
+
+    Raises:
+        InputError: The model is unknown, or has other coefficients.
     """
     lens = _lens(camera)
     uv, seen = np.full((len(points_cam), 2), np.nan), np.zeros(len(points_cam), bool)
@@ -66,8 +71,11 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
 
 
 def rays(camera: Camera, uv: Float) -> Float:
-    """Return (N,3) unit vectors in the camera frame of (N,2) image coordinates; NaN where the lens
-    sees nothing. The inverse of `image_points`, with its errors."""
+    """Return (N,3) unit vectors in the camera frame of (N,2) image coordinates.
+
+    This is the inverse of `image_points`, with its errors. The result is NaN outside the view of
+    the lens.
+    """
     lens = _lens(camera)
     on_plane = (np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T)[:, :2]
     if not camera.is_rectified:
@@ -80,8 +88,10 @@ def rays(camera: Camera, uv: Float) -> Float:
 
 
 def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
-    """Return (N,2,3) the Jacobian of the projection of points (N,3) that are seen: the change of
-    u and v as a point moves by a metre along x, y and z of the camera frame."""
+    """Return (N,2,3) the Jacobian of the projection of visible points (N,3).
+
+    It is the change of u and v as a point moves by a metre along x, y and z of the camera frame.
+    """
     lens = _lens(camera)
     range_m = np.linalg.norm(points_cam, axis=1, keepdims=True)
     ray = points_cam / range_m
@@ -100,7 +110,7 @@ def depth_along(points_cam: Float, measure: str) -> Float:
 
 
 def converted(camera: Camera, depth_m: Float32, given: str, wanted: str) -> Float32:
-    """Return (H,W) depth in the other measure (``z`` or ``range``); 0 where it has no z > 0."""
+    """Return (H,W) depth in the other measure (``z`` or ``range``), 0 without a z > 0."""
     if given == wanted:
         return depth_m
     v, u = np.divmod(np.arange(depth_m.size, dtype=np.float64), camera.width_px)
@@ -111,8 +121,13 @@ def converted(camera: Camera, depth_m: Float32, given: str, wanted: str) -> Floa
 
 
 class _Lens(NamedTuple):
-    """The bending of the plane. numerator, denominator: of the radial factor, polynomials in the
-    squared radius. limit: squared radius up to which the distorted radius grows."""
+    """The distortion of a lens on the plane.
+
+    numerator.
+
+    denominator: of the radial factor, polynomials in the squared radius. limit: squared radius up
+    to which the distorted radius grows.
+    """
 
     numerator: Polynomial
     denominator: Polynomial
@@ -154,10 +169,10 @@ def _lens(camera: Camera) -> _Lens:
 
 
 def _stops_growing(n: Polynomial, d: Polynomial) -> float:
-    """Return the squared radius up to which the distorted one grows.
+    """Return the squared radius up to which the distorted radius grows.
 
     With s = r² and the factor n(s)/d(s), the distorted radius r n/d stops growing at the first
-    positive root of n d + 2 s (n' d - n d'), and means nothing beyond a pole, the first root of d.
+    positive root of n d + 2 s (n' d - n d'). Beyond a pole, the first root of d, it has no meaning.
     """
     growth = n * d + Polynomial([0.0, 2.0]) * (n.deriv() * d - n * d.deriv())
     roots = np.concatenate([growth.trim(1e-15).roots(), d.trim(1e-15).roots()])
@@ -166,7 +181,7 @@ def _stops_growing(n: Polynomial, d: Polynomial) -> float:
 
 
 def _in_view(camera: Camera, lens: _Lens, points_cam: Float) -> Bool:
-    """Return (N,) True where the lens sees that way, in the image or not."""
+    """Return (N,) True for directions in the view of the lens, in the image or not."""
     x, y, z = points_cam.T
     range_m = np.sqrt(x * x + y * y + z * z)  # norm takes three times as long over rows of three
     seen: Bool = z >= range_m * np.cos(np.radians(camera.max_angle_deg))
@@ -214,7 +229,7 @@ def _direction(camera: Camera, x: Float, y: Float) -> Float:
 
 
 def _bent(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float]:
-    """Return coordinates on the plane behind the lens."""
+    """Return distorted coordinates on the plane."""
     s = x**2 + y**2
     factor = lens.numerator(s) / lens.denominator(s)
     bent_x = factor * x + 2 * lens.p1 * x * y + lens.p2 * (s + 2 * x**2)
@@ -222,7 +237,7 @@ def _bent(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float]:
 
 
 def _pixels(camera: Camera, lens: _Lens, points_cam: Float) -> Float:
-    """Return (N,2) image coordinates of points (N,3) that the lens sees."""
+    """Return (N,2) image coordinates of points (N,3) in the view of the lens."""
     x, y = _plane(camera, points_cam)
     if not camera.is_rectified:
         x, y = _bent(lens, x, y)
@@ -231,9 +246,9 @@ def _pixels(camera: Camera, lens: _Lens, points_cam: Float) -> Float:
 
 
 def _unbent(lens: _Lens, wanted: Float) -> Float:
-    """Return the (N,2) inverse of `_bent`; NaN where there is none.
+    """Return the (N,2) inverse of `_bent`, NaN where there is none.
 
-    The radial part is looked up, then Newton's method takes in the rest.
+    The radial part is looked up. Newton's method adds the rest.
     """
     # Evenly in angle, since the plane of a lens that sees half of all directions has no end.
     radius = np.tan(np.linspace(0, np.arctan(np.sqrt(lens.limit)), _NUM_ANGLES))
@@ -255,7 +270,7 @@ def _unbent(lens: _Lens, wanted: Float) -> Float:
 
 
 def _slopes(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float, Float]:
-    """Return (N,) changes of the bent x by x, of either by the other, and of the bent y by y."""
+    """Return (N,) derivatives of the distorted x by x, of either by the other, and of y by y."""
     s, n, d = x**2 + y**2, lens.numerator, lens.denominator
     factor = n(s) / d(s)
     growth = 2 * (n.deriv()(s) - factor * d.deriv()(s)) / d(s)

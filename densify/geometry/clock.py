@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The times of sweeps, and which sweeps are near each other in time."""
+"""Answer which sweeps are near each other in time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ _BATCH_S = 0.1
 class Clock:
     """Reference times of W sweeps, at any rate and with gaps.
 
-    time_ns: (W,) int64, ascending. Sweeps are addressed by their index.
+    Sweeps are addressed by their index.
+
+    Attributes:
+        time_ns: (W,) int64, ascending.
     """
 
     time_ns: Int
@@ -31,12 +34,12 @@ class Clock:
 
     @cached_property
     def time_s(self) -> Float:
-        """(W,) `time_ns` in seconds."""
+        """The (W,) `time_ns` in seconds."""
         return np.asarray(self.time_ns * 1e-9, np.float64)
 
     @cached_property
     def period_ns(self) -> float:
-        """Median time between two sweeps; infinite for fewer than two."""
+        """The median time between two sweeps, infinite for fewer than two."""
         return float(np.median(np.diff(self.time_ns))) if len(self.time_ns) > 1 else np.inf
 
     def near(self, i: int, j: int, reach_s: float) -> bool:
@@ -44,14 +47,14 @@ class Clock:
         return bool(abs(self.time_ns[i] - self.time_ns[j]) <= self._slack_ns(reach_s))
 
     def num_in(self, duration_s: float) -> int:
-        """Return how many periods fill the duration, at least 1."""
+        """Return the number of periods in the duration, at least 1."""
         return max(1, round(duration_s * 1e9 / self.period_ns))
 
     def batches(self) -> tuple[tuple[int, ...], ...]:
-        """Group sweeps that follow each other within less than 0.1 s, to the nearest sweep.
+        """Return groups of consecutive sweeps within less than 0.1 s, to the nearest sweep.
 
-        A scanner that turns faster has fewer points in a sweep, and objects move less between
-        sweeps. A batch tells as much as one sweep at 10 Hz, where each batch is one sweep.
+        A faster scanner has fewer points in a sweep, and objects move less between sweeps. A batch
+        holds as much evidence as one sweep at 10 Hz, where each batch is one sweep.
         """
         groups: list[list[int]] = []
         for j, time_ns in enumerate(self.time_ns.tolist()):
@@ -65,7 +68,8 @@ class Clock:
     def around(self, i: int, reach_s: float, most: int) -> list[int]:
         """Return the other sweeps within ``reach_s`` and half a period of sweep i, ascending.
 
-        most: sweeps on each side; more are thinned evenly.
+        Args:
+            most: Number of sweeps on each side. A larger number is thinned out evenly.
         """
         within_ns = self._slack_ns(reach_s)
         first = int(np.searchsorted(self.time_ns, self.time_ns[i] - within_ns))
@@ -76,14 +80,14 @@ class Clock:
     def at(self, i: int, later_s: float) -> int | None:
         """Return the sweep nearest to ``later_s`` after sweep i, or before it if negative.
 
-        Only sweeps on that side count; None where there are none.
+        Only sweeps on that side count. Without any, return None.
         """
         side = range(i + 1, len(self.time_ns)) if later_s > 0 else range(i - 1, -1, -1)
         wanted_ns = self.time_ns[i] + later_s * 1e9
         return min(side, key=lambda j: abs(self.time_ns[j] - wanted_ns), default=None)
 
     def nearest(self, j: int, among: Iterable[int]) -> int:
-        """Return the sweep among these that is nearest to sweep j, the earlier of two."""
+        """Return the one of these sweeps that is nearest to sweep j, the earlier of two."""
         return min(among, key=lambda k: (abs(self.time_ns[k] - self.time_ns[j]), k))
 
     def from_end_s(self, i: int) -> float:
@@ -96,7 +100,7 @@ class Clock:
 
 
 def num_in_batch(period_s: float) -> int:
-    """Return how many sweeps a batch has, see `Clock.batches`."""
+    """Return the number of sweeps in a batch, see `Clock.batches`."""
     return max(1, int(np.ceil(_BATCH_S / period_s + 0.5)) - 1)
 
 

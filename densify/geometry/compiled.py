@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Compiled inner loops; the only door to numba.
+"""Compile inner loops by numba. No other module imports numba.
 
-A kernel takes arrays of fixed types, writes into arrays it is given and raises nothing. It lets go
-of the interpreter while it works, so that its rows can be shared out among threads.
+A kernel takes arrays of fixed types, writes into given arrays and raises nothing. It releases the
+interpreter while it runs, and threads can share its rows.
 
 Compiling takes a quarter of a first run. Rows are assigned number by number: an array or a tuple at
-once takes 1.6 s to compile. A literal handed to an inlined function compiles it once more.
+once takes 1.6 s to compile. A literal argument of an inlined function compiles it once more.
 
-Numba's own parallel loops are not used: their order of summation depends on the number of threads,
-their pools abort the process after a fork or when two threads enter them at once, and OpenMP waits
-in busy loops, which costs tenfold where cores are shared.
+Numba's own parallel loops are not used. Their order of summation depends on the number of threads.
+Their pools abort the process after a fork or when two threads enter them at once. OpenMP waits in
+busy loops, which costs tenfold where cores are shared.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _LEAST_ROWS = 4096  # to hand fewer to a second thread takes longer than most ke
 
 
 class _Compiling(event.Listener):
-    """Says once that the first run takes longer; numba tells when it compiles."""
+    """Log once that the first run takes longer, when numba compiles."""
 
     said = False
 
@@ -54,7 +54,7 @@ class _Compiling(event.Listener):
             )
 
     def on_end(self, event: event.Event) -> None:
-        """Do nothing; numba asks for it."""
+        """Do nothing; numba calls it."""
 
 
 _compiling = _Compiling()
@@ -68,7 +68,7 @@ def inlined(function: _Function) -> _Function:
 
 
 def _imported_code(function: Callable[..., Any]) -> str:
-    """Return a digest of the files of inlined functions that the function's own file imports.
+    """Return a digest of the imported files of inlined functions.
 
     Numba's cache notices changes of the function's own file only.
     """
@@ -94,12 +94,12 @@ def _is_open(folder: Path) -> bool:
 
 
 class Kernel:
-    """A function that is compiled when first called with new types, and kept for later runs.
+    """A function that is compiled at the first call with new types, and cached for later runs.
 
-    The cache lies beside the source file, else in the user's cache directory, or where the
-    environment variable NUMBA_CACHE_DIR says. Where none can be written, what lies there is
-    damaged, or others than those who can change the source could have put it there (it is loaded as
-    code), it is compiled anew in every run.
+    The cache is beside the source file, else in the user's cache directory, or where the
+    environment variable NUMBA_CACHE_DIR says. A cache is not used if it cannot be written, is
+    damaged, or if other users than those who can change the source could have written it, because
+    it is loaded as code. The function is then compiled in every run.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -116,6 +116,7 @@ class Kernel:
             self._do_without_cache(f"others can write to {folder}")
 
     def __call__(self, *arguments: Any) -> Any:
+        """Call the compiled function."""
         try:
             return self._compiled(*arguments)
         except Exception as error:  # a full disk, a damaged file: unpickling can raise anything
@@ -125,8 +126,8 @@ class Kernel:
     def over_rows(self, num_rows: int, *arguments: Any) -> None:
         """Call with (begin, end, *arguments) for parts of the rows, on all cores.
 
-        The parts do not change the result where a kernel treats every row by itself.
-        NUMBA_NUM_THREADS limits the threads.
+        The parts do not change the result of a kernel that treats each row alone. NUMBA_NUM_THREADS
+        limits the threads.
         """
         over_rows(self, num_rows, *arguments)
 
@@ -143,7 +144,9 @@ def num_threads() -> int:
 def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> None:
     """Call ``function(begin, end, *arguments)`` for ranges that cover 0 to ``num_rows``.
 
-    function: its result for a row must depend on that row alone. It may not call this one.
+    Args:
+        function: Its result for a row must depend on that row alone. It must not call this
+            function.
     """
     num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
     if num_parts <= 1:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Groups of points by distance: single linkage, and the points close to seeds; exact."""
+"""Group points by distance (single linkage), and find the points close to seeds; exact."""
 
 from __future__ import annotations
 
@@ -12,13 +12,17 @@ from densify.geometry.types import Bool, Float, Int
 
 
 def link(points: Float, distance_m: float) -> tuple[int, Int]:
-    """Group points by single linkage: points closer than ``distance_m`` share a group.
+    """Return groups of points by single linkage: points closer than ``distance_m`` share a group.
 
-    All points of a grid cell whose diagonal is the distance are linked. Only cells are paired, so
-    the cost does not grow with the square of the density.
+    All points of a grid cell whose diagonal is the distance are linked. Only cells are paired.
+    Therefore the cost does not grow with the square of the density.
 
-    points: (N,3).
-    Returns the number of groups and (N,) labels, numbered by the first point of each group.
+    Args:
+        points: (N,3) metres.
+        distance_m: Greatest distance of linked points.
+
+    Returns:
+        The number of groups and (N,) labels, numbered by the first point of each group.
     """
     if not len(points):
         return 0, np.zeros(0, np.int64)
@@ -41,11 +45,13 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
 
 
 def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
-    """Return (N,) True for the points closer than ``within_m`` to a seed that counts.
+    """Return (N,) True for the points closer than ``within_m`` to a dense seed.
 
-    A seed counts if seeds are at least ``least_share`` of the points within that distance of it.
+    A seed is dense if at least ``least_share`` of the points within that distance of it are seeds.
 
-    points: (N,3). seed: (N,).
+    Args:
+        points: (N,3) metres.
+        seed: (N,) bool.
     """
     seeds = points[seed]
     if not len(seeds):

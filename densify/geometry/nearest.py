@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Nearest neighbours by SciPy's tree, and clouds thinned by a grid."""
+"""Find nearest neighbours by SciPy's tree, and thin clouds by a grid."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ def tree_of(points: Float) -> cKDTree:
 
 
 def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Float, Int]:
-    """Return (N,) distances to the nearest point and (N,) its row, inf and -1 beyond ``within_m``.
+    """Return (N,) distances to the nearest point and (N,) its row.
 
-    queries: (N,d).
+    Beyond ``within_m`` they are inf and -1.
+
+    Args:
+        queries: (N,d).
     """
     distance_m, row = tree.query(queries, distance_upper_bound=within_m)
     distance_m = np.asarray(distance_m)
@@ -27,7 +30,9 @@ def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Fl
 def nearest_k(tree: cKDTree, queries: Float, k: int) -> tuple[Float, Int]:
     """Return (N,k) distances to the nearest points, nearest first, and (N,k) their rows.
 
-    k is cut to the number of points. queries: (N,d).
+    Args:
+        queries: (N,d).
+        k: Is cut to the number of points.
     """
     distance_m, row = tree.query(queries, np.arange(1, min(k, tree.n) + 1))
     return np.asarray(distance_m), np.asarray(row, np.int64)
@@ -39,10 +44,13 @@ def is_near(tree: cKDTree, queries: Float, within_m: float) -> Bool:
 
 
 def thinned(points: Float | Float32, order: Int, step: float, most: int) -> Int:
-    """The rows, ascending, of (N,3) points that are left if each cell of a grid keeps the first
-    ``most`` of its points in that ``order``.
+    """Return the rows, ascending, of (N,3) points after thinning by a grid.
 
-    step: side of a cell. Rows that are not in the order are left out.
+    Each cell keeps the first ``most`` of its points.
+
+    Args:
+        order: Rows in the order of preference. Other rows are dropped.
+        step: Side of a cell.
     """
     low = points.min(axis=0, initial=np.inf).astype(np.float64)
     cell = ((points.take(order, axis=0) - low) / step).astype(np.int64)

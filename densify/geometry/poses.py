@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Rigid motions as (4,4) float64 matrices named ``T_target_source``; (...,4,4) where it says so."""
+"""Compute with rigid motions: (4,4) float64 matrices named ``T_target_source``.
+
+Some functions take (...,4,4).
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ def rotate(T_a_b: Float, vectors_b: Float) -> Float:
 def log(T_a_b: Float) -> Float:
     """Return the (...,6) rotation vector (rad) and translation (m) of poses (...,4,4).
 
-    The translation is the plain one, not the screw's: at the turn of a vehicle within a sweep
+    The translation is the plain one, not that of the screw. At the turn of a vehicle within a sweep
     (≤ 0.1 rad) the two paths differ by millimetres, and rotation and translation stay separate.
     """
     turn = Rotation.from_matrix(T_a_b[..., :3, :3]).as_rotvec()
@@ -47,7 +50,7 @@ def log(T_a_b: Float) -> Float:
 
 
 def exp(twist: Float) -> Float:
-    """Return the poses (...,4,4) of (...,6); the inverse of `log`."""
+    """Return the poses (...,4,4) of (...,6), the inverse of `log`."""
     T_a_b = np.zeros((*twist.shape[:-1], 4, 4))
     T_a_b[..., :3, :3] = Rotation.from_rotvec(twist[..., :3]).as_matrix()
     T_a_b[..., :3, 3], T_a_b[..., 3, 3] = twist[..., 3:], 1
@@ -81,12 +84,12 @@ def transform_each(twist: Float, points: Float) -> Float:
 
 
 def interpolate(T_world_a: Float, T_world_b: Float, fraction: float) -> Float:
-    """Return the pose ``fraction`` of the way from a (0) to b (1); outside it extrapolates."""
+    """Return the pose ``fraction`` of the way from a (0) to b (1), extrapolated outside."""
     return T_world_a @ exp(fraction * log(inverse(T_world_a) @ T_world_b))
 
 
 def fit_rigid(source: Float, target: Float) -> Float:
-    """Return the (4,4) pose that brings (N,3) points nearest to others (Kabsch 1976).
+    """Return the (4,4) pose that moves (N,3) points nearest to others (Kabsch 1976).
 
     Points on a line do not turn about it, and a single point does not turn.
     """

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Where the lidar was at every sweep, and its own motion within a sweep undone."""
+"""Estimate the pose of the lidar at every sweep, and remove its motion within a sweep."""

@@ -23,7 +23,7 @@ _NORMAL_M = 0.0447  # two surfaces' spread along the normal, as small_gicp weigh
 
 
 def subsample(sweep: Sweep, most: int = _MANY_POINTS) -> Sweep:
-    """Return about ``most`` of the points of a sweep that has more, of all its rings alike."""
+    """Return about ``most`` points of a larger sweep, from all of its rings alike."""
     num = len(sweep)
     if num <= most:
         return sweep
@@ -33,7 +33,7 @@ def subsample(sweep: Sweep, most: int = _MANY_POINTS) -> Sweep:
 
 
 class Surface(NamedTuple):
-    """Points thinned to voxels, with the covariance of their neighbours; of small_gicp."""
+    """Points thinned to voxels, each with the covariance of its neighbours; of small_gicp."""
 
     points: Any
     tree: Any
@@ -42,18 +42,24 @@ class Surface(NamedTuple):
     def of(
         points: Float, voxel_m: float = _VOXEL_M, num_neighbors: int = _NUM_NEIGHBORS
     ) -> Surface:
-        """Make a surface of points (N,3); num_neighbors: used for a covariance."""
+        """Return a surface of points (N,3).
+
+        Args:
+            num_neighbors: Number of points for a covariance.
+        """
         import small_gicp
 
         return Surface(*small_gicp.preprocess_points(points, voxel_m, num_neighbors, 1))
 
 
 class Alignment(NamedTuple):
-    """How a source surface lies on a target.
+    """The alignment of a source surface with a target.
 
-    overlap: share of the source's points that met the target. information: (6,6) of rotation and
-    translation of the source, in its frame: ``x @ information @ x`` is the mean square in m² by
-    which a small motion x (rad, m) lifts the source off the target.
+    Attributes:
+        overlap: Share of the source's points with a match in the target.
+        information: (6,6) of rotation and translation of the source, in its frame. ``x @
+            information @ x`` is the mean square in m² by which a small motion x (rad, m) moves the
+            source off the target.
     """
 
     T_target_source: Float
@@ -62,6 +68,7 @@ class Alignment(NamedTuple):
 
     @staticmethod
     def of(found: Any, source: Surface) -> Alignment:
+        """Return the alignment that small_gicp found."""
         num = int(found.num_inliers)
         return Alignment(
             T_target_source=np.asarray(found.T_target_source),
@@ -71,7 +78,7 @@ class Alignment(NamedTuple):
 
 
 class SurfaceMap:
-    """Surfaces put together in one frame."""
+    """Several surfaces in one frame."""
 
     def __init__(self) -> None:
         import small_gicp
@@ -79,12 +86,14 @@ class SurfaceMap:
         self._voxels = small_gicp.GaussianVoxelMap(_LEAF_M)
 
     def insert(self, surface: Surface, T_map_surface: Float) -> None:
+        """Add a surface at its pose."""
         self._voxels.insert(surface.points, T_map_surface)
 
     def align(self, source: Surface, T_map_source: Float, match_m: float) -> Alignment:
         """Align a surface with the map, starting from ``T_map_source``.
 
-        match_m: the largest distance between corresponding points.
+        Args:
+            match_m: Greatest distance between corresponding points.
         """
         import small_gicp
 
@@ -119,9 +128,12 @@ def align_with_planes(
 ) -> Float:
     """Return ``T_target_source``, near the identity, of points (N,3) on the target's planes.
 
-    match_m: the largest distance between corresponding points.
-    hold: share of the matches that as many points, 10 m away, hold in place: where few planes
-        tell, as along a straight road, the source hardly moves; 0 lets it slide.
+    Args:
+        points: (N,3) metres.
+        match_m: Greatest distance between corresponding points.
+        hold: Share of the matches that is held in place by points 10 m away. Where few planes
+            constrain the motion, as along a straight road, the source then hardly moves. 0 lets it
+            slide.
     """
     import small_gicp
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Deskewing: move every point of a sweep to where it would be at the sweep's reference time."""
+"""Deskew sweeps: move every point to its position at the sweep's reference time."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from densify.geometry.types import Float, RegisteredSweep, Stretch, Sweep, Traje
 
 
 def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
-    """Undo the lidar's own motion within each sweep, and place the sweeps in the world.
+    """Return the sweeps in the world, with the lidar's own motion within each removed.
 
-    The part of a sweep before its reference time moves with the twist from the previous sweep, the
-    part after it with the twist to the next one. A sweep without point times keeps its points.
+    Points before the reference time move with the twist from the previous sweep, points after it
+    with the twist to the next one. A sweep without point times keeps its points.
 
-    sweeps: raw, a subset of the trajectory's frames.
+    Args:
+        sweeps: Raw, a subset of the frames of the trajectory.
     """
     registered = []
     for sweep in sweeps:
@@ -30,7 +31,7 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
 def deskew_sweep(
     sweep: Sweep, T_world_lidar: Float, twist_before: Float, twist_after: Float
 ) -> RegisteredSweep:
-    """Deskew one raw sweep by the (6,) twists per second before and after its reference time."""
+    """Return a raw sweep deskewed by the (6,) twists per second before and after its stamp."""
     points: Float = sweep.points
     if sweep.offset_ns is not None:
         offset_s = sweep.offset_ns[:, None] * 1e-9
@@ -41,7 +42,7 @@ def deskew_sweep(
 
 
 def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
-    """Return the (6,) twists per second before and after sweep i; at an end, both are the same."""
+    """Return the (6,) twists per second before and after sweep i, equal at an end."""
     last = len(trajectory.frames) - 1
     if last == 0:
         return np.zeros(6), np.zeros(6)

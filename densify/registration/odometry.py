@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Lidar odometry of dense sweeps by KISS-ICP, in two passes, and the search for a start speed.
+"""Estimate odometry of dense sweeps by KISS-ICP, in two passes, from a searched start speed.
 
 Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
 """
@@ -38,11 +38,12 @@ def find_odometry(
 ) -> tuple[Trajectory, list[Sweep]]:
     """Return the trajectory of raw, dense sweeps, and the sweeps deskewed by the first pass.
 
-    Sweeps of a fast scanner are grouped in time (`densify.geometry.clock.Clock.batches`), so that
-    sparse sweeps are not registered against each other. One by one, the sweeps of a highway at
-    20 Hz look as if the vehicle stood: 19 m off after 0.75 s.
+    Sweeps of a fast scanner are grouped in time (`densify.geometry.clock.Clock.batches`), because
+    sparse sweeps cannot be registered against each other. One by one, the sweeps of a highway at 20
+    Hz look as if the vehicle stood: 19 m off after 0.75 s.
 
-    sweeps: ascending in time, one or more.
+    Args:
+        sweeps: Ascending in time, one or more.
     """
     stamp_ns, frames = np.array([s.stamp_ns for s in sweeps], np.int64), [s.frame for s in sweeps]
     groups = [list(rows) for rows in Clock(stamp_ns).batches()]
@@ -77,13 +78,15 @@ def register(
     settings: RegisterSettings,
     rough: Trajectory | None = None,
 ) -> Float:
-    """Register S sweeps one after the other; return ``T_first_lidar`` (S,4,4).
+    """Return ``T_first_lidar`` (S,4,4) of S sweeps, registered one after another.
 
-    The first pass starts each sweep at constant velocity, the first one at `search_twist`, because
-    KISS-ICP assumes a start at rest. Its voxels are twice as large.
+    The first pass starts each sweep at constant velocity, and the first sweep at `search_twist`,
+    because KISS-ICP assumes a start at rest. Its voxels are twice as large.
 
-    stamp_ns: (S,) ascending. points: (N,3) of each; raw in the first pass, then deskewed.
-    rough: the trajectory of the first pass, around which the second pass searches.
+    Args:
+        stamp_ns: (S,) ascending.
+        points: (N,3) of each sweep; raw in the first pass, then deskewed.
+        rough: Trajectory of the first pass, around which the second pass searches.
     """
     from kiss_icp.kiss_icp import KissICP
 
@@ -122,9 +125,10 @@ def _between(known: Trajectory, stamp_ns: Int) -> Float:
 def _kiss_icp_config(  # type: ignore[no-untyped-def]
     settings: RegisterSettings, voxel_size_m: float, second_pass: bool
 ):
-    """Set every field here: KISS-ICP otherwise reads ``kiss_icp_*`` environment variables.
+    """Return the settings of KISS-ICP, every field set.
 
-    In the second pass the kernel is as wide as a voxel, because the first pass is a good start.
+    A field that is not set is read from ``kiss_icp_*`` environment variables. In the second pass
+    the kernel is as wide as a voxel, because the first pass is a good start.
     """
     from kiss_icp.config import KISSConfig
     from kiss_icp.config.config import (
@@ -158,11 +162,13 @@ def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
     """Return the (6,) twist per second at the start, without rotation, by a grid search.
 
     The velocity is the one that best aligns the points above the ground in the first three sweeps.
-    Distances below the gap between rays count as none: a guard rail looks the same from a vehicle
-    at rest and from one that follows it. The grid moves the second sweep by steps of 1 m, then of
-    0.5 m around the best, or less where the sweeps follow within 0.1 s.
+    Distances below the gap between rays count as none, because a guard rail looks the same from a
+    vehicle at rest and from one that moves along it. The grid moves the second sweep by steps of 1
+    m, then of 0.5 m around the best position, or less for sweeps less than 0.1 s apart.
 
-    stamp_ns: (S,) ascending. points: (N,3) of each sweep.
+    Args:
+        stamp_ns: (S,) ascending.
+        points: (N,3) of each sweep.
     """
     step_s = np.diff(stamp_ns[:3]) * 1e-9
     step_m = _STEP_M * min(1.0, step_s[0] / _STEP_S)
@@ -198,7 +204,7 @@ def _grid(center: Float, reach_m: float, step_m: float) -> Float:
 
 
 def above_ground(points: Float) -> Float:
-    """Return the points above the lowest of their 1 m cell: the ground's rings hide the motion."""
+    """Return the points above the lowest of their 1 m cell. Rings on the ground hide the motion."""
     if not len(points):
         return points
     x, y, z = points.T

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Poses of the sweeps along the road before and behind a window: a chain, and a pose graph.
+"""Estimate poses of the sweeps along the road, before and after a window.
 
-The chain registers one sweep after another on a map of Gaussian voxels. The graph then aligns
+A chain registers one sweep after another on a map of Gaussian voxels. A pose graph then aligns
 submaps with several before them: Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE
-Intelligent Transportation Systems Magazine 2010. A Cauchy weight keeps a wrong pair from bending
-the others.
+Intelligent Transportation Systems Magazine 2010. With a Cauchy weight a bad pair does not bend the
+others.
 """
 
 from __future__ import annotations
@@ -50,14 +50,19 @@ def follow_road(
 ) -> Iterator[tuple[Sweep, Float, Float]]:
     """Yield raw sweeps along the road, ``T_world_lidar`` (4,4), and the (6,) twist per second.
 
-    Each sweep is aligned with a map of the sweeps before it, from where it would be at constant
-    velocity. The chain ends where a sweep cannot be read, is too sparse, does not lie on the map,
-    or moves as no vehicle does.
+    Each sweep is aligned with a map of the sweeps before it, starting at constant velocity. The
+    chain ends at a sweep that cannot be read, is too sparse, does not fit the map, or moves as no
+    vehicle does.
 
-    known: registered sweeps, the nearest to the others last. frames, stamp_ns: the others,
-        ascending or descending in time, beginning beside the last known one.
-    read: returns a raw sweep. prepare: called with the frames that are read next.
-    reach_m: of travel. step_m: between sweeps, about; those between are not read.
+    Args:
+        known: Registered sweeps, the nearest to the others last.
+        frames: The other frames, ascending or descending in time, beginning beside the last
+            known one.
+        stamp_ns: Their stamps.
+        read: Returns a raw sweep.
+        prepare: Is called with the frames that are read next.
+        reach_m: Travel to cover.
+        step_m: Approximate travel between sweeps. The sweeps between are not read.
     """
     backwards = len(frames) > 0 and int(stamp_ns[0]) < known[-1].sweep.stamp_ns
     end, travel_m, row = _ChainEnd(known, backwards), 0.0, 0
@@ -80,7 +85,7 @@ def follow_road(
 
 
 class _ChainEnd:
-    """The map of all sweeps of the chain, and pose, time and twist of the last."""
+    """The map of all sweeps of the chain, and pose, time and twist of the last sweep."""
 
     def __init__(self, known: Sequence[RegisteredSweep], backwards: bool) -> None:
         self._map, last = SurfaceMap(), known[-1]
@@ -95,7 +100,7 @@ class _ChainEnd:
         return float(np.linalg.norm(self.twist[3:]))
 
     def move_to(self, sweep: Sweep) -> bool:
-        """Align the next sweep with the map; return False where that fails."""
+        """Align the next sweep with the map, and return False if that fails."""
         if len(sweep) < MIN_NUM_POINTS:
             return False
         step_s = (sweep.stamp_ns - self.stamp_ns) * 1e-9
@@ -113,7 +118,7 @@ class _ChainEnd:
 
 
 def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: float) -> list[int]:
-    """Choose the next few sweeps, about ``step_m`` apart at this speed."""
+    """Return the next few sweeps, about ``step_m`` apart at this speed."""
     gap_ns = 1e9 * min(_LONGEST_GAP_S, step_m / max(speed_m_s, 1e-3))
     rows: list[int] = []
     for r in range(row, len(stamp_ns)):
@@ -128,30 +133,36 @@ def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: 
 
 
 class Relaxed(NamedTuple):
-    """Poses that agree. T_world_lidar: (n,4,4). holds: (n,) False for sweeps that only bad pairs
-    join to the known ones."""
+    """Consistent poses of n sweeps.
+
+    Attributes:
+        T_world_lidar: (n,4,4).
+        holds: (n,) False for sweeps that only bad pairs connect to the known ones.
+    """
 
     T_world_lidar: Float
     holds: Bool
 
 
 def num_in_submap(num_points: float) -> int:
-    """Return how many sweeps of that many points make a submap."""
+    """Return the number of sweeps of that many points in a submap."""
     return int(np.clip(np.ceil(_LEAST_POINTS / max(num_points, 1)), 1, _MOST_SWEEPS))
 
 
 def relax_poses(
     points: Sequence[Float], T_world_lidar: Float, known: Bool, num_sweeps: int
 ) -> Relaxed:
-    """Correct the poses of n neighbouring sweeps so that their surfaces agree.
+    """Return poses of n consecutive sweeps, corrected until their surfaces agree.
 
-    A submap is joined to the known ones up to where neighbours overlap by less than half, or more
-    than a quarter of the pairs across are off by more than 0.1 m. Right poses are off by up to
-    0.03 m. A slide along a road without landmarks cannot be told.
+    Submaps are connected to the known ones up to the first bad place. There neighbours overlap by
+    less than half, or more than a quarter of the pairs across are off by more than 0.1 m. Good
+    poses are off by up to 0.03 m. A slide along a road without landmarks cannot be detected.
 
-    points: (N,3) of each sweep, deskewed, lidar frame; a sample suffices.
-    T_world_lidar: (n,4,4), about. known: (n,) poses that stay, one or more neighbours.
-    num_sweeps: of a submap; within it, poses keep their distances.
+    Args:
+        points: (N,3) of each sweep, deskewed, lidar frame; a sample suffices.
+        T_world_lidar: (n,4,4) approximate poses.
+        known: (n,) poses that stay, one or more consecutive ones.
+        num_sweeps: Number of sweeps in a submap, within which poses keep their distances.
     """
     member, middle = _submaps(known, num_sweeps)
     T, fixed = T_world_lidar[middle], known[middle]
@@ -184,9 +195,10 @@ def relax_poses(
 
 
 def _submaps(known: Bool, num_sweeps: int) -> tuple[Int, Int]:
-    """Return (n,) the submap of each sweep, ascending, and (m,) the middle sweep of each.
+    """Return (n,) the submap of each sweep, ascending, and (m,) the middle sweep of each submap.
 
-    No submap holds known sweeps and others; the incomplete ones are the farthest from the known.
+    No submap holds known sweeps and others. Incomplete submaps are the farthest from the known
+    ones.
     """
     begin, end = np.flatnonzero(known)[[0, -1]] + (0, 1)
     row = np.arange(len(known))
@@ -204,7 +216,7 @@ def _submaps(known: Bool, num_sweeps: int) -> tuple[Int, Int]:
 
 
 class _Graph:
-    """Submaps and the pairs of them that were aligned.
+    """Submaps and their aligned pairs.
 
     ends: (p,2) target and source of each pair. fixed: (m,) submaps that stay.
     """
@@ -217,7 +229,7 @@ class _Graph:
         self._overlap = np.array([a.overlap for a in pairs])
 
     def relaxed(self, T_world_submap: Float) -> Float:
-        """Return the poses (m,4,4) that agree best, by Gauss-Newton."""
+        """Return the poses (m,4,4) that fit the pairs best, by Gauss-Newton."""
         T, free = T_world_submap.copy(), ~self._fixed
         if not free.any():
             return T
@@ -229,7 +241,7 @@ class _Graph:
         return T
 
     def holds(self, T: Float) -> Bool:
-        """Return (m,) which submaps good pairs join to fixed ones, by poses (m,4,4)."""
+        """Return (m,) True for submaps that good pairs connect to fixed ones, at poses (m,4,4)."""
         target, source = self._ends.T
         wrong = self.off_m(self._apart(T)) > _MOST_LEFT_M
         across = np.zeros((2, len(self._fixed)))
@@ -250,11 +262,11 @@ class _Graph:
         return poses.inverse(T[self._ends[:, 0]]) @ T[self._ends[:, 1]]
 
     def _apart(self, T: Float) -> Float:
-        """Return (p,6) how far each source is off where its pair was aligned."""
+        """Return (p,6) the motion of each source away from its aligned pose."""
         return poses.log(self._T_source_target @ self._between(T))
 
     def off_m(self, apart: Float) -> Float:
-        """Return (p,) how far that is for the surfaces, root mean square."""
+        """Return (p,) root mean square distance of the surfaces at these motions."""
         square = np.einsum("pi,pij,pj->p", apart, self._information, apart)
         return np.sqrt(np.maximum(square, 0))
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Registration of sweeps on the surfaces that the last second measured, point to plane.
+"""Register sweeps point to plane on the surfaces of the last second.
 
-Point to point (`densify.registration.odometry`), a sweep is matched with the scan pattern of those
-before, which moves with the vehicle and pulls the poses: by 1 cm with 64 rings, 1.3 cm with 32,
-and a rosette that turns 7 degrees a sweep takes the poses with it. A second of sweeps together
-shows surfaces, whose normals do not depend on the pattern (Chen, Medioni, "Object modelling by
+Point to point (`densify.registration.odometry`), a sweep is matched with the scan pattern of
+earlier sweeps, which moves with the vehicle. That pulls the poses by 1 cm with 64 rings and 1.3 cm
+with 32. A rosette that turns 7 degrees a sweep takes the poses with it. A second of sweeps together
+has surfaces whose normals do not depend on the pattern (Chen, Medioni, "Object modelling by
 registration of multiple range images", IVC 1992).
 """
 
@@ -38,9 +38,10 @@ _HOLD = 0.01  # along highways one plane in fifty tells
 
 
 def refine(sweeps: Sequence[Sweep], rough: Trajectory) -> Trajectory:
-    """Align each raw sweep with those before it, and the first ones with those after them.
+    """Return the trajectory with each raw sweep aligned with those before it.
 
-    A sweep that would move by more than 0.3 m from ``rough`` keeps its place. The first pose stays.
+    The first sweeps are aligned with those after them. A sweep that would move by more than 0.3 m
+    from ``rough`` keeps its pose. The first pose does not change.
     """
 
     def expected(i: int, _: Float) -> Float:
@@ -54,10 +55,10 @@ def refine(sweeps: Sequence[Sweep], rough: Trajectory) -> Trajectory:
 
 
 def register_on_surfaces(sweeps: Sequence[Sweep]) -> Trajectory:
-    """Register sparse sweeps without other odometry, raw and ascending in time.
+    """Return the trajectory of sparse raw sweeps, ascending in time, without other odometry.
 
     Each sweep starts at constant velocity. The first second is registered twice: from
-    `search_twist`, which is some metres per second off, then from the twist that this finds.
+    `search_twist`, which is some metres per second off, then from the twist of that result.
     """
 
     def expected(_: int, before: Float) -> Float:
@@ -85,8 +86,12 @@ class _SweepRow:
         match_m: Sequence[float],
         most_m: float = np.inf,
     ) -> None:
-        """num_neighbors: used for a normal. match_m: the largest distance between corresponding
-        points, in turn. most_m: a sweep found farther from its expected place is put there."""
+        """Prepare the sweeps.
+
+        num_neighbors: used for a normal. match_m: greatest distance between corresponding points,
+        for each round. most_m: A sweep that is found farther from its expected position is put
+        there.
+        """
         self._sweeps = [subsample(sweep, _NUM_POINTS) for sweep in sweeps]
         self.stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
         self._num_neighbors, self._match_m, self._most_m = num_neighbors, match_m, most_m
@@ -97,7 +102,7 @@ class _SweepRow:
         """Return ``T_first_lidar`` (S,4,4).
 
         twist: (6,) per second at the start. expected: returns the twist from sweep i - 1 to i,
-            given the one before.
+        given the previous one.
         """
         num, stamp_ns = len(self._sweeps), self.stamp_ns
         num_start = min(_NUM_START, num // 2)
@@ -118,7 +123,7 @@ class _SweepRow:
         return np.stack([np.eye(4), *(poses.inverse(self._T[0]) @ T for T in self._T[1:])])
 
     def _place(self, i: int, step: int, T_guess: Float, twist: Float, on: Iterable[int]) -> Float:
-        """Align sweep i with others; return the twist from sweep ``step`` - 1 to ``step``.
+        """Align sweep i with others, and return the twist from sweep ``step`` - 1 to ``step``.
 
         on: the others, nearest first; none to keep the guess.
         """
@@ -142,7 +147,7 @@ class _SweepRow:
         return twist
 
     def _seconds(self, i: int) -> float:
-        """Return the time from the sweep before to sweep i."""
+        """Return the time from the previous sweep to sweep i."""
         return float(self.stamp_ns[i] - self.stamp_ns[i - 1]) * 1e-9
 
 

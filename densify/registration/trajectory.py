@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Poses of consecutive sweeps: the recording's own, or those of registration, and their checks."""
+"""Find and check the poses of consecutive sweeps, recorded or registered."""
 
 from __future__ import annotations
 
@@ -36,9 +36,11 @@ _OVERLAP_NS = 350_000_000  # within it a pattern that does not repeat fills its 
 
 
 class LeftOut(NamedTuple):
-    """Why a sweep is not used.
+    """The reason for which a sweep is not used.
 
-    unreadable: it could not be read; else it was not registered. unfit: because of its content.
+    Attributes:
+        unreadable: It could not be read; else it was not registered.
+        unfit: Its content is the reason.
     """
 
     reason: str
@@ -46,7 +48,7 @@ class LeftOut(NamedTuple):
     unfit: bool = False
 
     def error(self, frame: int) -> InputError | SweepError:
-        """Return the error to raise where nothing can be made without the sweep."""
+        """Return the error to raise if nothing can be made without the sweep."""
         if self.unreadable:
             return InputError(self.reason)
         return (UnfitSweepError if self.unfit else UnplacedSweepError)(self.reason, frame)
@@ -56,9 +58,10 @@ class LeftOut(NamedTuple):
 class Registration:
     """The poses of a block of sweeps.
 
-    pieces: neighbouring sweeps, each piece in a world of its own; the lead-in sweeps before the
-        block are among them.
-    bad: frame -> why it is left out.
+    Attributes:
+        pieces: Consecutive sweeps, each piece in a world of its own. The lead-in sweeps before
+            the block are among them.
+        bad: Frame -> reason for which it is left out.
     """
 
     pieces: tuple[Trajectory, ...]
@@ -70,11 +73,14 @@ def find_trajectory(
 ) -> Trajectory:
     """Return the poses of raw sweeps, ascending in time.
 
-    Dense sweeps are registered point to point and then aligned with the surfaces of those before,
-    sparse ones on surfaces alone.
+    Dense sweeps are registered point to point and then aligned with the surfaces of earlier sweeps.
+    Sparse sweeps are registered on surfaces alone.
 
-    recorded: the recording's own poses, which are checked and used; None to register.
-    Raises SweepError naming the frame where the poses cannot be right.
+    Args:
+        recorded: The recording's own poses, which are checked and used; None to register.
+
+    Raises:
+        SweepError: The poses cannot be right. The message names the frame.
     """
     _check_stamps([s.frame for s in sweeps], np.array([s.stamp_ns for s in sweeps], np.int64))
     if recorded is not None:
@@ -120,7 +126,7 @@ def _check_stamps(frames: Sequence[int], stamp_ns: Int) -> None:
 
 
 def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
-    """Raise UnplacedSweepError where the trajectory jumps as no vehicle does."""
+    """Raise UnplacedSweepError if the trajectory jumps as no vehicle does."""
     T, before = trajectory.T_world_lidar, None
     if not np.isfinite(T).all():
         bad = trajectory.frames[int(np.argmin(np.isfinite(T).all((1, 2))))]
@@ -137,9 +143,10 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
 
 
 def find_jump(twist: Float, before: Float | None, step_s: float) -> str:
-    """Return why no vehicle moves by a (6,) twist per second for ``step_s``; "" if one may.
+    """Return why no vehicle moves by a (6,) twist per second for ``step_s``, "" if one may.
 
-    before: the twist of the step before.
+    Args:
+        before: The twist of the previous step.
     """
     slack_m_s = _POSE_NOISE_M / step_s
     speed_m_s, turn_deg_s = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))
@@ -159,11 +166,11 @@ def find_jump(twist: Float, before: Float | None, step_s: float) -> str:
 def check_overlap(
     sweeps: Sequence[Sweep], trajectory: Trajectory, settings: RegisterSettings
 ) -> None:
-    """Raise UnplacedSweepError where a sweep does not lie on those of the last third of a second.
+    """Raise UnplacedSweepError if a sweep does not overlap those of the last third of a second.
 
-    Odometry may glide on at constant velocity over sweeps of another place. One sweep before is
+    Odometry may continue at constant velocity over sweeps of another place. One earlier sweep is
     not enough for a scan pattern that does not repeat. Near the start, the next third of a second
-    must agree too. Sweeps too sparse to tell are passed.
+    must agree too. Very sparse sweeps pass.
     """
     frames, stamp_ns = trajectory.frames, trajectory.stamp_ns
 
@@ -196,7 +203,7 @@ def check_overlap(
 
 
 def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
-    """Return the share of (N,3) points that lie on one of the sweeps; 1 for too few to tell."""
+    """Return the share of (N,3) points close to one of the sweeps, 1 for very few points."""
     if min(len(points), sum(tree.n for tree in trees)) < _OVERLAP_POINTS // 10:
         return 1.0
     left = points[:: len(points) // _OVERLAP_POINTS + 1]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The verbs, and the parser of them all.
+"""Collect the verbs, and parse the command line.
 
-Each verb has a function ``add``, which adds its options, and a function ``answer``, which opens,
-calls the Python API, writes, and yields what there is to say. Heavy packages are imported when a
-verb is called: help answers at once.
+Each verb has a function ``add``, which adds its options, and a function ``answer``. The latter
+opens recordings, calls the Python API, writes files, and yields answers. Heavy packages are
+imported when a verb is called. Therefore help answers at once.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _MORE = (
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Return the options of one command; ``options.verb(options)`` runs it.
 
-    Exits with 2 on a bad argument.
+    It exits with 2 on a bad argument.
     """
     parser = _command_line()
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -66,13 +66,13 @@ def _command_line() -> argparse.ArgumentParser:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Complains in one line, suggests what may be meant, and takes no abbreviated options."""
+    """A parser that complains in one line, suggests words, and takes no abbreviated options."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options, allow_abbrev=False)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse the arguments; refuse an unknown option here, where its verb's are known."""
+        """Parse the arguments. Refuse an unknown option here, where the verb is known."""
         found, others = super().parse_known_args(args, namespace)
         unknown = next((text for text in others if text.startswith("--")), None)
         if unknown is not None:
@@ -89,7 +89,7 @@ class _Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"got {value!r}; {hint}{expected}")
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        """Print the message; errors of writing are not hidden."""
+        """Print the message. Errors of writing are not hidden."""
         if message:
             print(message, end="", file=file or sys.stderr)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``densify bench``: measured tables."""
+"""Answer ``densify bench``: measured tables."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``densify dataset``: every key of whole recordings."""
+"""Answer ``densify dataset``: every key of whole recordings."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def _made(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _describe(summary: Summary) -> str:
-    """Return what was made, and what is missing and why."""
+    """Return the numbers of keys by status, mean scores, and the reasons of missing keys."""
     facts = _facts(summary)
     states = {"done": "done", "aside": "put aside", "failed": "failed", "left": "to make"}
     numbers = {state: facts[f"num_{state}"] for state in states}

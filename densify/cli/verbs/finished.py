@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Verbs of finished runs: ``densify export`` for other tools, ``densify report`` for a page,
-``densify view`` for a window."""
+"""Answer the verbs of finished runs: ``densify export``, ``report`` and ``view``."""
 
 from __future__ import annotations
 
@@ -72,7 +71,7 @@ def add_report(commands: Any) -> None:
 
 
 def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
-    """Write a page of what is in a folder."""
+    """Write the page of a folder."""
     from densify.dataset.report import write_report
 
     yield Answer(files=write_report(options.place, options.overwrite))
@@ -96,7 +95,7 @@ def add_view(commands: Any) -> None:
 
 
 def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
-    """Show it."""
+    """Show finished runs in a viewer."""
     from densify.outputs.export import open3d_window, rrd
     from densify.outputs.export.finished_run import finished_runs
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""``densify flow``: scene flow of two point files or of a recording; ``densify labels``: scene flow
-from tracked boxes."""
+"""Answer ``densify flow``: scene flow of two point files or of a recording.
+
+``densify labels`` makes scene flow from tracked boxes.
+"""
 
 from __future__ import annotations
 
@@ -99,8 +101,8 @@ def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
 def read_points(path: Path) -> Float:
     """Return the (N,3) float64 points of a file, metres, row by row as in the file.
 
-    Raises InputError for a file of another form, without points, or with points that are not
-    finite.
+    Raises:
+        InputError: The file has another form, no points, or points that are not finite.
     """
     import numpy as np
 

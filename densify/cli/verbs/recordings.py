@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Verbs of recordings: ``densify info`` says what one holds, ``densify doctor`` what may be wrong
-with it, ``densify simulate`` writes the built-in street as one."""
+"""Answer the verbs of recordings: ``densify info``, ``doctor`` and ``simulate``."""
 
 from __future__ import annotations
 
@@ -36,7 +35,7 @@ def add_info(commands: Any) -> None:
 
 
 def answer_info(options: argparse.Namespace) -> Iterator[Answer]:
-    """Say what a recording holds."""
+    """Print what a recording holds."""
     from densify.readers import open_sequence
     from densify.readers.describe import findings, in_lines
 
@@ -61,7 +60,7 @@ def add_doctor(commands: Any) -> None:
 
 
 def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
-    """Say what may be wrong with a recording."""
+    """Print the findings about a recording."""
     config, spec = config_of(options), recording_of(options)
     from densify.doctor import Verdict, examine
     from densify.readers import open_sequence
@@ -111,7 +110,7 @@ def add_simulate(commands: Any) -> None:
 
 
 def answer_simulate(options: argparse.Namespace) -> Iterator[Answer]:
-    """Write the street and say where it is."""
+    """Write the street and print its path."""
     from densify.outputs.simulated_street import write_street
     from densify.readers.street import Street
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``densify run``: one key or several; ``densify compare``: methods side by side."""
+"""Answer ``densify run``, for one key or several, and ``densify compare``."""
 
 from __future__ import annotations
 

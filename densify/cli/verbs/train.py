@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``densify train flow``: a network for scene flow."""
+"""Answer ``densify train flow``: a network for scene flow."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Accumulated clouds, cameras and depth maps."""
+"""Define accumulated clouds, cameras and depth maps."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Cloud:
 
     Attributes:
         points: (M,3) metres, key frame.
-        rigid_points: (M,3) positions by registration alone.
+        rigid_points: (M,3) positions of rigid accumulation.
         frame: (M,) int32 frame of the source sweep.
         since_key_ns: (M,) int64 from the key's reference time to that of the source sweep.
-        row: (M,) int64 row in the source sweep's file.
+        row: (M,) int64 row in the file of the source sweep.
         lidar: (M,) uint8 number of the scanner that measured the point.
         moving: (M,) bool.
         instance: (M,) int32 number of the moving object, -1 none.
@@ -57,7 +57,7 @@ class Cloud:
         return np.sqrt(x * x + y * y + z * z).astype(np.float32)
 
     def joined(self, other: Cloud) -> Cloud:
-        """Return the cloud with another's points behind its own."""
+        """Return the cloud with the points of another one appended."""
         return Cloud(**{n: np.concatenate([c, vars(other)[n]]) for n, c in vars(self).items()})
 
     def select(self, keep: Bool) -> Cloud:
@@ -66,8 +66,11 @@ class Cloud:
         return Cloud(**{name: column.take(rows, axis=0) for name, column in vars(self).items()})
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return all columns (M,) by name, vectors by axis: x y z, rigid_x rigid_y rigid_z,
-        velocity_x velocity_y velocity_z (m/s), red green blue, and the rest as above."""
+        """Return all columns (M,) by name, vectors by axis.
+
+        These are x y z, rigid_x rigid_y rigid_z, velocity_x velocity_y velocity_z (m/s), red green
+        blue, and the other attributes.
+        """
         by_axis = {
             "points": "x y z",
             "rigid_points": "rigid_x rigid_y rigid_z",
@@ -90,13 +93,16 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Patches:
-    """The surface patch of each of a cloud's M points; see `densify.depth.patches`.
+    """The surface patches of M points of a cloud; see `densify.depth.patches`.
 
-    normal: (M,3) float32 key frame, of any length, of the tangent plane. spacing_m: (M,2) float32
-    to the neighbouring rays of the same sweep, across and along elevation. free: (M,) bool, the key
-    sweep saw through the point. sweep: (M,) int32, number of the point's sweep by frame, those
-    beyond the window last. place: (M,) int32, number of the piece of road from which a sweep
-    beyond the window measured the point; -1 within the window.
+    Attributes:
+        normal: (M,3) float32 normal of the tangent plane, of any length, key frame.
+        spacing_m: (M,2) float32 distance to the neighbouring rays of the same sweep, across and
+            along elevation.
+        free: (M,) bool, the key sweep saw through the point.
+        sweep: (M,) int32 number of the source sweep by frame, those beyond the window last.
+        place: (M,) int32 number of the piece of road from which a sweep beyond the window
+            measured the point; -1 within the window.
     """
 
     normal: Float32
@@ -106,7 +112,7 @@ class Patches:
     place: NDArray[np.int32]
 
     def joined(self, other: Patches) -> Patches:
-        """Return the patches with those of another cloud behind them; no sweep is in both."""
+        """Return the patches with those of another cloud appended. No sweep may be in both."""
         num_sweeps = np.int32(self.sweep.max(initial=-1) + 1)
         behind = vars(other) | {"sweep": num_sweeps + other.sweep}
         return Patches(**{n: np.concatenate([c, behind[n]]) for n, c in vars(self).items()})
@@ -123,11 +129,16 @@ class Patches:
 class StandingWorld:
     """K points of static surfaces, measured along the road.
 
-    points: (K,3) float32 metres. normal: (K,3) float32 of any length, of the tangent plane.
-    spacing_m: (K,2) float32 to the neighbouring rays of the same sweep. source: (K,) int32, which
-    of the sweeps ``frames`` measured it. row, lidar, intensity: as in `Cloud`. frames: n sweeps.
-    stamp_ns: (n,) int64. travel_m: (n,) float64 along the road: 0 at the key's window, negative
-    behind it. left_out: sweeps that could not be registered well.
+    Attributes:
+        points: (K,3) float32 metres.
+        normal: (K,3) float32 normal of the tangent plane, of any length.
+        spacing_m: (K,2) float32 distance to the neighbouring rays of the same sweep.
+        source: (K,) int32 index of the source sweep in ``frames``.
+        row: As in `Cloud`; lidar and intensity too.
+        frames: Frames of n sweeps.
+        stamp_ns: (n,) int64.
+        travel_m: (n,) float64 along the road: 0 at the key's window, negative before it.
+        left_out: Sweeps that could not be registered well.
     """
 
     points: Float32
@@ -156,7 +167,7 @@ _COLUMNS_OF_STANDING = ("points", "normal", "spacing_m", "source", "row", "lidar
 
 
 class Reason(IntEnum):
-    """Why a point is not in a depth map; the first that applies."""
+    """Why a point is not in a depth map; the first reason that applies."""
 
     KEPT = 0  # its pixel's depth is from it
     VETOED = 1  # the key sweep saw through its place
@@ -178,12 +189,13 @@ class Camera:
         height_px: Height of the image.
         K: (3,3) intrinsics in pixels; an integer coordinate is the centre of a pixel.
         T_cam_lidar: (4,4) pose.
-        distortion: Coefficients of the lens. Of a pinhole OpenCV's (k1 k2 p1 p2 k3 ...), empty if
-            rectified; of a fisheye k1 k2 k3 k4; of mei xi k1 k2 p1 p2.
+        distortion: Coefficients of the lens. Of a pinhole OpenCV's (k1 k2 p1 p2 k3 ...), empty
+            if rectified; of a fisheye k1 k2 k3 k4; of mei xi k1 k2 p1 p2.
         model: ``pinhole``, ``fisheye`` (Kannala-Brandt) or ``mei``.
-        max_angle_deg: Angle off its axis beyond which the lens sees nothing.
-        row_time_s: Time from the exposure of a row to that of the row below, negative if the image
-            is read from the bottom, 0 for all at once. Stamps are those of the image's middle.
+        max_angle_deg: Greatest angle off the axis in the view of the lens.
+        row_time_s: Time from the exposure of a row to that of the row below, negative if the
+            image is read from the bottom, 0 for all at once. Stamps are those of the image's
+            middle.
         column_time_s: The same from a column to the one on its right.
     """
 
@@ -200,38 +212,43 @@ class Camera:
 
     @property
     def is_rolling(self) -> bool:
-        """Return True if its rows or columns are exposed one after another."""
+        """True if rows or columns are exposed one after another."""
         return bool(self.row_time_s or self.column_time_s)
 
     @property
     def readout_s(self) -> float:
-        """Return about the seconds from the exposure of the first row or column to the last."""
+        """Approximate seconds from the exposure of the first row or column to the last."""
         along = abs(self.row_time_s) * self.height_px
         return along + abs(self.column_time_s) * self.width_px
 
     @property
     def is_rectified(self) -> bool:
-        """Return True for a pinhole without distortion."""
+        """True for a pinhole without distortion."""
         return self.model == "pinhole" and not self.distortion
 
     @property
     def measure(self) -> str:
-        """Return the default measure of depth: camera ``z``, or ``range`` for a lens that may see
-        behind its image plane, where z is negative."""
+        """The default measure of depth, camera ``z`` or ``range``.
+
+        A lens that may see behind its image plane, where z is negative, has ranges.
+        """
         return "z" if self.model == "pinhole" else "range"
 
     @property
     def focal_px(self) -> float:
-        """Return pixels to the right per radian, in the middle of the image."""
+        """Pixels to the right per radian, in the middle of the image."""
         xi = self.distortion[0] if self.model == "mei" else 0.0
         return float(self.K[0, 0] / (1 + xi))
 
 
 class Ranked(NamedTuple):
-    """The inputs of the confidence of a map's pixels (`densify.depth.confidence`); (H,W).
+    """The inputs of the confidence of a map's pixels (`densify.depth.confidence`).
 
-    rank: float32 0 to 1, larger is more certain, 0 where ``filled_m`` has none. group: uint8, kind
-    of the pixel. contradicted: float32 0 to 1, how far measurements around contradict each other.
+    Attributes:
+        rank: (H,W) float32 0 to 1, larger is more certain, 0 where ``filled_m`` has none.
+        group: (H,W) uint8 kind of the pixel.
+        contradicted: (H,W) float32 0 to 1, share of the measurements around that contradict
+            each other.
     """
 
     rank: Float32
@@ -243,8 +260,10 @@ class Ranked(NamedTuple):
 class CameraView:
     """The viewpoint of a depth map.
 
-    T_cam_key: (4,4) at the moment the map shows. late_s: seconds from the key's reference time to
-    that moment. number: of the image, None where there is none.
+    Attributes:
+        T_cam_key: (4,4) at the moment the map shows.
+        late_s: Seconds from the key's reference time to that moment.
+        number: Number of the image, None without one.
     """
 
     camera: Camera
@@ -263,9 +282,9 @@ class DepthMap:
         filled_m: The same, and pixels interpolated between measured ones.
         confidence: float32 0 to 1, of every pixel in ``filled_m``.
         frame: int32 frame of the sweep that measured the pixel, -1 elsewhere.
-        reason: (M,) uint8 `Reason` of each point of the cloud; empty if the cloud is not at hand.
-        age_s: float32 time between the moment of the map and the sweep that measured the pixel, of
-            every pixel in ``filled_m``, nan elsewhere; None before
+        reason: (M,) uint8 `Reason` of each point of the cloud; empty without the cloud.
+        age_s: float32 time between the moment of the map and the sweep that measured the pixel,
+            of every pixel in ``filled_m``, nan elsewhere; None before
             `densify.depth.views.with_ages`.
         measure: ``z`` along the camera's axis, or ``range`` from the lens.
         warnings: What could not be done as asked.

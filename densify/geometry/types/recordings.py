@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Recordings: the interface of readers, boxes around objects, and exact truth of simulations."""
+"""Define the interface of readers, boxes around objects, and exact truth of simulations."""
 
 from __future__ import annotations
 
@@ -19,30 +19,33 @@ class LidarSequence(Protocol):
     """A recording, opened lazily. A reader is one class with these members.
 
     Frames are absolute numbers. Methods raise InputError with a full sentence for anything missing
-    or malformed. A reader may also have these methods, which are asked for by name:
+    or malformed. A reader may also have these methods, which are found by name:
 
-    findings() -> Sequence[tuple[str, str]]: what it found or assumed, short labels and texts.
-    gaps() -> Sequence[str]: what is missing and what is assumed instead, a sentence each.
-    prepare(frames, images=()): make these sweeps and images (camera, number), which are read next.
-    T_world_cam(camera, number) -> (4,4): pose of an image's exposure, in the world of the lidar's.
-    boxes(frame) -> Boxes | None: around objects in a sweep; None where nobody drew any.
-    sweep_bytes() -> Mapping[int, int]: size of each sweep's file; empty where sweeps share files.
-    num_rows(frame) -> int: how many rows the sweep's file has, valid or not.
+    - findings() -> Sequence[tuple[str, str]]: findings and assumptions, short labels and texts.
+    - gaps() -> Sequence[str]: missing parts and what is assumed instead, a sentence each.
+    - prepare(frames, images=()): make these sweeps and images (camera, number), read next.
+    - T_world_cam(camera, number) -> (4,4): pose of an image's exposure in the lidar's world.
+    - boxes(frame) -> Boxes | None: around objects in a sweep; None where nobody drew any.
+    - sweep_bytes() -> Mapping[int, int]: size of each sweep's file; empty for shared files.
+    - num_rows(frame) -> int: number of rows of the sweep's file, valid or not.
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name for people and outputs."""
 
     @property
     def frames(self) -> Sequence[int]:
-        """Numbers of the sweeps that exist, ascending."""
+        """Numbers of the existing sweeps, ascending."""
         ...
 
     @property
-    def cameras(self) -> Mapping[str, Camera]: ...
+    def cameras(self) -> Mapping[str, Camera]:
+        """The cameras by name."""
 
     @property
-    def truth(self) -> Truth | None: ...
+    def truth(self) -> Truth | None:
+        """Exact truth, None if there is none."""
 
     def __getitem__(self, frame: int) -> Sweep: ...
 
@@ -68,9 +71,10 @@ class LidarSequence(Protocol):
 
 @dataclass(frozen=True)
 class BoxView:
-    """The image of the one camera that boxes were drawn in.
+    """The image of the one camera in which boxes were drawn.
 
-    left_out_px: (R,4) left, top, right, bottom of rectangles without boxes.
+    Attributes:
+        left_out_px: (R,4) left, top, right, bottom of rectangles without boxes.
     """
 
     camera: Camera
@@ -81,14 +85,17 @@ class BoxView:
 class Boxes:
     """The K boxes of one sweep.
 
-    track: (K,) text, the same for an object in every sweep; empty for one that is not tracked.
-    T_lidar_box: (K,4,4) lidar frame at the reference time; the points are assumed to be
-        ego-motion compensated. The box's origin is in its middle, x to the front, z up.
-    size_m: (K,3) length, width, height.
-    offset_ns: (K,) int64 since the reference time, where boxes are in the lidar frame of another
-        time; None for 0.
-    lidar: (K,) scanner whose points a box is drawn around, -1 of all; None for all.
-    view: None for boxes all round.
+    Attributes:
+        track: (K,) text, the same for an object in every sweep; empty for one that is not
+            tracked.
+        T_lidar_box: (K,4,4) lidar frame at the reference time; the points are assumed to be
+            ego-motion compensated. The origin of a box is in its middle, x to the front, z up.
+        size_m: (K,3) length, width, height.
+        offset_ns: (K,) int64 since the reference time, where boxes are in the lidar frame of
+            another time; None for 0.
+        lidar: (K,) number of the scanner whose points a box is drawn around, -1 for all; None
+            for all.
+        view: None for boxes all round.
     """
 
     track: NDArray[Any]
@@ -103,8 +110,11 @@ class Boxes:
 class SweepTruth:
     """The truth of the N points of a raw sweep, row by row.
 
-    T_world_lidar: (4,4) at the reference time. points: (N,3) lidar frame at the reference time.
-    instance: (N,) int32, -1 static. moving: (N,) bool, moves at that time.
+    Attributes:
+        T_world_lidar: (4,4) at the reference time.
+        points: (N,3) lidar frame at the reference time.
+        instance: (N,) int32, -1 static.
+        moving: (N,) bool, moves at that time.
     """
 
     T_world_lidar: Float
@@ -116,18 +126,24 @@ class SweepTruth:
 class Truth(Protocol):
     """Exact truth of a simulated sequence."""
 
-    def sweep(self, frame: int) -> SweepTruth: ...
+    def sweep(self, frame: int) -> SweepTruth:
+        """Return the truth of a sweep."""
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return the (N,3) scene flow from the reference time of ``frame`` to that of ``target``,
-        in the lidar frame of ``frame``, ego-motion removed."""
+        """Return the (N,3) scene flow from the reference time of ``frame`` to that of ``target``.
+
+        It is in the lidar frame of ``frame``, with ego-motion removed.
+        """
         ...
 
     def depth_m(self, camera: str, number: int) -> Float32:
-        """Return (H,W) the nearest solid surface at the exposure (of each row), 0 none, in the
-        camera's own measure (`Camera.measure`)."""
+        """Return (H,W) the true depth of an image, 0 none.
+
+        It is the nearest solid surface at the exposure of each row, in the camera's own measure
+        (`Camera.measure`).
+        """
         ...
 
     def moving_mask(self, camera: str, number: int) -> Bool:
-        """Return (H,W) True where the pixel shows something that moves."""
+        """Return (H,W) True for pixels of moving objects."""
         ...

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One densified key: its maps, tracks and costs, and its maps completed with a prior."""
+"""Define the result of a key: its maps, tracks and costs, and its maps completed with a prior."""
 
 from __future__ import annotations
 
@@ -20,14 +20,19 @@ METHOD_NAMES = {"none": "single sweep", "icp": "rigid accumulation", "flow": "sc
 
 @dataclass(frozen=True)
 class ObjectTrack:
-    """One moving object at n moments: the reference times of the sweeps that saw it, and of the
-    key.
+    """One moving object at n times: the reference times of its sweeps, and that of the key.
 
-    instance: as in `Cloud`. size_m: (3,) length, width and height of the box around
-    its points, in its own frame: x to where it moves at the key's moment, z along the key's, origin
-    in the box's middle. frames: n sweeps, ascending. stamp_ns: (n,). T_key_object: (n,4,4), with
-    the vehicle's own motion removed: the key's coordinates do not move. velocity_m_s: (n,3) of the
-    box's middle, key frame. num_points: (n,) returns of that sweep.
+    The frame of the object has its origin in the middle of the box, x along the motion at the key's
+    time, z along the key's.
+
+    Attributes:
+        instance: Number as in `Cloud`.
+        size_m: (3,) length, width and height of the box around its points.
+        frames: n sweeps, ascending.
+        stamp_ns: (n,) int64.
+        T_key_object: (n,4,4), ego-motion removed.
+        velocity_m_s: (n,3) of the middle of the box, key frame.
+        num_points: (n,) returns in the sweep.
     """
 
     instance: int
@@ -41,10 +46,12 @@ class ObjectTrack:
 
 @dataclass(frozen=True)
 class Prior:
-    """A depth image that the user brings, as large as the map it is for.
+    """A depth image that the user brings, as large as its map.
 
-    value: (H,W) float32, 0 none: depth or inverse depth, relative or metric. sky: (H,W) bool, to be
-    left empty. source: where it is from, for messages.
+    Attributes:
+        value: (H,W) float32, 0 none: depth or inverse depth, relative or metric.
+        sky: (H,W) bool, to be left empty.
+        source: Origin, for messages.
     """
 
     value: Float32
@@ -54,13 +61,17 @@ class Prior:
 
 @dataclass(frozen=True)
 class PriorFit:
-    """How a prior's values p become depth z in metres over the whole image, before the local
-    correction: kind ``depth``, z = scale p + shift_m; ``inverse``, 1/z = scale p + shift_per_m;
-    ``log``, ln z = scale ln p + shift.
+    """The fit of a prior's values p to depth z in metres over the image, before local correction.
 
-    residual: mean of |ln z - ln measured| over the measured pixels, held to ln 1.25, each octave of
-    depth counted alike. wrong: share of them, in the same way, that are off by more than 25 %.
-    used: whether the prior fits well enough to be used.
+    Kind ``depth``: z = scale p + shift_m. ``inverse``: 1/z = scale p + shift_per_m. ``log``: ln z =
+    scale ln p + shift.
+
+    Attributes:
+        residual: Mean of |ln z - ln measured| over the measured pixels, at most ln 1.25 each.
+            Each octave of depth counts alike.
+        wrong: Share of the measured pixels, weighted in the same way, that are off by more than
+            25 %.
+        used: The prior fits well enough to be used.
     """
 
     kind: str
@@ -73,11 +84,13 @@ class PriorFit:
 
 @dataclass(frozen=True)
 class FullDepth:
-    """A depth map completed with a prior; (H,W) each.
+    """A depth map completed with a prior.
 
-    depth_m: float32 metres, 0 none: ``DepthMap.filled_m`` where that has a depth. confidence:
-    float32 0 to 1, of the prior's pixels less than of all others. from_prior: bool, the prior's.
-    source: where the prior is from.
+    Attributes:
+        depth_m: (H,W) float32 metres, 0 none: ``DepthMap.filled_m`` where that has a depth.
+        confidence: (H,W) float32 0 to 1, lower for pixels of the prior than for all others.
+        from_prior: (H,W) bool.
+        source: Origin of the prior.
     """
 
     depth_m: Float32
@@ -93,7 +106,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class StageCost:
-    """Wall seconds of a stage and the process's peak memory at its end."""
+    """The wall seconds of a stage and the peak memory of the process at its end."""
 
     name: str
     seconds: float
@@ -117,15 +130,15 @@ class Result:
         movers: Each moving object alone, by instance (``output.movers``).
         optical_flow: By name (H,W,2) pixels to the "previous" and the "next" image
             (``output.optical_flow``).
-        rejected: By name (H,W) `Reason` of the points that were left out (``output.rejected``).
+        rejected: By name (H,W) `Reason` of the rejected points (``output.rejected``).
         full: Maps completed with a prior, by name.
-        images: By name (H,W,3) RGB, where there is an image.
+        images: By name (H,W,3) RGB, if there is an image.
         far_frames: Sweeps beyond the window from which the cloud has static points.
         far_left_out: Sweeps beyond the window that could not be registered.
-        warnings: What was assumed or looks wrong, a sentence each.
-        stamp_ns: The key's reference time.
+        warnings: Assumptions and suspicions, a sentence each.
+        stamp_ns: Reference time of the key.
         views: Camera and pose of each map, by name.
-        truth_m: By name (H,W) true depth, 0 none, where there is truth.
+        truth_m: By name (H,W) true depth, 0 none, if there is truth.
         T_key_lidar: (4,4) of every sweep of the window, by frame.
         tracks: Path of each moving object.
     """

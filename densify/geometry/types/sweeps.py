@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Sweeps as measured and registered, and their scene flow."""
+"""Define sweeps as measured and registered, and their scene flow."""
 
 from __future__ import annotations
 
@@ -67,19 +67,24 @@ class Sweep:
         )
 
     def axes(self, lidar: int) -> Float:
-        """Return the rotation (3,3) from the lidar frame's axes to that scanner's."""
+        """Return the rotation (3,3) from the axes of the lidar frame to those of the scanner."""
         return np.eye(3) if self.R_scanner_lidar is None else self.R_scanner_lidar[lidar]
 
     def origin_m(self, lidar: int) -> Float:
-        """Return (3,) where the rays of that scanner start, lidar frame."""
+        """Return (3,) the origin of the scanner's rays, lidar frame."""
         return np.zeros(3) if self.scanner_origins is None else self.scanner_origins[lidar]
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the lidar was: frames ascending, stamp_ns (n,) int64, T_world_lidar (n,4,4).
+    """The poses of a lidar.
 
-    R_level_lidar: (3,3) turns the lidar's axes so that z is up; not the identity where it leans.
+    Attributes:
+        frames: Ascending.
+        stamp_ns: (n,) int64.
+        T_world_lidar: (n,4,4).
+        R_level_lidar: (3,3) turns the axes of the lidar until z is up. It is the identity
+            unless the lidar leans.
     """
 
     frames: tuple[int, ...]
@@ -88,7 +93,7 @@ class Trajectory:
     R_level_lidar: Float = field(default_factory=lambda: np.eye(3))
 
     def part(self, frames: Sequence[int], origin: int) -> Trajectory:
-        """Return the poses of these frames, in the upright world of that ``origin``."""
+        """Return the poses of these frames, in the upright world of the frame ``origin``."""
         rows = [self.frames.index(f) for f in frames]
         T_new_lidar = np.eye(4)
         T_new_lidar[:3, :3] = self.R_level_lidar
@@ -103,13 +108,15 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class RegisteredSweep:
-    """A deskewed sweep with its place in the world.
+    """A deskewed sweep with its pose.
 
-    sweep: points in the lidar frame at ``sweep.stamp_ns``.
-    T_world_lidar: (4,4).
-    twist_before, twist_after: (6,) rotation vector and translation per second (rad/s, m/s) of the
-        lidar before and after its reference time, in the lidar frame: a raw point fired at offset t
-        lies at ``exp(t · twist) @ p_raw``.
+    Attributes:
+        sweep: Points in the lidar frame at ``sweep.stamp_ns``.
+        T_world_lidar: (4,4).
+        twist_before: (6,) rotation vector and translation per second (rad/s, m/s) of the lidar
+            before its reference time, in the lidar frame. A raw point fired at offset t is at
+            ``exp(t · twist) @ p_raw``.
+        twist_after: The same after its reference time.
     """
 
     sweep: Sweep
@@ -119,6 +126,7 @@ class RegisteredSweep:
 
     @property
     def frame(self) -> int:
+        """The frame of the sweep."""
         return self.sweep.frame
 
     @staticmethod
@@ -145,6 +153,7 @@ class Stretch:
 
     @property
     def frames(self) -> tuple[int, ...]:
+        """The frames of the sweeps."""
         return tuple(s.frame for s in self.sweeps)
 
     def __getitem__(self, frame: int) -> RegisteredSweep:
@@ -184,14 +193,14 @@ class FlowField:
 
     @property
     def total(self) -> Float:
-        """Return (N,3) from where a point was measured to where it is at the target time."""
+        """Return (N,3) metres from the measured position to the one at the target time."""
         if self.to_reference is None:
             return self.displacement
         return self.to_reference + self.displacement
 
     @staticmethod
     def zero(num_points: int) -> FlowField:
-        """Return the flow of points that do not move."""
+        """Return the flow of static points."""
         return FlowField(
             displacement=np.zeros((num_points, 3)),
             moving=np.zeros(num_points, bool),
@@ -201,7 +210,7 @@ class FlowField:
 
 
 class Motion(Protocol):
-    """The motion of everything in a stretch, found by any engine."""
+    """The motion of all points of a stretch, found by any engine."""
 
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of every point of a sweep to another sweep's reference time."""
@@ -217,8 +226,10 @@ class StretchFlow:
 
     @staticmethod
     def towards(key: int, stretch: Stretch, motion: Motion) -> StretchFlow:
-        """Return the flow of each sweep to the next one towards the key, and of the key to a
-        neighbour."""
+        """Return the flow of each sweep to the next one towards the key.
+
+        The key has the flow to a neighbour.
+        """
         before = [f for f in stretch.frames if f <= key]
         after = [f for f in reversed(stretch.frames) if f >= key]
         hops = [*pairwise(before), *pairwise(after)]
