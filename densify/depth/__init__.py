@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""From registered sweeps to depth maps: accumulation, visibility, filling, colour, age."""
+"""Make depth maps of registered sweeps: accumulation, visibility, fill, colour, age."""

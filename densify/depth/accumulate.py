@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Accumulation: the points of all sweeps at the key's reference time, and the tracks of the moving
-objects over the window."""
+"""Accumulate the points of all sweeps at the key's reference time.
+
+Also fit the tracks of moving objects over the window.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +23,14 @@ _BEYOND_PERCENT = 1.0  # of its points that lie outside its box on each side
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
     """Return one cloud in the key frame.
 
-    fields: scene flow of each sweep to the key. key: its frame. drop_lost: leave out moving points
-    that could not be followed; else they stay where registration puts them. Static points are
-    placed by registration alone, to the last bit.
+    Static points keep their rigid positions, to the last bit. Confidence is a relative score. It
+    falls with the time from the key, and is lower for moved points.
 
-    Confidence is a relative score: it falls with the time from the key and for moved points.
+    Args:
+        stretch: The window.
+        fields: Scene flow of each sweep to the key.
+        key: Frame of the key.
+        drop_lost: Leave out moving points without a track. Else they keep their rigid position.
     """
     parts = []
     for registered, flow in zip(stretch.sweeps, fields, strict=True):
@@ -65,8 +70,11 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
 
 
 class _Sighting(NamedTuple):
-    """One sweep's points of an object, key frame: (N,3) at the sweep's reference time and at the
-    key's, and their velocity (3,)."""
+    """The points of an object in one sweep, key frame.
+
+    They are (N,3) at the reference time of the sweep and at that of the key, with their velocity
+    (3,).
+    """
 
     there: Float
     at_key: Float
@@ -78,10 +86,13 @@ def object_tracks(
 ) -> tuple[ObjectTrack, ...]:
     """Return the tracks of objects by instance.
 
-    fields: of each sweep to the key. The pose at a sweep is the rigid motion nearest in least
-    squares to the flow of its points to the key. Sweeps with fewer than three points of an object
-    are left out, and so are objects that all sweeps show so. An object points to where it goes, by
-    its velocity or by its way over the window, whichever is longer.
+    The pose at a sweep is the rigid motion that fits the flow of its points to the key best, in
+    least squares. Sweeps with fewer than three points of an object are left out, and so are objects
+    without any other sweep. The x axis of an object points along its velocity, or along its path
+    over the window if that is longer.
+
+    Args:
+        fields: Scene flow of each sweep to the key.
     """
     seen: dict[int, dict[int, _Sighting]] = {}
     for registered, flow in zip(stretch.sweeps, fields, strict=True):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Which pixels measured close to a depth discontinuity are kept: the image decides.
+"""Decide by the image which pixels close to a depth discontinuity are kept.
 
-Every known pixel that is seen first in one of 16 directions votes on the depth of a pixel: for it
-if its surface goes on to there, else against it. A vote weighs less the more colours change on the
-way, as in a bilateral grid or in geodesic matting: without an edge of the image between them, two
-pixels show the same surface.
+The first known pixel in each of 16 directions votes on the depth of a pixel. It votes for the depth
+if its surface, extended, has that depth there, else against it. A vote weighs less the more the
+colours change between the two pixels, as in a bilateral grid or in geodesic matting. Without an
+edge of the image between them, two pixels belong to the same surface.
 """
 
 from __future__ import annotations
@@ -49,15 +49,17 @@ _MOVED = (
 
 
 def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
-    """Accept boundary pixels (``rim_m``) as the knob ``project.rims`` says.
+    """Return the layers with the boundary pixels (``rim_m``) that ``project.rims`` accepts.
 
-    rims: ``image`` accepts those that the image puts on the measured surface, ``keep`` also all
-    others that are not occluded, ``strict`` none. Accepted are 97 % of the votes. Boundary pixels
-    vote too, by half, and in a second round less the less they are believed.
+    97 % of the votes accept a pixel. Boundary pixels vote too, with half the weight, and in a
+    second round by their own share of votes. An image that is up to three steps off is shifted,
+    with a warning. An image that does not fit or is blurred is not used, with a warning. ``lab`` is
+    kept only if it is used. The ``confidence`` of boundary pixels becomes 0 to 0.2, by the share of
+    the votes against them.
 
-    An image that lies up to three steps aside is moved, with a warning. One that does not fit or is
-    blurred is not used, with a warning. ``lab`` goes on only if it is used. The ``confidence`` of
-    boundary pixels becomes 0 to 0.2, by the share of the votes against.
+    Args:
+        rims: ``image`` accepts pixels that the image assigns to the measured surface, ``keep``
+            also all others that are not occluded, ``strict`` none.
     """
     pixel = np.flatnonzero(layers.rim_m)
     share, lab, warnings = np.full(len(pixel), np.float32(0.5)), None, layers.warnings
@@ -92,7 +94,7 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
 
 
 def shares(layers: Layers, pixel: Int) -> Float32:
-    """Return the (R,) share of the votes for each of the boundary pixels ``pixel`` (R,)."""
+    """Return the (R,) share of the votes for each boundary pixel ``pixel`` (R,)."""
     voters = _voters(layers, np.maximum(layers.depth_m, layers.rim_m))
     share, weight = np.ones(len(pixel), np.float32), np.ones_like(layers.depth_m)
     for _ in range(_NUM_ROUNDS):
@@ -109,18 +111,26 @@ def voted_for(
     least_share: float,
     surely: bool = False,
 ) -> Bool:
-    """Return (P,) True where ``least_share`` of the votes or more is for ``depth_m`` (P,) of the
-    pixels ``pixel`` (P,); known_m: (H,W) depth of those that vote, 0 none. surely: see `vote`."""
+    """Return (P,) True where ``least_share`` of the votes or more is for the depth of a pixel.
+
+    Args:
+        known_m: (H,W) depth of the voters, 0 none.
+        pixel: (P,) the pixels.
+        depth_m: (P,) their depths.
+        surely: See `vote`.
+    """
     weight = np.ones_like(known_m)
     share = vote(layers, _voters(layers, known_m), pixel, depth_m, weight, surely)
     return share >= _ROUNDED * least_share
 
 
 class Voters(NamedTuple):
-    """Pixels whose depth is known.
+    """Pixels with a known depth.
 
-    steps: (16,H,W) of `densify.depth.neighbours.first_known`. inverse: (H,W) 1/m. tilt: (H,W,2)
-    slope of it, 1/m per px.
+    Attributes:
+        steps: (16,H,W) of `densify.depth.neighbours.first_known`.
+        inverse: (H,W) 1/m.
+        tilt: (H,W,2) slope of inverse depth, 1/m per px.
     """
 
     steps: NDArray[np.uint8]
@@ -138,8 +148,12 @@ def vote(
 ) -> Float32:
     """Return the (P,) share of the votes for the depths of pixels.
 
-    pixel: (P,). depth_m: (P,). weight: (H,W) of each voter. surely: take the least share wherever
-    the image lies, as it is or 0.6 gaps to any side, and with a doubt; else without voters it is 0.
+    Args:
+        pixel: (P,) the pixels.
+        depth_m: (P,) their depths.
+        weight: (H,W) of each voter.
+        surely: Take the least share of several positions of the image, as it is or 0.6 gaps to
+            any side, and one vote against. Otherwise the share without voters is 0.
     """
     share = np.zeros(len(pixel), np.float32)
     lab = np.zeros((0, 0, 3), np.float32) if layers.lab is None else layers.lab
@@ -166,8 +180,10 @@ def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 @inlined
 def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill the steps to the voter in each direction, 0 where none is near, and whether its surface
-    goes on to the pixel; return how many do, and how many do not."""
+    """Fill the steps to the voter in each direction, 0 without one, and whether it agrees.
+
+    It agrees if its surface, extended, has the pixel's depth. Return the numbers for and against.
+    """
     same = _SAME_M + _SAME_FRACTION * depth
     num_for, num_against = 0, 0
     for d in range(len(steps)):
@@ -186,10 +202,10 @@ def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-
 
 @inlined
 def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
-    """Return what the image, if there is one, leaves of a vote: exp(-c² / 2 s²) + ``_THROUGH``.
+    """Return the weight that the image leaves of a vote: exp(-c² / 2 s²) + ``_THROUGH``.
 
-    c is the largest distance in colour on the way of k steps, s is ``_COLOURS``. The image goes on
-    at its border.
+    c is the largest colour distance on the path of k steps, s is ``_COLOURS``. The image is
+    continued beyond its border.
     """
     if lab.size == 0:
         return 1 + _THROUGH
@@ -213,8 +229,10 @@ def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _vote(first, last, pixel, inverse, voters, weight, lab, gap_px, surely, share):  # type: ignore[no-untyped-def]
-    """share: (P,) float32, filled as `vote` says. inverse: (P,) depth, 1/m. lab: (H,W,3), empty
-    without an image. gap_px: (H,W) between rays."""
+    """Fill ``share`` (P,) float32, as in `vote`.
+
+    inverse: (P,) depth, 1/m. lab: (H,W,3), empty without an image. gap_px: (H,W) between rays.
+    """
     width, num = gap_px.shape[1], len(DIRECTIONS)
     steps, agrees = np.zeros(num, np.int64), np.zeros(num, np.bool_)
     doubt = _DOUBT if surely else 0.0

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Car windows closed.
+"""Close car windows.
 
-Lasers go through glass: what they measure in a window are seats, headrests and what lies beyond.
-Most uses of a depth map (and KITTI's stereo benchmark) count that as wrong. A window is a hole in
-one smooth surface. Its rim lies in a plane, and in it more rays of the key sweep are lost than on
-the rim: glass and dark paint send nothing back, while the gaps of a fence lose no ray.
+Lasers pass through glass and measure seats, headrests and the background. Most uses of a depth map,
+and KITTI's stereo benchmark, count these depths as outliers. A car window is a hole in one smooth
+surface. Its rim lies in a plane. More rays of the key sweep are lost in it than on the rim, because
+glass and dark paint send nothing back. A gap of a fence loses no ray.
 """
 
 from __future__ import annotations
@@ -33,9 +33,11 @@ _EIGHT, _CROSS = np.ones((3, 3), bool), ndimage.generate_binary_structure(2, 1)
 
 
 def share_lost(key_image: RangeImage) -> Callable[[Float], Float] | None:
-    """Return the function that says which share of the key sweep's rays around points (N,3), key
-    frame, has no return, (N,) from 0 to 1; None if no scanner turns, as then nobody knows where
-    rays went."""
+    """Return a function that gives the share of lost rays of the key sweep around points.
+
+    It takes points (N,3), key frame, and returns (N,) shares from 0 to 1. The result is None for
+    scanners that do not spin, because the directions of their lost rays are unknown.
+    """
     turning = RangeImage(tuple(s for s in key_image.scanners if len(s.offset_s) == 1))
     if not turning.scanners:
         return None
@@ -52,10 +54,13 @@ def share_lost(key_image: RangeImage) -> Callable[[Float], Float] | None:
 def close_windows(
     layers: Layers, exposure: Exposure, share_lost: Callable[[Float], Float]
 ) -> Layers:
-    """Put the plane of its rim into each car window, and take out what was measured behind it.
+    """Return the layers with the plane of the rim in each car window.
 
-    share_lost: see the function of that name. ``layers.solid`` says where windows are,
-    ``layers.glass`` where a measured pixel was taken out.
+    Measurements behind a window are removed. ``layers.solid`` marks the windows, ``layers.glass``
+    the measured pixels that are removed.
+
+    Args:
+        share_lost: See `share_lost`.
     """
     changed = ("depth_m", "filled_m", "confidence", "tilt")
     window, glass = np.zeros((2, *layers.filled_m.shape), bool)
@@ -80,8 +85,10 @@ def close_windows(
 
 
 def _close(layers: Layers, hole: Bool, depth_m: Float32, slopes: Float, least: np.float32) -> Bool:
-    """Put a plane into a hole, but not behind what is known there; return (h,w) where it took out
-    what was measured. least: confidence of the rim."""
+    """Put a plane into a hole, but not behind known pixels.
+
+    Return (h,w) True where a measured pixel is removed. least: confidence of the rim.
+    """
     known_m = layers.filled_m
     takes = hole & ((known_m == 0) | (known_m > depth_m + _agree_m(depth_m)))
     taken: Bool = takes & (layers.depth_m > 0)
@@ -93,21 +100,23 @@ def _close(layers: Layers, hole: Bool, depth_m: Float32, slopes: Float, least: n
 
 
 def _agree_m(depth_m: Float | Float32) -> Float:
-    """Return the largest deviation (N,) metres of points on one surface."""
+    """Return the greatest deviation (N,) in metres between points of one surface."""
     return AGREE_M + AGREE_FRACTION * depth_m.astype(np.float64)
 
 
 def _num_rays(layers: Layers, pixels: Bool) -> float:
-    """Return how many rays of a sweep go through the pixels (H,W)."""
+    """Return the number of rays of a sweep through the pixels (H,W)."""
     return float((1 / layers.spacing_px[pixels].prod(axis=1)).sum())
 
 
 def _log_odds(lost: float, on_rim: float) -> float:
-    """Return the mean log-likelihood ratio of a ray, glass against a surface like the rim.
+    """Return the mean log-likelihood ratio of a ray, for glass against a surface like the rim.
 
-    lost, on_rim: shares of the rays without a return, in the hole and on the rim. A missing return
-    adds log(P(none | glass) / P(none | surface)); a return adds the log ratio of 1 - P(none).
-    P(none | glass) is the measured share where that is larger than the usual one.
+    lost.
+
+    on_rim: shares of the rays without a return, in the hole and on the rim. A missing return adds
+    log(P(none | glass) / P(none | surface)). A return adds the log ratio of 1 - P(none). P(none |
+    glass) is the measured share if that is larger than the usual one.
     """
     ordinary = max(on_rim, _LEAST_LOST)
     in_glass = min(max(lost, _LOST_IN_GLASS), 1 - _LEAST_LOST)
@@ -118,8 +127,11 @@ def _log_odds(lost: float, on_rim: float) -> float:
 
 
 def _holes(layers: Layers) -> Iterator[tuple[tuple[slice, slice], Bool, Bool]]:
-    """Yield a box of the image around each hole in a smooth surface of the filled map, (h,w) the
-    hole, and (h,w) its rim, a gap between rays wide. Leaves out holes in which too few rays go."""
+    """Yield each hole in a smooth surface of the filled map that enough rays hit.
+
+    A hole is a box of the image, (h,w) the hole in it, and (h,w) its rim, as wide as a gap between
+    rays.
+    """
     label, _ = ndimage.label(_smooth(layers.filled_m), _EIGHT)
     away_px = max(1, round(float(np.median(layers.gap_px))))
     for number, box in enumerate(ndimage.find_objects(label), start=1):
@@ -144,8 +156,11 @@ def _smooth(known_m: Float32) -> Bool:
 
 
 def _plane_of(known_m: Float32, rim: Bool) -> Float | None:
-    """Return (3,) inverse depth in the box's first pixel and its slopes to the right and down, of
-    the plane in which a rim (h,w) lies; None if too little of it does."""
+    """Return (3,) the plane in which most of a rim (h,w) lies, None without one.
+
+    It is given by the inverse depth in the first pixel of the box and its slopes to the right and
+    down.
+    """
     row, column = np.nonzero(rim)
     depth_m = known_m[rim].astype(np.float64)
     terms = np.column_stack([np.ones(len(row)), column, row])
@@ -159,7 +174,7 @@ def _plane_of(known_m: Float32, rim: Bool) -> Float | None:
 
 
 def _points(exposure: Exposure, uv: Float, depth_m: Float32) -> Float:
-    """Return (N,3) key frame, what static pixels (N,2) show at these depths (N,)."""
+    """Return (N,3) key-frame positions of static pixels (N,2) at these depths (N,)."""
     ray = cameras.rays(exposure.camera, uv.astype(np.float64))
     along = depth_m / exposure.depth_m(ray)
     return poses.transform(poses.inverse(exposure.T_cam_key), along[:, None] * ray)

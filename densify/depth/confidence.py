@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Confidence: the probability that a pixel's depth is wrong by KITTI's rule.
+"""Compute confidence: the probability that a pixel is an outlier by KITTI's rule.
 
-The stages of a map rank its pixels: by sweeps and points that agree, distance to an edge,
-roughness, how far was filled, votes of the image. The probability that a pixel is wrong is a sum:
-a share for its rank, and another in proportion to how far the surroundings contradict each other.
-Both fall with the rank. They were measured against exact truth by group: how a pixel came to its
-depth, and how ragged its surroundings are. ``examples/fit_confidence.py`` makes these tables,
-``confidence.json`` beside this file.
+The stages of a map rank its pixels by the number of sweeps and points that agree, the distance to a
+depth discontinuity, roughness, the distance of the fill, and the votes of the image. The
+probability is a sum of two terms: a share for the rank, and a share in proportion to the
+contradiction around the pixel. Both fall with the rank. They were measured against exact truth by
+group of pixels: the origin of the depth, and the roughness around. ``examples/fit_confidence.py``
+makes these tables, ``confidence.json`` beside this file.
 
-Within a map the order of the ranks stays, of measured and of filled pixels. Each rank gets the mean
+The order of the ranks within a map stays, of measured and of filled pixels. Each rank gets the mean
 probability of the map's own pixels at that rank, made to fall with the rank.
 """
 
@@ -58,11 +58,11 @@ _GIVEN = 2.0  # pixels around that are taken to agree: few do not tell
 
 
 def contradicted(layers: Layers, focal_px: float) -> Float32:
-    """Return (H,W) the share of the measured pixels around each filled pixel whose surface would
-    make it wrong by KITTI's rule, within a gap between rays to all sides.
+    """Return (H,W) the share of the measured pixels around that contradict a filled pixel.
 
-    Boundary pixels count too. Nothing contradicts closed car windows: what is behind them may be
-    measured.
+    A measured pixel contradicts if its surface would make the filled one an outlier. The
+    surroundings are a gap between rays to all sides. Boundary pixels count too. Closed car windows
+    have no contradiction, because the background may be measured through them.
     """
     measured_m = np.maximum(layers.depth_m, layers.rim_m)
     inverse, known = (
@@ -81,10 +81,12 @@ def contradicted(layers: Layers, focal_px: float) -> Float32:
 
 @Kernel
 def _contradicted(first, last, pixel, inverse, known, tilt, half_px, apart, share):  # type: ignore[no-untyped-def]
-    """share: (H,W) float32, filled for each ``pixel`` (P,).
+    """Fill ``share`` (H,W) float32 for each ``pixel`` (P,).
 
-    inverse, known: (H,W) float32, 1/m, of the pixels and of those around, 0 none. half_px: how far
-    around; every pixel is looked at, or every n-th, up to 11 across. apart: inverse depth, 1/m.
+    inverse.
+
+    known: (H,W) float32, 1/m, of the pixels and of those around, 0 none. half_px: size of the
+    surroundings, of which up to 11 pixels across are compared. apart: inverse depth, 1/m.
     """
     height, width = known.shape
     step = max(1, -(-half_px // 5))
@@ -109,17 +111,20 @@ def _contradicted(first, last, pixel, inverse, known, tilt, half_px, apart, shar
 
 
 def rank_pixels(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
-    """Return the rank and the group of a map's pixels, and how contradicted their places are.
+    """Return the rank and the group of a map's pixels, and the contradiction around them.
 
-    far: (H,W) measured by sweeps beyond the window. contradicted: (H,W). It and raggedness are
-    means over four gaps between rays to all sides.
+    Contradiction and roughness are means over four gaps between rays to all sides.
+
+    Args:
+        far: (H,W) measured by sweeps beyond the window.
+        contradicted: (H,W), see `contradicted`.
     """
     rim, measured = layers.rim_m > 0, (layers.depth_m > 0) | (layers.rim_m > 0)
     shown = layers.filled_m > 0
     size = 2 * max(2, round(_AROUND * float(np.median(layers.gap_px)))) + 1
 
     def mean(values: Float32 | Bool, of: Bool) -> Float32:
-        """(H,W) over the pixels ``of`` around."""
+        """Return (H,W) means over the pixels ``of`` around."""
         sums, num = (
             ndimage.uniform_filter(part.astype(np.float32), size, mode="constant")
             for part in (np.where(of, values, 0), of)
@@ -134,10 +139,11 @@ def rank_pixels(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
 
 
 def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float32:
-    """Return (H,W) confidence, ``-log10(P) / 5`` with the probability P that a depth is wrong.
+    """Return (H,W) confidence, ``-log10(P) / 5`` with the probability P of an outlier.
 
-    shown: (H,W); 0 elsewhere. tables: (G,2,R) by group, cause and step of the rank, else the
-    package's own.
+    Args:
+        shown: (H,W) pixels with a confidence; 0 elsewhere.
+        tables: (G,2,R) by group, term and step of the rank; None for the package's own.
     """
     rank, group = found.rank[shown], found.group[shown]
     log_wrong = curves(amounts(found, shown), _own_tables() if tables is None else tables)
@@ -151,13 +157,18 @@ def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float
 
 
 def steps_of(rank: Float32) -> NDArray[np.int64]:
-    """Return the step that each rank falls into."""
+    """Return the step of each rank."""
     return np.minimum((rank * NUM_RANKS).astype(np.int64), NUM_RANKS - 1)
 
 
 def amounts(found: Ranked, of: Bool) -> Float:
-    """Return (G,2,R) by group and step of the rank: the number of the pixels ``of`` (H,W), and by
-    how much they are contradicted together. Times a table it is the number of wrong ones."""
+    """Return (G,2,R) by group and step of the rank: the number of pixels, and their contradiction.
+
+    The product with a table is the expected number of outliers.
+
+    Args:
+        of: (H,W) the pixels that count.
+    """
     place = found.group[of].astype(np.int64) * NUM_RANKS + steps_of(found.rank[of])
     size = len(GROUPS) * NUM_RANKS
     sums = [np.bincount(place, weights, size) for weights in (None, found.contradicted[of])]
@@ -165,8 +176,14 @@ def amounts(found: Ranked, of: Bool) -> Float:
 
 
 def curves(pixels: Float, tables: Float) -> Float:
-    """Return (2,R) log10 of the probability that a measured and that a filled pixel is wrong, by
-    step of the rank. pixels: (G,2,R) of `amounts`. tables: (G,2,R)."""
+    """Return (2,R) log10 of the probability of an outlier, by step of the rank.
+
+    The rows are for measured and for filled pixels.
+
+    Args:
+        pixels: (G,2,R) of `amounts`.
+        tables: (G,2,R).
+    """
     num = pixels[:, 0]
     wrong_num = np.minimum((pixels * tables).sum(axis=1), num)
     shares = [
@@ -177,8 +194,10 @@ def curves(pixels: Float, tables: Float) -> Float:
 
 
 def falling(num: Float, wrong_num: Float) -> Float:
-    """Return (R,) ``wrong_num / num``, made to fall with the rank by isotonic regression; steps
-    without pixels lie between their neighbours."""
+    """Return (R,) ``wrong_num / num``, made to fall with the rank by isotonic regression.
+
+    Steps without pixels are between their neighbours.
+    """
     some = num > 0
     if not some.any():
         return np.zeros(len(num))
@@ -194,25 +213,25 @@ def _own_tables() -> Float:
 
 
 def own_file() -> dict[str, Any]:
-    """Return the package's own tables, as examples/fit_confidence.py wrote them."""
+    """Return the package's own tables, written by examples/fit_confidence.py."""
     return read_json(_FILE)
 
 
 def tables_of(written: dict[str, Any]) -> Float:
-    """Return (G,2,R) the share that is wrong, from what examples/fit_confidence.py wrote."""
+    """Return (G,2,R) the share of outliers, from the content of such a file."""
     middle = (np.arange(NUM_RANKS) + 0.5) / NUM_RANKS
     knots = [[np.array(written["tables"][g][c]).T for c in CAUSES] for g in GROUPS]
     return np.array([[np.interp(middle, *ends) for ends in row] for row in knots])
 
 
 def wrong(confidence: Float | Float32) -> Float:
-    """Return the probability that a depth is wrong."""
+    """Return the probability of an outlier at a confidence."""
     probability: Float = 10.0 ** (-DECADES * np.asarray(confidence, np.float64))
     return probability
 
 
 def expected_outliers(maps: DepthMap) -> dict[str, float | None]:
-    """Return the expected share of wrong pixels of the ``measured`` and the ``filled`` map."""
+    """Return the expected share of outliers of the ``measured`` and the ``filled`` map."""
     shares: dict[str, float | None] = {}
     for name, depth_m in (("measured", maps.depth_m), ("filled", maps.filled_m)):
         some = depth_m > 0
@@ -221,10 +240,13 @@ def expected_outliers(maps: DepthMap) -> dict[str, float | None]:
 
 
 def reliability(maps: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[str, Any]]:
-    """Compare expected with true outliers by confidence, over the filled pixels with a truth.
+    """Return expected and true outliers by confidence, over the filled pixels with a truth.
 
-    truth_m: (H,W) metres, 0 none. Returns for each step of 0.05 with pixels: ``confidence`` where
-    it begins, ``num_compared``, the ``expected`` share of wrong pixels, and the true ``outliers``.
+    Each step of 0.05 with pixels has ``confidence`` (its begin), ``num_compared``, the ``expected``
+    share of outliers, and the true ``outliers``.
+
+    Args:
+        truth_m: (H,W) metres, 0 none.
     """
     compared = (truth_m > 0) & (maps.filled_m > 0)
     confidence = maps.confidence[compared]

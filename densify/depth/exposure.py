@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The images of a key, and where a camera sees points at the exposure of an image.
+"""Find the images of a key, and project points at the exposure of an image.
 
 A key takes the image exposed nearest to its sweep, or every image nearer to it than to any other.
 """
@@ -37,8 +37,10 @@ _NUM_ROW_STEPS = 4  # of the search for the row that sees a point
 
 @dataclass(frozen=True)
 class Shot:
-    """The subject of a depth map: the image of this number, None for the key sweep's time, at
-    ``stamp_ns``."""
+    """The subject of a depth map: an image by its number, at ``stamp_ns``.
+
+    Without a number it is the time of the key sweep.
+    """
 
     camera: Camera
     number: int | None
@@ -53,10 +55,10 @@ def key_shots(
 ) -> dict[str, Shot]:
     """Return the depth maps of a key by name.
 
-    A camera's map is named like the camera and shows the image exposed nearest to the key's sweep,
-    of two equally near ones the earlier. With ``project.per=image`` there is a map CAMERA/NUMBER of
-    each image nearer to this sweep than to any other. Without an image within about half a period
-    the map shows the time of the sweep.
+    The map of a camera has the name of the camera and shows the image exposed nearest to the key
+    sweep, the earlier of two. With ``project.per=image`` there is a map CAMERA/NUMBER for each
+    image nearer to this sweep than to any other. Without an image within about half a period the
+    map shows the time of the sweep.
     """
     stamp_ns = sequence.stamp_ns(key)
     begin_ns, end_ns = _own_time_ns(sequence, key)
@@ -96,7 +98,7 @@ def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str,
 
 
 def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
-    """Return begin and end of the time that is nearer to the key's sweep than to another."""
+    """Return begin and end of the time that is nearer to the key sweep than to another sweep."""
     frames = list(sequence.frames)
     at = frames.index(key)
     stamps_ns = {}
@@ -116,8 +118,13 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
 
 
 class InView(NamedTuple):
-    """The K points of a cloud that are on the image: their ascending ``rows`` (K,) of the cloud,
-    and ``points_cam``, ``uv`` of a `Sight`."""
+    """The K points of a cloud in an image.
+
+    Attributes:
+        rows: (K,) rows of the cloud, ascending.
+        points_cam: (K,3) as in `Sight`.
+        uv: (K,2) as in `Sight`.
+    """
 
     exposure: Exposure
     rows: Int
@@ -126,8 +133,13 @@ class InView(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """Points as a camera sees them: ``points_cam`` (N,3) metres, camera frame, when seen; ``uv``
-    (N,2) px, NaN where there is no pixel; ``inside`` (N,) on the image, with a depth."""
+    """Projected points.
+
+    Attributes:
+        points_cam: (N,3) metres, camera frame, at the exposure.
+        uv: (N,2) px, NaN without a pixel.
+        inside: (N,) on the image, with a depth.
+    """
 
     points_cam: Float
     uv: Float
@@ -138,9 +150,13 @@ class Sight(NamedTuple):
 class Exposure:
     """A camera at the time of a shot.
 
-    T_cam_key: (4,4), with the ego motion from the key's reference time. late_s: seconds after it.
-    twist: (6,) of the camera, rad/s and m/s in its own frame. number: of the image. measure: depth
-    is camera ``z`` or ``range``. others: "previous" and "next" image, if the window reaches them.
+    Attributes:
+        T_cam_key: (4,4), with the ego-motion from the key's reference time.
+        late_s: Seconds after the key's reference time.
+        twist: (6,) of the camera, rad/s and m/s in its own frame.
+        number: Number of the image.
+        measure: Depth is camera ``z`` or ``range``.
+        others: "previous" and "next" image, if the window reaches them.
     """
 
     camera: Camera
@@ -155,8 +171,11 @@ class Exposure:
     def of(
         sequence: LidarSequence, stretch: Stretch, key: int, shot: Shot, settings: Config
     ) -> Exposure:
-        """Return the exposure of a shot: the vehicle moves on from the nearest sweep with that
-        sweep's twist, or the recording knows the pose of the image itself."""
+        """Return the exposure of a shot.
+
+        The vehicle moves on from the nearest sweep with the twist of that sweep. A recorded pose of
+        the image is used instead if there is one.
+        """
         others: dict[str, Exposure] = {}
         if settings.output.optical_flow and shot.number is not None:
             stamps_ns = sequence.image_stamps_ns(shot.camera.name)
@@ -180,8 +199,8 @@ class Exposure:
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
         """Project points (N,3) with velocities (N,3), key frame, at the key's reference time.
 
-        A rolling shutter sees each point at the time of the row or column it lands on, where camera
-        and point have moved on. Points beside or behind a wide lens have no z: they are not inside.
+        A rolling shutter observes each point at the time of its row or column, when camera and
+        point have moved on. Points beside or behind a wide lens have no z and are not inside.
         """
         late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)
@@ -200,14 +219,14 @@ class Exposure:
         return Sight(there, uv, inside & (self.depth_m(there) > NEAREST_M))
 
     def sees(self, cloud: Cloud) -> InView:
-        """Return the part of a cloud, at the key's reference time, that is on the image."""
+        """Return the part of a cloud, at the key's reference time, in the image."""
         sight = self.see(cloud.points, cloud.velocity_m_s)
         rows = np.flatnonzero(sight.inside)
         points_cam, uv = (a.take(rows, axis=0) for a in (sight.points_cam, sight.uv))
         return InView(self, rows, points_cam, uv)
 
     def depth_m(self, points_cam: Float) -> Float:
-        """Return (N,) depth of points (N,3), as ``measure`` says."""
+        """Return (N,) depth of points (N,3), in ``measure``."""
         return depth_along(points_cam, self.measure)
 
 
@@ -220,7 +239,10 @@ def _exposure(
     settings: Config,
     others: Mapping[str, Exposure] | None = None,
 ) -> Exposure:
-    """frame: of the sweep from which the vehicle moves on."""
+    """Return the exposure of a shot by the twist of one sweep.
+
+    frame: of the sweep from which the vehicle moves on.
+    """
     camera, registered = shot.camera, stretch[frame]
     late_s = float(shot.stamp_ns - registered.sweep.stamp_ns) * 1e-9
     twist = registered.twist_before if late_s < 0 else registered.twist_after

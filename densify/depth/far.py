@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The static world as sweeps beyond a key's window measured it, and the part of it a key needs."""
+"""Select the static points of sweeps beyond a key's window, and the part that a key needs."""
 
 from __future__ import annotations
 
@@ -44,18 +44,22 @@ _WITNESSES_M, _WITNESS_M, _LEAST_WITNESS_M = 5.0, 3.5, 2.0
 
 
 def in_reach(sweep: Sweep) -> Bool:
-    """Return (N,) True for returns near enough to be placed well."""
+    """Return (N,) True for returns near enough for a good registration."""
     x, y, z = sweep.points.T
     return x * x + y * y + z * z < _MOST_RANGE_M**2
 
 
 def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
-    """Return (N,) of each sweep, True where another one saw through the point.
+    """Return (N,) for each sweep, True where another sweep saw through the point.
 
-    sweeps: deskewed, in the order of the road. travel_m: (S,) where along it they were, ascending.
-    Points ahead of a sweep are compared with the next witness at least 3.5 m on, points behind it
-    with the one before: by then even a vehicle that drives along has left most of the place. At the
-    ends of the road it is the last sweep, 2 m away or more, or the one on the other side.
+    Points ahead of a sweep are compared with the next witness at least 3.5 m farther, points behind
+    it with the previous one. By then even a vehicle that drives along has left most of the place.
+    At the ends of the road the witness is the last sweep, 2 m away or more, or the one on the other
+    side.
+
+    Args:
+        sweeps: Deskewed, in the order of the road.
+        travel_m: (S,) their positions along the road, ascending.
     """
     asked = [0] if sweeps else list[int]()
     for i, at_m in enumerate(travel_m.tolist()):
@@ -143,8 +147,10 @@ _NOTHING = StandingWorld(
 
 
 def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
-    """Return (N,) False where a camera certainly does not see a point (N,3), world, were it up to
-    ``slack_m`` elsewhere; True for all of a lens that is no pinhole."""
+    """Return (N,) False where a camera certainly does not observe a point (N,3) of the world.
+
+    The camera may be up to ``slack_m`` elsewhere. A lens that is no pinhole may observe all points.
+    """
     if camera.model != "pinhole":
         return np.ones(len(points), bool)
     T = T_cam_world.astype(np.float32)
@@ -166,11 +172,15 @@ def far_cloud(
     exposures: Mapping[str, Exposure],
     standing_only: bool,
 ) -> tuple[Cloud, Patches]:
-    """Return the points beyond the window that a camera sees, in the key frame, and their patches.
+    """Return the points beyond the window that a camera observes, and their patches; key frame.
 
-    T_key_found: (4,4) to the key from the world of ``found``. stretch: the window. standing_only:
-    without points that the first or the last sweep of the window saw through. In a pixel one point
-    of every depth is enough.
+    One point of every depth in a pixel is enough.
+
+    Args:
+        T_key_found: (4,4) to the key from the world of ``found``.
+        stretch: The window.
+        standing_only: Without points that the first or the last sweep of the window saw
+            through.
     """
     beyond = ~np.isin(found.frames, stretch.frames)
     rows = np.flatnonzero(beyond[found.source])
@@ -212,8 +222,10 @@ def far_cloud(
 
 
 def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
-    """Return the rows, ascending, of the points (N,3), world, that a camera needs: one in every
-    pixel and step of depth, in an order that mixes the sweeps."""
+    """Return the rows, ascending, of the points (N,3) of the world that a camera needs.
+
+    It needs one in every pixel and step of depth, from sweeps in mixed order.
+    """
     T_cam_world = exposure.T_cam_key @ T_key_world
     near = np.flatnonzero(may_see(exposure.camera, T_cam_world, points, _SLACK_M))
     there = poses.transform(T_key_world, points[near].astype(np.float64))
@@ -228,8 +240,7 @@ def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
 
 
 def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:
-    """Return (M,) True where one of these sweeps of the window saw through a point (M,3), key
-    frame."""
+    """Return (M,) True where one of these sweeps saw through a point (M,3), key frame."""
     free = np.zeros(len(points), bool)
     for frame in witnesses:
         there = poses.transform(stretch.T_target_source(frame, key), points)

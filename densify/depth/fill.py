@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Interpolation between the measured pixels of a depth map.
+"""Interpolate between the measured pixels of a depth map.
 
-First the two-sided fill: planes through the measured pixels of a window. Then the star fill: holes
-that known pixels surround. The votes of measured pixels decide what stays of both.
+The two-sided fill takes planes through the measured pixels of a window. The star fill takes holes
+that known pixels surround. The votes of measured pixels check both.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ _ABOVE = 12  # index of the direction upwards
 
 
 def fill(layers: Layers, reach: float) -> Layers:
-    """Return the layers with the two-sided fill, as far as nine tenths of the votes are for it.
+    """Return the layers with the two-sided fill where nine tenths of the votes are for it.
 
-    reach: half size of the largest window, in spacings of rays.
+    Args:
+        reach: Half size of the largest window, in spacings of rays.
     """
     measured = np.where(layers.depth_m > 0, layers.confidence, np.float32(0))
     filled_m, confidence, tilt = fill_between(
@@ -54,7 +55,7 @@ def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     """Drop pixels filled since ``before_m`` (H,W) for which fewer than ``least_share`` vote.
 
     Measured pixels vote; filled ones would vote for themselves. Boundary pixels that were not
-    accepted may only turn a vote down, unless they are occluded: so the pillar of a car with few
+    accepted may only vote against, unless they are occluded. Therefore the pillar of a car with few
     measured pixels is not filled over.
     """
     filled = (layers.filled_m > 0) & (before_m == 0)
@@ -69,7 +70,7 @@ def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
 
 
 def without_shreds(layers: Layers) -> Layers:
-    """Drop filled pixels where fewer than three tenths of the pixels around are known."""
+    """Drop filled pixels if fewer than three tenths of the pixels around are known."""
     known = layers.filled_m > 0
     row, column = np.nonzero(known & (layers.depth_m == 0))
     gap_px = layers.spacing_px[row, column].max(axis=1)
@@ -85,7 +86,7 @@ def without_shreds(layers: Layers) -> Layers:
 
 
 class _Known(NamedTuple):
-    """Measured pixels row by row; those of row r left of column c come before ``before[r, c]``.
+    """Measured pixels row by row. Those of row r left of column c come before ``before[r, c]``.
 
     before: (H,W+1) int32. num: (H+1,W+1) int32 integral image. column: (K,) int32. inverse: (K,)
     float64, 1/m. confidence: (K,) float32.
@@ -99,7 +100,7 @@ class _Known(NamedTuple):
 
 
 class _Inside(NamedTuple):
-    """The measured pixels in a window: inverse depth (1/m), columns and rows from its middle."""
+    """The measured pixels in a window: inverse depth (1/m), columns and rows from its centre."""
 
     inverse: Float
     right: Float
@@ -113,16 +114,23 @@ def fill_between(
     """Interpolate empty pixels that have measured pixels on both sides.
 
     An empty pixel is filled if its window holds measured pixels in a column to the left, in one to
-    the right, in a row above and in one below, and if no depth edge runs through them. There is an
-    edge if deviations from a plane differ by more than 0.2 m and 5 % of the nearest depth; of
-    fewer than six pixels the depths themselves. The pixel gets the depth of the plane, held between
-    the least and the greatest in the window: nothing is extrapolated. Weights fall to zero just
-    outside the window. The window grows in thirds of the spacing of rays, up to ``reach`` of it,
-    and the smallest that serves is taken.
+    the right, in a row above and in one below, and if no depth discontinuity runs through them.
+    There is a discontinuity if deviations from a plane differ by more than 0.2 m and 5 % of the
+    nearest depth, or the depths themselves for fewer than six pixels. The pixel gets the depth of
+    the plane, limited to the range of the window: nothing is extrapolated. Weights fall to zero
+    just outside the window. The window grows in thirds of the spacing of rays, up to ``reach`` of
+    it, and the smallest sufficient one is taken.
 
-    depth_m, confidence: (H,W), 0 none. tilt: (H,W,2) slope of inverse depth, 1/m per px.
-    spacing_px: (H,W,2) between rays, across and down. Returns the first three with the filled
-    pixels; their confidence is the least in the window, and less the larger the window is.
+    Args:
+        depth_m: (H,W) metres, 0 none.
+        confidence: (H,W).
+        tilt: (H,W,2) slope of inverse depth, 1/m per px.
+        spacing_px: (H,W,2) between rays, across and down.
+        reach: Greatest half size of the window, in spacings.
+
+    Returns:
+        depth_m, confidence and tilt with the filled pixels. Their confidence is the least in
+            the window, and lower for a larger window.
     """
     filled_m, filled_confidence, tilt = depth_m.copy(), confidence.copy(), tilt.copy()
     share = np.zeros(depth_m.shape, np.float32)
@@ -211,7 +219,7 @@ def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, share):  # type: ignore[no-untyped-def]
-    """Fill the empty pixels from ``first`` to ``last`` as `fill_between` says.
+    """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`.
 
     known: `_Known`. reaches: (n,) half sizes of the windows in spacings, ascending. share: (H,W)
     float32, set to the size of the window as a share of the largest.
@@ -255,10 +263,11 @@ def fill_stars(layers: Layers) -> Layers:
     """Fill holes from the first known pixel, measured or filled, in each of 16 directions.
 
     The inverse depth of each known pixel is extended along its surface, and weighted by one over
-    its steps. A hole is filled if known pixels lie within a spacing of the rays in at least eight
-    directions, with at most seven neighbouring directions without, if all predict the same depth to
-    10 %, and if eight of ten votes are for it. In an empty strip of up to six rows along the lower
-    border of the image two directions fewer are enough. The confidence is half the least of theirs.
+    its steps. A hole is filled if known pixels are within a spacing of the rays in at least eight
+    directions, with at most seven neighbouring directions without. All must predict the same depth
+    to 10 %, and eight of ten votes must be for it. In an empty strip of up to six rows along the
+    lower border of the image two directions fewer are enough. The confidence is half the least of
+    the known pixels.
     """
     known = layers.filled_m > 0
     inverse = np.divide(1, layers.filled_m, out=np.zeros_like(layers.filled_m), where=known)
@@ -276,7 +285,7 @@ def fill_stars(layers: Layers) -> Layers:
 
 @inlined
 def _widest_gap(met):  # type: ignore[no-untyped-def]
-    """Return the largest number of neighbouring directions that are not met."""
+    """Return the largest number of neighbouring directions without a known pixel."""
     widest = run = 0
     for d in range(2 * len(met)):
         run = 0 if met[d % len(met)] else run + 1
@@ -289,7 +298,8 @@ def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  
     """Predict the depth of empty pixels from the first known ones around them.
 
     pixel: (P,) row by row. steps: (16,H,W) of `first_known`. inverse: (H,W) 1/m. known: (H,W)
-    confidence. found: (2,P) float32, depth in m and least confidence, 0 where they do not agree.
+    confidence. found: (2,P) float32, depth in m and least confidence, 0 where the predictions
+    differ.
     """
     height, width = inverse.shape
     met = np.zeros(len(DIRECTIONS), np.bool_)

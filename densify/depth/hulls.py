@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Lines that meet a convex hull."""
+"""Intersect lines with convex hulls."""
 
 from __future__ import annotations
 
@@ -10,13 +10,20 @@ from densify.geometry.arrays import Bool, Float
 
 
 def half_spaces(corners: Float) -> Float:
-    """Return (F,4) normal n and offset d of a hull's sides; n · x + d ≤ 0 inside."""
+    """Return (F,4) normal n and offset d of the sides of a hull; n · x + d ≤ 0 inside."""
     return np.unique(ConvexHull(corners).equations, axis=0)
 
 
 def crossing(spaces: Float, start: Float, way: Float) -> tuple[Float, Float]:
-    """Return (K,) the t at which lines start + t · way enter and leave a convex body; a line that
-    misses it leaves before it enters. spaces: (F,4). start: (K,3) or (3,). way: (K,3)."""
+    """Return (K,) the t at which lines start + t · way enter a convex body, and leave it.
+
+    A line that misses the body leaves before it enters.
+
+    Args:
+        spaces: (F,4) of `half_spaces`.
+        start: (K,3) or (3,).
+        way: (K,3).
+    """
     enter, leave = np.full(len(way), -np.inf), np.full(len(way), np.inf)
     for side in spaces:
         slope, outside = way @ side[:3], start @ side[:3] + side[3]
@@ -29,7 +36,7 @@ def crossing(spaces: Float, start: Float, way: Float) -> tuple[Float, Float]:
 
 
 def passes_near(corners: Float, start: Float, way: Float) -> Bool:
-    """Return (K,) True where lines come within the sphere around the corners (V,3)."""
+    """Return (K,) True for lines that pass within the sphere around the corners (V,3)."""
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius_m = np.linalg.norm(corners - middle, axis=1).max()
     off = np.linalg.norm(np.cross(start - middle, way), axis=1)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A camera's image in L*a*b*, and where it lies over the depth map.
+"""Convert a camera's image to L*a*b*, and align it with the depth map.
 
-The image is shifted in steps of a third of the gap between rays. Where it fits, its edges lie on
-the edges of depth, and the sum of its changes there stands out from that of all other shifts.
+The image is shifted in steps of a third of the gap between rays. At the right shift its edges lie
+on the depth discontinuities, and the sum of its changes there is much larger than at all other
+shifts.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ _REBLUR_PX, _MOST_BLUR, _EDGES_LOOKED_AT = 1.5, 2.0, 0.03  # px; steps; share of
 def lab(image: NDArray[np.uint8]) -> Float32:
     """Return (H,W,3) float32 CIE L*a*b*, L from 0 to 100, of an (H,W,3) RGB image.
 
-    It is slightly blurred, and lightened if it is dark: distances say how different colours look.
+    It is slightly blurred, and lightened if it is dark. Distances measure how different colours
+    look.
     """
     blurred = cv2.GaussianBlur(image.astype(np.float32) / 255, (0, 0), _BLUR_PX)
     colours = cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB).astype(np.float32, copy=False)
@@ -45,14 +47,14 @@ def lab(image: NDArray[np.uint8]) -> Float32:
 
 
 class Aligned(NamedTuple):
-    """An image (H,W,3) moved to where it fits, and by how much it lay aside."""
+    """An image (H,W,3), shifted to fit, and its offset before."""
 
     lab: Float32
     right_px: int = 0
     down_px: int = 0
 
     def __str__(self) -> str:
-        """Return where it lay, such as "2 px to the left and 1 px too high"."""
+        """Return the offset in words, such as "2 px to the left and 1 px too high"."""
         across = f"{abs(self.right_px)} px to the {'right' if self.right_px > 0 else 'left'}"
         along = f"{abs(self.down_px)} px too {'low' if self.down_px > 0 else 'high'}"
         ways = ((self.right_px, across), (self.down_px, along))
@@ -60,12 +62,13 @@ class Aligned(NamedTuple):
 
 
 def align_image(layers: Layers) -> Aligned | None:
-    """Return the image of the layers, moved to where it fits; None if it does not, or is blurred.
+    """Return the image of the layers, shifted to fit, None if it does not fit or is blurred.
 
-    Its edges must stand out most at most 3.2 steps away. It stays if they stand out by 3.05 as it
-    is, and by at most 1.9 less than where most; else it is moved, if they stand out by 5 there. It
-    is blurred if its edges are by more than two steps: the sharper an edge, the more another blur
-    takes from its gradient (Zhuo and Sim, "Defocus map estimation from a single image", 2011).
+    The sum of changes on depth discontinuities must be largest at most 3.2 steps away. In standard
+    deviations of the sums elsewhere, an image with 3.05 at no shift stays, unless the maximum is
+    more than 1.9 larger. It is shifted if the maximum is at least 5. It is blurred if its edges
+    have a blur of more than two steps: the sharper an edge, the more another blur lowers its
+    gradient (Zhuo and Sim, "Defocus map estimation from a single image", 2011).
     """
     lab, step_px = layers.lab, max(1, round(0.3 * float(np.median(layers.gap_px))))
     if lab is None or _blur_px(lab) > _MOST_BLUR * step_px:
@@ -88,8 +91,7 @@ def align_image(layers: Layers) -> Aligned | None:
 
 
 def _standing_out(sums: Float) -> Float:
-    """Return (29,29) how far each of the sums stands out, in standard deviations of those
-    elsewhere, once their slow trend is taken off."""
+    """Return (29,29) the sums in standard deviations of those elsewhere, without slow trend."""
     offsets = np.arange(-_REACH, _REACH + 1)
     right, down = np.meshgrid(offsets, offsets)
     elsewhere = np.hypot(right, down) > _ELSEWHERE
@@ -101,11 +103,11 @@ def _standing_out(sums: Float) -> Float:
 
 
 def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
-    """Return (29,29) how much the image, shifted so many steps down and to the right, changes
-    across the edges of depth.
+    """Return (29,29) the changes of the shifted image across depth discontinuities.
 
-    These are boundary pixels, and jumps between neighbouring known pixels, with boundary pixels and
-    without. Each kind counts as a multiple of its mean.
+    The shifts are steps down and to the right. Discontinuities are boundary pixels, and jumps
+    between neighbouring known pixels, with boundary pixels and without. Each kind counts as a
+    multiple of its mean.
     """
     known_m = np.maximum(layers.depth_m, layers.rim_m)
     strict_m = np.where(layers.rim_m == 0, layers.depth_m, np.float32(0))
@@ -127,8 +129,10 @@ def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
 def _sums(
     changes: Float32, row: Int, column: Int, right: float | Float32, down: float | Float32
 ) -> Float:
-    """Return (29,29) the changes at rows and columns (E,) along ``right`` and ``down``, (E,) or the
-    same everywhere."""
+    """Return (29,29) the changes at rows and columns (E,) along ``right`` and ``down``.
+
+    The direction is (E,), or the same everywhere.
+    """
     width, (x, y) = changes.shape[2], changes.reshape(2, -1)
     offsets = np.arange(-_REACH, _REACH + 1)
     beside = (row + _REACH) * width + column + _REACH + offsets[:, None]
@@ -139,14 +143,16 @@ def _sums(
 
 
 def _some(values: Int) -> Int:
-    """Return the values, or 6,000 of them, evenly."""
+    """Return the values, or 6,000 evenly spaced ones of them."""
     return values[:: len(values) // _MOST + 1]
 
 
 def _jumps(depth_m: Float32, gap: int, step_px: int) -> tuple[Int, Int]:
-    """Return rows and columns, in steps, where depth (H,W) jumps from one surface to another
-    between neighbouring known pixels of a row, at most ``gap`` steps apart. Both surfaces go on,
-    which leaves out most of leaves."""
+    """Return rows and columns, in steps, of jumps of depth (H,W) from one surface to another.
+
+    They are between neighbouring known pixels of a row, at most ``gap`` steps apart. Both surfaces
+    continue, which leaves out most of leaves.
+    """
     row, column = np.nonzero(depth_m)
     known_m = depth_m[row, column]
     off_m, least_m = np.abs(np.diff(known_m)), np.minimum(known_m[1:], known_m[:-1])
@@ -171,7 +177,7 @@ def _blur_px(lab: Float32) -> float:
 
 
 def _reduced(image: Float32, step_px: int) -> Float32:
-    """Return an image each pixel of which is the mean of ``step_px`` by ``step_px``."""
+    """Return an image of means over ``step_px`` by ``step_px`` pixels."""
     if step_px == 1:
         return image
     size = (-(-image.shape[1] // step_px), -(-image.shape[0] // step_px))
@@ -179,7 +185,7 @@ def _reduced(image: Float32, step_px: int) -> Float32:
 
 
 def _across(depth_m: Float32, step_px: int) -> Float32:
-    """Return (2,H,W) the direction right and down in which depth changes most, reduced."""
+    """Return (2,H,W) the direction right and down of the greatest change of depth, reduced."""
     known = depth_m > 0
     inverse = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=known)
     sums, weight = (
@@ -191,7 +197,7 @@ def _across(depth_m: Float32, step_px: int) -> Float32:
 
 
 def _changes(lab: Float32) -> Float32:
-    """Return (2,H,W) the gradient of the channel that changes most, against those around."""
+    """Return (2,H,W) the gradient of the channel that changes most, relative to those around."""
     change, size = _gradient(lab[..., 0]), np.zeros(lab.shape[:2], np.float32)
     for channel in np.moveaxis(lab, 2, 0):
         gradient = _gradient(channel)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The accumulated points in one image, the surface around each, and what hides them."""
+"""Collect the accumulated points in one image, with their surface patches and occlusion."""
 
 from __future__ import annotations
 
@@ -29,10 +29,18 @@ _MOST_SWEEPS = np.iinfo(np.int64).bits - 1  # that are told apart when they are 
 class PointsInImage:
     """The K points in the image.
 
-    index: rows of the cloud. uv: (K,2) px. depth: (K,) m. focal_px: (K,2) local scale, px per metre
-    at a depth of 1 m. slope: (K,2) of the tangent plane's inverse depth, 1/m per px. spacing_px:
-    (K,2) between neighbouring rays. moving: (K,). frame, sweep: (K,) source, see `_witness`.
-    age_ns: (K,) see `_ages_ns`. far: (K,) from a sweep beyond the window.
+    Attributes:
+        index: (K,) rows of the cloud.
+        uv: (K,2) px.
+        depth: (K,) m.
+        focal_px: (K,2) local scale, px per metre at a depth of 1 m.
+        slope: (K,2) of the tangent plane's inverse depth, 1/m per px.
+        spacing_px: (K,2) between neighbouring rays.
+        moving: (K,) bool.
+        frame: (K,) source sweep.
+        sweep: (K,) number of the source, see `_witness`.
+        age_ns: (K,) see `_ages_ns`.
+        far: (K,) from a sweep beyond the window.
     """
 
     index: Int
@@ -48,6 +56,7 @@ class PointsInImage:
     far: Bool
 
     def select(self, keep: Bool) -> PointsInImage:
+        """Return the points where ``keep`` (K,) is True."""
         if keep.all():
             return self
         rows = np.flatnonzero(keep)
@@ -56,7 +65,7 @@ class PointsInImage:
         )
 
     def at(self, rows: Int) -> Int:
-        """Return where rows of the cloud, all in the image, are among these."""
+        """Return the positions of rows of the cloud, all in the image, among these points."""
         place = np.zeros(int(self.index.max(initial=-1)) + 1, np.int64)
         place[self.index] = np.arange(len(self.index))
         found: Int = place[rows]
@@ -64,12 +73,16 @@ class PointsInImage:
 
     @property
     def inverse(self) -> Float:
+        """The (K,) inverse depths."""
         return 1 / self.depth.astype(np.float64)
 
 
 def points_in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> PointsInImage:
-    """Return the points of the cloud in the view; vetoed: without those the key sweep saw
-    through."""
+    """Return the points of the cloud in the view.
+
+    Args:
+        vetoed: Leave out those that the key sweep saw through.
+    """
     row = np.rint(view.uv[:, 1]).astype(np.uint16)
     kept = np.argsort(row, kind="stable")
     if vetoed:
@@ -102,8 +115,10 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) 
 def _pinhole(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> tuple[Float, Float, Float]:
-    """Return focal_px, slope and spacing_px for the camera z of a rectified image, where patches
-    count as facing it."""
+    """Return focal_px, slope and spacing_px for the camera z of a rectified image.
+
+    Patches count as facing the camera.
+    """
     focal_px = exposure.camera.K[[0, 1], [0, 1]]
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
     d = np.einsum("ij,ij->i", normal, points_cam)
@@ -118,8 +133,8 @@ def _any_lens(
 ) -> tuple[Float, Float, Float]:
     """Return focal_px, slope and spacing_px by the Jacobian J (2,3) of the projection at points p.
 
-    Moving on the plane n · p = d so that the image moves by one pixel, p moves by
-    δ = J⁺ - p (n · J⁺) / d, and the inverse depth by -δ_z / z², the inverse range by -p · δ / r³.
+    If a point moves on the plane n · p = d until the image moves by one pixel, p moves by δ = J⁺ -
+    p (n · J⁺) / d, the inverse depth by -δ_z / z², and the inverse range by -p · δ / r³.
     """
     J = pixels_per_metre(exposure.camera, points_cam)
     focal_px = np.linalg.norm(J, axis=2) * depth[:, None]
@@ -143,8 +158,11 @@ def _any_lens(
 
 
 def _witness(patches: Patches, far: Bool) -> NDArray[np.int32]:
-    """Return (M,) the number, of 63, by which a point's sweep is counted: one for each sweep of the
-    window, and for each part of the road beyond it; distant parts may share one."""
+    """Return (M,) the number, of 63, that identifies the source of a point.
+
+    There is one for each sweep of the window, and for each part of the road beyond it. Distant
+    parts may share one.
+    """
     num_near = min(int(patches.sweep[~far].max(initial=-1)) + 1, _MOST_SWEEPS - 1)
     shared = num_near + patches.place % (_MOST_SWEEPS - num_near)
     return np.where(far, shared, np.minimum(patches.sweep, _MOST_SWEEPS - 1)).astype(np.int32)
@@ -153,8 +171,8 @@ def _witness(patches: Patches, far: Bool) -> NDArray[np.int32]:
 def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32], far: Bool) -> Int:
     """Return (K,) times between the key and the points' sweeps.
 
-    Sweeps of the window less than 10 ms apart count as equally old: clocks that jitter do not
-    decide between the sweeps before and after the key.
+    Sweeps of the window less than 10 ms apart count as equally old, because clocks that jitter must
+    not decide between the sweeps before and after the key.
     """
     near = ~far
     of_sweep = np.zeros(int(sweep[near].max(initial=-1)) + 1, np.int64)
@@ -168,8 +186,10 @@ def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32], far: Bool) -> Int:
 
 
 def distance_behind(points: PointsInImage, camera: Camera) -> Float:
-    """Return (K,) how far each point lies behind the nearest patch over its pixel, as a share of
-    what is allowed; above 1 it is hidden."""
+    """Return (K,) distance of each point behind the nearest patch over its pixel.
+
+    It is a share of the tolerance. A point above 1 is occluded.
+    """
     slack_px = _SLACK_M * points.focal_px / points.depth[:, None]
     half_px = np.clip(_FOOTPRINT * points.spacing_px + slack_px, 0.5, _MAX_HALF_PX)
     nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
@@ -187,9 +207,13 @@ def distance_behind(points: PointsInImage, camera: Camera) -> Float:
 def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
     """Raise canvas (H,W) float32 to the greatest inverse depth of the patches over a pixel.
 
-    uv, slope, half_px: (K,2); inverse: (K,). A patch covers the pixel centres within ``half_px`` of
-    its point, with inverse depth ``inverse + slope · offset``, between half of ``inverse`` and all
-    of it: a patch is never nearer than its point.
+    A patch covers the pixel centres within ``half_px`` of its point, with inverse depth ``inverse +
+    slope · offset``, between half of ``inverse`` and all of it: a patch is never nearer than its
+    point. uv, slope.
+
+    Args:
+        half_px: (K,2).
+        inverse: (K,).
     """
     height, width = canvas.shape
     for i in range(len(inverse)):
@@ -210,8 +234,10 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
 def sorted_by_pixel(
     points: PointsInImage, rank: Int, confidence: Float32, camera: Camera
 ) -> tuple[Int, Int]:
-    """Return ``start`` and ``order``: the points of pixel p are ``order[start[p]:start[p + 1]]``,
-    the least in rank (K,) first, then the nearest."""
+    """Return ``start`` and ``order``: the points of pixel p are ``order[start[p]:start[p + 1]]``.
+
+    The least in ``rank`` (K,) comes first, then the nearest.
+    """
     column, row = np.rint(points.uv).astype(np.int64).T
     start = np.empty(camera.height_px * camera.width_px + 1, np.int64)
     order = np.empty(len(rank), np.int64)

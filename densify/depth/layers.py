@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A depth map in the making: what the stages of `densify.depth.project` hand on."""
+"""Hold a depth map in the making, which the stages of `densify.depth.project` hand on."""
 
 from __future__ import annotations
 
@@ -14,17 +14,23 @@ from densify.geometry.types import Bool, Float32
 
 @dataclass(frozen=True)
 class Layers:
-    """One camera's map with all that is known of its pixels; (H,W) everywhere, depths in m, 0 none.
+    """The map of one camera with all properties of its pixels; (H,W) each, depths in m, 0 none.
 
-    depth_m: accepted as measured. rim_m: measured so close to a depth discontinuity that the pixel
-    may show what lies beyond; it stays when the pixel is accepted. veiled: this boundary pixel is
-    measured behind the patch of a nearer point. filled_m: accepted and interpolated pixels.
-    confidence: 0 to 1. point: row of the cloud that measured the pixel, -1 none. tilt: (H,W,2)
-    slope of the surface's inverse depth to the right and down, 1/m per px. spacing_px: (H,W,2)
-    between neighbouring rays of one sweep, across and down, everywhere. lab: (H,W,3) the image in
-    L*a*b*, if there is one. warnings: what could not be done as asked. solid: closed car windows,
-    and moving bodies. glass: where a measured pixel was taken out of a window. key_only: only the
-    key sweep has returns of the surface.
+    Attributes:
+        depth_m: Accepted as measured.
+        rim_m: Boundary pixels: measured so close to a depth discontinuity that they may show
+            the background. A pixel stays here when it is accepted.
+        veiled: This boundary pixel is measured behind the patch of a nearer point.
+        filled_m: Accepted and interpolated pixels.
+        confidence: 0 to 1.
+        point: Row of the cloud that measured the pixel, -1 none.
+        tilt: (H,W,2) slope of the surface's inverse depth to the right and down, 1/m per px.
+        spacing_px: (H,W,2) between neighbouring rays of one sweep, across and down, everywhere.
+        lab: (H,W,3) the image in L*a*b*, None without one.
+        warnings: What could not be done as asked.
+        solid: Closed car windows, and moving bodies.
+        glass: A measured pixel was removed from a car window.
+        key_only: Only the key sweep has returns of the surface.
     """
 
     depth_m: Float32
@@ -43,7 +49,7 @@ class Layers:
 
     @property
     def gap_px(self) -> Float32:
-        """(H,W) between neighbouring rays, whichever way."""
+        """The (H,W) distance between neighbouring rays, in the wider direction."""
         return np.sqrt(self.spacing_px[..., 0] * self.spacing_px[..., 1])
 
     def part(self, box: tuple[slice, slice]) -> Layers:
@@ -53,8 +59,10 @@ class Layers:
         return Layers(**values | images)
 
     def without(self, dropped: Bool) -> Layers:
-        """Take out the pixels ``dropped`` (H,W) of the filled map; what was measured there becomes
-        a boundary pixel that is not accepted."""
+        """Remove the pixels ``dropped`` (H,W) from the filled map.
+
+        Measured ones become boundary pixels that are not accepted.
+        """
         dropped = dropped & (self.filled_m > 0)
         rim_m = np.where(dropped & (self.depth_m > 0), self.depth_m, self.rim_m)
         depth_m, filled_m, confidence = (

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The depth that the points of an image give its pixels.
+"""Compute the depth that the points of an image give its pixels.
 
-Of the points in a pixel that are not hidden, the one measured nearest in time to the key wins. Its
-depth is that of the plane through the points around that agree with it, in the middle of the pixel.
-It counts if enough sweeps agree; if a depth edge is near, it is a boundary pixel.
+Of the points in a pixel that are not occluded, the one measured nearest in time to the key wins.
+Its depth is that of the plane through the points around that agree with it, at the centre of the
+pixel. The pixel is measured if enough sweeps agree. Close to a depth discontinuity it is a boundary
+pixel.
 """
 
 from __future__ import annotations
@@ -49,8 +50,12 @@ _NEVER_NS = int(np.iinfo(np.int64).max)
 class MeasuredPixels(NamedTuple):
     """The H·W pixels of an image, row by row.
 
-    winner: int, which of the points in the image gives the depth, -1 none. depth_m, confidence:
-    float32. inside: no depth edge is near. veiled, key_only: as in `densify.depth.layers.Layers`.
+    Attributes:
+        winner: int, point in the image that gives the depth, -1 none.
+        depth_m: float32.
+        confidence: float32.
+        inside: No depth discontinuity is near.
+        veiled: As in `densify.depth.layers.Layers`; key_only too.
     """
 
     winner: Int
@@ -62,7 +67,7 @@ class MeasuredPixels(NamedTuple):
 
     @staticmethod
     def at(camera: Camera, pixel: Int, *columns: np.ndarray) -> MeasuredPixels:
-        """Return the pixels (P,) with these columns (P,), the others without a depth."""
+        """Return the pixels (P,) with these columns (P,), and the others without a depth."""
         num = camera.height_px * camera.width_px
         images = [np.full(num, -1, np.int64), *(np.zeros(num, c.dtype) for c in columns[1:])]
         for image, column in zip(images, columns, strict=True):
@@ -73,7 +78,7 @@ class MeasuredPixels(NamedTuple):
 def nearest_pixels(
     points: PointsInImage, own: Float32, camera: Camera, reason: NDArray[np.uint8]
 ) -> MeasuredPixels:
-    """Return each pixel's nearest point as it is; fill in the ``reason`` of the others."""
+    """Return the nearest point of each pixel as it is; fill in the ``reason`` of the others."""
     start, order = sorted_by_pixel(points, np.zeros(len(own), np.int64), own, camera)
     pixel = np.flatnonzero(np.diff(start))
     nearest = order[start[pixel]]
@@ -92,10 +97,12 @@ def visible_pixels(
 ) -> MeasuredPixels:
     """Return the pixels that visible points measure; fill in the ``reason`` of the others.
 
-    own: (K,) confidence of the points. support: sweeps that must agree.
+    Points beyond the window come second. They measure pixels that the window leaves empty, away
+    from depth discontinuities, and support those that few sweeps of the window measured.
 
-    Points beyond the window come second. They give pixels where the window has none away from depth
-    edges, and support there what the window saw too rarely.
+    Args:
+        own: (K,) confidence of the points.
+        support: Number of sweeps that must agree.
     """
     near = np.flatnonzero(~points.far)
     pixels, why = _settled(points.select(~points.far), own[near], camera, support)
@@ -121,9 +128,9 @@ def _settled(
 ) -> tuple[MeasuredPixels, NDArray[np.uint8]]:
     """Return the pixels that points measure, and the `Reason` of every point.
 
-    taken: (H·W,) where given, pixels to leave alone; the others get the stricter rules of points
-    beyond the window. Elsewhere several returns of the key sweep are enough: an object that moves
-    without being noticed was elsewhere at other times.
+    Several returns of the key sweep are enough support, because an object that moves unnoticed was
+    elsewhere at other times. taken: (H·W,) pixels to leave alone; with them the others get the
+    stricter rules of points beyond the window.
     """
     many = int(points.sweep.max(initial=0)) + 1
     least = min(support, max(1, many // 2))
@@ -160,11 +167,11 @@ def _settled(
 
 
 class _Visible(NamedTuple):
-    """K points in an image, sorted by pixel, hidden ones last in each pixel.
+    """K points in an image, sorted by pixel, occluded ones last in each pixel.
 
     start: of `sorted_by_pixel`. uv: (K,2) px. inverse: (K,) depth, 1/m. slope: (K,2) of it, 1/m per
-    px. spacing_px: (K,2) between rays. edge_px: (K,) added to the reach of a depth edge. sweep:
-    (K,) 0 to 62. hidden, moving: (K,). age_ns: (K,) from the key.
+    px. spacing_px: (K,2) between rays. edge_px: (K,) added to the reach of a depth discontinuity.
+    sweep: (K,) 0 to 62. hidden. moving: (K,). age_ns: (K,) from the key.
     """
 
     start: Int
@@ -187,8 +194,10 @@ def _found(
     least: int,
     taken: Bool | None,
 ) -> tuple[Int, Int, Float32]:
-    """Return the pixels (P,) with points, the first point of each (P,), and (7,P) what `_settle`
-    finds around it; with pixels ``taken`` neither these nor those with hidden points alone."""
+    """Return the pixels (P,) with points, the first point of each (P,), and (7,P) of `_settle`.
+
+    With pixels ``taken``, these are left out, and so are those with occluded points alone.
+    """
     last = int(points.age_ns.max(initial=0)) + 1
     late = points.age_ns > 0
     rank = np.where(hidden, last + late, points.age_ns)
@@ -226,13 +235,13 @@ def _window(reach_px):  # type: ignore[no-untyped-def]
 
 @inlined
 def _fit(reach_px):  # type: ignore[no-untyped-def]
-    """Return where the weight has fallen to zero."""
+    """Return the distance at which the weight has fallen to zero."""
     return min(max(reach_px, _LEAST_FIT_PX), _MOST_PX) + 1
 
 
 @inlined
 def _extend(reach, u, v):  # type: ignore[no-untyped-def]
-    """Raise how far points lie in eight directions."""
+    """Raise the reach of points in eight directions."""
     reach[0], reach[1] = max(reach[0], u), max(reach[1], -u)
     reach[2], reach[3] = max(reach[2], v), max(reach[3], -v)
     a, b = np.sqrt(0.5) * (u + v), np.sqrt(0.5) * (u - v)
@@ -252,13 +261,13 @@ def _count(seen):  # type: ignore[no-untyped-def]
 
 @inlined
 def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach):  # type: ignore[no-untyped-def]
-    """Compare the points around a pixel with point i's tangent plane, ``centre`` in the pixel.
+    """Compare the points around a pixel with the tangent plane of point i.
 
-    witness_ns: how long before or after the key a point behind shows an edge; `_NEVER_NS` for
-    static points. Fills the moments m (9,) and how far the surface goes on, reach (8,). Returns a
-    bit for each sweep that agrees, the age of the youngest, the number of points in the fit, their
-    weighted squares, True if something lies behind close by, and of a moving point the number of
-    returns of the key sweep around it that agree.
+    The plane is ``centre`` in the pixel. Fills the moments m (9,) and the extent of the surface,
+    reach (8,). Returns a bit for each sweep that agrees, the age of the youngest, the number of
+    points in the fit, their weighted squares, True if a point is close behind, and for a moving
+    point the number of returns of the key sweep around that agree. witness_ns: greatest age of a
+    point behind that shows a discontinuity; `_NEVER_NS` for static points.
     """
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
@@ -311,14 +320,14 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
 
 @Kernel
 def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-untyped-def]
-    """Find each pixel's depth from the points around that agree with its first point.
+    """Find the depth of each pixel from the points around that agree with its first point.
 
-    points: `_Visible`. few: where fewer sweeps agree, a return of the key sweep is judged by the
-    key sweep only, as a moving point is. taken: (P,) pixels to leave alone. found: (7,P) float32:
-    depth (m), number of sweeps that agree, age of the youngest (ns), points in the fit, their root
-    mean square residual (m), how far the surface goes on to all sides as a share of the reach of
-    edges, and number of returns that agree where the key sweep only is asked. Hidden points agree
-    with a hidden one only.
+    points: `_Visible`. few: if fewer sweeps agree, a return of the key sweep is judged by the key
+    sweep only, as a moving point is. taken: (P,) pixels to leave alone. found: (7,P) float32: depth
+    (m), number of sweeps that agree, age of the youngest (ns), points in the fit, their root mean
+    square residual (m), extent of the surface to all sides as a share of the reach of
+    discontinuities, and number of agreeing returns of the key sweep. Occluded points agree with
+    occluded ones only.
     """
     m, reach = np.zeros(9), np.zeros(8)
     for p in range(first, last):

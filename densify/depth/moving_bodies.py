@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Moving objects as closed surfaces: nothing that lies behind one shines through it.
+"""Close the surfaces of moving objects: nothing behind them shows through.
 
-Lidar gets no return from much of a near car: dark paint, panes. Other sweeps measured the
-background there, while the car was elsewhere. So every moving object is a body: the convex hull of
-all its points of the window, at the key's moment. The rays of all sweeps, moved along with the
-object, tell where the body is closed: there they end on it. Between the legs of a walker or under
-a bumper they go through.
+Lidar gets no return from much of a near car: dark paint, glass. Other sweeps measured the
+background there, while the car was elsewhere. Therefore every moving object is a body: the convex
+hull of all its points of the window, at the key's time. The rays of all sweeps are moved along with
+the object. Where they end on the body, it is closed. Between the legs of a pedestrian or under a
+bumper they pass through.
 
 In the image, pixels well inside the closed part show the body. The image decides the pixels along
-its outline. The surface is the front of the hull, moved smoothly onto the object's own returns.
+its silhouette. The surface is the front of the hull, moved smoothly onto the object's own returns.
 """
 
 from __future__ import annotations
@@ -52,10 +52,9 @@ class MovingBody(NamedTuple):
     """A moving object at the key's reference time; key frame, metres.
 
     corners: (V,3) of its convex hull. velocity_m_s: (3,). entries: (K,3) where rays enter the hull.
-    ends: (K,) True if the ray ends on the object, False if it goes through. weight: (K,) of the
-    ray: less long before or after the key, and where it passes just below the surface of the hull;
-    0 where it ends on the object, but far behind the front: at wheels, below a trailer. frame: (K,)
-    of its sweep.
+    ends: (K,) True if the ray ends on the object, False if it passes through. weight: (K,) of the
+    ray: less far from the key in time, and where it passes just below the surface of the hull; 0 if
+    it ends on the object, but far behind the front, as on wheels. frame: (K,) source sweep.
     """
 
     corners: Float
@@ -96,7 +95,7 @@ def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
 def without_sweep(
     bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
 ) -> dict[int, MovingBody]:
-    """Return the bodies as told by the other sweeps alone. cloud: their points."""
+    """Return the bodies with the evidence of the other sweeps alone. cloud: their points."""
     told = {}
     for k, body in bodies.items():
         corners = _corners(cloud.points[cloud.moving & (cloud.instance == k)])
@@ -133,7 +132,7 @@ class _Sweep(NamedTuple):
     """The returns of one sweep, key frame.
 
     origin: (3,) of the scanner at the reference time. azimuth: (N,) radians, seen from there.
-    range_m: (N,) level distance from there. moved_m: by the scanner from there, at most.
+    range_m: (N,) level distance from there. moved_m: greatest motion of the scanner from there.
     """
 
     cloud: Cloud
@@ -152,7 +151,7 @@ class _Sweep(NamedTuple):
         return _Sweep(part, rays, origin, np.arctan2(y, x), np.hypot(x, y), float(moved_m))
 
     def met(self, instance: int, corners: Float, T_key_there: Float) -> _Met:
-        """Return the rays that meet a hull, entering it where it is at the key.
+        """Return the rays that meet a hull, with their entries at the key's time.
 
         corners: (V,3) of the hull at the key. T_key_there: motion of the object from this sweep.
         """
@@ -188,13 +187,11 @@ class _Sweep(NamedTuple):
 def close_bodies(
     layers: Layers, cloud: Cloud, exposure: Exposure, bodies: Mapping[int, MovingBody]
 ) -> Layers:
-    """Return the layers with the surfaces of moving bodies.
+    """Return the layers with the surfaces of moving bodies. cloud: at the key's reference time.
 
-    What lies clearly before a body stays. Elsewhere inside the outline of its hull stays only what
-    is measured of something that moves. Pixels at which one of the body's own returns lies on its
-    surface count as measured. ``solid`` says where bodies are.
-
-    cloud: at the key's reference time.
+    Points clearly in front of a body stay. Elsewhere inside the outline of its hull only
+    measurements of moving objects stay. Pixels at which one of the body's own returns is on its
+    surface count as measured. ``solid`` marks the bodies.
     """
     changed = ("depth_m", "filled_m", "confidence", "tilt", "point")
     layers = replace(layers, **{name: getattr(layers, name).copy() for name in changed})
@@ -210,8 +207,7 @@ def close_bodies(
 
 
 def far_inside(bodies: Iterable[MovingBody], exposure: Exposure, depth_m: Float32) -> Bool:
-    """Return (H,W) True where a depth (H,W) lies far behind the front of a body: behind its glass,
-    or where the hull is not tight."""
+    """Return (H,W) True where a depth (H,W) is far behind the front of a body, as behind glass."""
     far = np.zeros(depth_m.shape, bool)
     for body in bodies:
         front = _Front.of(body, exposure, 0)
@@ -243,7 +239,7 @@ class _Front(NamedTuple):
 
     @staticmethod
     def of(body: MovingBody, exposure: Exposure, margin_px: int) -> _Front | None:
-        """Return None if the body is not in view. margin_px: of the box, to all sides."""
+        """Return the front, None if the body is out of view. margin_px: of the box, all round."""
         camera = exposure.camera
         sight = exposure.see(body.corners, _each(body.velocity_m_s, body.corners))
         if not sight.inside.any():
@@ -266,7 +262,7 @@ class _Front(NamedTuple):
         return _Front(box, inverse.reshape(row.shape)) if inside.any() else None
 
     def pixels(self, exposure: Exposure, points: Float, velocity_m_s: Float32) -> _Pixels:
-        """Return where points (N,3), key frame, show within the box."""
+        """Return the positions of points (N,3), key frame, within the box."""
         sight = exposure.see(points, velocity_m_s)
         column, row = np.rint(np.where(sight.inside, sight.uv.T, -1)).astype(np.int64)
         row, column = row - self.box[0].start, column - self.box[1].start
@@ -330,10 +326,7 @@ def _close(
 
 
 def _surface(layers: Layers, rows: Int, front: _Front) -> Float:
-    """Return (h,w) the inverse depth of a body's surface, 1/m, in the box of its front.
-
-    rows: of its points in the cloud.
-    """
+    """Return (h,w) the inverse depth (1/m) of the surface of the body with these ``rows``."""
     inside = front.inverse > 0
     known_m = np.maximum(layers.depth_m, layers.rim_m)
     own = inside & (known_m > 0) & np.isin(layers.point, rows)
@@ -348,9 +341,9 @@ def _shown(
 ) -> tuple[Bool, Bool]:
     """Return (h,w) the pixels that show a body, and those of them at which its returns count.
 
-    Takes out of ``layers`` what else is inside its outline. surface: (h,w) inverse depth of the
-    body, 1/m. agree_m: (h,w) what is farther behind it is something else. share: (h,w) of the rays
-    that end on it, 0 outside its outline.
+    Other content inside its outline is removed from ``layers``. surface: (h,w) inverse depth of the
+    body, 1/m. agree_m: (h,w) tolerance of depth behind it. share: (h,w) of the rays that end on it,
+    0 outside its outline.
     """
     inside, now_m, surface_m = share > 0, layers.filled_m, (1 / surface).astype(np.float32)
     whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
@@ -380,8 +373,10 @@ def _well_inside(closed: Bool, away_px: float) -> Bool:
 
 
 def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
-    """Return (h,w) the smooth offset o that is the least of
-    Σ known (o - offset)² + stiff Σ |∇o|² + held Σ o² over the pixels ``inside``."""
+    """Return (h,w) the smooth offset o of the pixels ``inside``.
+
+    It is the least of Σ known (o - offset)² + stiff Σ |∇o|² + held Σ o².
+    """
     number = np.cumsum(inside).reshape(inside.shape) - 1
     across, down = inside[:, :-1] & inside[:, 1:], inside[:-1] & inside[1:]
     one = np.concatenate([number[:, :-1][across], number[:-1][down]])

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Known pixels around a pixel: the first one in sixteen directions, and the plane through them.
+"""Find the first known pixel in sixteen directions, and fit planes through known pixels.
 
-A plane in space is linear in inverse depth over the image, so planes are fitted in inverse depth.
+A plane in space is linear in inverse depth over the image. Therefore planes are fitted in inverse
+depth.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _LEAST, _MOST = 0.7, 1.4  # of the inverse depth: how far a slope is followed
 
 
 def _directions() -> NDArray[np.int64]:
-    """(16,2,2) columns and rows: see `DIRECTIONS`."""
+    """Return (16,2,2) columns and rows, see `DIRECTIONS`."""
     axis, diagonal = (1, 0), (1, 1)
     quarter = [(axis, (2, 0)), (axis, (2, 1)), (diagonal, (2, 2)), ((0, 1), (1, 2))]
     turn = np.array([[0, -1], [1, 0]])
@@ -32,8 +33,10 @@ right. Each step goes to one of the eight neighbours."""
 
 
 def first_known(known: Bool) -> NDArray[np.uint8]:
-    """(H,W) -> (16,H,W) steps to the first known pixel in each of `DIRECTIONS`, 0 at a known pixel
-    itself, `NONE` where there is none."""
+    """Return (16,H,W) the steps to the first known pixel in each of `DIRECTIONS`.
+
+    They are 0 at a known pixel itself, and `NONE` without any.
+    """
     padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
     steps = padded[:, 2:-2, 2:-2]
     steps[:] = np.where(known, np.uint8(0), np.uint8(NONE))
@@ -43,7 +46,10 @@ def first_known(known: Bool) -> NDArray[np.uint8]:
 
 @Kernel
 def _march(steps):  # type: ignore[no-untyped-def]
-    """steps: (16,H,W), 0 where known, with a border of two pixels that stays as it is."""
+    """Fill the steps to known pixels.
+
+    steps: (16,H,W), 0 at known pixels, with a border of two pixels that stays as it is.
+    """
     height, width = steps.shape[1:]
     for d in range(len(DIRECTIONS)):
         u1, v1, u2, v2 = DIRECTIONS[d].ravel()
@@ -66,7 +72,7 @@ def _march(steps):  # type: ignore[no-untyped-def]
 
 @inlined
 def offset(d, k):  # type: ignore[no-untyped-def]
-    """Columns and rows after k steps in direction d."""
+    """Return columns and rows after k steps in direction d."""
     du = (k // 2) * DIRECTIONS[d, 1, 0] + (k % 2) * DIRECTIONS[d, 0, 0]
     dv = (k // 2) * DIRECTIONS[d, 1, 1] + (k % 2) * DIRECTIONS[d, 0, 1]
     return du, dv
@@ -74,9 +80,11 @@ def offset(d, k):  # type: ignore[no-untyped-def]
 
 @inlined
 def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
-    """Inverse depth of the surface in pixel (v, u), seen ``du`` columns and ``dv`` rows before it.
+    """Return the inverse depth of the surface in pixel (v, u), extended by du columns and dv rows.
 
-    inverse: (H,W) 1/m. tilt: (H,W,2) slope of it, 1/m per px.
+    Args:
+        inverse: (H,W) 1/m.
+        tilt: (H,W,2) slope of it, 1/m per px.
     """
     there = inverse[v, u]
     here = there - tilt[v, u, 0] * du - tilt[v, u, 1] * dv
@@ -85,18 +93,21 @@ def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
 
 @inlined
 def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
-    """Slopes of the least-squares plane from centred second moments."""
+    """Return the slopes of the least-squares plane from centred second moments."""
     determinant = uu * vv - uv * uv
     return (vv * uw - uv * vw) / determinant, (uu * vw - uv * uw) / determinant
 
 
 @inlined
 def plane(n, u, v, uu, uv, vv, w, uw, vw, ridge):  # type: ignore[no-untyped-def]
-    """Inverse depth in the origin and both slopes of the weighted least-squares plane.
+    """Return the inverse depth at the origin and both slopes of the least-squares plane.
 
     The arguments are sums over the pixels of the weight and of its products with columns u, rows v
-    and inverse depths w. ridge: px² added to both variances, so that pixels on one line do not tilt
-    the plane across it.
+    and inverse depths w.
+
+    Args:
+        ridge: px² added to both variances, so that pixels on one line do not tilt the plane
+            across it.
     """
     u, v, w = u / n, v / n, w / n
     uu, vv, uv = uu / n - u * u + ridge, vv / n - v * v + ridge, uv / n - u * v

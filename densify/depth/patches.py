@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The patch of surface that each accumulated point stands for.
+"""Compute the surface patch of each accumulated point.
 
-It is as large as the gap to the neighbouring rays of its own sweep, and slanted as its neighbours
-there tell. On a plane the inverse range is normal · direction, so its derivatives by azimuth and
+It is as large as the gap to the neighbouring rays of its own sweep, with the slant of its
+neighbours. On a plane the inverse range is normal · direction. Its derivatives by azimuth and
 elevation give the normal.
 """
 
@@ -38,14 +38,17 @@ def patches(
 ) -> Patches:
     """Return the patches of a cloud.
 
-    key: its frame. sensors: the scanners. origins: (S,3) of the scanners, key frame, by frame.
-    key_image: of the key sweep; without it nothing is ``free``. wanted: (M,) the points that some
-    camera sees, all if None; of others only ``sweep`` is set.
+    A patch is tangent to the neighbours of the same scanner and sweep. If they are on no single
+    surface, it faces the scanner. A point of another sweep is free if the key sweep saw through it.
+    Only rays of the key count, because others rightly saw through the position that a moving object
+    reached later.
 
-    A patch is tangent to the neighbours of the same scanner and sweep; where they show no single
-    surface it faces the scanner. A point of another sweep is free if the key sweep saw through it.
-    Only the key's rays count: others rightly saw through the position that a moving object reached
-    later.
+    Args:
+        key: Frame of the key.
+        sensors: The scanners.
+        origins: (S,3) origins of the scanners, key frame, by frame.
+        key_image: Range image of the key sweep; without it nothing is ``free``.
+        wanted: (M,) points in view of a camera, all for None. Other points have only ``sweep``.
     """
     frames, inverse = np.unique(cloud.frame, return_inverse=True)
     sweep: NDArray[np.int32] = inverse.ravel().astype(np.int32)
@@ -77,9 +80,14 @@ def tangents(
 ) -> tuple[Float32, Float32]:
     """Return normals (M,3) and spacings (M,2) of the points ``wanted`` (M,).
 
-    points: (M,3), rigidly registered. lidar: (M,) which scanner. sweep: (M,) which of ``origins``,
-    (S,3) each. A normal has any length: the plane is normal · (p - origin) = 1. Spacings are metres
-    between neighbouring rays, across and along elevation.
+    A normal has any length: the plane is normal · (p - origin) = 1. Spacings are metres between
+    neighbouring rays, across and along elevation.
+
+    Args:
+        points: (M,3) at their rigid positions.
+        lidar: (M,) number of the scanner.
+        sweep: (M,) index in ``origins``.
+        origins: (S,3) for each sweep.
     """
     normal = np.zeros((len(points), 3), np.float32)
     spacing_m = np.zeros((len(points), 2), np.float32)
@@ -104,8 +112,10 @@ def tangents(
 
 @Kernel
 def _look(first, last, points, origins, place, seen):  # type: ignore[no-untyped-def]
-    """seen: (3,N) float32, filled with azimuth, elevation (rad) and range (m) of the points (N,3)
-    from origins (P,3), the one numbered ``place`` (N,)."""
+    """Fill ``seen`` (3,N) float32 with azimuth, elevation (rad) and range (m) of points (N,3).
+
+    The origins are (P,3), numbered by ``place`` (N,).
+    """
     for i in range(first, last):
         x = points[i, 0] - origins[place[i], 0]
         y = points[i, 1] - origins[place[i], 1]
@@ -147,8 +157,10 @@ def _before(seen, i, j):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _nearest_in_cells(seen, members, grid, cells):  # type: ignore[no-untyped-def]
-    """cells: (R,C) int32, filled with the nearest of ``members`` (indices) in each, -1 none. Of
-    equally near ones the direction decides, not the order of the points."""
+    """Fill ``cells`` (R,C) int32 with the nearest of ``members`` (indices) in each, -1 none.
+
+    Between equally near ones the direction decides, not the order of the points.
+    """
     cells[:] = -1
     for i in members:
         row, column = _cell(seen[0, i], seen[1, i], grid)
@@ -159,7 +171,7 @@ def _nearest_in_cells(seen, members, grid, cells):  # type: ignore[no-untyped-de
 
 @inlined
 def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
-    """Return the point in the first filled cell of those at the given distances, -1 none."""
+    """Return the point in the first filled cell at the given distances, -1 none."""
     for k in range(len(rows)):
         r = row + rows[k]
         if 0 <= r < cells.shape[0]:
@@ -173,7 +185,8 @@ def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
 def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
     """Return the slope from the changes of inverse range per radian on both sides (NaN: none).
 
-    Where both show one surface it is their mean; else the lesser, unless that is a step in depth.
+    If both are on one surface it is their mean, else the lesser one, unless that is a step in
+    depth.
     """
     metres = step * range_m * range_m  # of range per step, by a unit of slope
     if abs(one - other) * metres <= _BEND_M + _BEND * abs(one + other) * metres:
@@ -185,8 +198,10 @@ def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
 
 @inlined
 def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-untyped-def]
-    """Return the change of inverse range per radian along one angle, without that along the other;
-    NaN if there is no point."""
+    """Return the change of inverse range per radian along one angle, NaN without a point.
+
+    The change along the other angle is removed.
+    """
     if there < 0:
         return np.nan
     apart = seen[axis, there] - seen[axis, i]
@@ -214,8 +229,10 @@ def _put(i, seen, table, level, rise, normal, spacing):  # type: ignore[no-untyp
 
 @Kernel
 def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
-    """Fill normal (N,3) and spacing (N,2) of points from their neighbours on the ring, above and
-    below. members: (n,) indices. seen: (3,N). cells: of `_nearest_in_cells`."""
+    """Fill normal (N,3) and spacing (N,2) of points from neighbours on the ring, above and below.
+
+    members: (n,) indices. seen: (3,N). cells: of `_nearest_in_cells`.
+    """
     right, left = np.array([-2, -1, -3]), np.array([2, 1, 3])
     same = np.zeros(3, np.int64)
     up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
@@ -238,8 +255,11 @@ def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, s
 
 @Kernel
 def _tangents_anywhere(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
-    """As `_tangents_on_rings`, of rays without order: least squares over the points around, then
-    over those that the first plane fits. If half of them do not, the patch faces the scanner."""
+    """Fill normal and spacing of points of rays without order.
+
+    It is least squares over the points around, then over those that the first plane fits. If it
+    does not fit half of them, the patch faces the scanner.
+    """
     num_rows, num_columns = cells.shape
     for k in range(first, last):
         i = members[k]

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Depth where nothing is measured, from a depth image that the user brings, such as a monocular
-network's.
+"""Complete depth from a depth image of the user, such as one of a monocular network.
 
-One curve takes the prior's values to metres, by robust least squares. What it leaves differs from
-place to place: that correction of the logarithm of depth is spread over the image as a membrane
-that is tied to the known pixels and torn at the prior's own depth edges (random walks, Grady,
-"Random walks for image segmentation", PAMI 2006).
+A curve, fitted by robust least squares, converts the values of the prior to metres. The remaining
+error differs from place to place. A correction of the logarithm of depth is spread over the image
+as a membrane. It is tied to the known pixels and torn at the prior's own depth discontinuities
+(random walks, Grady, "Random walks for image segmentation", PAMI 2006).
 """
 
 from __future__ import annotations
@@ -38,15 +37,17 @@ _EMPTY = 2 * np.log(FAR_M)  # logarithm of a depth that is farther than all
 
 
 def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
-    """Add the prior's pixels where a depth map has neither measured nor filled ones.
+    """Return a depth map with pixels of the prior where it has neither measured nor filled ones.
 
-    maps: none of its pixels is changed. prior: of the same shape, its depth measured as the map's.
-    kind: of its values, ``depth``, ``inverse`` or ``auto``.
+    Pixels stay empty without a value, in the sky of the mask, beyond ``FAR_M``, at the prior's own
+    far limit, and between two surfaces, as blurred priors have them. A prior that does not fit is
+    not used. Confidences are a ranking: a pixel of the prior has at most 0.2, less the more the
+    prior deviates from known pixels nearby and the steeper it is. All known pixels have more.
 
-    Pixels stay empty without a value, in the mask's sky, beyond ``FAR_M``, at the prior's own far
-    limit, and between two surfaces, as blurred priors have them. A prior that does not fit is not
-    used. Confidences are a ranking: a pixel of the prior has at most 0.2, less the more the prior
-    deviates from known pixels nearby and the steeper it is; all known pixels have more.
+    Args:
+        maps: None of its pixels is changed.
+        prior: Of the same shape, with the same measure of depth.
+        kind: Of its values, ``depth``, ``inverse`` or ``auto``.
     """
     known = (prior.value > 0) & ~prior.sky
     above = MOST_CONFIDENCE + (1 - MOST_CONFIDENCE) * maps.confidence
@@ -77,9 +78,14 @@ def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
 
 
 def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
-    """Return the curve from a prior's values to depth with the least ``residual``.
+    """Return the curve from the values of a prior to depth with the least ``residual``.
 
-    value, depth_m: (N,) above 0, of measured pixels. A curve that turns near into far is none.
+    A curve that turns near into far is rejected.
+
+    Args:
+        value: (N,) above 0.
+        depth_m: (N,) above 0, of measured pixels.
+        kind: As in `complete`.
     """
     p, z = value.astype(np.float64), depth_m.astype(np.float64)
     fits = [_fitted(form, p, z) for form in _FORMS[kind]]
@@ -87,8 +93,10 @@ def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
 
 
 def _fitted(form: str, p: Float, z: Float) -> PriorFit:
-    """Fit one form through the medians of the values in steps of depth: measured depth is exact,
-    values are not, and a wrong tenth of them moves no median."""
+    """Fit one form through the medians of the values in steps of depth.
+
+    Measured depth is exact and values are not. A tenth of outliers moves no median.
+    """
     if len(z) < _MIN_FITTED:
         return PriorFit(form, 0.0, 0.0, np.inf, 1.0, False)
     step = np.floor(np.log(z / z.min()) / _USUAL).astype(np.int64)
@@ -104,8 +112,11 @@ def _fitted(form: str, p: Float, z: Float) -> PriorFit:
 
 
 def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
-    """Return scale and shift. The form is linear in both, weighted so that residuals are about
-    those of the logarithm of depth, and convex."""
+    """Return scale and shift.
+
+    The form is linear in both, and convex. Its weights make residuals about those of the logarithm
+    of depth.
+    """
     unit, one = float(np.median(p)), np.ones(len(z))
     if form == "log":
         columns, target = [np.log(p / unit), one], np.log(z)
@@ -124,7 +135,7 @@ def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
 
 
 def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
-    """Return the logarithm of depth in metres by the curve alone; far where the curve ends."""
+    """Return the logarithm of depth in metres by the curve alone, far beyond its end."""
     value = value.astype(np.float64)
     if fit.kind == "log":
         return fit.scale * np.log(np.maximum(value, np.finfo(np.float64).tiny)) + fit.shift
@@ -133,15 +144,18 @@ def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
 
 
 def _at_far_limit(value: Float32, known: Bool, fit: PriorFit) -> Bool:
-    """Return (H,W) True where the prior has its farthest value: many say so of the sky."""
+    """Return (H,W) True where the prior has its farthest value, which often means the sky."""
     if not known.any():
         return known
     return known & (value == (value[known].min() if fit.kind == "inverse" else value[known].max()))
 
 
 class _Cells(NamedTuple):
-    """The image in squares of ``size`` pixels. guide: (R,C) logarithm of depth of their middle
-    pixels. of: (H,W) number of each pixel's cell, row by row."""
+    """The image in squares of ``size`` pixels.
+
+    guide: (R,C) logarithm of depth of their central pixels. of: (H,W) number of each pixel's cell,
+    row by row.
+    """
 
     size: int
     guide: Float
@@ -159,8 +173,10 @@ class _Cells(NamedTuple):
         return _Cells(size, guide[np.ix_(rows, columns)].astype(np.float64), of)
 
     def membrane(self) -> sparse.csr_array:
-        """Return the (RC,RC) matrix whose quadratic form is the squared difference between
-        neighbouring cells, which counts less the more their guides differ."""
+        """Return the (RC,RC) matrix of the squared differences between neighbouring cells.
+
+        A difference counts less the more the guides differ.
+        """
         number = np.arange(self.guide.size).reshape(self.guide.shape)
         first = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
         second = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
@@ -171,8 +187,10 @@ class _Cells(NamedTuple):
         return sparse.diags_array(both.sum(axis=1)) - both
 
     def at_pixels(self, values: Float, guide: Float32) -> Float:
-        """Return (K,H,W) values (K,RC) of cells, between the four cells around each pixel; those
-        with another surface's guide hardly count."""
+        """Return (K,H,W) values (K,RC) of cells, interpolated between four cells.
+
+        Cells with the guide of another surface hardly count.
+        """
         grid = values.reshape(-1, *self.guide.shape)
         down, right = ((np.arange(length) - self.size // 2) / self.size for length in guide.shape)
         total, result = np.zeros(guide.shape), np.zeros((len(grid), *guide.shape))
@@ -187,7 +205,7 @@ class _Cells(NamedTuple):
 
 
 def _both_ways(place: Float, num: int) -> list[tuple[Int, Float]]:
-    """Return the cells before and behind fractional places, and their weights."""
+    """Return the cells before and after fractional positions, and their weights."""
     before = np.clip(np.floor(place), 0, num - 1).astype(np.int64)
     share = np.clip(place - before, 0, 1)
     return [(before, 1 - share), (np.minimum(before + 1, num - 1), share)]
@@ -196,8 +214,11 @@ def _both_ways(place: Float, num: int) -> list[tuple[Int, Float]]:
 def _correction(
     filled_m: Float32, log_depth: Float, guide: Float32, steepness: Float32, usable: Bool
 ) -> tuple[Float, Float]:
-    """Return (H,W) what to add to the logarithm of depth, and how far known pixels nearby on the
-    same surface still are from it; where none are near, no correction and the usual error."""
+    """Return (H,W) the correction of the logarithm of depth, and its remaining error.
+
+    The error is that of known pixels nearby on the same surface. Without any, there is no
+    correction and the usual error.
+    """
     cells = _Cells.over(guide)
     area, num = cells.size**2, cells.guide.size
     near = usable & (filled_m > 0) & (np.abs(guide - cells.guide.ravel()[cells.of]) < _USUAL)
@@ -206,7 +227,7 @@ def _correction(
     membrane = cells.membrane()
 
     def at_rest(trust: Float, values: Float, elsewhere: float) -> Float:
-        """(RC,) where the membrane comes to rest if known pixels pull it to their values."""
+        """Return (RC,) the membrane at rest if known pixels pull it to their values."""
         tied = np.bincount(cell, trust, num) / area + _TOWARDS_NONE
         pulled = np.bincount(cell, trust * values, num) / area + _TOWARDS_NONE * elsewhere
         system = (membrane + sparse.diags_array(tied)).tocsc()
@@ -214,7 +235,7 @@ def _correction(
         return rest
 
     def trusted(off: Float | Float32) -> Float:
-        """(N,) weight of known pixels that are so far from what is expected."""
+        """Return (N,) weight of known pixels at these deviations."""
         weight: Float = 1 / (1 + (off.astype(np.float64) / (2 * _USUAL)) ** 2)
         return weight
 

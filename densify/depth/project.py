@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""One depth map from the accumulated cloud: the steps in order.
+"""Make one depth map from the accumulated cloud, step by step.
 
-Nothing depends on the order of the points. Planes are fitted in inverse depth, or in inverse range
-where depth is the range.
+The order of the points has no effect. Planes are fitted in inverse depth, or in inverse range if
+depth is the range.
 """
 
 from __future__ import annotations
@@ -45,14 +45,20 @@ def project(
     share_lost: Callable[[Float], Float] | None = None,
     bodies: Mapping[int, MovingBody] | None = None,
 ) -> DepthMap:
-    """Return the depth map of a cloud as a camera sees it.
+    """Return the depth map of a cloud in the view of a camera.
 
-    cloud: at the key's reference time. exposure: of the camera; what moves is shown where it was
-    then. settings: knobs; without ``visibility`` the nearest point of each pixel is taken as it is.
-    patches: of the cloud. filled: False leaves out the fill. lab: (H,W,3) the image in L*a*b*;
-    without it no boundary pixel is accepted. rays: of the window; without them no pixel is taken
-    out as seen through. share_lost: of `densify.depth.car_windows.share_lost`; without it no window
-    is closed. bodies: of moving objects, by instance.
+    Args:
+        cloud: At the key's reference time.
+        exposure: Of the camera. Moving objects are shown at their position then.
+        settings: Section ``project``. Without ``visibility`` the nearest point of each pixel is
+            taken as it is.
+        patches: Of the cloud.
+        filled: False leaves out the fill.
+        lab: (H,W,3) the image in L*a*b*. Without it no boundary pixel is accepted.
+        rays: Of the window. Without them no pixel is rejected as seen through.
+        share_lost: Of `densify.depth.car_windows.share_lost`. Without it no car window is
+            closed.
+        bodies: Of moving objects, by instance.
     """
     view, camera, visible = exposure.sees(cloud), exposure.camera, settings.visibility
     points = points_in_image(cloud, view, patches, vetoed=visible)
@@ -92,13 +98,13 @@ def project(
 def _layers_of(
     pixels: MeasuredPixels, points: PointsInImage, camera: Camera, lab: Float32 | None
 ) -> Layers:
-    """Return measured pixels as layers, those at depth edges as boundary pixels."""
+    """Return measured pixels as layers, those close to a depth discontinuity as boundary pixels."""
     shape = (camera.height_px, camera.width_px)
     known, inside = pixels.winner >= 0, pixels.inside
     winner = pixels.winner[known]
 
     def image(values: np.ndarray, none: float = 0) -> np.ndarray:
-        """(H,W,…) of the points that give pixels their depth."""
+        """Return (H,W,…) values of the points that give pixels their depth."""
         made = np.full((known.size, *values.shape[1:]), none, values.dtype)
         made[known] = values[winner]
         return made.reshape(*shape, *values.shape[1:])
@@ -123,8 +129,9 @@ def _layers_of(
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     """Return (H,W,2) the spacing of rays across and down, the mean over blocks of pixels.
 
-    Blocks without points take the nearest block's. Down, a block takes that of the block above or
-    below if it is far larger: the gap below the last of a scanner's denser rings is as wide.
+    Blocks without points take the nearest block's spacing. Down, a block takes that of the block
+    above or below if it is far larger, because the gap below the last of a scanner's denser rings
+    is as wide.
     """
     height, width = (-(-size // _BLOCK_PX) for size in shape)
     column, row = np.rint(points.uv).astype(np.int64).T // _BLOCK_PX
@@ -145,7 +152,7 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
 
 
 def _set_reasons(layers: Layers, reason: NDArray[np.uint8]) -> None:
-    """Set the ``reason`` of points in the map, and of those taken out of it."""
+    """Set the ``reason`` of points in the map, and of those removed from it."""
     reason[layers.point[(layers.rim_m > 0) & ~layers.veiled]] = Reason.EDGE
     reason[layers.point[layers.depth_m > 0]] = Reason.KEPT
     if layers.glass is not None:

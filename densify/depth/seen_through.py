@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Pixels through whose surface more rays went than stopped at it: the gaps of a fence.
+"""Reject pixels through whose surface too many rays passed, such as the gaps of a fence.
 
-The image alone cannot tell: what a scanner saw elsewhere behind a car shows on the car too. So
-every ray is followed to where it crosses the map's own surface, and counts there (free-space
-evidence as in occupancy grids: Thrun et al., "Probabilistic Robotics", 2005, ch. 9).
+The image cannot decide this, because the background that a scanner measured from elsewhere is
+behind the car in the image too. Every ray is followed to its crossing with the map's own surface,
+and counts there (free-space evidence as in occupancy grids: Thrun et al., "Probabilistic Robotics",
+2005, ch. 9).
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Rays:
     key: int
 
     def starts(self, cloud: Cloud) -> Float:
-        """Return (M,3) key frame, where the ray of each point started when it was fired."""
+        """Return (M,3) key-frame origins of the rays of the points, at their firing times."""
         starts = np.empty((len(cloud), 3))
         for frame in np.unique(cloud.frame).tolist():
             mine, registered = np.flatnonzero(cloud.frame == frame), self.stretch[frame]
@@ -58,15 +59,17 @@ class Rays:
 def without_seen_through(
     layers: Layers, cloud: Cloud, view: InView, rays: Rays, reason: NDArray[np.uint8]
 ) -> Layers:
-    """Take out the pixels that rays went through.
+    """Return the layers without the pixels that rays passed through.
 
-    view: of the cloud. reason: (M,) `Reason` of each point so far.
+    A ray of an occluded point passed through where it crosses the surface of the map, clearly
+    before its end. A ray of another point ended in its pixel. Both are blurred by about a third of
+    the gap between rays. A pixel is rejected if a quarter of the rays passed through. Closed car
+    windows and moving bodies stay. So do pixels within a gap of surfaces that only the key sweep
+    measured, because an object that moves unnoticed was elsewhere at other times.
 
-    A ray of a hidden point went through where it crosses the surface of the map, clearly before its
-    end. A ray of another point stopped in its pixel. Both are blurred by about a third of the gap
-    between rays; a pixel goes if a quarter of the rays went through. Closed car windows and moving
-    bodies stay, and what is within a gap of surfaces that only the key sweep measured: an object
-    that moves without being noticed was elsewhere at other times.
+    Args:
+        view: Of the cloud.
+        reason: (M,) `Reason` of each point so far.
     """
     counts = np.isin(cloud.frame, rays.stretch.frames)
     counts &= (reason != Reason.OUTSIDE) & (reason != Reason.VETOED)
@@ -75,7 +78,7 @@ def without_seen_through(
     gap_px, shape = float(np.median(layers.gap_px)), layers.filled_m.shape
 
     def through(hits: Bool) -> Float:
-        """(K,2) px where rays of these points (M,) went through the map."""
+        """Return (K,2) px of the crossings of rays of these points (M,) with the map."""
         if not hits.any():
             return np.zeros((0, 2))
         ends = cloud.select(hits)
@@ -94,7 +97,7 @@ def without_seen_through(
 
 
 def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
-    """Return (H,W) the number of places (K,2) px in each pixel, blurred out to 2.5 deviations."""
+    """Return (H,W) the number of positions (K,2) px in each pixel, blurred to 2.5 deviations."""
     column, row = np.rint(uv).astype(np.int64).T
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
     size = 2 * round(2.5 * blur_px) + 1
@@ -104,11 +107,14 @@ def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
 
 
 def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Exposure) -> Float:
-    """Return (P,2) px where rays from ``from_key`` to ``to_key`` (K,3), key frame, cross the
-    surface (H,W) clearly before they end.
+    """Return (P,2) px where rays cross the surface (H,W) clearly before they end.
 
-    The search starts from the ray's end: at the depth of the surface in its pixel the ray shows in
+    The search starts at the end of the ray. At the depth of the surface in its pixel the ray is in
     another pixel, and so on until the depth stays the same.
+
+    Args:
+        from_key: (K,3) origins of the rays, key frame.
+        to_key: (K,3) ends of the rays, key frame.
     """
     start = poses.transform(exposure.T_cam_key, from_key)
     end = poses.transform(exposure.T_cam_key, to_key)
@@ -133,8 +139,12 @@ def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Expo
 
 
 def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
-    """Return (P,) the share of the ways from start to end (P,3), camera frame, at which they have
-    this depth; NaN: nowhere."""
+    """Return (P,) the share of the path from start to end at this depth, NaN for none.
+
+    start.
+
+    end: (P,3) camera frame.
+    """
     way = end - start
     with np.errstate(divide="ignore", invalid="ignore"):
         if measure == "z":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The pixels that a laser's spot covers, not only the one that its middle falls into.
+"""Count as measured the pixels that a laser's spot covers, beside the one at its centre.
 
-A camera with a long focal length has several pixels to a beam: a return measures all of them.
+A camera with a long focal length has several pixels to a beam. A return measures all of them.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ _MOST_PX = 4  # of it
 
 
 def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
-    """Count filled pixels as measured where the spot of a measured return covers them.
+    """Count filled pixels as measured if the spot of a measured return covers them.
 
-    The ``point`` of the nearest return is taken. The fill must lie on the return's surface: what
-    the fill left empty stays empty. Depth and confidence remain the fill's.
+    The ``point`` of the nearest return is taken. The fill must lie on the surface of the return.
+    Depth and confidence remain those of the fill. Pixels without fill stay empty.
     """
     shape = layers.depth_m.shape
     measured = np.flatnonzero(layers.depth_m > 0)
@@ -46,10 +46,12 @@ def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
 def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, found, nearest):  # type: ignore[no-untyped-def]
     """Find the measured pixel whose spot covers a filled one, nearest in the image.
 
-    pixel, radius_px: (P,) of the measured ones. uv: (P,2) px of their returns. depth_m: (H,W).
-    tilt: (H,W,2) slope of inverse depth, 1/m per px. filled_m: (H,W) of the pixels that may be
-    covered, 0 elsewhere. found: (H,W) int64, set to the measured pixel. nearest: (H,W) inf, squared
-    distance to its spot.
+    pixel.
+
+    radius_px: (P,) of the measured ones. uv: (P,2) px of their returns. depth_m: (H,W). tilt:
+    (H,W,2) slope of inverse depth, 1/m per px. filled_m: (H,W) of the pixels that may be covered, 0
+    elsewhere. found: (H,W) int64, set to the measured pixel. nearest: (H,W) inf, squared distance
+    to its spot.
     """
     height, width = filled_m.shape
     for i in range(len(pixel)):

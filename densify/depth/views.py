@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""All depth maps of a key: what its cameras see of the accumulated cloud, each at its exposure."""
+"""Make all depth maps of a key: the accumulated cloud in the view of each camera."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class SeenCloud(NamedTuple):
     bodies: Mapping[int, MovingBody] = {}
 
     def joined(self, far: SeenCloud | None) -> SeenCloud:
-        """Return it with what sweeps beyond the window measured."""
+        """Return the cloud with the points of sweeps beyond the window."""
         if far is None or not len(far.cloud):
             return self
         return self._replace(
@@ -68,10 +68,14 @@ class SeenCloud(NamedTuple):
 
 @dataclass(frozen=True)
 class Views:
-    """Where the depth maps of a key look from, by their names.
+    """The viewpoints of the depth maps of a key, by their names.
 
-    key_image: of the key sweep. sensors: the scanners. origins: (S,3) of them in each sweep, key
-    frame, by frame. rays: of the window. lab: (H,W,3) L*a*b* of the maps that show an image.
+    Attributes:
+        key_image: Range image of the key sweep.
+        sensors: The scanners.
+        origins: (S,3) of the scanners in each sweep, key frame, by frame.
+        rays: Of the window.
+        lab: (H,W,3) L*a*b* of the maps that show an image.
     """
 
     key: int
@@ -93,6 +97,7 @@ class Views:
         images: Mapping[str, NDArray[np.uint8]],
         settings: Config,
     ) -> Views:
+        """Return the views of a key."""
         sensors = Sensors.of(stretch.sweeps)
         return Views(
             key=key,
@@ -112,7 +117,7 @@ class Views:
         )
 
     def see(self, cloud: Cloud, visible: bool = True) -> SeenCloud:
-        """Return a cloud with its patches; visible: and which of it the key sweep saw through."""
+        """Return a cloud with its patches; ``visible`` marks points the key sweep saw through."""
         key_image = self.key_image if visible else None
         wanted = np.zeros(len(cloud), bool)
         for exposure in self.exposures.values():
@@ -122,14 +127,17 @@ class Views:
         )
 
     def bodies(self, cloud: Cloud) -> dict[int, MovingBody]:
-        """Return the bodies of moving objects by instance. cloud: all the points of the window."""
+        """Return the bodies of moving objects by instance, of all points of the window."""
         return moving_bodies(cloud, self.rays)
 
     def far(
         self, found: StandingWorld, T_key_found: Float, stretch: Stretch, standing_only: bool
     ) -> SeenCloud:
-        """Return what sweeps beyond the window measured, see `densify.depth.far.far_cloud`;
-        standing_only: for maps with visibility."""
+        """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`.
+
+        Args:
+            standing_only: For maps with visibility.
+        """
         cloud, surface = far_cloud(
             found, T_key_found, stretch, self.key, self.exposures, standing_only
         )
@@ -141,8 +149,12 @@ class Views:
     def depth(
         self, seen: SeenCloud, visible: bool = True, filled: bool = True
     ) -> dict[str, DepthMap]:
-        """Return depth maps by name; visible: without what is hidden, seen through or unsupported;
-        filled: with the fill."""
+        """Return depth maps by name.
+
+        Args:
+            visible: Without occluded, seen-through and unsupported points.
+            filled: With the fill.
+        """
         settings = replace(self.settings, visibility=visible)
         lost = None if self.key_image is None else share_lost(self.key_image)
         return {
@@ -166,10 +178,13 @@ class Views:
         depth: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
-        """Return the cloud with the colours of the images where a camera sees it.
+        """Return the cloud with the colours of the images that observe it.
 
-        depth: the maps made of it. A point is seen unless it is clearly behind its pixel's depth;
-        pixels without depth colour nothing.
+        A point is observed unless it is clearly behind the depth of its pixel. Pixels without depth
+        colour nothing.
+
+        Args:
+            depth: The maps made of the cloud.
         """
         rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
@@ -182,7 +197,7 @@ class Views:
         return replace(seen.cloud, rgb=rgb)
 
     def truth(self, truth: Truth) -> dict[str, tuple[Float32, Bool]]:
-        """Return true depth and (H,W) what moves, of the maps that show an image."""
+        """Return the true depth and (H,W) the moving pixels of the maps that show an image."""
         known = {}
         for name, e in self.exposures.items():
             if e.number is not None:
@@ -192,7 +207,7 @@ class Views:
         return known
 
     def cameras(self) -> dict[str, CameraView]:
-        """Return where each map looks from."""
+        """Return the viewpoint of each map."""
         return {
             name: CameraView(e.camera, e.T_cam_key, e.late_s, e.number)
             for name, e in self.exposures.items()
@@ -213,7 +228,7 @@ class Views:
     def rejected(self, cloud: Cloud, depth: Mapping[str, DepthMap]) -> dict[str, NDArray[np.uint8]]:
         """Return (H,W) by name: the `Reason` of the nearest rejected point of a pixel, 0 none.
 
-        Points that another one outdid in their pixel do not count.
+        Points that lost their pixel to another one do not count.
         """
         maps = {}
         for name, e in self.exposures.items():
@@ -234,7 +249,7 @@ class Views:
         bodies: Mapping[int, MovingBody],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> dict[int, Mover]:
-        """Return every moving object by itself, and as -1 all moving points without one."""
+        """Return every moving object alone, and as -1 all moving points without an object."""
         movers = {}
         for instance in np.unique(cloud.instance[cloud.moving]).tolist():
             part = self.see(cloud.select(cloud.moving & (cloud.instance == instance)), visible)
@@ -247,8 +262,12 @@ class Views:
 def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, other: Exposure) -> Float32:
     """Return (H,W,2) pixels to the right and down from one exposure to another, NaN if unknown.
 
-    cloud: at the key's reference time. depth: the map made of it. What moves goes on at its
-    velocity. Known are the measured pixels; those that only spots cover go with the nearest.
+    Moving objects continue at their velocity. Measured pixels are known; those that only spots
+    cover move with the nearest one.
+
+    Args:
+        cloud: At the key's reference time.
+        depth: The map made of it.
     """
     chosen = np.flatnonzero(depth.reason == Reason.KEPT)
     points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
@@ -266,10 +285,13 @@ def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, other: Expos
 
 
 def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: float) -> DepthMap:
-    """Return the map with ``age_s``, seconds between its time and each pixel's source sweep.
+    """Return the map with ``age_s``, seconds between its time and the source sweep of each pixel.
 
-    stamps_ns: reference times of the sweeps, by frame. late_s: from the key's reference time to the
-    map's. A filled pixel has the age of the measured pixel nearest to it in the image.
+    A filled pixel has the age of the nearest measured pixel in the image.
+
+    Args:
+        stamps_ns: Reference times of the sweeps, by frame.
+        late_s: From the key's reference time to that of the map.
     """
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
     age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
@@ -290,8 +312,10 @@ def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: f
 class HeldOut:
     """The key sweep's own returns as the truth for the key densified from its neighbours alone.
 
-    key_alone: maps of the key sweep, without boundary pixels. moving: (H,W) its moving returns.
-    gap_rad: usual angle between its rings.
+    Attributes:
+        key_alone: Maps of the key sweep, without boundary pixels.
+        moving: (H,W) its moving returns.
+        gap_rad: Usual angle between its rings.
     """
 
     views: Views
@@ -301,13 +325,17 @@ class HeldOut:
 
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
-        """cloud: says what moves in the key sweep, and how fast."""
+        """Return the truth of a key.
+
+        Args:
+            cloud: Has the moving points of the key sweep and their velocities.
+        """
         views = replace(views, key_image=None)  # what is held out must not help
         settings = replace(views.settings, rims="strict", visibility=True)
         own = cloud.select(cloud.frame == views.key)
 
         def alone(part: SeenCloud) -> dict[str, DepthMap]:
-            """Maps of returns of the key sweep."""
+            """Return the maps of returns of the key sweep."""
             return {
                 name: project(part.cloud, exposure, settings, part.patches, filled=False)
                 for name, exposure in views.exposures.items()
@@ -324,7 +352,7 @@ class HeldOut:
         return HeldOut(views, key_alone, moving, float(np.median(known)) if len(known) else 0.0)
 
     def without_key(self, seen: SeenCloud) -> SeenCloud:
-        """Return the cloud without the key sweep, and what it told of free space and bodies."""
+        """Return the cloud without the key sweep and its evidence about free space and bodies."""
         others = seen.cloud.frame != self.views.key
         surface = seen.patches.select(others)
         surface = replace(surface, free=np.zeros(len(surface.free), bool))
@@ -332,12 +360,12 @@ class HeldOut:
         return SeenCloud(cloud, surface, without_sweep(seen.bodies, cloud, self.views.key))
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
-        """Return scores by name, with the ``curve`` of precision over density, ``reliability``, and
-        the share of filled pixels ``unjudged`` for want of a return of the key sweep within a gap
-        between rays; None for a cloud of the key sweep alone.
+        """Return scores by name, None for a cloud of the key sweep alone.
 
-        Returns from far inside a moving body are no truth: the key sweep measured them through its
-        windows, and the map shows the glass.
+        They have the ``curve`` of precision over density, ``reliability``, and the share of filled
+        pixels ``unjudged`` for lack of a return of the key sweep within a gap between rays. Returns
+        from far inside a moving body are no truth: the key sweep measured them through its windows,
+        and the map shows the glass.
         """
         others = self.without_key(seen)
         if not len(others.cloud):
@@ -360,7 +388,7 @@ class HeldOut:
     def _unjudged(
         self, name: str, maps: DepthMap, bodies: Mapping[int, MovingBody]
     ) -> dict[str, float | None]:
-        """Return the share of a map's filled pixels that have no return of the key sweep near."""
+        """Return the share of a map's filled pixels without a return of the key sweep nearby."""
         away_px = ndimage.distance_transform_edt(self.key_alone[name].depth_m == 0)
         unjudged = away_px > self.gap_rad * self.views.exposures[name].camera.focal_px
         filled = maps.filled_m > 0
