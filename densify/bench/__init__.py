@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Measured tables: this package's depth and scene flow beside other methods and exact truth."""
+"""Measure tables: depth and scene flow of this package beside other methods and exact truth."""

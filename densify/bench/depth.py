@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""``densify bench depth``: depth maps of several configurations against every truth there is.
+"""Compare depth maps of several settings against every truth there is: ``densify bench depth``.
 
 ``truth``: exact depth of a simulated recording within a scanner's reach, that is below its top ring
 and within 80 m. ``key held out``: the key sweep's returns, for the map made from the other sweeps.
-``scanner``: the returns of one of several scanners, none of which goes into the maps.
+``scanner``: the returns of one of several scanners, none of which is used for the maps.
 """
 
 from __future__ import annotations
@@ -40,10 +40,11 @@ _WRONG_M, _WRONG_FRACTION = 0.3, 0.05
 class TruthMap(NamedTuple):
     """True depth of an image.
 
-    depth_m: (H,W), 0 none.
-    moving: (H,W) of moving objects.
-    by_disparity: outliers are those of KITTI's rule (more than 3 px of disparity and 5 %); else
-        they are off by more than 0.3 m and 5 %.
+    Attributes:
+        depth_m: (H,W), 0 none.
+        moving: (H,W) of moving objects.
+        by_disparity: Outliers are those of KITTI's rule (more than 3 px of disparity and 5 %).
+            Else they are off by more than 0.3 m and 5 %.
     """
 
     depth_m: Float32
@@ -61,13 +62,21 @@ def bench_depth(
     method: str = "flow",
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Make the keys with each variant and score the pixels of all keys and cameras together.
+    """Make the keys with each variant, and score the pixels of all keys and cameras together.
 
-    variants: configurations by name. scanner: number of the scanner whose returns are the truth.
-    The other parameters are those of `densify.pipeline.run.run`. Returns plain numbers: by variant
-    ``density`` (mean share of the image) of each product, ``seconds`` a key of the stages after the
-    cloud, and ``scores`` by truth, product and part: num_pixels, coverage, outliers. Raises
-    InputError for what cannot be used, ComputationError where registration went wrong.
+    Args:
+        variants: Settings by name.
+        scanner: Number of the scanner whose returns are the truth. The other arguments as in
+            `densify.pipeline.run.run`.
+
+    Returns:
+        Plain numbers, by variant: ``density`` (mean share of the image) of each product,
+            ``seconds`` a key of the stages after the cloud, and ``scores`` by truth, product and
+            part: num_pixels, coverage, outliers.
+
+    Raises:
+        InputError: An argument cannot be used.
+        ComputationError: Registration fails.
     """
     choose_cameras(sequence, cameras)
     if method not in METHODS:
@@ -171,8 +180,10 @@ def _exact_truth(
 
 
 class _Sums:
-    """Pixels counted over keys and cameras, by truth, product and part: those with a true depth,
-    those compared, the outliers."""
+    """Numbers of pixels over keys and cameras, by truth, product and part.
+
+    They count those with a true depth, those compared, and the outliers.
+    """
 
     def __init__(self) -> None:
         self._counts: defaultdict[tuple[str, str, str], Any] = defaultdict(lambda: np.zeros(3, int))
@@ -185,6 +196,7 @@ class _Sums:
         truths: Mapping[str, Mapping[str, TruthMap]],
         cameras: Mapping[str, Camera],
     ) -> None:
+        """Add one result."""
         self._seconds += sum(cost.seconds for cost in made.costs if cost.name == "project")
         for name, maps in made.depth.items():
             focal_px = cameras[maps.camera].focal_px
@@ -202,6 +214,7 @@ class _Sums:
                     self._counts["key held out", product, part] += counts
 
     def numbers(self, num_keys: int) -> dict[str, Any]:
+        """Return the scores."""
         scores: dict[str, Any] = {}
         for (source, product, part), (num, compared, outliers) in self._counts.items():
             scores.setdefault(source, {}).setdefault(product, {})[part] = {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Depth maps on disk against true ones: every pair is read and scored, and the scores averaged."""
+"""Score depth maps on disk against true ones, and average the scores."""
 
 from __future__ import annotations
 
@@ -34,10 +34,9 @@ def evaluate(
     baseline_m: float = KITTI_BASELINE_M,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Score pairs of depth maps: the mean over images of each image's value, as in KITTI's kit.
+    """Return the mean over images of the value of each image, as in KITTI's kit.
 
-    focal_px, baseline_m: turn depth into the disparity that defines outliers and depth edges.
-    Returns plain numbers ready for JSON, None where undefined::
+    The result has plain numbers ready for JSON, None if undefined::
 
         schema_version, focal_px, baseline_m, num_images
         density      predicted, truth: mean share of all the pixels that have a depth
@@ -45,7 +44,15 @@ def evaluate(
         images       of each pair: predicted, truth, mask (paths or None), density, `DepthErrors`
         without_truth, without_prediction, without_mask   paths
 
-    Raises InputError if a file is no depth map or mask, or the sizes of a pair differ.
+    Args:
+        pairs: The files.
+        focal_px: With the baseline, turns depth into the disparity that defines outliers and
+            depth discontinuities.
+        baseline_m: Stereo baseline.
+        progress: Is called with (stage, done, total).
+
+    Raises:
+        InputError: A file is no depth map or mask, or the sizes of a pair differ.
     """
     stereo = {"focal_px": focal_px, "baseline_m": baseline_m}
     by_part: dict[str, list[DepthErrors]] = defaultdict(list)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""``densify bench flow``: engines of scene flow on the same windows, in one process.
+"""Compare engines of scene flow on the same windows: ``densify bench flow``.
 
 Errors are over the points above the ground of all sweeps of the window together, each with the flow
 to its neighbour towards the key. Seconds are per pair of sweeps, from the ground to the flow to the
-key; registration does not count, nor what is compiled when first used. Scores are against the truth
-where there is one, and without.
+key. Registration does not count, nor the compilation at the first use. Scores are against the truth
+if there is one, and without.
 """
 
 from __future__ import annotations
@@ -41,8 +41,9 @@ _LEAST_MOTION_M = 0.5
 class Window:
     """Consecutive registered sweeps around a key.
 
-    around: the sweeps that our engine takes the motion from.
-    above: by frame (N,), above the ground.
+    Attributes:
+        around: Sweeps from which our engine takes the motion.
+        above: By frame (N,), above the ground.
     """
 
     stretch: Stretch
@@ -60,16 +61,19 @@ class Window:
         return self.frames.index(self.key) - self.frames.index(frame)
 
     def towards_key(self, frame: int) -> int:
-        """Return the neighbour on the way to the key, the key itself for the key."""
+        """Return the neighbour on the way to the key. For the key it is the key itself."""
         return self.frames[self.frames.index(frame) + int(np.sign(self.hops(frame)))]
 
 
 class SweepTruth(NamedTuple):
-    """The truth of one sweep's N points, in its own lidar frame.
+    """The truth of the N points of one sweep, in its own lidar frame.
 
-    step, to_key: (N,3) flow to the neighbour towards the key, and to the key.
-    moving, foreground: (N,) moves now; belongs to an object.
-    certain: (N,) moves, at least 0.5 m over the window, on an object of 30 returns.
+    Attributes:
+        step: (N,3) flow to the neighbour towards the key.
+        to_key: (N,3) flow to the key.
+        moving: (N,) moves now.
+        foreground: (N,) belongs to an object.
+        certain: (N,) moves, at least 0.5 m over the window, on an object of 30 returns.
     """
 
     step: Float
@@ -94,12 +98,14 @@ class SweepTruth(NamedTuple):
 
 @dataclass(frozen=True)
 class Scorer:
-    """Scores methods' flows of one window.
+    """The scores of methods on one window.
 
-    Errors are over the points above the ground, since no method moves the ground.
-    sources: frames whose step is scored.
-    truths: by frame, None without exact truth.
-    labels: of the steps of the sources, none without truth.
+    Errors are over the points above the ground, because no method moves the ground.
+
+    Attributes:
+        sources: Frames whose step is scored.
+        truths: By frame, None without exact truth.
+        labels: Of the steps of the sources, none without truth.
     """
 
     window: Window
@@ -111,8 +117,12 @@ class Scorer:
     def of(
         sequence: LidarSequence, window: Window, sources: tuple[int, ...], place: Path | None = None
     ) -> Scorer:
-        """Return the scorer of a window. place: of true flow, see `densify.readers.flow_files`;
-        None for the exact truth of the sequence, where it has one."""
+        """Return the scorer of a window.
+
+        Args:
+            place: Folder of true flow, see `densify.readers.flow_files`; None for the exact
+                truth of the sequence, if it has one.
+        """
         truths, labels = None, {}
         if sequence.truth is not None:
             truths = {f: SweepTruth.of(sequence.truth, window, f) for f in window.frames}
@@ -125,8 +135,10 @@ class Scorer:
         return Scorer(window, sources, truths, labels)
 
     def challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
-        """Score the flow to the next sweep as the Argoverse 2 challenges do, all pairs together,
-        see `densify.scores.challenge`; None without truth."""
+        """Return the scores of the Argoverse 2 challenges, all pairs together, None without truth.
+
+        They are of the flow to the next sweep, see `densify.scores.challenge`.
+        """
         if not self.labels:
             return None
         scorer = ChallengeScorer()
@@ -144,11 +156,11 @@ class Scorer:
         }
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Score the flow to the next sweep, all pairs together.
+        """Return the scores of the flow to the next sweep, all pairs together.
 
-        found: share of the certain moving points above the ground that are called moving.
-        found_movers_m: error of the moving points that are called moving.
-        falsely_moving: share of all static points, ground included.
+        found: share of the certain moving points above the ground that are called moving (recall).
+        found_movers_m: error of the moving points that are called moving. falsely_moving: share of
+        false positives among all static points, ground included.
         """
         truths = self.truths
         if truths is None:
@@ -172,8 +184,11 @@ class Scorer:
         return {"num_movers": int(moving.sum()), **_plainly(scores)}
 
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Score the flow to the key: ghosts, and with truth the errors of the moving points above
-        the ground by the number of sweeps to the key, of all and of those called moving."""
+        """Return the scores of the flow to the key: ghosts, and with truth errors of moving points.
+
+        The errors are of points above the ground, by the number of sweeps to the key, of all and of
+        those called moving.
+        """
         stretch, key = self.window.stretch, self.window.key
         cloud = accumulate(stretch, [to_key[f] for f in stretch.frames], key, drop_lost=True)
         scores: dict[str, Any] = {"ghost_rate": ghost_rate(cloud, RangeImage.of(stretch[key]), key)}
@@ -223,13 +238,20 @@ def bench_flow(
     progress: Progress | None = None,
     truth: Path | None = None,
 ) -> dict[str, Any]:
-    """Run and measure methods; plain numbers ready for JSON, None where nothing is known.
+    """Run and measure methods. The result has plain numbers, None if unknown.
 
-    window: sweeps on each side of the key. methods: of `METHODS`; ``ours`` is the engine of the
-    configuration. truth: a place of true flow (`densify.readers.flow_files`), to score only the
-    pairs before the key; None for the sequence's own. Returns ``methods`` by name, each with
-    ``seconds_per_pair`` and the scores ``step``, ``challenge``, ``window`` of `Scorer`. Raises
-    InputError for unknown methods, a window without neighbours, or missing frames.
+    Args:
+        window: Number of sweeps on each side of the key.
+        methods: Of `METHODS`; ``ours`` is the configured engine.
+        truth: Folder of true flow (`densify.readers.flow_files`), to score only the pairs
+            before the key; None for the sequence's own.
+
+    Returns:
+        ``methods`` by name, each with ``seconds_per_pair`` and the scores ``step``,
+            ``challenge``, ``window`` of `Scorer`.
+
+    Raises:
+        InputError: A method is unknown, the window has no neighbours, or a frame is missing.
     """
     unknown = [method for method in methods if method not in METHODS]
     if unknown or not methods:
@@ -260,8 +282,12 @@ def bench_flow(
 
 
 def open_window(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
-    """Return the key's registered window. Raises InputError for a missing key, ComputationError
-    where registration went wrong."""
+    """Return the registered window of a key.
+
+    Raises:
+        InputError: The key does not exist.
+        ComputationError: Registration fails.
+    """
     recording = Recording(sequence, config, size, [key], looks_around=True)
     stretch = recording.window(key)
     heights = ground(stretch)

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""``densify bench paper``: the tables of Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or
-without Learning" (3DV 2020), measured again.
+"""Make the tables of the paper again: ``densify bench paper``.
 
-Methods see 2,048 points drawn of each cloud within 35 m, as in the paper; this package and trained
-networks see all points, and are scored at the drawn ones. Scores are the paper's: mean end-point
-error; share of points within 5 cm or 5 %, within 10 cm or 10 %; mean angle to the true flow where
-that is not 0. Means over pairs.
+Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020.
 
-Sets of others are folders of .npz files as FlowNet3D's authors made them (Liu et al., CVPR 2019):
+Methods get 2,048 points drawn from each cloud within 35 m, as in the paper. This package and
+trained networks get all points, and are scored at the drawn ones. Scores are the paper's: mean
+end-point error; share of points within 5 cm or 5 %, within 10 cm or 10 %; mean angle to the true
+flow where that is not 0. They are means over pairs.
+
+Other sets are folders of .npz files as FlowNet3D's authors made them (Liu et al., CVPR 2019):
 ``points1``, ``points2``, ``flow`` and ``valid_mask1`` (FlyingThings3D; camera axes, z forward), or
 ``pos1``, ``pos2`` and ``gt`` (KITTI without ground; z up).
 """
@@ -48,10 +49,12 @@ _R_FLU_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 class PaperPair:
     """Two clouds and the true flow between them.
 
-    source, target: (n,3), (m,3) metres, z up.
-    flow: (n,3) metres.
-    moving: (n,), None where the set does not tell.
-    sweeps: the input of networks.
+    Attributes:
+        source: (n,3) metres, z up.
+        target: (m,3) metres, z up.
+        flow: (n,3) metres.
+        moving: (n,), None if unknown.
+        sweeps: Input of networks.
     """
 
     name: str
@@ -105,10 +108,12 @@ def bench_paper(
     num_points: int = NUM_POINTS,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure methods and trained models on pairs; plain numbers ready for JSON.
+    """Measure methods and trained models on pairs.
 
-    Returns ``num_pairs``, ``num_points`` and ``methods``, rows by name.
-    Raises InputError for an unknown method, no pairs, or a file that is no model.
+    The result has ``num_pairs``, ``num_points`` and ``methods``, rows by name, as plain numbers.
+
+    Raises:
+        InputError: A method is unknown, there are no pairs, or a file is no model.
     """
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
@@ -168,7 +173,7 @@ def _drawn(points: Float, count: int, rng: np.random.Generator) -> Int:
 
 
 def _mean(measured: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Return the means over the pairs where there is a number."""
+    """Return the means over the pairs with a number."""
     means: dict[str, float | None] = {}
     for name in measured[0]:
         values = np.array([m[name] for m in measured if name in m])
@@ -183,10 +188,13 @@ def has_truth(spec: str) -> bool:
 
 
 def pair_of_recording(spec: str, key: int) -> PaperPair:
-    """Return a sweep and its next one, without ground and the motion of the vehicle.
+    """Return a sweep and its next one, without ground and ego-motion.
 
-    Where the recording has no truth, the flow is what this package's engine finds. Raises
-    InputError for a key without a next sweep, ComputationError where one cannot be registered.
+    Without truth in the recording, the flow is that of this package's engine.
+
+    Raises:
+        InputError: The key has no next sweep.
+        ComputationError: A sweep cannot be registered.
     """
     sequence = open_sequence(spec)
     teacher, settings = "engine", resolve(None)
@@ -205,7 +213,8 @@ def pair_of_recording(spec: str, key: int) -> PaperPair:
 def pairs_of_files(folder: Path, most: int) -> Iterator[PaperPair]:
     """Yield the first ``most`` files of a folder, by name; 0 for all.
 
-    Raises InputError for a folder without any, or a file of another form.
+    Raises:
+        InputError: For a folder without any, or a file of another form.
     """
     paths = sorted(folder.glob("*.npz"))
     if not paths:

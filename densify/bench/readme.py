@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""``densify bench readme``: the tables of docs/results.md, made again as Markdown.
+"""Make the tables of docs/results.md again, as Markdown: ``densify bench readme``.
 
-Each table is a list of recordings and keys, and one function that measures a row. Real recordings
-are rows where their folders are given.
+Each table is a list of recordings and keys, and one function that measures a row. Rows of real
+recordings need their folders.
 """
 
 from __future__ import annotations
@@ -24,8 +24,12 @@ from densify.readers import open_sequence
 
 
 class Scene(NamedTuple):
-    """A recording and its keys. window: sweeps on each side. scanner: whose returns are the truth,
-    None for exact truth or the key held out."""
+    """A recording and its keys.
+
+    Attributes:
+        window: Number of sweeps on each side.
+        scanner: Scanner whose returns are the truth, None for exact truth or the key held out.
+    """
 
     data: str
     keys: tuple[int, ...]
@@ -68,7 +72,10 @@ _REGISTERED = _streets("""
 
 
 class _Table(NamedTuple):
-    """row: the cells of a scene. real: has rows of real recordings."""
+    """A table of results.
+
+    row: returns the cells of a scene. real: has rows of real recordings.
+    """
 
     about: str
     titles: str
@@ -85,8 +92,13 @@ def tables(
 ) -> Iterator[str]:
     """Make the tables of these names, all of `TABLES` if none, and yield each line when measured.
 
-    kitti: the folder of drive 2011_09_26_drive_0013_sync. pandaset: that of sequence 002.
-    Raises InputError for other names, ComputationError where registration went wrong.
+    Args:
+        kitti: Folder of drive 2011_09_26_drive_0013_sync.
+        pandaset: Folder of sequence 002.
+
+    Raises:
+        InputError: A name is unknown.
+        ComputationError: Registration fails.
     """
     for name in names:
         if name not in TABLES:
@@ -160,7 +172,7 @@ def _row_of_flow(scene: Scene) -> list[str]:
 
 
 def _row_of_registration(scene: Scene) -> list[str]:
-    """Return the root mean square errors of the window's poses relative to the key's."""
+    """Return the root mean square errors of the window's poses relative to that of the key."""
     sequence, key = open_sequence(scene.data), scene.keys[0]
     stretch = Recording(sequence, resolve(None), scene.window, [key]).window(key)
     T_true_world = poses.inverse(sequence.T_world_lidar(key))

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The configuration: every knob (`densify.config.sections`), and where its value comes from
-(`densify.config.resolving`)."""
+"""Hold the settings (`densify.config.sections`) and find their values (`.resolving`)."""
 
 from densify.config.resolving import as_mapping as as_mapping
 from densify.config.resolving import presets as presets

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The cache on disk: results of pipeline steps, found again by all that they were made from. An
-entry is an ``.npz`` file without pickles: the arrays, and the rest as JSON. A damaged entry is made
-again. Its folder belongs to the user alone: nobody else can put anything there."""
+"""Cache results of pipeline steps on disk, by all inputs that they were made of.
+
+An entry is an ``.npz`` file without pickles: the arrays, and the rest as JSON. A damaged entry is
+made again. The folder belongs to the user alone: nobody else can write there.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +35,18 @@ _MOST_ENTRIES = 10_000
 
 
 class Cache:
-    """A folder of entries. limit_bytes: bound of its size, kept by `trim`. folder: the user's own
-    if None. Raises InputError if others can write to that."""
+    """A folder of entries."""
 
     def __init__(self, limit_bytes: int = 10 * 1024**3, folder: Path | None = None) -> None:
+        """Open a cache.
+
+        Args:
+            limit_bytes: Bound of its size, kept by `trim`.
+            folder: None for the user's own.
+
+        Raises:
+            InputError: Others can write to the folder.
+        """
         self._folder, self._limit_bytes = folder or own_folder("steps"), limit_bytes
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -44,8 +54,11 @@ class Cache:
             _log.warning("%s: %s; nothing is kept for later", self._folder, error.strerror or error)
 
     def get(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
-        """Return what ``make`` returns, now or when it was made of the same inputs before. inputs:
-        all that it depends on, as `digest` takes."""
+        """Return the result of ``make``, computed now or cached.
+
+        Args:
+            inputs: All that the result depends on, as `digest` takes it.
+        """
         path = self._folder / f"{step}-{digest((__version__, _STEP_VERSIONS, inputs))}.npz"
         try:
             with np.load(path, allow_pickle=False) as arrays:
@@ -65,7 +78,7 @@ class Cache:
         return value
 
     def trim(self) -> None:
-        """Delete what was used longest ago until the rest keeps the bound."""
+        """Delete the least recently used entries until the size is within the bound."""
         with suppress(OSError):  # another process deletes too
             entries = [(e.stat().st_mtime_ns, e, e.stat().st_size) for e in self._folder.iterdir()]
             left = sum(num_bytes for *_, num_bytes in entries)
@@ -76,12 +89,12 @@ class Cache:
 
 
 def kept(cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:
-    """Return what ``make`` returns, by the cache if there is one."""
+    """Return the result of ``make``, by the cache if there is one."""
     return make() if cache is None else cache.get(step, inputs(), make)
 
 
 def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write an ``.npz`` file that appears when it is whole."""
+    """Write an ``.npz`` file that appears when it is complete."""
     number, aside = tempfile.mkstemp(".tmp", dir=path.parent)
     try:
         with open(number, "wb") as file:
@@ -103,8 +116,10 @@ def digest(value: Any) -> str:
 
 
 def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
-    """Return the value as JSON, and the arrays in it by the names that stand for them there. Values
-    that JSON lacks are ``{KIND: content}``. Raises TypeError for other parts."""
+    """Return the value as JSON, and its arrays by their names there.
+
+    Values that JSON lacks are ``{KIND: content}``. Raises TypeError for other parts.
+    """
     arrays: dict[str, np.ndarray] = {}
 
     def tree(value: Any) -> Any:
@@ -126,8 +141,11 @@ def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
 
 
 def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the value of `_packed`'s parts. Its classes are dataclasses and named tuples of
-    modules that are imported already; they are filled without calling anything of theirs."""
+    """Return the value of `_packed`'s parts.
+
+    Its classes are dataclasses and named tuples of already imported modules. They are filled
+    without calling their code.
+    """
     if isinstance(tree, list):
         return [_unpacked(part, arrays) for part in tree]
     if not isinstance(tree, dict):
@@ -148,10 +166,13 @@ def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 
 def own_folder(name: str) -> Path:
-    """Return that folder of the user's cache directory, or of the one that the environment variable
-    DENSIFY_CACHE_DIR names. It is made with mode 0700 where that is possible.
+    """Return a folder of this name in the user's cache directory.
 
-    Raises InputError if others can write to it.
+    The environment variable DENSIFY_CACHE_DIR names another directory. The folder is made with mode
+    0700 if possible.
+
+    Raises:
+        InputError: Others can write to it.
     """
     named = os.environ.get("DENSIFY_CACHE_DIR")
     root = Path(named or platformdirs.user_cache_dir("densify"))

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The errors that are no bugs of densify, and their one line: what happened, where, what was
-expected, what to do."""
+"""Define the errors that are no bugs of densify, each with a one-line message.
+
+The message says what happened, where, what was expected, and what to do.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,10 @@ def _cut(text: str, num_characters: int) -> str:
 
 
 def how_to_install(extra: str) -> str:
-    """Return the commands that install an optional extra. ``densify`` on the package index is
-    another project."""
+    """Return the commands that install an optional extra.
+
+    ``densify`` on the package index is another project.
+    """
     return f"pip install 'densify-lidar[{extra}]', or in a checkout pip install '.[{extra}]'"
 
 

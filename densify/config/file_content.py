@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Bounded reading of files: bytes, text, JSON and YAML; optional packages, imported where they are
-used; and one error for whatever a malformed description raises."""
+"""Read files with bounds: bytes, text, JSON and YAML; and import optional packages.
+
+Every error of a malformed description becomes one InputError.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,11 @@ _MALFORMED = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a file for reading; the caller closes it. Raises InputError at once if it is missing,
-    unreadable, or a folder, pipe or device."""
+    """Open a file for reading; the caller closes it.
+
+    Raises:
+        InputError: At once, if it is missing, unreadable, or a folder, pipe or device.
+    """
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
@@ -37,7 +42,11 @@ def open_file(path: Path) -> BinaryIO:
 
 
 def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return a file's content. Raises InputError if it cannot be read or is larger than that."""
+    """Return the content of a file.
+
+    Raises:
+        InputError: If it is unreadable or larger than that.
+    """
     with open_file(path) as file:
         check_size(os.fstat(file.fileno()).st_size, path, most_bytes)
         try:
@@ -47,7 +56,11 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
-    """Unpack gzip data. Raises InputError if it is damaged or its content larger than that."""
+    """Return unpacked gzip data.
+
+    Raises:
+        InputError: If it is damaged or larger than that.
+    """
     unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         content = unpack.decompress(data, most_bytes + 1)
@@ -68,13 +81,17 @@ def check_size(num_bytes: int, where: Path | str, most_bytes: int = MOST_BYTES) 
 
 
 def reason(error: BaseException) -> str:
-    """Return what an exception says, on one line."""
+    """Return the message of an exception on one line."""
     said = error.strerror if isinstance(error, OSError) else None
     return said or " ".join(str(error).split()) or type(error).__name__
 
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
-    """Return a file's text. Raises InputError if it cannot be read, is too large or no text."""
+    """Return the text of a file.
+
+    Raises:
+        InputError: If it is unreadable, too large or no text.
+    """
     try:
         return read_bytes(path, most_bytes).decode("utf-8")
     except UnicodeDecodeError as error:
@@ -82,12 +99,16 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file. Raises InputError if it cannot be read or is broken."""
+    """Return the content of a JSON file.
+
+    Raises:
+        InputError: If it is unreadable or broken.
+    """
     return parse_json(read_bytes(path), path)
 
 
 def parse_json(data: bytes, where: Path | str) -> Any:
-    """Return the content of JSON text. Raises InputError, which begins with ``where``."""
+    """Return the content of JSON text. Raise InputError, which begins with ``where``."""
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -97,15 +118,16 @@ def parse_json(data: bytes, where: Path | str) -> Any:
 
 
 def read_yaml(path: Path) -> tuple[Any, dict[str, int]]:
-    """`parse_yaml` of a file."""
+    """Return `parse_yaml` of a file."""
     return parse_yaml(read_text(path, _MOST_YAML_BYTES), path)
 
 
 def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
-    """Return the content of YAML text, None if empty, and the line of each key by its dotted name.
+    """Return the content of YAML text, None if empty, and the line of each key by dotted name.
 
-    Raises InputError, which begins with ``where``, for broken YAML, tags other than YAML's own, a
-    key that is given twice, or more than 30 aliases.
+    Raises:
+        InputError: The YAML is broken, has other tags than YAML's own, a key twice, or more
+            than 30 aliases. The message begins with ``where``.
     """
     import yaml
 
@@ -139,9 +161,13 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
 def needed(module: str, extra: str, what: str) -> Any:
     """Return the imported module.
 
-    extra: the optional extra of densify that installs it.
-    what: the things that need it, such as "Argoverse 2 recordings", for the message.
-    Raises InputError, with the command that installs it.
+    Args:
+        module: Import path.
+        extra: Extra of densify that installs it.
+        what: Things that need it, such as "Argoverse 2 recordings", for the message.
+
+    Raises:
+        InputError: It is not installed. The message has the command that installs it.
     """
     package = module.partition(".")[0]
     try:
@@ -159,8 +185,10 @@ def needed(module: str, extra: str, what: str) -> Any:
 
 @contextmanager
 def described_in(where: Path | str, expected: str) -> Iterator[None]:
-    """Raise InputError, which begins with ``where``, for a key that is absent or a value of another
-    kind in what is read meanwhile."""
+    """Raise InputError, which begins with ``where``, for an absent key or a wrong kind of value.
+
+    It covers what is read within the block.
+    """
     try:
         yield
     except InputError:

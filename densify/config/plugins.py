@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Plug-ins: the built-in readers and engines, and those that other packages add by entry points.
-Rows name modules and import none.
+"""List the built-in readers and engines, and find those of other packages by entry points.
 
-The entry point's name is the plug-in's, its value a module::
+Rows name modules and import none. The name of an entry point is that of the plug-in, its value a
+module::
 
     [project.entry-points."densify.readers"]
     npy = "densify_npy.reader"
@@ -25,14 +25,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Plugin:
-    """One plug-in. Another package's module has the other fields as attributes: ``holds`` as HOLDS,
-    ``recognises`` as it is.
+    """One plug-in.
 
-    name: as users write it. module: import path. Of readers, ``recognises`` returns True if a
-    place, which exists, holds such recordings, judged by names alone; ``holds`` says what is there,
-    and ``boxes`` where tracked boxes are, for messages; ``scenes``: a place may hold several, named
-    by ``#SCENE``. Of engines, ``argument`` is what follows the name after a colon; ``shared``: the
-    motion of a long stretch serves every key in it (`densify.flow.engines.SharedMotion`).
+    A module of another package has the other fields as attributes, and ``holds`` as HOLDS.
+
+    Attributes:
+        name: As users write it.
+        module: Import path.
+        recognises: Of readers: returns True if an existing place holds such recordings, judged
+            by names alone.
+        holds: Of readers: what is there, for messages.
+        boxes: Of readers: where tracked boxes are, for messages.
+        scenes: Of readers: a place may hold several recordings, named by ``#SCENE``.
+        argument: Of engines: the text after the name and a colon.
+        shared: Of engines: the motion of a long stretch serves every key in it
+            (`densify.flow.engines.SharedMotion`).
     """
 
     name: str
@@ -46,7 +53,7 @@ class Plugin:
 
     @property
     def usage(self) -> str:
-        """How users write it."""
+        """The text that users write."""
         return f"{self.name}:{self.argument}" if self.argument else self.name
 
     def work(self) -> Any:
@@ -56,8 +63,13 @@ class Plugin:
 
 @dataclass(frozen=True)
 class Table:
-    """kind: for messages. group: of the entry points. members: functions that the module of another
-    package has."""
+    """The plug-ins of one kind.
+
+    Attributes:
+        kind: For messages.
+        group: Of the entry points.
+        members: Functions that the module of another package has.
+    """
 
     kind: str
     group: str
@@ -69,8 +81,10 @@ class Table:
         return [row.name for row in self.built_in] + sorted(self._added())
 
     def require(self, name: str, where: str) -> None:
-        """Raise InputError, which begins with ``where``, unless there is such a plug-in. Imports
-        none."""
+        """Raise InputError, which begins with ``where``, unless there is such a plug-in.
+
+        It imports none.
+        """
         if name not in self.names():
             usages = [row.usage for row in self.built_in] + sorted(self._added())
             raise InputError(
@@ -79,21 +93,26 @@ class Table:
             )
 
     def row(self, name: str, where: str) -> Plugin:
-        """Return the row of that name; imports the module of another package. Raises InputError if
-        there is none, or the package is broken."""
+        """Return the row of that name. It imports the module of another package.
+
+        Raises:
+            InputError: There is none, or the package is broken.
+        """
         self.require(name, where)
         rows = {row.name: row for row in self.built_in}
         return rows[name] if name in rows else self._load(self._added()[name])
 
     def __iter__(self) -> Iterator[Plugin]:
-        """Yield the built-in rows and those of other packages, imported one by one; last the last
-        built-in one, the most general."""
+        """Yield all rows, the most general built-in one last.
+
+        Rows of other packages are imported one by one.
+        """
         yield from self.built_in[:-1]
         yield from (self._load(point) for _, point in sorted(self._added().items()))
         yield self.built_in[-1]
 
     def _added(self) -> dict[str, EntryPoint]:
-        """Return the entry points of other packages by name; none replaces a built-in one."""
+        """Return the entry points of other packages by name. None replaces a built-in one."""
         from importlib.metadata import entry_points
 
         built_in = {row.name for row in self.built_in}
@@ -136,8 +155,11 @@ ENGINES = Table(
 
 
 def check_engine_spec(spec: str) -> tuple[str, str]:
-    """Return name and argument of an engine's ``NAME[:ARGUMENT]``; imports none. Raises InputError
-    unless there is one, with an argument or without as it needs."""
+    """Return name and argument of an engine's ``NAME[:ARGUMENT]``, without import.
+
+    Raises:
+        InputError: There is no such engine, or it has an argument too many or too few.
+    """
     name, _, argument = spec.partition(":")
     ENGINES.require(name, "flow.engine")
     for row in ENGINES.built_in:
@@ -147,13 +169,17 @@ def check_engine_spec(spec: str) -> tuple[str, str]:
 
 
 def engine(spec: str) -> tuple[Plugin, str]:
-    """Return row and argument of ``NAME[:ARGUMENT]``. Raises InputError for no such engine."""
+    """Return row and argument of ``NAME[:ARGUMENT]``.
+
+    Raises:
+        InputError: For no such engine.
+    """
     name, argument = check_engine_spec(spec)
     return ENGINES.row(name, "flow.engine"), argument
 
 
 def _any(*patterns: str) -> Callable[[Path], bool]:
-    """Return a function that recognises a folder in which one of the patterns is found."""
+    """Return a function that recognises a folder in which one of the patterns exists."""
     return lambda path: any(any(path.glob(pattern)) for pattern in patterns)
 
 
@@ -179,8 +205,10 @@ _BESIDE = re.compile(r"\..*|(timestamps?|times|stamps|poses?|trajectory)\.\w+", 
 
 
 def _holds_sweeps(path: Path) -> bool:
-    """Look down to two folders below; tables of numbers count only where nothing else lies beside
-    them."""
+    """Return True if sweeps are in a folder, or up to two folders below.
+
+    Tables of numbers count only if nothing else is beside them.
+    """
     near = (found for pattern in ("*", "*/*", "*/*/*") for found in path.glob(pattern))
     if (path / "densify.yaml").is_file() or any(_SWEEP.fullmatch(found.name) for found in near):
         return True
@@ -233,8 +261,13 @@ READERS = Table(
 
 
 class Form(NamedTuple):
-    """module: in `densify.outputs.export`, with the function ``write_NAME``. owned: the files and
-    folders that it writes. of_drive: it takes several keys of a drive."""
+    """A form of exports.
+
+    Attributes:
+        module: In `densify.outputs.export`, with the function ``write_NAME``.
+        owned: Files and folders that it writes.
+        of_drive: It takes several keys of a drive.
+    """
 
     module: str
     owned: tuple[str, ...]

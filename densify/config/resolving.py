@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Makes a checked `Config` of a preset, a file, a mapping and single knobs."""
+"""Make a checked `Config` of a preset, a file, a mapping and single settings."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def resolve(
 
 
 def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
-    """Return ``{section: {key: value}}`` with every key; `resolve` makes the Config again."""
+    """Return ``{section: {key: value}}`` with every key. `resolve` makes the Config again."""
     return dataclasses.asdict(config)
 
 
@@ -60,8 +60,11 @@ def presets() -> dict[str, Path]:
 
 
 def parse_override(override: str) -> dict[str, dict[str, Any]]:
-    """Return ``{section: {key: value}}`` of ``section.key=value``. Raises InputError for other
-    text."""
+    """Return ``{section: {key: value}}`` of ``section.key=value``.
+
+    Raises:
+        InputError: The text has another form.
+    """
     name, equals, text = override.partition("=")
     section, dot, key = name.strip().partition(".")
     if not (equals and dot and section and key):
@@ -86,8 +89,11 @@ def apply_changes(
     where: str,
     sections: Mapping[str, type[Section]] = _SECTIONS,
 ) -> None:
-    """Write ``{section: {key: value}}`` over values of that form. Raises InputError, which begins
-    with ``where``, as `resolve`."""
+    """Write ``{section: {key: value}}`` over values of that form.
+
+    Raises:
+        InputError: As in `resolve`. The message begins with ``where``.
+    """
     for name, keys in _mapping(changes, where, "sections"):
         if name not in values:
             hint = _expected(str(name), values, "section")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Every knob of the pipeline: a frozen dataclass per stage, collected in `Config`.
+"""Define every setting of the pipeline: a frozen dataclass per stage, collected in `Config`.
 
-To add a knob, add it to a section here, and to configs/default.yaml with a comment that explains
+To add a setting, add it to a section here, and to configs/default.yaml with a comment that explains
 it. To add a section, add its class and one line in `Config`.
 """
 
@@ -30,7 +30,7 @@ def one_of(*words: str) -> Any:
 
 @dataclass(frozen=True)
 class Section:
-    """The knobs of one stage, checked whenever one is made."""
+    """The settings of one stage, checked whenever one is made."""
 
     def __post_init__(self) -> None:
         for knob in fields(self):
@@ -39,10 +39,13 @@ class Section:
 
 
 def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
-    """Return the value as its knob's type.
+    """Return the value as the type of its setting.
 
-    where: file or option that the value comes from, for the message.
-    Raises InputError for another type or a value out of range.
+    Args:
+        where: File or option that the value comes from, for the message.
+
+    Raises:
+        InputError: The type is another one, or the value is out of range.
     """
     knob = section.__dataclass_fields__[key]
     kind, _, optional = str(knob.type).partition(" | ")
@@ -89,7 +92,7 @@ class RegisterSettings(Section):
 
 @dataclass(frozen=True)
 class FlowSettings(Section):
-    """Which points move, and how."""
+    """The motion of points."""
 
     engine: str = "groups"
     look_around_s: float | None = within(None, 0, 5)
@@ -99,9 +102,9 @@ class FlowSettings(Section):
         check_engine_spec(self.engine)
 
     def around_s(self, points_per_s: float) -> float:
-        """Return ``look_around_s``, for a scanner of ``points_per_s`` where it is null.
+        """Return ``look_around_s``, for a scanner of ``points_per_s`` if it is null.
 
-        With few points, moving objects are seen too seldom within a window.
+        With few points, moving objects are observed too rarely within a window.
         """
         if self.look_around_s is not None:
             return self.look_around_s
@@ -120,7 +123,7 @@ class ObjectiveSettings(Section):
 
 @dataclass(frozen=True)
 class AccumulateSettings(Section):
-    """All points at the key's time."""
+    """The accumulated cloud at the key's time."""
 
     unfollowed: str = one_of("drop", "rigid")
     far_m: float = within(40.0, 0, 500)
@@ -128,7 +131,7 @@ class AccumulateSettings(Section):
 
 @dataclass(frozen=True)
 class ProjectSettings(Section):
-    """From the accumulated cloud to each camera's depth map."""
+    """Depth maps of the accumulated cloud."""
 
     at: str = one_of("camera", "sweep")
     per: str = one_of("sweep", "image")
@@ -150,7 +153,7 @@ class ProjectSettings(Section):
 
 @dataclass(frozen=True)
 class PriorSettings(Section):
-    """Depth images that the user brings (--prior), where nothing is measured."""
+    """Depth images that the user brings (--prior), for pixels without a measurement."""
 
     kind: str = one_of("auto", "depth", "inverse")
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Looks a recording over before it is densified: what may be wrong with it, and what mends it.
+"""Examine a recording before it is densified: find what may be wrong, and how to mend it.
 
-A check is a function of the `Sample` and one line in `CHECKS`. It measures, and compares what the
-recording says with what it would say under the usual mistakes.
+A check is a function of the `Sample` and one line in `CHECKS`. It measures, and compares the
+recording as given with the recording under the usual mistakes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FETCH = "fetch these files again; windows end before sweeps that cannot be read
 
 
 def check_sweep_files(sample: Sample) -> list[Finding]:
-    """Compare the sizes of the sweeps' files; name sweeps that cannot be read."""
+    """Compare the sizes of the sweeps' files, and name sweeps that cannot be read."""
     findings = []
     if sample.unreadable:
         frame, reason = next(iter(sample.unreadable.items()))
@@ -54,7 +54,7 @@ def check_sweep_files(sample: Sample) -> list[Finding]:
 
 
 def check_registration(sample: Sample) -> list[Finding]:
-    """Report where odometry cannot register the sweeps."""
+    """Report sweeps that odometry cannot register."""
     failures = [spot.failure for spot in sample.spots if spot.trajectory is None]
     if len(sample.timeline.frames) < 2:
         return [finding("registration", UNKNOWN, failures[0])]
@@ -85,21 +85,29 @@ CHECKS: tuple[Callable[[Sample], list[Finding]], ...] = (
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """sample: what was looked at. findings: in the order of `CHECKS`."""
+    """The findings about a recording.
+
+    Attributes:
+        sample: The sweeps that were examined.
+        findings: In the order of `CHECKS`.
+    """
 
     sample: Sample
     findings: tuple[Finding, ...]
 
     @property
     def worst(self) -> Verdict:
+        """The worst verdict."""
         return max((finding.verdict for finding in self.findings), default=Verdict.FINE)
 
 
 def examine(sequence: LidarSequence, config: Config) -> Diagnosis:
-    """Check a recording. At most fifteen of its sweeps and three images of each camera are read,
-    however long it is.
+    """Check a recording.
 
-    Raises InputError if none of these sweeps can be read.
+    At most fifteen of its sweeps and three images of each camera are read, whatever its length.
+
+    Raises:
+        InputError: None of these sweeps can be read.
     """
     sample = Sample.of(sequence, config.register)
     return Diagnosis(sample, tuple(found for check in CHECKS for found in check(sample)))

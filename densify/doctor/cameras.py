@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Cameras: images that are there, and whether depth edges fall on image edges.
+"""Check cameras: existing images, and whether depth discontinuities are on image edges.
 
-The score of a calibration is how much stronger the image's edges are where depth edges of the sweep
-fall than where its other returns fall, in standard errors (after Levinson and Thrun, "Automatic
+The score of a calibration compares the strength of the image's edges at depth discontinuities of
+the sweep with that at its other returns, in standard errors (after Levinson and Thrun, "Automatic
 Online Calibration of Cameras and Lasers", RSS 2013).
 """
 
@@ -43,9 +43,12 @@ _LEAST_SPEED_M_S = 3.0
 class Pair:
     """A sweep and an image taken near it.
 
-    points: (N,3) lidar frame, deskewed. edge: (N,) on the near side of a depth edge. twist: (6,)
-    of the lidar, per second. exposed_s: since the sweep's reference time. strength: (H,W) of image
-    edges, relative to those around.
+    Attributes:
+        points: (N,3) lidar frame, deskewed.
+        edge: (N,) on the near side of a depth discontinuity.
+        twist: (6,) of the lidar, per second.
+        exposed_s: Since the reference time of the sweep.
+        strength: (H,W) of image edges, relative to those around.
     """
 
     points: Float
@@ -99,7 +102,7 @@ def _check_images(sample: Sample, camera: Camera) -> Finding:
 
 
 def image_pairs(sample: Sample, camera: Camera) -> tuple[list[Pair], str]:
-    """Return a sweep of each registered spot with its nearest image; and why one cannot be read."""
+    """Return a sweep of each registered spot with its nearest image, and why one cannot be read."""
     exposed_ns = sample.sequence.image_stamps_ns(camera.name)
     pairs: list[Pair] = []
     for spot in sample.registered:
@@ -139,9 +142,10 @@ def _pair(spot: Spot, row: int, image: NDArray[np.uint8], apart_s: float, camera
 
 
 def depth_edges(points: Float) -> Bool:
-    """Return (N,) True where something much farther is seen right beside the point.
+    """Return (N,) True where a return right beside the point is much farther.
 
-    points: (N,3) of one scanner, from where it stands.
+    Args:
+        points: (N,3) of one scanner, in its frame.
     """
     x, y, z = points.T
     range_m = np.linalg.norm(points, axis=1)
@@ -155,7 +159,7 @@ def depth_edges(points: Float) -> Bool:
 
 
 def edge_strength(image: NDArray[np.uint8], focal_px: float) -> Float32:
-    """Return (H,W) the gradient's size against that around, at most 4, of an image (H,W,3)."""
+    """Return (H,W) the size of the gradient relative to that around, at most 4, of an image."""
     scale = focal_px / _FOCAL_PX
     gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), max(0.8, scale))
     x, y = (cv2.Sobel(gray, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))
@@ -168,10 +172,13 @@ def edge_strength(image: NDArray[np.uint8], focal_px: float) -> Float32:
 def score(
     camera: Camera, pairs: list[Pair], later_s: float = 0.0, right_px: float = 0.0
 ) -> tuple[float, int]:
-    """Return the standard errors by which the image is edged where depth is, over all pairs, 0
-    where too few points are seen; and the number of edges of depth in the images.
+    """Return the score of a calibration over all pairs, and the number of depth discontinuities.
 
-    later_s: what the images' clock is late. right_px: what the depth is moved in the images.
+    The score is in standard errors. It is 0 if too few points are in view.
+
+    Args:
+        later_s: Delay of the images' clock.
+        right_px: Shift of the depth in the images.
     """
     on, off, num_edges = [], [], 0
     for pair in pairs:
@@ -202,7 +209,7 @@ def alternatives(T: Float) -> dict[str, Float]:
 
 
 def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
-    """Compare the calibration and the clock as given with others; the best of all explains most."""
+    """Compare the calibration and the clock as given with others. The best of all explains most."""
     given, num_given = score(camera, pairs)
     name, text = f"{camera.name}: calibration", f"depth edges lie on image edges by {given:.1f}"
     text += " standard errors as given"
@@ -245,11 +252,11 @@ def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
 
 
 def _check_clock(camera: Camera, pairs: list[Pair], clearly: float) -> tuple[float, list[Finding]]:
-    """Measure the difference between the clocks of camera and lidar; nothing where the vehicle is
-    too slow, or too few images are there, to tell.
+    """Measure the difference between the clocks of camera and lidar.
 
-    clearly: the score that the best clock must have to be said to be off. Returns the score with
-    the best clock, 0 where there is none, and the finding.
+    Return the score with the best clock, 0 without one, and the finding. There is none if the
+    vehicle is too slow, or too few images exist. clearly: the least score of the best clock at
+    which it is said to be off.
     """
     moving = [p for p in pairs if np.linalg.norm(p.twist[3:]) > _LEAST_SPEED_M_S]
     if len(moving) < _LEAST_PAIRS:

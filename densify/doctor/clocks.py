@@ -84,7 +84,7 @@ def _rate(period_s: float) -> Finding:
 
 
 def check_point_times(sample: Sample) -> list[Finding]:
-    """Check how much of a period the firing times within a sweep span; none if there are none."""
+    """Check the share of a period that the firing times within a sweep span."""
     findings, sweeps = [], [spot.sweeps[spot.middle] for spot in sample.spots]
     period_s = sample.timeline.period_ns * 1e-9
     if len(sample.timeline.frames) < 2 or any(s.offset_ns is None for s in sweeps):
@@ -142,8 +142,10 @@ def check_deskewing(sample: Sample) -> list[Finding]:
 
 
 def _apart_m(spot: Spot) -> float:
-    """Return the median distance (m) of near points above the ground in the last sweep from the
-    first sweep; 1 m where they cannot be registered."""
+    """Return the median distance (m) of near points above the ground between last and first sweep.
+
+    It is 1 m if they cannot be registered.
+    """
     if spot.trajectory is None:
         return _CLOSE_M
     ends = spot.stretch.sweeps[0], spot.stretch.sweeps[-1]

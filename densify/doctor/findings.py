@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The findings of a check and their verdicts."""
+"""Define the findings of a check and their verdicts."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from enum import IntEnum
 
 
 class Verdict(IntEnum):
-    """How bad a finding is. UNKNOWN: the recording does not show it, for instance because the
-    vehicle stands still."""
+    """The severity of a finding.
+
+    UNKNOWN: the recording does not show it, for instance because the vehicle stands.
+    """
 
     FINE = 0
     UNKNOWN = 1
@@ -29,9 +31,11 @@ Value = float | int | str | list[float]
 class Finding:
     """The result of one check.
 
-    check: the subject, such as "stamps". evidence: one sentence with the number that the verdict
-    rests on. remedy: the option or line that mends it; empty where nothing is wrong. values: the
-    numbers by name, with units in the names.
+    Attributes:
+        check: Subject, such as "stamps".
+        evidence: One sentence with the number that the verdict rests on.
+        remedy: The option or line that mends it; empty if nothing is wrong.
+        values: The numbers by name, with units in the names.
     """
 
     check: str
@@ -44,5 +48,5 @@ class Finding:
 def finding(
     check: str, verdict: Verdict, evidence: str, remedy: str = "", **values: Value
 ) -> Finding:
-    """Return a finding; without the remedy unless something may be wrong."""
+    """Return a finding, without the remedy unless something may be wrong."""
     return Finding(check, verdict, evidence, remedy if verdict >= SUSPICIOUS else "", values)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The recording's poses against the path that odometry finds from the sweeps alone."""
+"""Compare the recording's poses with the path that odometry finds from the sweeps alone."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
 def changed(
     rotation: Callable[[Float], Float] = np.copy, scale: float = 1.0
 ) -> Callable[[Float], Float]:
-    """Return the change of (4,4) poses that changes their (3,3) rotations and scales their
-    translations."""
+    """Return a change of (4,4) poses: of their (3,3) rotations, and a scale of translations."""
 
     def change(T: Float) -> Float:
         new = np.eye(4)
@@ -91,8 +90,11 @@ def check_poses(sample: Sample) -> list[Finding]:
 
 
 def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
-    """Measure the difference between the clocks of poses and sweeps: the shift with which the poses
-    agree best with odometry. It shows where the vehicle turns or changes its speed."""
+    """Measure the difference between the clocks of poses and sweeps.
+
+    It is the shift with which the poses agree best with odometry. It shows where the vehicle turns
+    or changes its speed.
+    """
     late_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
     cost, num_used = np.zeros(len(late_s)), 0
     for spot, step in zip(sample.registered, found, strict=True):
@@ -123,7 +125,7 @@ def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
 
 
 def _track(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:
-    """Return the recording's poses around a spot; None at its ends, or where one is missing."""
+    """Return the recording's poses around a spot, None at its ends, or if one is missing."""
     reach_ns = int(1e9 * _CLOCK_S)
     timeline = sample.timeline
     frames = timeline.within(first_ns - 2 * reach_ns, last_ns + 2 * reach_ns)
@@ -155,5 +157,5 @@ def _off(given: list[Float], found: list[Float]) -> tuple[float, float]:
 
 
 def _cost(off: tuple[float, float], way_m: float) -> float:
-    """Return the larger of both errors, as a share of what is allowed."""
+    """Return the larger of both errors, as a share of its tolerance."""
     return max(off[0] / (_OFF_M + _OFF_PER_M * way_m), off[1] / _OFF_DEG)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Checks of the points: units, axes, the own vehicle, reflectances, scanners."""
+"""Check the points: units, axes, the own vehicle, reflectances, scanners."""
 
 from __future__ import annotations
 
@@ -64,8 +64,10 @@ def _median_range_m(points: Float) -> float:
 
 
 def check_axes(sample: Sample) -> list[Finding]:
-    """Check which axis points up: the one along which a layer holds most returns and hardly any
-    lie below."""
+    """Check the axis that points up.
+
+    A layer along it holds most returns, and hardly any are below the layer.
+    """
     level = {name: _ground_share(sample, up) for name, up in _UP.items()}
     best = max(level, key=lambda name: level[name])
     values = {f"share_{name}": share for name, share in level.items()}
@@ -84,9 +86,11 @@ def check_axes(sample: Sample) -> list[Finding]:
 
 
 def _ground_share(sample: Sample, up: Float) -> float:
-    """Return the share of the near returns in the fullest layer that is not above the origin and
-    has few returns below it, beyond what an even spread over all heights would have there; the
-    median over the spots."""
+    """Return the share of the near returns in the fullest layer with few returns below it.
+
+    The layer is not above the origin. Few means: relative to an even spread over all heights. The
+    result is the median over the spots.
+    """
     shares = []
     for spot in sample.spots:
         points = spot.sweeps[spot.middle].points
@@ -105,8 +109,10 @@ def _ground_share(sample: Sample, up: Float) -> float:
 
 
 def check_own_vehicle(sample: Sample) -> list[Finding]:
-    """Look for returns of the vehicle that carries the scanner: they are at the same place in
-    sweeps far apart in time, while the vehicle drives."""
+    """Check for returns of the vehicle that carries the scanner.
+
+    They are at the same place in sweeps far apart in time, while the vehicle drives.
+    """
     moving = [
         spot
         for spot in sample.registered
@@ -128,8 +134,10 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
 
 
 def _own_returns(spots: list[Spot]) -> tuple[float, int]:
-    """Return how far away they are, and how many a sweep has. Ground looks the same everywhere as
-    well: the lowest layer does not count."""
+    """Return the distance of these returns, and their number in a sweep.
+
+    Ground looks the same everywhere too. Therefore the lowest layer does not count.
+    """
     cells = []
     for sweep in [s for spot in spots for s in (spot.sweeps[0], spot.sweeps[-1])]:
         range_m = np.linalg.norm(sweep.points, axis=1)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Checks by the rings of a spinning scanner: they are cones about its own axis only if the points
-are seen from where it stood, as they were fired."""
+"""Check the rings of a spinning scanner.
+
+They are cones about its own axis only for points relative to its position at their firing.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +30,11 @@ _OFF_M = 0.3
 
 
 def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
-    """Return how much the elevations seen from the origin stand in rings, 1 for an even spread.
+    """Return how much the elevations at an origin are concentrated in rings, 1 for an even spread.
 
-    In each window of elevation: the chance that two of its returns share a cell of ``bins`` times
-    0.02 degrees, relative to an even spread; then the mean over the windows, each counted alike,
-    since from a place on the ground all of a flat ground falls into one of them.
+    In each window of elevation it is the chance that two returns share a cell of ``bins`` times
+    0.02 degrees, relative to an even spread. The result is the mean over the windows, each counted
+    alike, because from a place on the ground all of a flat ground is in one of them.
     """
     x, y, z = (points - origin_m).T
     elevation = np.arctan2(z, np.hypot(x, y))
@@ -48,7 +50,7 @@ def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
 
 
 def check_rings(sample: Sample) -> list[Finding]:
-    """Check where each scanner stands, and that its sweeps are as they were fired."""
+    """Check the position of each scanner, and that its sweeps are as they were fired."""
     findings = []
     for lidar in sample.lidars:
         R = sample.spots[0].sweeps[0].axes(lidar)  # rings are level in the scanner's own axes
@@ -65,9 +67,9 @@ def check_rings(sample: Sample) -> list[Finding]:
 def _check_compensation(
     sample: Sample, lidar: int, R: Float, origins_m: tuple[Float, Float]
 ) -> Finding:
-    """Check that the motion within a sweep is not undone already.
+    """Check that the motion within a sweep is not removed already.
 
-    R: into the scanner's axes. origins_m: where the scanner may be.
+    R: into the scanner's axes. origins_m: possible positions of the scanner.
     """
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     spot = sample.fastest
@@ -109,10 +111,10 @@ def _check_compensation(
 def _sharpness_by_motion(
     points: Float, offset_s: Float, twist: Float, R: Float, origins_m: tuple[Float, Float]
 ) -> tuple[float, float, float, str]:
-    """Return how sharp the rings are as they are, with a compensation of motion undone, and with
-    one done; and the moment that they would be compensated to.
+    """Return the sharpness of rings as stored, with compensation undone, and with compensation.
 
-    points: (N,3) raw, fired at offset_s: (N,). twist: (6,) of the lidar, per second.
+    The last result is the moment that they would be compensated to. points: (N,3) raw, fired at
+    offset_s (N,). twist: (6,) of the lidar, per second.
     """
 
     def sharpest(moved: Float) -> float:
@@ -160,9 +162,11 @@ def _still_points(sample: Sample, lidar: int) -> Float:
 
 
 def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: Float) -> Finding:
-    """Compare the given and the found place of a scanner.
+    """Compare the given and the found position of a scanner.
 
-    points, given_m, found_m: in the scanner's axes, into which R turns the lidar frame's.
+    points, given_m.
+
+    found_m: in the scanner's axes, into which R turns those of the lidar frame.
     """
     name = "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
     given, found = sharpness(points, given_m), sharpness(points, found_m)
@@ -188,8 +192,11 @@ def _text(place_m: Float) -> str:
 
 
 def found_origin(points: Float, start_m: Float) -> Float:
-    """Return (3,) from where the rings are sharpest, searched up to 3 m ahead and behind a place,
-    0.8 m aside, 2.4 m above and below. Heights are tried closely, since they move every ring."""
+    """Return (3,) the position with the sharpest rings.
+
+    The search covers 3 m ahead and behind a position, 0.8 m aside, 2.4 m above and below. Heights
+    have fine steps, because they move every ring.
+    """
     axes = [np.arange(-r, r + 1e-9, step) for r, step in zip(_REACH_M, _GRID_M, strict=True)]
     grid = start_m + np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     far = points[np.linalg.norm(points, axis=1) > _COARSE_FROM_M]

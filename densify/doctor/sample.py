@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The sweeps that are looked at: few, from all over the recording, registered by odometry whatever
-poses it has."""
+"""Select the sweeps to examine: few, from all over the recording, registered by odometry."""
 
 from __future__ import annotations
 
@@ -23,8 +22,12 @@ _STEP_S = 0.1
 
 @dataclass(frozen=True)
 class Spot:
-    """A few sweeps in a row. sweeps: as read, own vehicle included. trajectory: None where they
-    cannot be registered, for the reason in ``failure``."""
+    """A few consecutive sweeps.
+
+    Attributes:
+        sweeps: As read, own vehicle included.
+        trajectory: None if they cannot be registered, for the reason in ``failure``.
+    """
 
     sweeps: tuple[Sweep, ...]
     trajectory: Trajectory | None
@@ -32,17 +35,17 @@ class Spot:
 
     @cached_property
     def stretch(self) -> Stretch:
-        """Return the sweeps deskewed, in the odometry's world; empty without registration."""
+        """The sweeps deskewed, in the odometry's world; empty without registration."""
         return Stretch(()) if self.trajectory is None else deskew(self.sweeps, self.trajectory)
 
     @property
     def middle(self) -> int:
-        """Return the row of the sweep in the middle."""
+        """The row of the sweep in the middle."""
         return len(self.sweeps) // 2
 
     @property
     def twist(self) -> Float:
-        """Return (6,) rad/s and m/s in the middle, lidar frame; zeros if it is not registered."""
+        """The (6,) rad/s and m/s in the middle, lidar frame; zeros if it is not registered."""
         if self.trajectory is None:
             return np.zeros(6)
         sweep = self.stretch.sweeps[self.middle]
@@ -50,10 +53,11 @@ class Spot:
 
     @property
     def speed_m_s(self) -> float:
+        """The speed in the middle."""
         return float(np.linalg.norm(self.twist[3:]))
 
     def too_slow(self, least_m_s: float) -> str:
-        """Say that a check needs a faster vehicle."""
+        """Return a sentence that a check needs a faster vehicle."""
         return (
             f"the vehicle drives at {self.speed_m_s:.1f} m/s where it was looked at, "
             f"{least_m_s:g} are needed"
@@ -62,9 +66,15 @@ class Spot:
 
 @dataclass(frozen=True)
 class Sample:
-    """sequence: the recording. timeline: when its sweeps were taken. spots: in order of time.
-    unreadable: frame -> why a sweep that was to be looked at could not be read. settings: of the
-    registration."""
+    """The examined sweeps.
+
+    Attributes:
+        sequence: The recording.
+        timeline: Times of its sweeps.
+        spots: In order of time.
+        unreadable: Frame -> reason for which a chosen sweep could not be read.
+        settings: Of the registration.
+    """
 
     sequence: LidarSequence
     timeline: Timeline
@@ -104,7 +114,7 @@ class Sample:
 
     @property
     def fastest(self) -> Spot | None:
-        """Return the registered spot where the vehicle is fastest."""
+        """The registered spot with the fastest vehicle."""
         return max(self.registered, key=lambda spot: spot.speed_m_s, default=None)
 
 
@@ -119,7 +129,7 @@ def _chosen(timeline: Timeline) -> list[list[int]]:
 
 
 def spot_of(sweeps: tuple[Sweep, ...], settings: RegisterSettings) -> Spot:
-    """Register sweeps by odometry, if they can be."""
+    """Return a spot of sweeps, registered by odometry if possible."""
     if len(sweeps) < 2:
         return Spot(sweeps, None, "one sweep alone cannot be registered")
     try:

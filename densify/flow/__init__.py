@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Scene flow between point clouds. Import its modules: the package itself loads nothing."""
+"""Estimate scene flow between point clouds. The package itself loads nothing."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Scene flow from tracked boxes: points in a box move with it, all others are static.
+"""Compute scene flow from tracked boxes: points in a box move with it, all others are static.
 
-As the scene flow of Argoverse and nuScenes was made (Pontes, Hays, Lucey, 3DV 2020, section 4.1;
-Jund et al., RA-L 2022).
+The scene flow of Argoverse and nuScenes was made in this way (Pontes, Hays, Lucey, 3DV 2020,
+section 4.1; Jund et al., RA-L 2022).
 """
 
 from __future__ import annotations
@@ -22,9 +22,15 @@ MOVES_M_S = 0.5
 
 @dataclass(frozen=True)
 class BoxMargins:
-    """grown_m: added to each side of a box; larger takes in mirrors and feet, and more of the
-    ground. unsure_m: points so much farther outside are unsure. foot_m: in a moving box, points
-    lower than this above its bottom are unsure, since they may be the road."""
+    """Margins around a box.
+
+    Attributes:
+        grown_m: Added to each side of a box. A larger one takes in mirrors and feet, and more
+            of the ground.
+        unsure_m: Points up to this much farther outside are uncertain.
+        foot_m: In a moving box, points lower than this above its bottom are uncertain, because
+            they may be the road.
+    """
 
     grown_m: float = 0.1
     unsure_m: float = 0.3
@@ -38,14 +44,18 @@ def flow_of_boxes(
     next_boxes: Boxes,
     margins: BoxMargins | None = None,
 ) -> tuple[FlowField, Bool]:
-    """Return the flow of the N points of one sweep to the next, and which of it is sure.
+    """Return the flow of the N points of one sweep to the next, and the points of certain flow.
 
-    here, after: the two sweeps in one world; of the second the points are not used. boxes,
-    next_boxes: of the two.
+    Args:
+        here: The sweep.
+        after: The next sweep in the same world. Its points are not used.
+        boxes: Boxes of the sweep.
+        next_boxes: Boxes of the next sweep.
 
-    Returns the field, whose ``instance`` is the box's row (-1 none), and (N,) bool: False in two
-    boxes, just outside one, at the foot of one that moves, in a box that is not there in the next
-    sweep, and where nobody drew boxes.
+    Returns:
+        The field, whose ``instance`` is the row of the box (-1 none), and (N,) bool. It is
+            False in two boxes, just outside one, at the bottom of a moving one, in a box that the
+            next sweep lacks, and where nobody drew boxes.
     """
     margins = margins or BoxMargins()
     points = here.sweep.points
@@ -83,8 +93,10 @@ def flow_of_boxes(
 
 
 def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator[tuple[Int, Float]]:
-    """Yield the rows of the points in and around each box, and its pose. Boxes of one scanner have
-    points of that scanner only."""
+    """Yield the rows of the points in and around each box, and its pose.
+
+    Boxes of one scanner have points of that scanner only.
+    """
     points = here.sweep.points
     reach_m = np.linalg.norm(boxes.size_m / 2 + margins.grown_m + margins.unsure_m, axis=1)
     x, y = np.ascontiguousarray(points[:, 0]), np.ascontiguousarray(points[:, 1])
@@ -99,8 +111,7 @@ def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator
 
 
 def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
-    """Return (K,4,4) the boxes in the lidar frame at the sweep's reference time, deskewed as the
-    points are."""
+    """Return (K,4,4) the boxes in the lidar frame at the reference time, deskewed as the points."""
     if boxes.offset_ns is None:
         return boxes.T_lidar_box
     T = boxes.T_lidar_box.copy()
@@ -111,7 +122,7 @@ def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
 
 
 def _looked_at(view: BoxView | None, points: Float) -> Bool:
-    """Return (N,) True in the image area where boxes were drawn."""
+    """Return (N,) True in the image area in which boxes were drawn."""
     if view is None:
         return np.ones(len(points), bool)
     uv, seen = image_points(view.camera, poses.transform(view.camera.T_cam_lidar, points))

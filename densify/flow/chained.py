@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Chaining: flow between neighbouring sweeps becomes flow over many, k -> k±1 -> … -> target."""
+"""Chain flow between neighbouring sweeps to flow over many, k -> k±1 -> … -> target."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ _MAX_GAP_M = 0.5
 class ChainedMotion:
     """The motion of a stretch by flows between neighbours: a `Motion`.
 
-    step: returns the flow of sweep number i to number j = i ± 1; called once for each, when needed.
+    Attributes:
+        step: Returns the flow of sweep number i to number j = i ± 1. It is called once for
+            each, on demand.
     """
 
     stretch: Stretch
@@ -33,10 +35,12 @@ class ChainedMotion:
 
         The flow of the next sweep is looked up at the moved point. The points of an object share
         its rigid motion there, plus the deviation of the nearest points from it. A point without an
-        object takes the mean flow of the nearest moving ones. A point is lost where its object has
-        no points in the next sweep, or no moving point lies within 0.5 m.
+        object takes the mean flow of the nearest moving ones. A point is lost if its object has no
+        points in the next sweep, or no moving point is within 0.5 m.
 
-        frame, target: frame numbers.
+        Args:
+            frame: Frame of the sweep.
+            target: Frame of the other sweep.
         """
         here, there = self.stretch.frames.index(frame), self.stretch.frames.index(target)
         return self._flow(here, there)
@@ -98,7 +102,7 @@ class ChainedMotion:
 def _object_motion(source: Float, target: Float) -> Float:
     """Return the (4,4) motion of an object from (N,3) points to others.
 
-    Fewer than three points, and points on a line, do not tell a rotation: they are translated.
+    Fewer than three points, and points on a line, determine no rotation. They are translated.
     """
     if np.linalg.matrix_rank(source - source.mean(axis=0), tol=_LINE_M) < 2:
         T = np.eye(4)

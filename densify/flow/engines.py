@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One call for all engines of scene flow; `densify.config.plugins` has their table."""
+"""Call any engine of scene flow. `densify.config.plugins` has their table."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ from densify.geometry.types import Motion, Stretch
 class Scene:
     """The input of an engine: registered sweeps in one world, their ground and free space.
 
-    ground: under all sweeps. asked: frames whose flow will be asked for, None for all; the other
-    sweeps only help to find what moves.
+    Attributes:
+        ground: Under all sweeps.
+        asked: Frames whose flow is needed, None for all. The other sweeps only help to find
+            motion.
     """
 
     stretch: Stretch
@@ -39,48 +41,52 @@ class Scene:
         return find_candidates(self.stretch, self.space, self.ground)
 
     def is_asked(self, i: int) -> bool:
-        """Return True if the flow of sweep number i will be asked for."""
+        """Return True if the flow of sweep number i is needed."""
         return self.asked is None or self.stretch.sweeps[i].frame in self.asked
 
 
 class SharedMotion(Motion, Protocol):
     """Motion of a long stretch that serves every key in it.
 
-    A dataclass that is kept on disk without points.
+    It is a dataclass that is cached on disk without points.
     """
 
     def with_stretch(self, stretch: Stretch) -> SharedMotion:
-        """Return the same motion with other copies of its sweeps, which may lack their points; an
-        empty stretch before it is written to disk."""
+        """Return the same motion with other copies of its sweeps, which may lack their points.
+
+        Before it is written to disk the stretch is empty.
+        """
         ...
 
 
 class EngineModule(Protocol):
     """The functions of an engine's module.
 
-    It may also have ``check_argument(argument: str) -> None``, called before anything is computed,
-    which raises InputError for an argument that cannot be used.
+    It may also have ``check_argument(argument: str) -> None``. It is called before anything is
+    computed, and raises InputError for a bad argument.
     """
 
     def estimate_motion(self, scene: Scene, settings: Config, argument: str) -> Motion:
-        """Return how everything in the scene's stretch moves; same input, same bytes.
+        """Return the motion of all points of the scene's stretch.
 
-        argument: the part of ``flow.engine`` after the colon, "" for none. Work may be postponed
-        until the motion's ``flow`` is called. If the engine's row says ``shared``, the motion is
-        a `SharedMotion`.
+        The same input gives the same bytes. Work may be postponed until the motion's ``flow`` is
+        called. If the engine's row says ``shared``, the motion is a `SharedMotion`.
+
+        Args:
+            argument: The part of ``flow.engine`` after the colon, "" for none.
         """
         ...
 
 
 def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
-    """Estimate by the engine ``NAME[:ARGUMENT]``, that of ``flow.engine`` if None."""
+    """Return the motion by the engine ``NAME[:ARGUMENT]``, that of ``flow.engine`` for None."""
     row, argument = engine(spec or settings.flow.engine)
     module = cast(EngineModule, row.work())
     return module.estimate_motion(scene, settings, argument)
 
 
 def check_engine(spec: str) -> None:
-    """Raise InputError if the engine is not there or cannot use its argument; imports it."""
+    """Raise InputError if the engine does not exist or cannot use its argument; imports it."""
     row, argument = engine(spec)
     check = getattr(row.work(), "check_argument", None)
     if check is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid motions about the vertical, and alignment of points with a surface.
+"""Align points with a surface by rigid motions about the vertical.
 
 Segal, Haehnel, Thrun, "Generalized-ICP", RSS 2009, with yaw as the only rotation. A state (4,) is a
 displacement x y z (m) and a yaw (rad) about an object's centre.
@@ -23,15 +23,16 @@ _LOOSE = 10.0  # of the covariance: sliding along a surface must not be held up 
 
 
 def apply(state: Float, points: Float, centre: Float) -> Float:
-    """Move (N,3) points of an object by a state (4,) or by one state each (N,4).
+    """Return (N,3) points of an object, moved by a state (4,) or by one state each (N,4).
 
-    centre: (3,) or (N,3).
+    Args:
+        centre: (3,) or (N,3).
     """
     return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
 
 def undo(state: Float, points: Float, centre: Float) -> Float:
-    """Inverse of `apply`."""
+    """Return the inverse of `apply`."""
     return _turned(points - centre - state[..., :3], -state[..., 3]) + centre
 
 
@@ -44,7 +45,10 @@ def _turned(arms: Float, yaw: float | Float) -> Float:
 def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
     """Return (N,3,3) the inverse covariance (1/m²) of the surface around each point.
 
-    points: (M,3). near: (N,k) rows of each point's neighbours. loose: factor of the covariance.
+    Args:
+        points: (M,3).
+        near: (N,k) rows of the neighbours of each point.
+        loose: Factor of the covariance.
     """
     away = points[near]
     away -= away.mean(axis=1, keepdims=True)
@@ -77,13 +81,16 @@ class Model:
     def align(
         self, points: Float, centre: Float, predicted: Float, prediction_std: Float
     ) -> Float | None:
-        """Return the state (4,) in which the model fits the points; None for too few matches.
+        """Return the state (4,) in which the model fits the points, None for too few matches.
 
-        The height is not aligned: what few beams hit would climb with the beams. Weights are
-        Tukey's.
+        The height is not aligned, because an object that few beams hit would climb with the beams.
+        Weights are Tukey's.
 
-        points: (N,3), all at one time. centre: (3,). predicted: (4,) where to start.
-        prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
+        Args:
+            points: (N,3), all at one time.
+            centre: (3,).
+            predicted: (4,) state to start from.
+            prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
         """
         state, prior = predicted.copy(), prediction_std**-2
         for gate_m in GATES_M:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Free space: range images, the scanner's rays, what they passed through, and the ground."""
+"""Find free space: range images, the scanner's rays, the space that they passed, and the ground."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The ground: its height under a stretch of sweeps, and how a lidar is mounted above it."""
+"""Estimate the height of the ground, and the mount of the lidar above it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ def ground(stretch: Stretch) -> HeightMap:
 class HeightMap:
     """Ground heights on a grid.
 
-    heights_m: (X,Y) at the cells' centres. low_m: (2,) the grid's lower corner.
+    Attributes:
+        heights_m: (X,Y) at the centres of the cells.
+        low_m: (2,) lower corner of the grid.
     """
 
     heights_m: Float
@@ -41,13 +43,15 @@ class HeightMap:
 
     @staticmethod
     def of(clouds: Sequence[Float]) -> HeightMap:
-        """Find the ground under point clouds.
+        """Return the ground under point clouds.
 
-        The second lowest point of a cell is its ground (the lowest may be a stray reflection). A
-        cell below all slopes from the median around it is repaired. The slope limit then cuts cars
-        and walls away, and humps are removed. The points near this lower hull are averaged.
+        The second lowest point of a cell is its ground, because the lowest may be a stray
+        reflection. A cell below all slopes from the median around it is repaired. The slope limit
+        then removes cars and walls, and humps are removed. The points near this lower hull are
+        averaged.
 
-        clouds: (N,3) each, metres, z up, at least one point in all.
+        Args:
+            clouds: (N,3) each, metres, z up, at least one point in all.
         """
         low, shape = _grid(clouds)
         lowest, second = np.full((2, *shape), np.inf)
@@ -102,8 +106,8 @@ def _cells(points: Float, low_m: Float) -> tuple[Int, Int]:
 def _averaged(hull: HeightMap, clouds: Sequence[Float]) -> Float:
     """Return the (X,Y) mean height of the points close to the hull, around each cell.
 
-    The hull itself is lower where more points were measured; an object that drives from one such
-    place to another must not climb.
+    The hull itself is lower where more points were measured. An object that drives from one of
+    these places to another must not climb.
     """
     total, number = np.zeros((2, *hull.heights_m.shape))
     for points in clouds:
@@ -118,7 +122,7 @@ def _averaged(hull: HeightMap, clouds: Sequence[Float]) -> Float:
 
 
 def _without_humps(heights: Float) -> Float:
-    """Remove narrow humps, such as a vehicle that never left its place; slopes and kerbs stay.
+    """Remove narrow humps, such as a vehicle that never left its place. Slopes and kerbs stay.
 
     Morphological opening: Zhang et al., "A Progressive Morphological Filter for Removing Nonground
     Measurements from Airborne LIDAR Data", TGRS 2003.
@@ -138,12 +142,12 @@ def _slope_limited(heights: Float, rise: float) -> Float:
 
 
 def find_upright(sweeps: Sequence[Sweep]) -> Float:
-    """Return (3,3) ``R_level_lidar``, which turns the lidar's axes so that z is up.
+    """Return (3,3) ``R_level_lidar``, which turns the axes of the lidar until z is up.
 
     The ground plane is found by RANSAC (Fischler, Bolles, "Random sample consensus", 1981): most
     points are on it, few below it, and the lidar is above it. A lidar is upside down if the ground
-    is found that way alone. The identity is returned where there is no ground, and for half the
-    slope that a height map follows.
+    is found only in that way. Without a ground, and for half the slope that a height map follows,
+    the identity is returned.
     """
     num = sum(map(len, sweeps)) // _NUM_POINTS + 1
     points = np.concatenate([s.points[::num] for s in sweeps])
@@ -163,7 +167,7 @@ def _level(up: Float) -> Float:
 
 
 def _ground_normal(points: Float) -> Float | None:
-    """Return the (3,) unit normal of the ground plane, upwards; None where there is none."""
+    """Return the (3,) unit normal of the ground plane, upwards, None without a ground."""
     if len(points) < 3:
         return None
     rng = np.random.default_rng(0)

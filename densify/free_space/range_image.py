@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Range images: what a sweep measured in each direction, and where it therefore saw free space.
+"""Build range images: the measurements of a sweep by direction, and its free space.
 
-A range image is built in the scanner's frame at each ray's firing time, where the rays form a
+A range image is built in the scanner's frame at the firing time of each ray, where the rays form a
 regular grid. Its cells follow the sensor: rows are its rings, columns its azimuth step, both
 measured in the returns (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for free space).
 
-A scanner without a firing order by azimuth (solid state, rosettes) faces a cell at several moments
-of a sweep. Each cell then keeps the middle of these times and their spread, which widens the
-margin. Its rays have no single density: images of several cell sizes are made, each twice as
-coarse as the one before, and each is used where enough of its cells are filled.
+A scanner without a firing order by azimuth (solid state, rosettes) faces a cell at several times of
+a sweep. Each cell then keeps the middle of these times and their spread, which widens the margin.
+Its rays have no single density. Therefore images of several cell sizes are made, each twice as
+coarse as the previous one, and each is used where enough of its cells are filled.
 """
 
 from __future__ import annotations
@@ -41,18 +41,23 @@ _PI = np.float32(np.pi)
 
 
 class ScannerImage(NamedTuple):
-    """One scanner's range image; columns start at azimuth -pi and wrap around.
+    """The range image of one scanner. Columns start at azimuth -pi and wrap around.
 
-    offset_s, spread_s: (1,C) or (R,C) float32, the middle of the times at which the scanner faced
-        the column or cell, and the largest difference from it.
-    settled_s: where a column has one time, the largest difference between two guesses of the time
-        at which a point is faced; more is the seam of the turn.
-    nearest_m: (R,C) float32, nearest return in the 3 x 3 cells around each cell, inf if none.
-    num_filled: (R,C) uint8, how many of these nine cells hold a return.
-    row_edges_rad: (R+1,) float32 ascending elevations.
-    origin_m: (3,) float32 of the scanner in the lidar frame. axes: (3,3) float32 to its own axes.
-    twists: (2,6) float32 of the lidar before and after the reference time.
-    from_m, to_m: range in which it is used.
+    Attributes:
+        offset_s: (1,C) or (R,C) float32, middle of the times at which the scanner faced the
+            column or cell.
+        spread_s: The same shape, greatest difference from that time.
+        settled_s: If a column has one time, the greatest difference between two guesses of the
+            time at which a point is faced. A larger one is at the seam of the turn.
+        nearest_m: (R,C) float32, nearest return in the 3 x 3 cells around each cell, inf if
+            none.
+        num_filled: (R,C) uint8, number of these nine cells with a return.
+        row_edges_rad: (R+1,) float32 ascending elevations.
+        origin_m: (3,) float32 of the scanner in the lidar frame.
+        axes: (3,3) float32 to its own axes.
+        twists: (2,6) float32 of the lidar before and after the reference time.
+        from_m: Least range at which it is used.
+        to_m: Greatest range at which it is used.
     """
 
     offset_s: Float32
@@ -68,7 +73,7 @@ class ScannerImage(NamedTuple):
     to_m: float
 
     def in_range(self, points: Float32) -> Bool:
-        """Return (N,) whether the image is used for points (N,3), lidar frame."""
+        """Return (N,) True for points (N,3), lidar frame, at which the image is used."""
         if self.from_m == 0 and self.to_m == np.inf:
             return np.ones(len(points), bool)
         away = points - self.origin_m
@@ -84,11 +89,13 @@ class RangeImage:
 
     @staticmethod
     def of(registered: RegisteredSweep, num_together: int = 1, by_ring: bool = False) -> RangeImage:
-        """Build the images of a deskewed sweep.
+        """Return the images of a deskewed sweep.
 
-        num_together: sweeps that will be asked together; the columns are as many times finer.
-        by_ring: also use rings one by one: dense rings for far points, where an error of
-            registration is smaller than their distance, and lone rings right at their rays.
+        Args:
+            num_together: Number of sweeps that are tested together. The columns are finer by
+                this factor.
+            by_ring: Use rings one by one too: dense rings for far points, where an error of
+                registration is smaller than their distance, and single rings right at their rays.
         """
         scanners: list[ScannerImage] = []
         for lidar in np.unique(registered.sweep.lidar).tolist():
@@ -105,12 +112,14 @@ class RangeImage:
     ) -> Bool:
         """Return (N,) True where the space at points (N,3) is certainly free.
 
-        Concretely: of the 3 x 3 cells around the point's direction at least ``min_filled`` hold a
-        return, and every return in them is farther than the point by more than
-        ``max(margin_m, margin_fraction * range)``. A larger margin tolerates errors of
-        registration and misses movers close to a background.
+        Of the 3 x 3 cells around the direction of the point, at least ``min_filled`` must hold a
+        return. Every return in them must be farther than the point by more than ``max(margin_m,
+        margin_fraction * range)``. A larger margin tolerates errors of registration and misses
+        moving objects close to a background.
 
-        points: lidar frame at the reference time. velocity_m_s: (N,3) of points that move.
+        Args:
+            points: Lidar frame at the reference time.
+            velocity_m_s: (N,3) of moving points.
         """
         beyond = self.num_beyond(points, (margin_m, margin_fraction), min_filled, velocity_m_s)
         return np.asarray((beyond >= min_filled).any(axis=0))
@@ -124,8 +133,8 @@ class RangeImage:
     ) -> NDArray[np.int16]:
         """Return (S,N) for each image the filled cells around each point, if all are farther.
 
-        The number is far below 0 where a return is not farther (see `sees_through`), and 0 where
-        fewer than ``least`` cells are filled. The numbers of several sweeps may be added.
+        The number is far below 0 if a return is not farther (see `sees_through`), and 0 if fewer
+        than ``least`` cells are filled. The numbers of several sweeps may be added.
         """
         points32 = np.ascontiguousarray(points, np.float32)
         velocity = np.zeros((0, 3), np.float32)
@@ -147,8 +156,8 @@ class RangeImage:
 class _Cells(NamedTuple):
     """The cells of one image: edges of the rows (R+1,), and the range in which it is used.
 
-    lone: every other row is a lone ring, the others lie between. coarser: used only where the
-    image before has too many empty cells.
+    lone: every other row is a single ring, the others are between. coarser: used only where the
+    previous image has too many empty cells.
     """
 
     row_edges_rad: Float32
@@ -228,7 +237,7 @@ def _over_3x3(join: Callable[..., Any], cells: NDArray[Any], empty: float) -> ND
 
 
 def _offset_per_column(column: Int, offset_s: Float32, num_columns: int) -> Float32:
-    """Return the (C,) mean firing time of each column; of an empty one that of its neighbours."""
+    """Return the (C,) mean firing time of each column. An empty one has that of its neighbours."""
     num_rays, sum_s = np.bincount(column), np.bincount(column, offset_s)
     filled = np.flatnonzero(num_rays)
     if not len(filled):
@@ -264,7 +273,7 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
 
 
 def _cells_of_rings(rings: Float, step: float, by_ring: bool) -> list[_Cells]:
-    """Reach half way to the next ring with each row, and as far outwards with the outermost."""
+    """Return cells that reach half way to the next ring, and as far outwards at the outermost."""
     middle = 0.5 * (rings[1:] + rings[:-1])
     outer: Float = 2 * rings[[0, -1]] - middle[[0, -1]]
     edges: Float = np.concatenate([outer[:1], middle, outer[1:]])
@@ -286,9 +295,10 @@ def _grid(edges: NDArray[np.floating], step: float) -> _Cells:
 
 
 def _no_closer(edges: Float, distance: float) -> Float:
-    """Drop edges so that rows are at least this high; the first and the last edge stay.
+    """Drop edges until rows are at least this high. The first and the last edge stay.
 
-    Rows of dense rings are joined: a slight error of registration would leave their cells.
+    Rows of dense rings are joined, because with a slight error of registration points leave their
+    cells.
     """
     kept = [edges[0]]
     for edge in edges[1:]:

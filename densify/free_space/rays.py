@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Compiled loops of range images: rays put back to their firing times, and points looked up."""
+"""Move rays back to their firing times, and look up points in range images; compiled loops."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _azimuth(x, y):  # type: ignore[no-untyped-def]
 
 @inlined
 def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
-    """Return the column; columns start behind, and a point without a direction is in the first."""
+    """Return the column. Columns start behind, and a point without a direction is in the first."""
     if not abs(azimuth) <= _PI:
         return np.int32(0)
     # 32 bits: many at once where it is called in a loop.
@@ -71,9 +71,9 @@ def _rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
 
 @inlined
 def _at_time(x, y, z, time_s, twists):  # type: ignore[no-untyped-def]
-    """Move a point from the reference time to the lidar frame at ``time_s``; undoes deskewing.
+    """Move a point from the reference time to the lidar frame at ``time_s``: undo deskewing.
 
-    The rotation is taken to second order: within a sweep it stays below 0.1 rad.
+    The rotation is taken to second order, because within a sweep it stays below 0.1 rad.
     """
     w = 0 if time_s < _ZERO else 1
     rx, ry, rz = twists[w, 0] * time_s, twists[w, 1] * time_s, twists[w, 2] * time_s
@@ -102,11 +102,17 @@ def _from_scanner(x, y, z, size, origin, R):  # type: ignore[no-untyped-def]
 
 @Kernel
 def aim(begin, end, points, offset_s, origin, axes, twists, rays):  # type: ignore[no-untyped-def]
-    """Find the rays that measured a deskewed scanner's points, seen from it at their firing times.
+    """Fill ``rays`` (3,N) with azimuth and elevation (rad) and range (m) of a scanner's points.
 
-    points: (N,3) lidar frame at the reference time. offset_s: (N,). origin: (3,) of the scanner.
-    axes: (3,3) from the lidar frame's to the scanner's. twists: (2,6) before and after the
-    reference time. rays: (3,N), filled with azimuth and elevation (rad) and range (m). All float32.
+    The points are deskewed. Each is taken in the scanner's frame at its firing time. All arrays are
+    float32.
+
+    Args:
+        points: (N,3) lidar frame at the reference time.
+        offset_s: (N,) firing times.
+        origin: (3,) of the scanner.
+        axes: (3,3) from the axes of the lidar frame to the scanner's.
+        twists: (2,6) before and after the reference time.
     """
     x, y, z = np.empty((3, 1), np.float32)
     for i in range(begin, end):
@@ -129,9 +135,9 @@ def _speed(x, y, z, vx, vy, vz, twist):  # type: ignore[no-untyped-def]
 
 @inlined
 def _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column):  # type: ignore[no-untyped-def]
-    """Find when the scanner faced each of ``size`` points, and move them to that time, in place.
+    """Find the time at which the scanner faced each of ``size`` points, and move them to that time.
 
-    Two rounds from the place at the reference time converge.
+    Two rounds from the position at the reference time converge.
     """
     num_columns, by_azimuth = image.nearest_m.shape[1], len(image.offset_s) == 1
     for k in range(size):
@@ -168,14 +174,18 @@ def _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row,
 
 @Kernel
 def see_beyond(begin, end, points, velocity, image, margins, least, beyond):  # type: ignore[no-untyped-def]
-    """Count the returns of one scanner that lie beyond points.
+    """Count the returns of one scanner that are beyond points.
 
-    Adds to ``beyond`` (N,) int16 how many of the 3 x 3 cells around each point hold a return, or
-    subtracts `HIDES` where one of these is not beyond it.
+    ``beyond`` (N,) int16 is increased by the number of the 3 x 3 cells around each point with a
+    return, or decreased by `HIDES` if one of these returns is not beyond it. All other arrays are
+    float32.
 
-    points: (N,3) lidar frame at the reference time. velocity: (N,3) m/s, or (0,3) if none moves.
-    image: `densify.free_space.range_image.ScannerImage`. margins: (2,) metres and share of the
-    range. All float32. least: fewer filled cells say nothing.
+    Args:
+        points: (N,3) lidar frame at the reference time.
+        velocity: (N,3) m/s, or (0,3) if none moves.
+        image: `densify.free_space.range_image.ScannerImage`.
+        margins: (2,) metres and share of the range.
+        least: Fewer filled cells are no evidence.
     """
     moving, by_azimuth = len(velocity) > 0, len(image.offset_s) == 1
     settled_s = np.float32(image.settled_s)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The rays of one scanner, and how it samples directions: rings, lines, or neither.
+"""Measure the rays of one scanner, and how it samples directions: rings, lines, or neither.
 
-Every return is put back to the moment it was fired and seen from where its scanner stood then:
-only there do the returns of a turning scanner lie on rings. Angles are in radians.
+Every return is moved back to its firing time and to the frame of its scanner at that time. Only
+there are the returns of a spinning scanner on rings. Angles are in radians.
 """
 
 from __future__ import annotations
@@ -44,9 +44,10 @@ _WINDOWS = (1, 3, 5, 9, 17, 33)  # cells
 
 
 class Aimed(NamedTuple):
-    """The rays of one scanner at their firing times, from where it stood; (N,) float32 each.
+    """The N rays of one scanner at their firing times, in its frame; (N,) float32 each.
 
-    offset_s: seconds after the sweep's reference time.
+    Attributes:
+        offset_s: Seconds after the reference time of the sweep.
     """
 
     azimuth: Float32
@@ -56,7 +57,7 @@ class Aimed(NamedTuple):
 
 
 def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
-    """Return the rays of one scanner; deskewing, which moved its points, is undone."""
+    """Return the rays of one scanner, with deskewing undone."""
     sweep = registered.sweep
     rows = np.flatnonzero(sweep.lidar == lidar)
     offset_s = np.zeros(len(rows), np.float32)
@@ -76,11 +77,15 @@ def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
 
 
 class RayTable(NamedTuple):
-    """Angles between neighbouring rays, (B,C) float32: ``across`` along the azimuth and ``along``
-    the elevation.
+    """Angles between neighbouring rays, by direction.
 
-    Row b is about the elevations from ``low_rad + b * bin_rad``, the outermost about all beyond;
-    column c about the azimuths from ``-pi + c * 2 pi / C``. C is 1 where they do not matter.
+    Attributes:
+        across: (B,C) float32 along the azimuth.
+        along: (B,C) float32 along the elevation.
+        low_rad: Row b is for elevations from ``low_rad + b * bin_rad``. The outermost rows are
+            for all beyond.
+        bin_rad: Height of a row. Column c is for azimuths from ``-pi + c * 2 pi / C``; C is 1
+            if they do not matter.
     """
 
     low_rad: float
@@ -98,13 +103,15 @@ class RayTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """How a scanner samples directions.
+    """The sampling of directions by a scanner.
 
-    rings_rad: (K,) elevation of every ring, ascending; None if there are no distinct rings.
-    unordered: there are no lines either, or the firing time does not go with the azimuth (solid
-        state, rosettes).
-    azimuth_step_rad: between rays of a ring or line; of an unordered scanner the usual spacing.
-    table: of the spacings.
+    Attributes:
+        rings_rad: (K,) elevation of every ring, ascending; None if there are no distinct rings.
+        unordered: There are no lines either, or the firing time does not follow the azimuth
+            (solid state, rosettes).
+        azimuth_step_rad: Angle between rays of a ring or line; the usual spacing of an
+            unordered scanner.
+        table: The spacings.
     """
 
     rings_rad: Float | None
@@ -114,10 +121,10 @@ class Layout:
 
 
 def measure(sweeps: Sequence[Aimed]) -> Layout:
-    """Measure a scanner by its rays in a few sweeps.
+    """Return the layout of a scanner, measured by its rays in a few sweeps.
 
-    The returns of lasers that do not share an origin smear over those of other rings where they
-    are near, as KITTI's HDL-64E. They still follow at even steps along the azimuth: lines.
+    The returns of lasers that do not share an origin smear over those of other rings at close
+    range, as for KITTI's HDL-64E. They still follow at even steps along the azimuth: lines.
     """
     if sum(len(rays.azimuth) for rays in sweeps) < FEW_POINTS:
         step, along = _DEFAULT_RAD
@@ -138,11 +145,11 @@ def measure(sweeps: Sequence[Aimed]) -> Layout:
 
 
 def find_rings(elevation: Float32) -> Float | None:
-    """Return (K,) ascending elevations of the beams; None if the returns do not lie on rings.
+    """Return (K,) ascending elevations of the beams, None if the returns are not on rings.
 
-    They do not for several scanners taken for one, processed clouds, scanners that have none, and
-    lasers that do not share an origin. The rings are the peaks of a fine histogram, if they stand
-    alone and hold nearly all returns; each is then the mean of the returns close to it.
+    There are no rings for several scanners taken for one, processed clouds, scanners without rings,
+    and lasers that do not share an origin. The rings are the peaks of a fine histogram, if they are
+    separate and hold nearly all returns. Each is then the mean of the returns close to it.
     """
     of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
     returns = np.bincount(of_return, minlength=int(np.pi / _RING_BIN_RAD) + 2).astype(float)
@@ -161,7 +168,10 @@ def find_rings(elevation: Float32) -> Float | None:
 
 
 def fires_by_azimuth(rays: Aimed) -> bool:
-    """Return True if all returns of a column are fired within a moment, or nothing tells when."""
+    """Return True if all returns of a column are fired at nearly the same time.
+
+    Without times the result is True.
+    """
     duration_s = float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
     if duration_s == 0.0:
         return True
@@ -174,7 +184,7 @@ def fires_by_azimuth(rays: Aimed) -> bool:
 
 
 def _some_sectors(rays: Aimed) -> Aimed:
-    """Return every fourth sector of a view all round, which tells as much."""
+    """Return every fourth sector of a view all round, which is enough evidence."""
     if len(rays.azimuth) > _MANY_POINTS:
         some = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
         if some.mean() > 0.1:
@@ -183,7 +193,10 @@ def _some_sectors(rays: Aimed) -> Aimed:
 
 
 def _gaps(group: NDArray[Any], angle: Float32) -> Float:
-    """Return the gaps between neighbouring angles of the same group; group: (N,) whole numbers."""
+    """Return the gaps between neighbouring angles of the same group.
+
+    group: (N,) whole numbers.
+    """
     apart = 4 * np.pi  # more than angles of one group can be
     found: Float = np.diff(np.sort(group * apart + angle.astype(np.float64)))
     return found[found < 2 * np.pi]
@@ -197,8 +210,11 @@ def _step_along(azimuth: Float32, ring: NDArray[Any]) -> float:
 
 
 def _even_step(rays: Aimed) -> tuple[float, float]:
-    """Return the usual azimuth between returns of about the same elevation, and the share of all
-    that follow at that distance: more than half of a turning scanner's, a fifth of strewn ones."""
+    """Return the usual azimuth between returns of about the same elevation, and their share.
+
+    More than half of the returns of a spinning scanner follow at that distance, and a fifth of
+    scattered ones.
+    """
     gap = _gaps(np.floor(rays.elevation / _BAND_RAD), rays.azimuth)
     gap = gap[gap > _LEAST_GAP_RAD]
     if not len(gap):
@@ -208,7 +224,7 @@ def _even_step(rays: Aimed) -> tuple[float, float]:
 
 
 def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
-    """The spacing at a ring is the mean of the gaps to both its neighbours."""
+    """Return spacings: at a ring the mean of the gaps to both its neighbours."""
     low = float(rings[0]) - _BEYOND_RAD
     num_bins = int((float(rings[-1]) + _BEYOND_RAD - low) / _RING_BIN_RAD) + 1
     elevation = low + (np.arange(num_bins) + 0.5) * _RING_BIN_RAD
@@ -217,8 +233,10 @@ def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
 
 
 def _table_of_lines(sweeps: Sequence[Aimed], step_rad: float) -> RayTable:
-    """Medians by elevation of the gaps within sectors of 1 degree, without those of one line and
-    those over missing returns."""
+    """Return medians by elevation of the gaps within sectors of 1 degree.
+
+    Gaps within one line and those over missing returns are left out.
+    """
     gaps, middles = [], []
     for rays in sweeps:
         sector = np.floor(rays.azimuth / _COLUMN_RAD)
@@ -248,8 +266,10 @@ def _table(low: float, bin_rad: float, across: Float, along: Float) -> RayTable:
 
 
 def _table_of_density(sweeps: Sequence[Aimed]) -> RayTable:
-    """The side of the square that each return of a sweep has to itself, by direction: returns are
-    counted in the smallest window around each cell of a degree that holds enough."""
+    """Return the side of the square that each return of a sweep has to itself, by direction.
+
+    Returns are counted in the smallest window around each cell of a degree that holds enough.
+    """
     low = float(min(r.elevation.min() for r in sweeps))
     rows = int((float(max(r.elevation.max() for r in sweeps)) - low) / _CELL_RAD) + 1
     columns = round(2 * np.pi / _CELL_RAD)
@@ -273,6 +293,6 @@ def _table_of_density(sweeps: Sequence[Aimed]) -> RayTable:
 
 
 def _in_windows(values: Float, cells: int) -> Float:
-    """Return the sums over square windows; azimuth goes round."""
+    """Return the sums over square windows. The azimuth wraps around."""
     mean: Float = ndimage.uniform_filter(values, cells, mode=("constant", "wrap"))
     return mean * cells**2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Free-space violations: the points of one sweep that other sweeps saw through."""
+"""Find free-space violations: the points of one sweep that other sweeps saw through."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ _MARGIN_M, _MARGIN_FRACTION = 0.4, 0.015  # the larger one; forgives errors of r
 def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
     """Return the range image of each sweep, with single rings where that is safe.
 
-    num_together: sweeps in a batch, see `densify.geometry.clock.num_in_batch`.
+    Args:
+        num_together: Number of sweeps in a batch, see `densify.geometry.clock.num_in_batch`.
     """
     image = partial(RangeImage.of, num_together=num_together, by_ring=True)
     with ThreadPoolExecutor() as pool:
@@ -36,8 +37,12 @@ def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[R
 class FreeSpace:
     """The free space that each of W sweeps observed.
 
-    images: (W,). T_lidar_world: (W,) of (4,4). clock: of the sweeps. sensors: angles between rays.
-    batches: sweeps that are tested together, see `Clock.batches`.
+    Attributes:
+        images: (W,).
+        T_lidar_world: (W,) of (4,4).
+        clock: Of the sweeps.
+        sensors: Angles between rays.
+        batches: Sweeps that are tested together, see `Clock.batches`.
     """
 
     images: tuple[RangeImage, ...]
@@ -48,7 +53,11 @@ class FreeSpace:
 
     @staticmethod
     def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
-        """images: of the sweeps, as `range_images` makes them; None makes them."""
+        """Return the free space of a stretch.
+
+        Args:
+            images: Of the sweeps, as in `range_images`; None makes them.
+        """
         clock = Clock.of(stretch)
         if images is None:
             images = range_images(stretch.sweeps, num_in_batch(clock.period_ns * 1e-9))
@@ -75,13 +84,14 @@ class FreeSpace:
         return {j: batch for batch in self.batches for j in batch}
 
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
-        """Return (N,) True where the batch of sweep j certainly saw free space.
+        """Return (N,) True where the batch of sweep j certainly observed free space.
 
-        No sweep of the batch may have a return near the point's direction that is not clearly
+        No sweep of the batch may have a return near the direction of the point that is not clearly
         farther away, and all together must have enough returns there.
 
-        points: (N,3) world, at the reference time of sweep j.
-        velocity_m_s: (N,3) of moving points, world.
+        Args:
+            points: (N,3) world, at the reference time of sweep j.
+            velocity_m_s: (N,3) of moving points, world.
         """
         batch, num_beyond = self._batch_of[j], []
         for k in batch:

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The scanners of a recording, measured from its own sweeps: where they stand, in which directions
-they look, and how far apart their rays are."""
+"""Measure the scanners of a recording in its own sweeps: position, field of view, ray spacing."""
 
 from __future__ import annotations
 
@@ -23,8 +22,12 @@ _HOLE_RAD = np.deg2rad(45.0)  # a building may hide as much
 class RayGrid(NamedTuple):
     """Cells of about one ray of a sweep each.
 
-    Rows go up: ``row_of`` (B+1,) counts them, a fraction at will, from elevation ``low_rad`` in
-    steps of ``bin_rad``. Columns go left from azimuth -pi, all round.
+    Columns go left from azimuth -pi, all round.
+
+    Attributes:
+        low_rad: Elevation of the first bin.
+        bin_rad: Height of a bin.
+        row_of: (B+1,) number of rows, which go up, below each bin; may be a fraction.
     """
 
     low_rad: float
@@ -38,11 +41,12 @@ class RayGrid(NamedTuple):
 class SensorModel(Layout):
     """One scanner.
 
-    origin_m: (3,) lidar frame, where its rays start.
-    axes: (3,3) from the lidar frame's to its own, in which its angles are.
-    elevation_rad: (2,) the lowest and the highest ray.
-    azimuth_rad: (2,) the rightmost and the leftmost ray; -pi and pi for a view all round, and
-        right > left where the view holds the direction backwards.
+    Attributes:
+        origin_m: (3,) origin of its rays, lidar frame.
+        axes: (3,3) from the axes of the lidar frame to its own, in which its angles are.
+        elevation_rad: (2,) lowest and highest ray.
+        azimuth_rad: (2,) rightmost and leftmost ray; -pi and pi for a view all round, and right
+            > left if the view holds the backward direction.
     """
 
     origin_m: Float
@@ -52,7 +56,7 @@ class SensorModel(Layout):
 
     @staticmethod
     def of(sweeps: Sequence[RegisteredSweep], lidar: int) -> SensorModel:
-        """Measure a scanner in at most three deskewed sweeps with its returns, evenly spread."""
+        """Return a scanner, measured in at most three deskewed sweeps with its returns."""
         holding = [s for s in sweeps if (s.sweep.lidar == lidar).any()]
         middles = (np.arange(_NUM_SWEEPS) + 0.5) * len(holding) / _NUM_SWEEPS
         chosen = [holding[i] for i in np.unique(middles.astype(int))]
@@ -68,8 +72,7 @@ class SensorModel(Layout):
 
     @property
     def grid(self) -> RayGrid:
-        """Return a row for each ring; for an unordered scanner, cells as small as its rays are
-        close where they are closest."""
+        """The cells: a row for each ring; for an unordered scanner as small as its closest rays."""
         low, bin_rad = self.table.low_rad, self.table.bin_rad
         if self.unordered:
             bin_rad = float(np.percentile(self.table.along, 5))
@@ -85,8 +88,10 @@ class SensorModel(Layout):
         return RayGrid(low, bin_rad, row_of, int(row_of[-1]) + 2, num_columns)
 
     def directions(self, points: Float) -> tuple[Float, Float, Float]:
-        """Return azimuth, elevation (rad) and range (m), (N,) each, of points (N,3), lidar frame,
-        seen from the scanner."""
+        """Return azimuth, elevation (rad) and range (m), (N,) each, of points (N,3), lidar frame.
+
+        They are relative to the scanner.
+        """
         away = points - self.origin_m
         x, y, z = (away if np.array_equal(self.axes, np.eye(3)) else away @ self.axes.T).T
         level = np.hypot(x, y)
@@ -102,10 +107,10 @@ class SensorModel(Layout):
         return inside & (elevation >= low) & (elevation <= high)
 
     def gap_m(self, points: Float) -> tuple[Float, Bool]:
-        """Return (N,) metres from points (N,3), lidar frame, to the next ring, or to the next ray
-        of a scanner without rings, and (N,) True where the scanner sees that way.
+        """Return (N,) metres from points (N,3), lidar frame, to the next ring, and (N,) in view.
 
-        The width of a beam is added: a return may be from anywhere in its spot.
+        A scanner without rings has the distance to the next ray. The width of a beam is added,
+        because a return may be from anywhere in its spot.
         """
         azimuth, elevation, range_m = self.directions(points)
         gap_rad = self.table.at(azimuth, elevation)[:, 1]
@@ -120,13 +125,13 @@ class Sensors:
 
     @staticmethod
     def of(sweeps: Sequence[RegisteredSweep]) -> Sensors:
-        """Measure every scanner that the deskewed sweeps hold returns of."""
+        """Return every scanner of the deskewed sweeps, measured."""
         numbers = {int(n) for s in sweeps for n in np.unique(s.sweep.lidar)}
         return Sensors({n: SensorModel.of(sweeps, n) for n in sorted(numbers)})
 
     @property
     def origins_m(self) -> Float:
-        """Return (S,3) lidar frame, by number; zeros of numbers that no scanner has."""
+        """The (S,3) origins by number, lidar frame; zeros for numbers without a scanner."""
         origins_m = np.zeros((1 + max(self.models, default=0), 3))
         for number, model in self.models.items():
             origins_m[number] = model.origin_m
@@ -141,16 +146,20 @@ class Sensors:
         return gap_m
 
     def finest_gap_m(self, points: Float) -> Float:
-        """Return the same of the scanner that sees each point most finely; of the coarsest where
-        none sees it."""
+        """Return the gap of the scanner with the finest view of each point.
+
+        For a point out of all views it is that of the coarsest scanner.
+        """
         gaps_m, sees = zip(*(m.gap_m(points) for m in self.models.values()), strict=True)
         finest = np.where(sees, gaps_m, np.inf).min(axis=0)
         return np.where(np.isfinite(finest), finest, np.max(gaps_m, axis=0))
 
 
 def _view(azimuth: Float32) -> tuple[float, float]:
-    """Return the ends of the widest gap without returns; all round unless that is wider than what
-    a building hides."""
+    """Return the ends of the widest gap without returns.
+
+    The view is all round unless the gap is wider than a building can cause.
+    """
     angles = np.unique(azimuth).astype(np.float64)
     gap = np.diff(angles, append=angles[0] + 2 * np.pi)
     widest = int(np.argmax(gap))

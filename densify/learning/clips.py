@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Clips: a few neighbouring sweeps of a recording, made ready for a network.
+"""Prepare clips for a network: a few neighbouring sweeps of a recording.
 
-They are registered and deskewed, without the ground, and with the flow of every sweep to its
-neighbours where labels are asked for.
+They are registered and deskewed, without the ground. With labels they have the flow of every sweep
+to its neighbours.
 """
 
 from __future__ import annotations
@@ -34,9 +34,14 @@ _POSES_GIVEN = {"register": {"source": "dataset"}}
 class ClipSweep:
     """The points of a sweep above the ground.
 
-    points: (n,3) metres, world axes about the clip's origin. height_m: (n,) above the ground.
-    origin_m: (3,) the scanner. time_s: since the first sweep. flow: (2,n,3) metres, to the previous
-    sweep and to the next, 0 where there is none. moving: (n,). Both are None without labels.
+    Attributes:
+        points: (n,3) metres, world axes about the clip's origin.
+        height_m: (n,) above the ground.
+        origin_m: (3,) the scanner.
+        time_s: Since the first sweep.
+        flow: (2,n,3) metres, to the previous sweep and to the next, 0 without one; None without
+            labels.
+        moving: (n,); None without labels.
     """
 
     points: Float32
@@ -53,9 +58,11 @@ Clip = tuple[ClipSweep, ...]
 
 @dataclass(frozen=True)
 class ClipMaker:
-    """Makes clips by number: the same number, the same clip, in any process.
+    """Make clips by number: the same number gives the same clip, in any process.
 
-    data: specifications of recordings, or `STREETS`. teacher: as of `make_clip`.
+    Attributes:
+        data: Specs of recordings, or `STREETS`.
+        teacher: As in `make_clip`.
     """
 
     data: tuple[str, ...]
@@ -65,8 +72,9 @@ class ClipMaker:
     def __call__(self, number: int) -> Clip:
         """Make one clip.
 
-        Raises InputError for a recording that cannot be read or has no truth where that is asked
-        for; ComputationError where none of several places can be registered.
+        Raises:
+            InputError: A recording cannot be read, or lacks the truth that is asked for.
+            ComputationError: None of several places can be registered.
         """
         rng = np.random.default_rng([self.seed, number])
         spec = self.data[int(rng.integers(len(self.data)))]
@@ -107,8 +115,9 @@ def _new_street(spec: str, rng: np.random.Generator) -> Street:
 def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
     """Return the sweeps around a key.
 
-    teacher: "truth" or "engine" labels them with the truth or the scene flow of this package's
-    engine; any other word leaves them without.
+    Args:
+        teacher: "truth" or "engine" labels them with the truth or with the scene flow of this
+            package's engine; another word leaves them without labels.
     """
     stretch = Recording(sequence, settings, NUM_SWEEPS // 2, [key]).window(key)
     heights, frames = ground(stretch), stretch.frames

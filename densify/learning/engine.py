@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A trained network as an engine: its flow proposes, the proof of `densify.flow.tracking` decides.
+"""Use a trained network as an engine: its flow proposes, `densify.flow.tracking` decides.
 
-Where the network sees points move, groups start with the velocity that it sees. They are followed
-and proven as by the engine ``groups``. Whatever else the network says moves nothing.
+Where the network finds moving points, groups start with its velocity. They are followed and
+confirmed as by the engine ``groups``. The network alone moves nothing.
 """
 
 from __future__ import annotations
@@ -23,12 +23,16 @@ MOVES_M_S = 0.5
 
 
 def check_argument(argument: str) -> None:
-    """Raise InputError unless it names a model."""
+    """Raise InputError unless the argument names a model."""
     read_model(Path(argument))
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """See `densify.flow.engines.EngineModule`. argument: the model's file."""
+    """See `densify.flow.engines.EngineModule`.
+
+    Args:
+        argument: The model's file.
+    """
     model, sweeps = read_model(Path(argument)), scene.stretch.sweeps
     rows = zip(sweeps, scene.candidates, strict=True)
     standing = [AboveGround.of(sweep, scene.ground, found.row) for sweep, found in rows]
@@ -46,9 +50,10 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
 
 
 def flows_of(model: Model, standing: list[AboveGround], origins: list[Float]) -> list[Float]:
-    """Return (n,3) metres for each sweep: to the next, of the last one to the one before; world.
+    """Return (n,3) metres for each sweep to the next, of the last one to the previous; world.
 
-    origins: (3,) world, the scanner at each sweep.
+    Args:
+        origins: (3,) world, the scanner at each sweep.
     """
     flows = []
     for i, own in enumerate(standing):
@@ -71,8 +76,8 @@ def _grouped(
 ) -> tuple[Candidates, Float]:
     """Return the points of sweep i that may start a track, and their (n,3) velocities, m/s.
 
-    Clusters of points that the network sees move may start one; those of the evidence alone may
-    only be found again by one that was started elsewhere.
+    Clusters of points that move by the network may start one. Clusters of the evidence alone may
+    only join a track that was started elsewhere.
     """
     moves = np.linalg.norm(velocity_m_s, axis=1) >= MOVES_M_S
     registered = scene.stretch.sweeps[i]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scene flow labels from tracked boxes: the flow of each sweep to the next one."""
+"""Make scene flow labels from tracked boxes: the flow of each sweep to the next one."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ from densify.pipeline.recording import Recording
 class Label:
     """The label of one sweep.
 
-    after: the next sweep. sure: (N,) mask of the points that count. T_next_here: (4,4) from the
-    sweep's lidar frame to the next sweep's.
+    Attributes:
+        after: The next sweep.
+        sure: (N,) mask of the points that count.
+        T_next_here: (4,4) from the lidar frame of the sweep to that of the next sweep.
     """
 
     registered: RegisteredSweep
@@ -40,8 +42,13 @@ def label_sweeps(
 ) -> Iterator[tuple[int, Label | ComputationError | InputError]]:
     """Yield the label of each sweep, or the error that prevents it, with its frame.
 
-    Sweeps without a next sweep or without boxes are left out. config: where poses come from.
-    Raises InputError for a recording without boxes.
+    Sweeps without a next sweep or without boxes are left out.
+
+    Args:
+        config: Says where poses come from.
+
+    Raises:
+        InputError: The recording has no boxes.
     """
     boxes = getattr(sequence, "boxes", None)
     if boxes is None or all(boxes(frame) is None for frame in sequence.frames):
@@ -77,7 +84,9 @@ def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: in
 def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
     """Write a flow file with ``valid``, complete or not at all.
 
-    Raises InputError for a file that exists, OutputError where it cannot be written.
+    Raises:
+        InputError: The file exists.
+        OutputError: It cannot be written.
     """
     sweep, field = label.registered.sweep, label.field
     path = folder / f"{sweep.frame:06d}_{label.after.frame:06d}.npz"

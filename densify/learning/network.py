@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""A network for whole sweeps: points to a grid of pillars, a U-Net over it, and back to points.
+"""Define a network for whole sweeps: points to a grid of pillars, a U-Net, back to points.
 
 It follows FastFlow3D (Jund et al., "Scalable Scene Flow from Point Clouds in the Real World", RA-L
-2022) and DeFlow (Zhang et al., ICRA 2024) and is small enough for a CPU. The points of each sweep
+2022) and DeFlow (Zhang et al., ICRA 2024), and is small enough for a CPU. The points of each sweep
 are encoded one by one and averaged over the cells of a grid of 0.4 m. The grids of all sweeps go
 through one U-Net, which can compare them. Each source point reads the result at its position,
 joined to its own code, and two more layers give its flow.
 
-A model file is numpy's archive of arrays, read without running any code: ``header`` holds JSON
+A model file is numpy's archive of arrays, read without running any code. ``header`` holds JSON
 (format, version, network, how it was trained), ``weights/NAME`` the network's arrays.
 """
 
@@ -53,8 +53,10 @@ _LARGEST_HEIGHT_M = 4.0
 class NetworkCloud(NamedTuple):
     """One sweep of n points.
 
-    points: (n,3) float32 metres, world axes (z up) about the scanner at the time of the *source*
-    sweep. height_m: (n,) float32 above the ground.
+    Attributes:
+        points: (n,3) float32 metres, world axes (z up) about the scanner at the time of the
+            *source* sweep.
+        height_m: (n,) float32 above the ground.
     """
 
     points: Tensor
@@ -64,7 +66,10 @@ class NetworkCloud(NamedTuple):
 class AboveGround(NamedTuple):
     """The points of a sweep above the ground.
 
-    row: (n,) in the sweep. points: (n,3) metres, world. height_m: (n,) above the ground.
+    Attributes:
+        row: (n,) in the sweep.
+        points: (n,3) metres, world.
+        height_m: (n,) above the ground.
     """
 
     row: Int
@@ -73,7 +78,7 @@ class AboveGround(NamedTuple):
 
     @staticmethod
     def of(registered: RegisteredSweep, ground: HeightMap, row: Int | None = None) -> AboveGround:
-        """Select the points above the ground, or those of the rows (n,)."""
+        """Return the points above the ground, or those of the rows (n,)."""
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
         row = np.flatnonzero(height_m >= ABOVE_GROUND_M) if row is None else row
@@ -88,7 +93,7 @@ class AboveGround(NamedTuple):
 def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> list[int | None]:
     """Return the numbers of the sweeps that a network gets for the flow from source to target.
 
-    Source and target come first, then the sweeps before the source in that direction of time; None
+    Source and target come first, then the sweeps before the source in that direction of time, None
     beyond the first and the last sweep.
     """
     step = source - target
@@ -122,7 +127,7 @@ class Voxels(nn.Module):
             self.decode[-1].bias.zero_()  # type: ignore[operator, union-attr]
 
     def forward(self, sweeps: Sweeps) -> Tensor:
-        """Return the flow (n,3) of the first sweep to the second, metres; 0 out of reach."""
+        """Return the flow (n,3) of the first sweep to the second, metres, 0 out of reach."""
         given = [*sweeps[:NUM_SWEEPS], *[None] * (NUM_SWEEPS - len(sweeps))]
         source = given[0]
         if source is None:
@@ -148,7 +153,7 @@ class Voxels(nn.Module):
         return flow.index_copy(0, first.row, decoded)
 
     def _unet(self, image: Tensor) -> Tensor:
-        """(1,C,256,256) -> (1,32,128,128)."""
+        """Return (1,32,128,128) codes of an image (1,C,256,256)."""
         levels = [image]
         for block in self.down:
             levels.append(block(levels[-1]))
@@ -167,7 +172,7 @@ def build(seed: int = 0) -> Voxels:
 
 
 class _Block(nn.Module):
-    """Two convolutions; groups are normalised, which needs no batch."""
+    """Two convolutions, normalised by groups, which needs no batch."""
 
     def __init__(self, num_in: int, num_out: int, stride: int) -> None:
         super().__init__()
@@ -186,11 +191,11 @@ class _Block(nn.Module):
 
 
 class _Pillars:
-    """The points of one sweep in reach, sorted by the cell they lie in.
+    """The points of one sweep in reach, sorted by cell.
 
-    row: (m,) of the sweep. cell: (m,) number of the cell. features: (m,6) offset from the cell's
-    middle in cells, height, and offset from the scanner in hundreds of metres. filled, size: (f,)
-    number and point count of each cell that holds points; of_point: (m,) which of them.
+    row: (m,) of the sweep. cell: (m,) number of the cell. features: (m,6) offset from the centre of
+    the cell in cells, height, and offset from the scanner in hundreds of metres. filled, size: (f,)
+    number and point count of each cell with points. of_point: (m,) index of the filled cell.
     """
 
     def __init__(self, row: Tensor, cell: Tensor, features: Tensor) -> None:
@@ -223,7 +228,7 @@ class _Pillars:
 
 
 def _at(image: Tensor, pillars: _Pillars) -> Tensor:
-    """Interpolate an image (1,C,128,128) at each point: (m,C)."""
+    """Return (m,C) an image (1,C,128,128), interpolated at each point."""
     cell = torch.stack([pillars.cell % NUM_CELLS, pillars.cell // NUM_CELLS], dim=1)
     at = (cell + pillars.features[:, :2] + 0.5) * (2.0 / NUM_CELLS) - 1.0
     found = functional.grid_sample(
@@ -239,23 +244,32 @@ _HEADER, _WEIGHTS = "header", "weights/"
 
 @dataclass(frozen=True)
 class Model:
-    """A network with its weights. made: how it was trained, plain values for JSON."""
+    """A network with its weights.
+
+    Attributes:
+        made: How it was trained, plain values for JSON.
+    """
 
     network: Voxels
     made: Mapping[str, Any] = field(default_factory=dict)
 
     def flow(self, sweeps: Sweeps) -> Float:
-        """Return the (n,3) flow of the first sweep to the second, metres; the same bytes on any
-        number of cores."""
+        """Return the (n,3) flow of the first sweep to the second, metres.
+
+        It has the same bytes on any number of cores.
+        """
         with on_one_thread(), torch.inference_mode():
             found: Float = self.network(sweeps).double().numpy()
         return found
 
 
 def write_model(path: Path, model: Model) -> None:
-    """Write a model file: the same bytes for the same model.
+    """Write a model file. The same model gives the same bytes.
 
-    The file appears when it is complete. Raises OutputError where it cannot be written.
+    The file appears when it is complete.
+
+    Raises:
+        OutputError: It cannot be written.
     """
     header = {"format": FORMAT, "version": VERSION, "network": NETWORK, "made": model.made}
     text = json.dumps(header, sort_keys=True).encode()
@@ -268,7 +282,11 @@ def write_model(path: Path, model: Model) -> None:
 
 
 def read_model(path: Path) -> Model:
-    """Read a model file. Raises InputError for another file, a damaged one, or another version."""
+    """Return the model of a file.
+
+    Raises:
+        InputError: It is another file, a damaged one, or another version.
+    """
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a model that densify train flow wrote")
     arrays = read_arrays(path)

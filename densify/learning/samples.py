@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Pairs of sweeps to train on, in an order that follows from a seed alone, and the losses of the
-teachers.
+"""Draw pairs of sweeps to train on, in an order that follows from a seed alone.
 
 The pairs of several clips come mixed, in both directions of time, and several times. Each time they
 are turned about the vertical, mirrored and scaled at random.
 
-The teacher ``objective`` is the published objective in m² per point (Pontes, Hays, Lucey, 3DV 2020,
-sections 3 and 4), with alpha = 4 (10 without learning) and a graph of 50 neighbours; it needs no
-labels. ``engine`` and ``truth`` compare with a known flow. Nearly all points are static, and a
-plain mean teaches a network to be static: the loss, in metres, is a sum of means over static
-points, points slower than 1 m/s, and faster ones (DeFlow, Zhang et al., ICRA 2024, eq. 5).
+The losses of the teachers are here too. ``objective`` is the published objective in m² per point
+(Pontes, Hays, Lucey, 3DV 2020, sections 3 and 4), with alpha = 4 (10 without learning) and a graph
+of 50 neighbours. It needs no labels. ``engine`` and ``truth`` compare with a known flow. Nearly all
+points are static, and a plain mean teaches a network to be static. Therefore the loss, in metres,
+is a sum of means over static points, points slower than 1 m/s, and faster ones (DeFlow, Zhang et
+al., ICRA 2024, eq. 5).
 """
 
 from __future__ import annotations
@@ -38,9 +38,13 @@ _SCALES = (0.95, 1.05)
 class Sample(NamedTuple):
     """One pair of sweeps.
 
-    sweeps: source, target, and those before the source. drawn: (d,) rows of the source that the
-    objective is computed for. drawn_target: (e,3) points of the target. in_reach: (n,) mask of the
-    source's points that count. flow: (n,3) tensor, moving: (n,), None without labels.
+    Attributes:
+        sweeps: Source, target, and those before the source.
+        drawn: (d,) rows of the source for the objective.
+        drawn_target: (e,3) points of the target.
+        in_reach: (n,) mask of the source's points that count.
+        flow: (n,3) tensor, None without labels.
+        moving: (n,), None without labels.
     """
 
     sweeps: Sweeps
@@ -63,7 +67,11 @@ def on_device(value: Any, device: torch.device) -> Any:
 
 
 def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
-    """Yield samples without end. num_wanted: sweeps that the network takes."""
+    """Yield samples without end.
+
+    Args:
+        num_wanted: Number of sweeps that the network takes.
+    """
     for group in count():
         mixed = [make(group * _NUM_MIXED + n) for n in range(_NUM_MIXED)]
         rng = np.random.default_rng([make.seed, group, 1])
@@ -75,7 +83,7 @@ def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
 
 
 def _pairs(c: int, clip: Clip, rng: np.random.Generator) -> list[tuple[int, int, int]]:
-    """Return as many (clip, source, target) of every clip, in rounds of all its pairs."""
+    """Return equally many (clip, source, target) of every clip, in rounds of all its pairs."""
     number = range(len(clip))
     found = [(c, i, j) for i in number for j in (i - 1, i + 1) if j in number]
     num_rounds = -(-_PAIRS_OF_CLIP // len(found))
@@ -92,8 +100,9 @@ def sample_of(
 ) -> Sample:
     """Return the sample of two neighbouring sweeps of a clip, by their numbers in it.
 
-    rng: turns, mirrors, scales and draws at random; None leaves the clouds as they are and draws
-    evenly.
+    Args:
+        rng: Turns, mirrors, scales and draws at random. None leaves the clouds as they are and
+            draws evenly.
     """
     here, there = clip[source], clip[target]
     change = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
@@ -152,8 +161,7 @@ def objective_loss(predict: Predict, sample: Sample) -> Tensor:
 
 
 def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the sum of the mean errors over static, slow and fast points of a sample with labels,
-    metres."""
+    """Return the sum of the mean errors over static, slow and fast points, metres."""
     flow, true, moving, counted = (
         predict(sample.sweeps),
         sample.flow,

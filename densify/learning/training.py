@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The training loop: samples, a teacher's loss, Adam.
+"""Train a network: samples, the loss of a teacher, Adam.
 
-The same seed gives the same weights, byte for byte, on CPUs of one kind: every sample follows from
+The same seed gives the same weights, byte for byte, on CPUs of one kind. Every sample follows from
 the seed and its number, and torch computes on one thread.
 """
 
@@ -31,7 +31,9 @@ _NUM_AVERAGED = 50  # losses
 class Training:
     """The settings of a training.
 
-    data: specifications of recordings. steps: pairs of sweeps to train on.
+    Attributes:
+        data: Specs of recordings.
+        steps: Number of pairs of sweeps.
     """
 
     data: tuple[str, ...]
@@ -44,8 +46,9 @@ class Training:
 def train(training: Training, out: Path, progress: Progress | None = None) -> float:
     """Train a network, write the model, and return the mean loss of the last 50 steps.
 
-    Raises InputError for settings or recordings that cannot be used, ComputationError if the loss
-    is not a number.
+    Raises:
+        InputError: A setting or a recording cannot be used.
+        ComputationError: The loss is not a number.
     """
     loss_of, device = TEACHERS[training.teacher], chosen_device(training.device)
     if training.steps < 1:
@@ -80,9 +83,10 @@ def train(training: Training, out: Path, progress: Progress | None = None) -> fl
 
 
 def chosen_device(name: str) -> torch.device:
-    """Return the device to train on; auto: CUDA if there is one.
+    """Return the device to train on. ``auto`` is CUDA if there is one.
 
-    Raises InputError for CUDA where there is none.
+    Raises:
+        InputError: CUDA is asked for, and there is none.
     """
     has_cuda = torch.cuda.is_available()
     if name == "cuda" and not has_cuda:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scene flow as the Argoverse 2 scene flow challenges score it, over many pairs of sweeps.
+"""Score scene flow as the Argoverse 2 scene flow challenges do, over many pairs of sweeps.
 
 Within 35 m on each side of the vehicle and without the ground, flow from a sweep to the next,
 ego-motion removed:
@@ -34,7 +34,7 @@ EDGES_M = np.linspace(0, 2.0, 51)
 
 
 class ThreeWayError(NamedTuple):
-    """Metres. mean_m: of the three, NaN where one is."""
+    """Mean errors in metres. ``mean_m`` is the mean of the three, NaN if one is."""
 
     foreground_dynamic_m: float
     foreground_static_m: float
@@ -43,15 +43,24 @@ class ThreeWayError(NamedTuple):
 
 
 class BucketedError(NamedTuple):
-    """static_m: metres. dynamic: error as a part of the speed; zero flow has 1."""
+    """The error of the static bucket in metres, and that of the others as a share of the speed.
+
+    An estimate of zero flow has a dynamic error of 1.
+    """
 
     static_m: float
     dynamic: float
 
 
 class ChallengeScores(NamedTuple):
-    """three_way: metres. by_class: of the classes that have points. mean: over these. num_points:
-    that were scored."""
+    """The scores of all pairs.
+
+    Attributes:
+        three_way: Metres.
+        by_class: Of the classes with points.
+        mean: Over these classes.
+        num_points: Number of scored points.
+    """
 
     three_way: ThreeWayError
     by_class: dict[str, BucketedError]
@@ -60,7 +69,7 @@ class ChallengeScores(NamedTuple):
 
 
 class ChallengeScorer:
-    """Sums over pairs of sweeps. within_m: half a side of the square that counts."""
+    """Sums over pairs of sweeps."""
 
     def __init__(self, within_m: float = WITHIN_M) -> None:
         self._within_m = within_m
@@ -70,8 +79,11 @@ class ChallengeScorer:
     def add(self, points: Float, estimated: Float, true: Float, classes: NDArray[Any]) -> None:
         """Add one pair, without unlabelled points and the ground.
 
-        points: (N,3) metres, vehicle frame. estimated, true: (N,3) metres to the next sweep.
-        classes: (N,) indices in `CLASSES`, or `IGNORED`.
+        Args:
+            points: (N,3) metres, vehicle frame.
+            estimated: (N,3) metres to the next sweep.
+            true: (N,3) metres to the next sweep.
+            classes: (N,) indices in `CLASSES`, or `IGNORED`.
         """
         counted = np.abs(points[:, :2]).max(axis=1, initial=0) < self._within_m
         counted &= classes < len(CLASSES)
@@ -87,7 +99,7 @@ class ChallengeScorer:
             self._buckets[row] += sums.reshape(self._buckets[row].shape)
 
     def scores(self) -> ChallengeScores:
-        """Return the scores of all pairs together; NaN over no points."""
+        """Return the scores of all pairs together, NaN over no points."""
         dynamic_m, static_m, background_m = (_ratio(e, num) for e, num in self._three_way)
         mean_m = (dynamic_m + static_m + background_m) / 3
         three_way = ThreeWayError(dynamic_m, static_m, background_m, mean_m)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Scores of an accumulated cloud without truth: its ghosts.
+"""Score an accumulated cloud without truth, by its ghosts.
 
-Every ``*_scores`` dictionary holds plain numbers ready for JSON; what is undefined is None.
+Every ``*_scores`` dictionary holds plain numbers ready for JSON. An undefined number is None.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
 
 
 def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
-    """Return (M,) True for points of other sweeps of the window that the key sweep saw through,
-    and (M,) True for those that it cannot judge.
+    """Return (M,) True for ghosts, and (M,) True for points that the key sweep cannot judge.
 
-    A ghost lies in front of all that the key sweep measured in its direction and in the eight
-    around, by more than max(0.5 m, 2 % of its range). Of these nine directions six must have a
-    return: dark paint and panes, which give none, hide ghosts.
+    A ghost is a point of another sweep of the window at a position that the key sweep saw through.
+    It is in front of all that the key sweep measured in its direction and in the eight around, by
+    more than max(0.5 m, 2 % of its range). Of these nine directions six must have a return. Dark
+    paint and glass, which give none, hide ghosts.
     """
     ghost, unjudged = np.zeros((2, len(cloud)), bool)
     other = np.flatnonzero(_others(cloud, key))
@@ -37,7 +37,7 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
 
 
 def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
-    """Return the fraction of the other sweeps' points in the window that are `ghosts`."""
+    """Return the share of `ghosts` among the points of other sweeps of the window."""
     return _mean(ghosts(cloud, key_image, key)[0][_others(cloud, key)])
 
 
@@ -45,7 +45,7 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
     """Return the rate of `ghosts` among the ``num_points`` of other sweeps of the window.
 
     It is given for ``all``, for ``moving`` and ``static`` points, by distance from the key in
-    frames (``by_distance["3"]``), and in seconds to 10 ms (``by_seconds["0.30"]``). ``unjudged``:
+    frames (``by_distance["3"]``), and in seconds to 10 ms (``by_seconds["0.30"]``). ``unjudged`` is
     the share of all, moving and static points for which the key sweep has no returns to compare.
     """
     other = np.flatnonzero(_others(cloud, key))
@@ -74,7 +74,7 @@ def _others(cloud: Cloud, key: int) -> Bool:
 
 
 def _rates(ghost: Bool, group: NDArray[np.integer]) -> dict[int, float]:
-    """Return the share of ghosts in every group (N,) that has points, ascending."""
+    """Return the share of ghosts in every group (N,) with points, ascending."""
     num, num_ghosts = np.bincount(group), np.bincount(group, ghost)
     return {g: float(num_ghosts[g] / num[g]) for g in np.flatnonzero(num).tolist()}
 

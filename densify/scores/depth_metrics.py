@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Depth against truth, of lists of pixels or whole maps.
+"""Compare depth with truth, as lists of pixels or whole maps.
 
 Definitions are those of KITTI's depth development kit (``evaluate_depth.cpp``; Uhrig et al.,
 "Sparsity Invariant CNNs", 3DV 2017), except that the kit fills holes of a prediction before it
-scores; here a missing pixel costs coverage and is no error.
+scores. Here a missing pixel lowers the coverage and is no error.
 """
 
 from __future__ import annotations
@@ -29,14 +29,23 @@ _LEAST_CONFIDENCES = tuple(round(0.05 * step, 2) for step in range(20))
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Errors of depth; an error over no pixels is None.
+    """Errors of depth z against the true depth t. An error over no pixels is None.
 
-    num_pixels: with a truth. num_compared: of those, with a predicted depth; the errors are over
-    these. coverage: num_compared / num_pixels. With z the predicted and t the true depth: mae_m,
-    rmse_m of z - t; imae_per_km, irmse_per_km of 1/z - 1/t; abs_rel: mean of |z - t| / t; sq_rel:
-    mean of (z - t)² / t². delta_1, delta_2, delta_3: fraction with max(z/t, t/z) < 1.25, 1.25²,
-    1.25³ (Eigen et al., NIPS 2014). outliers: fraction that is wrong by the rule of KITTI's 2015
-    stereo benchmark (Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015).
+    Attributes:
+        num_pixels: Number of pixels with a truth.
+        num_compared: Number of those with a predicted depth; the errors are over these.
+        coverage: num_compared / num_pixels.
+        mae_m: Mean of |z - t|.
+        rmse_m: Root mean square of z - t.
+        imae_per_km: Mean of |1/z - 1/t|.
+        irmse_per_km: Root mean square of 1/z - 1/t.
+        abs_rel: Mean of |z - t| / t.
+        sq_rel: Mean of (z - t)² / t².
+        delta_1: Share with max(z/t, t/z) < 1.25 (Eigen et al., NIPS 2014).
+        delta_2: The same below 1.25².
+        delta_3: The same below 1.25³.
+        outliers: Share of outliers by the rule of KITTI's 2015 stereo benchmark (Menze and
+            Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015).
     """
 
     num_pixels: int
@@ -64,9 +73,15 @@ def depth_errors(
 ) -> DepthErrors:
     """Return the errors of depths where truth exists and ``mask`` (all if None) is True.
 
-    predicted_m, truth_m: camera z in metres, 0 none; maps (H,W) or lists of pixels (N,). A depth is
-    an outlier if its disparity focal_px · baseline_m / z is off by more than 3 px *and* by more
-    than 5 % of the true one. focal_px: the camera's fx.
+    A depth is an outlier if its disparity focal_px · baseline_m / z is off by more than 3 px *and*
+    by more than 5 % of the true one.
+
+    Args:
+        predicted_m: Camera z in metres, 0 none; a map (H,W) or a list of pixels (N,).
+        truth_m: The same of the truth.
+        mask: The pixels that count.
+        focal_px: The fx of the camera.
+        baseline_m: Stereo baseline.
     """
     known = truth_m > 0 if mask is None else (truth_m > 0) & mask
     compared = known & (predicted_m > 0)
@@ -95,9 +110,11 @@ def depth_errors(
 def precision_density(
     maps: DepthMap, truth_m: Float32, camera: Camera
 ) -> list[dict[str, float | None]]:
-    """Return for each least confidence 0, 0.05, … 0.95 the fraction of all pixels that keep a depth
-    (``density``), and the fraction of those with a truth that is wrong (``outliers``), for
-    ``measured`` and ``filled`` depth."""
+    """Return density and outliers for each least confidence 0, 0.05, … 0.95.
+
+    ``density`` is the share of all pixels that keep a depth, ``outliers`` the share of outliers
+    among those with a truth, for ``measured`` and ``filled`` depth.
+    """
     curve = []
     for least in _LEAST_CONFIDENCES:
         kept = maps.confidence >= least
@@ -119,9 +136,12 @@ def errors_by_part(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> dict[str, DepthErrors]:
-    """Return `depth_errors` of ``all`` pixels, by true depth (``0-10 m`` … ``over 80 m``), on
-    `depth_edges` (``edge``) and off them (``not edge``), and, with a mask of moving pixels (H,W),
-    of ``moving`` and ``static`` ones."""
+    """Return `depth_errors` of parts of the pixels.
+
+    The parts are ``all`` pixels, by true depth (``0-10 m`` … ``over 80 m``), on `depth_edges`
+    (``edge``) and off them (``not edge``), and, with a mask of moving pixels (H,W), ``moving`` and
+    ``static`` ones.
+    """
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]
     parts: dict[str, Bool | None] = {"all": None}
@@ -139,11 +159,13 @@ def errors_by_part(
 
 
 def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_BASELINE_M) -> Bool:
-    """Return (H,W) True where depth jumps: within 3 px there is a true depth that would be an
-    outlier here.
+    """Return (H,W) True at depth discontinuities.
 
-    truth_m: (H,W) metres, 0 none. The ground is no edge: seen from 1.65 m up, its disparity grows
-    by 0.54/1.65 px from row to row.
+    Within 3 px of such a pixel there is a true depth that would be an outlier here. The ground is
+    no discontinuity: at 1.65 m above it, its disparity grows by 0.54/1.65 px from row to row.
+
+    Args:
+        truth_m: (H,W) metres, 0 none.
     """
     known = truth_m > 0
     disparity_px = np.zeros(truth_m.shape)
@@ -159,8 +181,10 @@ def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_
 
 
 def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
-    """Return the mean of each image's values, over the images where they are defined; counts are
-    added up."""
+    """Return the mean of the values of images, over the images where they are defined.
+
+    Counts are added up.
+    """
     means: dict[str, Any] = {}
     for field in fields(DepthErrors):
         values = [value for image in images if (value := getattr(image, field.name)) is not None]
@@ -170,15 +194,19 @@ def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
 
 
 def image_density(depth_m: Float32) -> float:
-    """Return the fraction (0 to 1) of the image's pixels that have a depth."""
+    """Return the share (0 to 1) of the image's pixels with a depth."""
     return float(np.mean(depth_m > 0)) if depth_m.size else 0.0
 
 
 def depth_scores(
     depth: DepthMap, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return `depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``, plain
-    numbers. truth_depth_m: (H,W) metres, 0 none. moving_mask: (H,W)."""
+    """Return `depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``.
+
+    Args:
+        truth_depth_m: (H,W) metres, 0 none.
+        moving_mask: (H,W) bool.
+    """
     return {
         product: scores_by_motion(image, truth_depth_m, moving_mask, camera)
         for product, image in (("measured", depth.depth_m), ("filled", depth.filled_m))
@@ -202,7 +230,7 @@ def is_outlier_depth(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> Bool:
-    """Return (N,) True where a depth (N,) above 0 is wrong by KITTI's rule."""
+    """Return (N,) True where a depth (N,) above 0 is an outlier by KITTI's rule."""
     disparity_m_px = focal_px * baseline_m
     predicted_px = disparity_m_px / predicted_m.astype(np.float64)
     return _is_outlier(predicted_px, disparity_m_px / truth_m.astype(np.float64))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Metrics of scene flow, each with its definition, unit and source.
+"""Compute metrics of scene flow, each with its definition, unit and source.
 
 Flow is (N,3) metres from one time to another, ego-motion removed. A mean over nothing is NaN.
 """
@@ -20,26 +20,33 @@ def end_point_errors(estimated: Float, true: Float) -> Float:
 
 
 def end_point_error(estimated: Float, true: Float, mask: Bool | None = None) -> float:
-    """Return EPE, metres: the mean of `end_point_errors`, over ``mask`` (N,) if given (Liu, Qi,
-    Guibas, "FlowNet3D", CVPR 2019)."""
+    """Return EPE, metres: the mean of `end_point_errors`, over ``mask`` (N,) if given.
+
+    Liu, Qi, Guibas, "FlowNet3D", CVPR 2019.
+    """
     error_m = end_point_errors(estimated, true)
     return mean_of(error_m if mask is None else error_m[mask])
 
 
 def accuracy(estimated: Float, true: Float, limit: float) -> float:
-    """Return the share (0 to 1) of the points with an error below ``limit`` metres *or* below
-    ``limit`` times the length of the true flow.
+    """Return the share (0 to 1) of the points with a small error.
 
-    limit: `STRICT` (0.05 m or 5 %) or `RELAXED` (0.1 m or 10 %), as FlowNet3D (CVPR 2019) and
-    Pontes et al. (3DV 2020) count.
+    The error is below ``limit`` metres *or* below ``limit`` times the length of the true flow.
+
+    Args:
+        limit: `STRICT` (0.05 m or 5 %) or `RELAXED` (0.1 m or 10 %), as in FlowNet3D (CVPR
+            2019) and Pontes et al. (3DV 2020).
     """
     error_m = end_point_errors(estimated, true)
     return mean_of((error_m < limit) | (error_m < limit * np.linalg.norm(true, axis=1)))
 
 
 def angle_error_rad(estimated: Float, true: Float) -> float:
-    """Return the mean angle between the estimated and the true flow, radians (Pontes et al., 3DV
-    2020), over the points whose true flow is not 0; an estimate of 0 counts as a right angle."""
+    """Return the mean angle between the estimated and the true flow, radians.
+
+    It is taken over the points whose true flow is not 0 (Pontes et al., 3DV 2020). An estimate of 0
+    counts as a right angle.
+    """
     length_m = np.linalg.norm(true, axis=1)
     flow, truth, length_m = (values[length_m > 0] for values in (estimated, true, length_m))
     lengths = np.linalg.norm(flow, axis=1) * length_m

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The published objective of Pontes, Hays, Lucey (3DV 2020), and its solvers."""
+"""Minimise the published objective of Pontes, Hays, Lucey (3DV 2020)."""

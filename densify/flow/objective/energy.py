@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The scene flow objective as differentiable torch code.
+"""Compute the scene flow objective as differentiable torch code.
 
 Source: Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020.
-Without learning alpha is 10 on a graph of 50 neighbours; as a training loss it is 4.
+Without learning alpha is 10 on a graph of 50 neighbours. As a training loss it is 4.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ from densify.flow.objective.graph import checked_cloud
 class Energy(NamedTuple):
     """Terms of the objective, 0-d tensors that carry the gradient.
 
-    total: ``data + alpha * smoothness``. data: E_d in m². smoothness: tr(FᵀLF) in m².
+    Attributes:
+        total: ``data + alpha * smoothness``.
+        data: E_d in m².
+        smoothness: tr(FᵀLF) in m².
     """
 
     total: Tensor
@@ -37,17 +40,23 @@ def energy(
 ) -> Energy:
     """Return the energy E(F) of a flow, differentiable with respect to the flow.
 
-    ::
+    The energy is::
 
         E(F)   = E_d(F) + alpha tr(Fᵀ L F)
         E_d(F) = Σ_p min_q |p + f_p - q|² + Σ_q min_p |p + f_p - q|²
 
-    flow: (n,3) metres. source: (n,3) P. target: (m,3) Q. laplacian: (n,n) of
-    `densify.flow.objective.graph.laplacian`. alpha: the smaller, the freer each point.
-
     Nearest neighbours are found on the CPU without gradient; the distances to them carry it. The
     gradient is exact wherever no two neighbours tie. The energy is a sum over points, not a mean.
-    Raises InputError for wrong shapes, no points, or NaN.
+
+    Args:
+        flow: (n,3) metres.
+        source: (n,3) P.
+        target: (m,3) Q.
+        laplacian: (n,n) of `densify.flow.objective.graph.laplacian`.
+        alpha: A smaller one leaves each point freer.
+
+    Raises:
+        InputError: The shapes are wrong, there are no points, or there is a NaN.
     """
     if flow.shape != source.shape:
         raise InputError(
@@ -72,7 +81,7 @@ def energy(
 
 @contextmanager
 def on_one_thread() -> Iterator[None]:
-    """Let torch work on one thread inside the block: with more its sums come out otherwise."""
+    """Let torch work on one thread inside the block. With more threads its sums differ."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -98,5 +107,5 @@ class _QuadraticForm(torch.autograd.Function):
 
 
 def _values(tensor: Tensor) -> Any:
-    """The numbers of a tensor as a float64 array."""
+    """Return the numbers of a tensor as a float64 array."""
     return tensor.detach().cpu().double().numpy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The graph of a point cloud and its Laplacian: the smoothness term of the flow objective.
+"""Build the graph of a point cloud and its Laplacian, the smoothness term of the objective.
 
 Source: Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020,
 section 3.
@@ -19,7 +19,9 @@ from densify.geometry.types import Float
 def checked_cloud(values: ArrayLike, name: str) -> Float:
     """Return a copy of a cloud as (n,3) float64 metres.
 
-    Raises InputError for no points, another shape, or coordinates that are not finite.
+    Raises:
+        InputError: There are no points, the shape is another one, or coordinates are not
+            finite.
     """
     try:
         points = np.array(values, dtype=np.float64, order="C")
@@ -41,12 +43,16 @@ def checked_cloud(values: ArrayLike, name: str) -> Float:
 def knn_graph(points: Float, num_neighbors: int) -> csr_array:
     """Return the weights W of the undirected k-nearest-neighbour graph.
 
-    points: (n,3) metres. num_neighbors: k, not counting the point itself, cut to n - 1. A larger k
-    lets the flow of a point pull on points farther away.
+    W is (n,n) symmetric float64, with ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is
+    among the k nearest of the other, 1 on the diagonal, 0 elsewhere.
 
-    Returns the (n,n) symmetric float64 matrix with ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where
-    either point is among the k nearest of the other, 1 on the diagonal, 0 elsewhere.
-    Raises InputError for no points, NaN, or k < 1.
+    Args:
+        points: (n,3) metres.
+        num_neighbors: k without the point itself, cut to n - 1. With a larger k the flow of a
+            point pulls on points farther away.
+
+    Raises:
+        InputError: There are no points, a NaN, or k < 1.
     """
     if num_neighbors < 1:
         raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
@@ -68,9 +74,11 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
 def laplacian(weights: csr_array) -> csr_array:
     """Return ``L = D^-1/2 (D - W) D^-1/2``, (n,n) symmetric, positive semi-definite, float64.
 
-    weights: W of `knn_graph`. The degree D holds the row sums of W with the self-weight
-    ``W_ii = 1``, as in the paper. The null space of L is ``D^1/2 · 1``: a constant flow costs
-    energy where the density changes.
+    The degree D holds the row sums of W with the self-weight ``W_ii = 1``, as in the paper. The
+    null space of L is ``D^1/2 · 1``: a constant flow costs energy where the density changes.
+
+    Args:
+        weights: W of `knn_graph`.
     """
     degree = weights.sum(axis=1)
     scale = diags_array(1.0 / np.sqrt(degree))

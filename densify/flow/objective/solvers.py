@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Two solvers of the scene flow objective of Pontes, Hays, Lucey (3DV 2020).
+"""Solve the scene flow objective of Pontes, Hays, Lucey (3DV 2020) in two ways.
 
 ``adam`` is the published protocol. ``pcg`` alternates nearest neighbours with preconditioned
 conjugate gradients. It reaches the same or a lower energy in a small part of the time.
@@ -32,14 +32,15 @@ _MAX_PRODUCTS, _RESIDUAL_DROP = 20, 0.2  # the matches are provisional: a full s
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """The settings of a solver; the defaults are the paper's except for the solver.
+    """The settings of a solver. The defaults are the paper's except for the solver.
 
-    solver: "pcg" or "adam".
-    alpha: weight of smoothness, at least 0. A larger alpha moves neighbours more alike.
-    num_neighbors: k of the graph. A larger k is stiffer and slower.
-    adam_num_steps: the lowest energy is usually reached within 200 steps.
+    A value out of range raises InputError.
 
-    Raises InputError for a value out of range.
+    Attributes:
+        solver: "pcg" or "adam".
+        alpha: Weight of smoothness, at least 0. A larger one moves neighbours more alike.
+        num_neighbors: k of the graph. A larger one is stiffer and slower.
+        adam_num_steps: The lowest energy is usually reached within 200 steps.
     """
 
     solver: str = "pcg"
@@ -59,12 +60,14 @@ class SolverSettings:
 
 @dataclass(frozen=True)
 class Solution:
-    """A flow and its energy at the alpha asked for.
+    """A flow and its energy at the requested alpha.
 
-    flow: (n,3) float64 metres. energy: ``data + alpha * smoothness``, m².
-    energies: the energy before each step and after the last. A step is one of Adam's, or one
-        alternation of pcg. Adam's energy rises at times, and its minimum is ``energy``; that of pcg
-        never rises on the last level.
+    Attributes:
+        flow: (n,3) float64 metres.
+        energy: ``data + alpha * smoothness``, m².
+        energies: The energy before each step and after the last. A step is one of Adam's, or
+            one alternation of pcg. Adam's energy rises at times, and its minimum is ``energy``.
+            That of pcg never rises on the last level.
     """
 
     flow: Float
@@ -82,11 +85,18 @@ def solve(
 ) -> Solution:
     """Return the flow that moves ``source`` onto ``target`` smoothly, a minimum of the objective.
 
-    source: (n,3), target: (m,3), metres, in one frame. settings: None means the defaults.
-    initial: (n,3) flow to start from, otherwise 0; pcg then works at the final alpha at once.
+    The same input gives the same bytes on the same CPU. Everything is computed in float64 about the
+    mean of the source.
 
-    Same input, same bytes on the same CPU. Everything is computed in float64 about the source's
-    mean. Raises InputError for no points, wrong shapes, or NaN.
+    Args:
+        source: (n,3) metres.
+        target: (m,3) metres, in the same frame.
+        settings: None for the defaults.
+        initial: (n,3) flow to start from, otherwise 0. pcg then works at the final alpha at
+            once.
+
+    Raises:
+        InputError: There are no points, wrong shapes, or NaN.
     """
     settings = settings or SolverSettings()
     moving, fixed = checked_cloud(source, "source"), checked_cloud(target, "target")
@@ -105,7 +115,7 @@ def solve(
 def _adam(
     source: Float, target: Float, smooth: csr_array, start: Float, settings: SolverSettings
 ) -> Solution:
-    """The published protocol, but for keeping the best flow of all steps instead of the last."""
+    """Return the solution of the published protocol, but keep the best flow of all steps."""
     import torch
 
     from densify.flow.objective.energy import energy, on_one_thread
@@ -131,7 +141,7 @@ def _adam(
 class _Value:
     """The energy of a flow, with the matches and the negative half of its gradient's data part.
 
-    data, smoothness: E_d and tr(FᵀLF). total: at the alpha asked for. pull: (n,3) from each moved
+    data, smoothness: E_d and tr(FᵀLF). total: at the requested alpha. pull: (n,3) from each moved
     point to its matches, summed. num_matches: (n,) matches of each point, both ways.
     """
 
@@ -150,12 +160,12 @@ class _Value:
         self.num_matches = 1.0 + np.bincount(to_source, minlength=len(moved))
 
     def at(self, alpha: float) -> float:
-        """The energy at another alpha."""
+        """Return the energy at another alpha."""
         return self.data + alpha * self.smoothness
 
 
 class _Problem:
-    """One pair of clouds about the source's mean."""
+    """One pair of clouds about the mean of the source."""
 
     def __init__(self, source: Float, target: Float, smooth: csr_array, alpha: float) -> None:
         self.source, self.target = source, target
@@ -165,11 +175,11 @@ class _Problem:
 
 
 def _pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
-    """Majorise and minimise.
+    """Return the solution by majorisation and minimisation.
 
-    With the matches fixed the energy is a quadratic that touches it from above: a step that lowers
-    the quadratic lowers the energy. At large alphas whole surfaces slide. Started at a small alpha
-    the points would be caught by their first neighbours.
+    With fixed matches the energy is a quadratic that touches it from above. A step that lowers the
+    quadratic lowers the energy. At large alphas whole surfaces slide. From a small alpha the points
+    would stick to their first neighbours.
     """
     value = _Value(problem, start)
     energies = [value.total]
@@ -210,7 +220,7 @@ def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
 
 
 def _levels(first: float, alpha: float) -> list[float]:
-    """Alphas from ``first`` down to ``alpha``, equal steps in the logarithm."""
+    """Return alphas from ``first`` down to ``alpha``, in equal steps of the logarithm."""
     least = max(alpha, _LEAST_ALPHA)
     if first <= least:
         return [alpha]

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Scene flow between any two clouds."""
+"""Estimate scene flow between any two clouds."""

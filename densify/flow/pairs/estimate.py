@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Scene flow between any two clouds in one frame: rigid groups that certainly move, or the
-published objective."""
+"""Estimate scene flow between any two clouds in one frame.
+
+It is that of rigid groups that certainly move, or of the published objective.
+"""
 
 from __future__ import annotations
 
@@ -51,21 +53,21 @@ def estimate_flow(
 ) -> FlowField:
     """Estimate the scene flow between two clouds in one coordinate frame.
 
-    Only groups of points move whose motion explains in both clouds what standing still leaves
-    unexplained. The flow of all other points is exactly 0, as it is farther than 400 m from the
-    middle. Without ``objective.static_prior`` every point takes the published objective's flow;
-    with ``flow.engine=paper`` the groups that move take it.
+    Groups of points move only if their motion explains, in both clouds, differences that a static
+    group leaves unexplained. The flow of all other points is exactly 0, also farther than 400 m
+    from the middle. Without ``objective.static_prior`` every point takes the flow of the published
+    objective; with ``flow.engine=paper`` the moving groups take it.
 
     Args:
         source: (N,3) metres, z up, with or without the ground.
         target: (M,3) metres.
         config: Settings; the sections ``flow`` and ``objective`` are used.
-        initial: (N,3) flow to start from. It is needed only where something moves farther than is
-            searched: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
-        source_offset_ns: (N,) time of each point. Give both clouds' times or neither. They are on
-            one clock, or each counts from its own sweep's reference time; then the target is taken
-            for the next revolution. Without times, an object that the scanner meets earlier or
-            later in the second sweep comes out too slow or too fast.
+        initial: (N,3) flow to start from. It is needed only for objects faster than the search
+            covers: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
+        source_offset_ns: (N,) time of each point. Give both clouds' times or neither. They are
+            on one clock, or each counts from its own sweep's reference time; then the target is
+            taken for the next revolution. Without times, an object that the scanner meets earlier
+            or later in the second sweep comes out too slow or too fast.
         target_offset_ns: (M,) time of each point.
         source_lidar: (N,) number of the scanner that measured each point. Give both or neither.
             Each scanner's points are compared with its own; with times, with the others' too.
@@ -73,7 +75,7 @@ def estimate_flow(
 
     Returns:
         The flow from the middle of the source's times to that of the target's. With times,
-        ``to_reference`` is the motion from a point's own time to the source's middle.
+            ``to_reference`` is the motion from a point's own time to the source's middle.
 
     Raises:
         InputError: No points, wrong shapes, NaN, or an engine that needs a recording.
@@ -105,8 +107,10 @@ def flow_between(
     settings: ObjectiveSettings,
     initial: ArrayLike | None = None,
 ) -> FlowField:
-    """The published objective's flow; with ``static_prior`` only of groups that it certainly
-    moves. Arguments and errors as `estimate_flow`."""
+    """Return the flow of the published objective; arguments and errors as in `estimate_flow`.
+
+    With ``static_prior`` only groups that certainly move have it.
+    """
     objective = SolverSettings(
         solver=settings.solver,
         alpha=settings.alpha,
@@ -166,13 +170,11 @@ def _attach_below(points: Float, field: FlowField, low: Int) -> None:
 
 
 def _tell_scanners(clouds: tuple[Float, Float], lag: tuple[Float, Float]) -> tuple[Int, Int] | None:
-    """Return (N,) and (M,) 0 or 1 for two scanners that spin half a turn apart; None if there are
-    no such.
+    """Return (N,) and (M,) 0 or 1 for two scanners that spin half a turn apart, else None.
 
-    Time plus or minus azimuth is one number for all points of a spinning scanner, its phase. Where
-    the phases of two scanners are half a turn apart, only the doubled phases agree.
-
-    lag: of the points, as a share of the time between the clouds, a whole number of turns.
+    Time plus or minus azimuth is one number for all points of a spinning scanner, its phase. If the
+    phases of two scanners are half a turn apart, only the doubled phases agree. lag: of the points,
+    as a share of the time between the clouds, a whole number of turns.
     """
     both = np.concatenate(clouds)
     far = np.hypot(both[:, 0], both[:, 1]) > _MIDDLE_M
@@ -193,7 +195,10 @@ def _tell_scanners(clouds: tuple[Float, Float], lag: tuple[Float, Float]) -> tup
 def _columns(
     source: ArrayLike | None, target: ArrayLike | None, clouds: tuple[Float, Float], name: str
 ) -> tuple[Int, Int] | None:
-    """(N,), (M,) int64 beside the clouds' points; None where not given. Raises InputError."""
+    """Return (N,), (M,) int64 columns beside the points of the clouds, None if not given.
+
+    Raises InputError for wrong ones.
+    """
     if source is None and target is None:
         return None
     columns = []
@@ -213,7 +218,7 @@ def _columns(
 
 
 class _Times(NamedTuple):
-    """When two clouds were measured.
+    """The times of two clouds.
 
     apart_s: from the middle of one cloud's times to that of the other's. lag: (N,), (M,) of the
     points after the middle of their cloud's times, as a share of that.
@@ -224,7 +229,7 @@ class _Times(NamedTuple):
 
 
 def _times(times_ns: tuple[Int, Int] | None) -> _Times | None:
-    """None where they tell nothing."""
+    """Return the times of two clouds, None if they are unknown or equal."""
     if times_ns is None:
         return None
     low, high = (np.array([int(of(times)) for times in times_ns]) for of in (np.min, np.max))
@@ -239,7 +244,7 @@ def _times(times_ns: tuple[Int, Int] | None) -> _Times | None:
 
 
 def _only_proven(source: Float, target: Float, flow: Float) -> FlowField:
-    """Keep the flow of groups that beat "did not move" in both directions."""
+    """Keep the flow of groups that fits better than "did not move" in both directions."""
     field = FlowField.zero(len(source))
     moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > _LEAST_MOTION_M)
     num_groups, group = link(source[moved], _LINK_M)
@@ -260,7 +265,10 @@ def _only_proven(source: Float, target: Float, flow: Float) -> FlowField:
 def _beats_standing_still(
     group: Float, target: Float, flow: Float, trees: tuple[cKDTree, cKDTree]
 ) -> bool:
-    """Judged by the group's common translation: a free flow always comes closer to the target."""
+    """Return True if the group's common translation fits the target better than no motion.
+
+    The free flow cannot decide this, because it always comes closer to the target.
+    """
     source_tree, target_tree = trees
     arrived = group + np.median(flow, axis=0)
 
@@ -293,7 +301,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
 
 
 def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowField:
-    """Flow of one sweep's points to another's reference time; sweeps by number."""
+    """Return the flow of one sweep's points to another's reference time; sweeps by number."""
     pair = [stretch.sweeps[i] for i in (here, there)]
     sweeps = [s.sweep for s in pair]
     if min(map(len, sweeps)) == 0:
@@ -314,7 +322,7 @@ def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowFiel
 
 
 def _offsets_ns(source: Sweep, target: Sweep) -> tuple[Int | None, Int | None]:
-    """When the points were measured, since the source's reference time."""
+    """Return the times of the points, since the source's reference time."""
     if source.offset_ns is None or target.offset_ns is None:
         return None, None
     return source.offset_ns, target.offset_ns + (target.stamp_ns - source.stamp_ns)

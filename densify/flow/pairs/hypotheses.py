@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Candidate motions of groups of points between two clouds, and their alignment.
+"""Propose motions of groups of points between two clouds, and align them.
 
 A group starts at the few displacements that most of its points vote for (Hough 1962). It is aligned
 there with the surfaces of the other cloud (Segal et al., "Generalized-ICP", RSS 2009, with yaw as
@@ -44,8 +44,11 @@ _ROUGH_M = 0.1  # off a plane: no ground to tell a slope
 class PairCloud:
     """The N points of a cloud above the ground.
 
-    points: (N,3) metres. lag: (N,) firing time after the cloud's reference time, as a share of the
-    time between the two clouds; zeros where unknown. lidar: (N,) scanner; None for a single one.
+    Attributes:
+        points: (N,3) metres.
+        lag: (N,) firing time after the cloud's reference time, as a share of the time between
+            the two clouds; zeros if unknown.
+        lidar: (N,) number of the scanner; None for a single one.
     """
 
     points: Float
@@ -54,17 +57,20 @@ class PairCloud:
 
     @cached_property
     def tree(self) -> cKDTree:
+        """The tree of the points."""
         return tree_of(self.places(self.points, np.arange(len(self.points))))
 
     @cached_property
     def even_tree(self) -> cKDTree:
-        """The tree of one point per voxel, since points are denser along scan lines."""
+        """The tree of one point per voxel, because points are denser along scan lines."""
         places = self.places(self.points, np.arange(len(self.points)))
         return tree_of(places[one_per_voxel(places, _EVEN_M)])
 
     def places(self, points: Float, rows: Int) -> Float:
-        """Return coordinates in which points of different scanners are far from each other: each
-        scanner measures an object at another time."""
+        """Return coordinates in which points of different scanners are far from each other.
+
+        Each scanner measures an object at another time.
+        """
         if self.lidar is None:
             return points
         return np.column_stack([points, 1e4 * self.lidar[rows]])
@@ -72,24 +78,27 @@ class PairCloud:
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Displacement x y z (m) and yaw (rad) about ``centre`` of an object, from one cloud's
-    reference time to the other's; ``seen_share`` of it between its measurements."""
+    """The motion of an object from one cloud's reference time to the other's.
+
+    It is a displacement x y z (m) and yaw (rad) about ``centre``. ``seen_share`` of it is between
+    its measurements.
+    """
 
     state: Float
     centre: Float
     seen_share: float
 
     def seen(self, points: Float) -> Float:
-        """Move (N,3) points from where the source measured them to where the target does."""
+        """Return (N,3) points, moved from their measurement in the source to that in the target."""
         return self.carry(points, self.seen_share)
 
     def carry(self, points: Float, share: float | Float) -> Float:
-        """Move (N,3) points of the object by a share of the motion, or by one share each."""
+        """Return (N,3) points of the object, moved by a share of the motion or by one share each."""
         return apply(self.state * np.reshape(share, (-1, 1)), points, self.centre)
 
 
 class Surface:
-    """Points of the target with the inverse covariance of the surface around each."""
+    """Points of the target, each with the inverse covariance of the surface around it."""
 
     def __init__(self, target: PairCloud, rows: Int) -> None:
         self.points, self.lag = target.points[rows], target.lag[rows]
@@ -103,9 +112,13 @@ class Surface:
 class Hypotheses:
     """Motions to try, H of them over P points in all.
 
-    group: (H,) number of the group. state: (H,4), centre: (H,3), see `RigidMotion`. row: (P,) of
-    the source, a sample of the group. of_point: (P,) the hypothesis. share: (H,) of the motion
-    between when the source and when the target measured the group.
+    Attributes:
+        group: (H,) number of the group.
+        state: (H,4), see `RigidMotion`.
+        centre: (H,3), see `RigidMotion`.
+        row: (P,) of the source, a sample of the group.
+        of_point: (P,) number of the hypothesis.
+        share: (H,) of the motion between the measurements of the group in source and target.
     """
 
     source: PairCloud
@@ -126,10 +139,12 @@ class Hypotheses:
         apart_s: float | None,
         ground: HeightMap,
     ) -> Hypotheses:
-        """Every group at the places it votes for, where it stands, and where ``initial`` puts it,
-        as high above the ground as it is.
+        """Return every group at its voted positions, at rest, and at the position of ``initial``.
 
-        apart_s: the time between the clouds, None where unknown.
+        The height above the ground stays.
+
+        Args:
+            apart_s: Time between the clouds, None if unknown.
         """
         group, state, centre, row = [], [], [], []
         there = target.points[candidates]
@@ -163,8 +178,10 @@ class Hypotheses:
         return apply(state, self.source.points[self.row], self.centre[self.of_point])
 
     def align(self, surface: Surface) -> None:
-        """Align all states at once by Gauss-Newton steps. A match spans the time from the source
-        point's measurement to the target point's."""
+        """Align all states at once by Gauss-Newton steps.
+
+        A match spans the time from the measurement of the source point to that of the target point.
+        """
         start = self.state.copy()
         lag = self.source.lag[self.row]
         for gate_m in GATES_M:
@@ -195,7 +212,10 @@ class Hypotheses:
 def _step(
     residual: Float, arm: Float, share: Float, information: Float, of_point: Int, prior: Float
 ) -> Float:
-    """Return (H,4) Gauss-Newton steps of all hypotheses. prior: (H,4) gradient of the prior."""
+    """Return (H,4) Gauss-Newton steps of all hypotheses.
+
+    prior: (H,4) gradient of the prior.
+    """
     J = np.zeros((len(arm), 3, 4))
     J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = 1.0
     J[:, 0, 3], J[:, 1, 3] = -arm[:, 1], arm[:, 0]
@@ -209,15 +229,15 @@ def _step(
 
 
 def _num_vote_steps(apart_s: float | None) -> int:
-    """Return how many steps the fastest object may travel."""
+    """Return the number of steps that the fastest object may travel."""
     apart_s = _USUAL_S if apart_s is None else min(apart_s, _LONGEST_S)
     return max(1, round(_MAX_SPEED_M_S * apart_s / _VOTE_STEP_M))
 
 
 def _vote(points: Float, there: Float, n: int) -> Float:
-    """Return (S,3) displacements, zero first, at which most of the (N,3) points meet another cloud.
+    """Return (S,3) displacements, zero first, at which most (N,3) points meet another cloud.
 
-    Each point votes once for a displacement, fewer than n steps away.
+    Each point votes once for a displacement of fewer than n steps.
     """
     zero = np.zeros((1, 3))
     span_m = np.array([n * _VOTE_STEP_M, n * _VOTE_STEP_M, _VOTE_SLACK_M])
@@ -249,8 +269,10 @@ def _vote(points: Float, there: Float, n: int) -> Float:
 
 
 def slope_of(ground: HeightMap, place: Float) -> Float:
-    """Return (2,) the slope of the ground around a place along x and y; 0 where the map is not
-    plane, since clouds may come without their ground."""
+    """Return (2,) the slope of the ground around a place along x and y.
+
+    It is 0 where the map is not plane, because clouds may come without their ground.
+    """
     steps = np.arange(-_SLOPE_STEPS, _SLOPE_STEPS + 1) * _SLOPE_STEP_M
     arm = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     height_m = ground.under(place[:2] + arm)
@@ -267,5 +289,5 @@ def one_per_voxel(places: Float, side_m: float) -> Int:
 
 
 def thinned(rows: Int, num: int) -> Int:
-    """Return the rows, thinned evenly to about ``num``."""
+    """Return about ``num`` of the rows, evenly spaced."""
     return rows[:: (len(rows) - 1) // num + 1] if len(rows) else rows

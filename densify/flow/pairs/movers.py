@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The rigid groups of one cloud that certainly moved to their place in another cloud.
+"""Find the rigid groups of one cloud that certainly moved to their place in another cloud.
 
 A point is unexplained if the other cloud has no counterpart at its position. Connected groups with
-many such points are aligned with the other cloud at several candidate positions
-(`densify.flow.pairs.hypotheses`). A group moves if that explains, in both clouds, the points that
-are unexplained if it is static.
+many unexplained points are aligned with the other cloud at several candidate positions
+(`densify.flow.pairs.hypotheses`). A group moves if its motion explains, in both clouds, the points
+that are unexplained if it is static.
 """
 
 from __future__ import annotations
@@ -42,9 +42,10 @@ def find_movers(
 ) -> tuple[list[RigidMotion], Int]:
     """Return the motions, and (N,) the motion of each source point, -1 for none.
 
-    ground: under both clouds. initial: (N,3) flow; a group is also tried at the median of its
-    members'. apart_s: the time between the clouds, None where unknown: what moves at up to 38 m/s
-    is looked for.
+    Args:
+        ground: Under both clouds.
+        initial: (N,3) flow. A group is also tried at the median flow of its members.
+        apart_s: Time between the clouds, None if unknown. The search covers up to 38 m/s.
     """
     with ThreadPoolExecutor(2) as pool:
         ours, theirs = pool.map(Unexplained.of, (source, target), (target, source))
@@ -78,7 +79,7 @@ def find_movers(
 def _choose(
     trials: list[Trial], groups: list[Int], ours: Unexplained, theirs: Unexplained
 ) -> tuple[list[RigidMotion], Int]:
-    """Choose at most one motion per group, so that each target is explained once."""
+    """Return at most one motion per group, with each target explained once."""
     free = np.ones(len(theirs.unexplained), bool)
     trials = _thinnest([t for t in trials if t.proves(free)])
     assigned = _assigned(trials, theirs.group)
@@ -95,8 +96,10 @@ def _choose(
 
 
 def _thinnest(trials: list[Trial]) -> list[Trial]:
-    """Drop the trials whose surfaces are thicker than those of another motion close by: nearest
-    points fit any ring."""
+    """Drop trials with thicker surfaces than another motion close by.
+
+    Nearest points cannot decide, because they fit any ring.
+    """
     kept = []
     for trial in trials:
         others_m = [
@@ -112,10 +115,10 @@ def _thinnest(trials: list[Trial]) -> list[Trial]:
 
 
 def _assigned(trials: list[Trial], target_group: Int) -> list[Trial]:
-    """Assign groups to groups of the target with the greatest total gain.
+    """Return groups assigned to groups of the target with the greatest total gain.
 
-    In a row of similar cars, each could take the place of the next, but the last would find none.
-    A group that is only a part of an object may stay unassigned, for its own gain.
+    In a row of similar cars, each could take the place of the next, but the last would find none. A
+    group that is only a part of an object may stay unassigned, for its own gain.
     """
     best: dict[tuple[int, int], Trial] = {}
     for trial in trials:
@@ -137,8 +140,10 @@ def _assigned(trials: list[Trial], target_group: Int) -> list[Trial]:
 def _attach(
     motions: list[RigidMotion], instance: Int, ours: Unexplained, theirs: Unexplained
 ) -> None:
-    """Give points close to a moving group its motion if that explains them; unexplained points
-    from farther away."""
+    """Give points close to a moving group its motion if that explains them.
+
+    Unexplained points may be farther away.
+    """
     points = ours.cloud.points
     members, others = np.flatnonzero(instance >= 0), np.flatnonzero(instance < 0)
     if not len(members) or not len(others):

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Motions refined until an object's surfaces, brought to one time, are thin.
+"""Refine motions until the surfaces of an object, moved to one time, are thin.
 
-The rings of a scanner lie elsewhere on an object that has moved. Nearest points fit any ring, so
-they hold the motion back. Where two scanners share a sweep, an object appears twice, half of the
-motion apart. Planes through several rings let a surface slide along itself, and the other surfaces
-tell how far (as in Stückler, Behnke, "Multi-Resolution Surfel Maps", JVCI 2014). Here the planes
-are made anew in every step, from all other points of the object, each at its own time.
+The rings of a scanner are elsewhere on an object that has moved. Nearest points fit any ring.
+Therefore they hold the motion back. If two scanners share a sweep, an object appears twice, half of
+the motion apart. Planes through several rings let a surface slide along itself, and the other
+surfaces fix the slide (as in Stückler, Behnke, "Multi-Resolution Surfel Maps", JVCI 2014). Here the
+planes are made anew in every step, from all other points of the object, each at its own time.
 """
 
 from __future__ import annotations
@@ -51,8 +51,10 @@ _ARRIVED_POINTS = 300
 
 
 class Refined(NamedTuple):
-    """A motion with the thickness of the object's surfaces (m), and its ratio to that of the static
-    object; None where too few points lie on surfaces."""
+    """A motion with the thickness of the object's surfaces (m), and its ratio to that at rest.
+
+    They are None if too few points are on surfaces.
+    """
 
     motion: RigidMotion
     thickness_m: float | None = None
@@ -68,11 +70,13 @@ def refined(
     ground: HeightMap,
     timed: bool,
 ) -> Refined:
-    """Refine the motion of the source's ``members``; keep it as it is if that is no thinner.
+    """Return the refined motion of the source's ``members``, or the motion itself if thinner.
 
-    candidates: rows of the target that may be the object's. timed: lags are known: every scanner's
-    points are compared with those of all others, each at its own time; otherwise with the other
-    cloud's, of the same scanner if that is known.
+    Args:
+        candidates: Rows of the target that may be the object's.
+        timed: Lags are known, and every scanner's points are compared with those of all others,
+            each at its own time. Otherwise they are compared with the other cloud, by the same
+            scanner if that is known.
     """
     if len(members) < _MIN_POINTS:
         return Refined(motion)
@@ -101,7 +105,7 @@ def refined(
 
 
 def _starts(motion: RigidMotion, slope: Float, source: PairCloud, timed: bool) -> list[Float]:
-    """Return starts on the ground: the motion, and others from which it may be held back."""
+    """Return starts on the ground: the motion, and others at which it may be held back."""
     way = motion.state[:2]
     length_m = np.linalg.norm(way)
     factors = (1.0, *(1 + shift / length_m for shift in _SHIFTS_M if length_m + shift > 0))
@@ -132,7 +136,7 @@ def _arrivals(
 
 @dataclass(frozen=True)
 class _Surfaces:
-    """An object's points in both clouds, see `_settle`."""
+    """The points of an object in both clouds, see `_settle`."""
 
     points: Float
     share: Float
@@ -165,8 +169,10 @@ class _Surfaces:
         )
 
     def settled(self, start: Float, gates_m: Float) -> tuple[Float, float, float]:
-        """Return the state after a step for each gate, the thickness of the surfaces (m), and the
-        share of points that lie on one."""
+        """Return the state after a step for each gate, and the quality of the surfaces.
+
+        The quality is their thickness (m) and the share of points on a surface.
+        """
         state, told = start.copy(), np.empty(2)
         _settle(
             self.points,
@@ -184,7 +190,7 @@ class _Surfaces:
 
 
 def _evenly(cloud: PairCloud, rows: Int) -> Int:
-    """Thin the rows to one point of each scanner per voxel, few enough in all."""
+    """Return the rows with one point of each scanner per voxel, few enough in all."""
     side_m = _SIDE_M
     while True:
         first = one_per_voxel(cloud.places(cloud.points[rows], rows), side_m)
@@ -206,13 +212,15 @@ def _settle(
     state: Float,
     told: Float,
 ) -> None:
-    """Move ``state`` (4,), in place, to where the surfaces are thin, by Gauss-Newton steps.
+    """Move ``state`` (4,), in place, until the surfaces are thin, by Gauss-Newton steps.
 
-    points, share: (n,3) as measured after that share (n,) of the motion. A point's distance is that
+    points.
+
+    share: (n,3) as measured after that share (n,) of the motion. The distance of a point is that
     from the plane of the points within ``reach_m`` whose sampling judges its own: sampling (n,),
-    judges (samplings, samplings). gates_m: for each step the distance from which on a point counts
-    nothing. told: (2,) filled with the mean distance, at most ``_LIMIT_M``, and with the share of
-    points that have a plane.
+    judges (samplings, samplings). gates_m: for each step the distance from which on a point has no
+    weight. told: (2,) filled with the mean distance, at most ``_LIMIT_M``, and with the share of
+    points with a plane.
     """
     H, g = np.empty((4, 4)), np.empty(4)
     start, at = state.copy(), np.empty_like(points)
@@ -233,7 +241,7 @@ def _settle(
 
 @inlined
 def _bring_back(points, share, centre, state, at):  # type: ignore[no-untyped-def]
-    """Fill ``at`` with where the points are at time 0."""
+    """Fill ``at`` with the positions of the points at time 0."""
     for i in range(len(points)):
         yaw = share[i] * state[3]
         c, s = np.cos(yaw), np.sin(yaw)
@@ -246,7 +254,7 @@ def _bring_back(points, share, centre, state, at):  # type: ignore[no-untyped-de
 
 @inlined
 def _add(H, g, J, weight, off_m):  # type: ignore[no-untyped-def]
-    """One residual, by its derivatives J (4,), to the normal equations."""
+    """Add one residual, by its derivatives J (4,), to the normal equations."""
     for m in range(4):
         g[m] += weight * J[m] * off_m
         for n in range(4):
@@ -255,7 +263,7 @@ def _add(H, g, J, weight, off_m):  # type: ignore[no-untyped-def]
 
 @inlined
 def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told):  # type: ignore[no-untyped-def]
-    """Fill the normal equations, by Tukey's weights, and ``told``; returns the weights' sum."""
+    """Fill the normal equations, by Tukey's weights, and ``told``; return the sum of weights."""
     H[:], g[:] = 0.0, 0.0
     total, distance_m, num_planes, first = 0.0, 0.0, 0, 0
     squared_reach = reach_m * reach_m

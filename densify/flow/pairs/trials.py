@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The test of a group's motion between two clouds: does it explain what differs?
+"""Test the motion of a group between two clouds: does it explain the differences?.
 
-Nearest points alone cannot tell. The rings of a scanner lie elsewhere on an object that has moved.
-Each promising motion is refined until the object's surfaces are thin (`densify.flow.pairs.refine`).
-It is judged by the points that it explains, and by the thickness of the surfaces compared with that
-of a static object.
+Nearest points alone cannot decide. The rings of a scanner are elsewhere on an object that has
+moved. Each promising motion is refined until the object's surfaces are thin
+(`densify.flow.pairs.refine`). It is judged by the points that it explains, and by the thickness of
+the surfaces relative to that at rest.
 """
 
 from __future__ import annotations
@@ -38,14 +38,20 @@ _MAX_OF_STANDING = 0.82  # where much is left
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """The evidence for a motion of a group, in the group and around its place in the target.
+    """The evidence for a motion of a group, in the group and around its position in the target.
 
-    group: its number. still: unexplained source points without the motion, left: with it, both of a
-    sample. misfit: mean distance to the target with it, as a share of the tolerance. still_there:
-    unexplained targets without it. firmly, firmly_there: those of all points that no scanner
-    explains. around: targets that are near. explained: those of them that it explains. own_gain_m:
-    by how much all distances from the group to the target become shorter, gain_m: and those from
-    the target around.
+    Attributes:
+        group: Number of the group.
+        still: Number of unexplained source points at rest, in a sample.
+        left: Number of unexplained source points with the motion, in the same sample.
+        misfit: Mean distance to the target with the motion, as a share of the tolerance.
+        still_there: Number of unexplained targets at rest.
+        firmly: Number of source points, of all, that no scanner explains.
+        firmly_there: Number of targets, of all, that no scanner explains.
+        around: Targets nearby.
+        explained: Targets nearby that the motion explains.
+        own_gain_m: Decrease of all distances from the group to the target.
+        gain_m: The same, with those from the target around.
     """
 
     group: int
@@ -65,7 +71,7 @@ class Trial:
     def of(
         group: int, members: Int, refined: Refined, ours: Unexplained, theirs: Unexplained
     ) -> Trial:
-        """Judge the motion of the source's ``members`` by nearest points."""
+        """Return the evidence for the motion of the source's ``members`` by nearest points."""
         sample = thinned(members, _LOOK_POINTS)
         place = ours.cloud.places(refined.motion.seen(ours.cloud.points[sample]), sample)
         far, tolerance_m = distances_m(place, theirs.cloud.tree), ours.tolerance_m(sample)
@@ -87,17 +93,24 @@ class Trial:
         )
 
     def after(self, found: Refined, settled: Trial) -> Trial:
-        """Return the trial of the refined motion. It is judged by nearest points before or after
-        the refinement, whichever fits better: rings drawn onto each other fit, but hold back."""
+        """Return the trial of the refined motion.
+
+        It is judged by nearest points before or after the refinement, whichever fits better. Rings
+        that are aligned with each other fit, but hold the motion back.
+        """
         here, there = (t._off(len(t.around) - len(t.explained)) for t in (self, settled))
         return replace(self, refined=found) if here < there else settled
 
     def left_there(self, free: Bool) -> int:
-        """Return the targets left unexplained. free: (M,) those that no other motion explains."""
+        """Return the number of targets that stay unexplained.
+
+        Args:
+            free: (M,) those that no other motion explains.
+        """
         return len(self.around) - int(free[self.explained].sum())
 
     def may_prove(self) -> bool:
-        """Return True if it explains enough, provided that its surfaces come out thin."""
+        """Return True if the motion explains enough, provided that its surfaces are thin."""
         far_m = float(np.linalg.norm(self.refined.motion.state[:2]))
         return (
             self.firmly >= MIN_UNEXPLAINED[0]
@@ -108,8 +121,11 @@ class Trial:
         )
 
     def proves(self, free: Bool) -> bool:
-        """Return True if the motion is confirmed. Less must be explained where the surfaces are
-        thin, and nearly all where they are as thin without the motion."""
+        """Return True if the motion is confirmed.
+
+        With thin surfaces less must be explained. If they are as thin at rest, nearly all must be
+        explained.
+        """
         left_there = self.left_there(free)
         off = self._off(left_there)
         if (
@@ -138,8 +154,10 @@ class Trial:
 def promising(
     hypotheses: Hypotheses, ours: Unexplained, theirs: Unexplained
 ) -> list[tuple[int, RigidMotion]]:
-    """Groups and motions that pass a first look, in the source alone; of several that are the same
-    the one that leaves least."""
+    """Return groups and motions that pass a first test, in the source alone.
+
+    Of several equal motions the one that leaves least is taken.
+    """
     num = len(hypotheses.state)
     row, of_point, state = hypotheses.row, hypotheses.of_point, hypotheses.state
     place = ours.cloud.places(hypotheses.seen(hypotheses.share[of_point]), row)
@@ -168,10 +186,11 @@ def promising(
 
 
 def _ambiguous(points: Float, way: Float) -> bool:
-    """Return True if the group cannot be told from another part of the same surface.
+    """Return True if the group could be another part of the same surface.
 
-    A flat group that moves along itself may be the strip of a wall seen through a gap. A level bar
-    may be any piece of a rail, unless it moves across itself and has the size of a far car's back.
+    A flat group that moves along itself may be a part of a wall, observed through a gap. A level
+    bar may be any part of a rail, unless it moves across itself and has the size of a far car's
+    back.
     """
     _, scale, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
     length_m, width_m, thickness_m = scale / np.sqrt(len(points))
@@ -186,8 +205,10 @@ def _ambiguous(points: Float, way: Float) -> bool:
 def _looked_back(
     motion: RigidMotion, members: Int, ours: Unexplained, theirs: Unexplained
 ) -> tuple[Int, Int, float]:
-    """What the target tells of the group where it arrives: `Trial`'s around, explained, and by how
-    much the distances become shorter (m)."""
+    """Return the evidence in the target at the position of the moved group.
+
+    It has `Trial`'s around and explained, and the decrease of the distances (m).
+    """
     sample = thinned(members, _JUDGE_POINTS)
     arrived = motion.seen(ours.cloud.points[sample])
     low, high = arrived.min(0) - _AROUND_M, arrived.max(0) + _AROUND_M

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The evidence of motion in two clouds: points of one without a counterpart in the other."""
+"""Find the evidence of motion in two clouds: points without a counterpart in the other cloud."""
 
 from __future__ import annotations
 
@@ -27,11 +27,15 @@ _MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # above the ground, of its lowest and highes
 
 
 class Unexplained:
-    """The points of a cloud that the other one does not explain, and the groups they form.
+    """The points of a cloud that the other one does not explain, and their groups.
 
-    distance_m: (N,) to the other cloud, at most 0.6 m. unexplained: (N,). firmly: (N,) unexplained
-    by the other scanners too: two scanners see the posts of a rail by different rings.
-    candidates: (C,) rows that belong to a group. group: (N,) its label, -1 for none.
+    Attributes:
+        distance_m: (N,) to the other cloud, at most 0.6 m.
+        unexplained: (N,) bool.
+        firmly: (N,) unexplained by the other scanners too: two scanners measure the posts of a
+            rail by different rings.
+        candidates: (C,) rows that belong to a group.
+        group: (N,) label of the group, -1 for none.
     """
 
     def __init__(self, cloud: PairCloud, distance_m: Float, alone: Bool) -> None:
@@ -45,6 +49,7 @@ class Unexplained:
 
     @staticmethod
     def of(cloud: PairCloud, other: PairCloud) -> Unexplained:
+        """Return the unexplained points of a cloud."""
         rows = np.arange(len(cloud.points))
         own_m = distances_m(cloud.places(cloud.points, rows), other.tree)
         alone = own_m > EXPLAINED_M
@@ -54,14 +59,17 @@ class Unexplained:
         return Unexplained(cloud, own_m, alone)
 
     def tolerance_m(self, rows: Int) -> Float:
-        """Return how far from each point a counterpart may be: sparse parts are sparse in both."""
+        """Return the distance of each point within which a counterpart counts.
+
+        It is larger in sparse parts, which are sparse in both clouds.
+        """
         k = min(_NUM_SPACING + 1, self.cloud.even_tree.n)
         place = self.cloud.places(self.cloud.points[rows], rows)
         spacing_m = np.asarray(self.cloud.even_tree.query(place, [k])[0])[:, 0]
         return np.clip(spacing_m, EXPLAINED_M, _MAX_EXPLAINED_M)
 
     def groups(self, ground: HeightMap) -> list[Int]:
-        """Return the rows of each group that may be a road user: no crowns of trees, no walls."""
+        """Return the rows of each group that may be a road user, without tree crowns and walls."""
         order = self.candidates[np.argsort(self.group[self.candidates], kind="stable")]
         parts = np.split(order, np.flatnonzero(np.diff(self.group[order])) + 1)
         return [
@@ -73,8 +81,11 @@ class Unexplained:
         ]
 
     def _grouped(self) -> Int:
-        """Return (N,) labels. Connected points are one group if it is no longer than a vehicle and
-        much of it is unexplained; elsewhere only the points close to unexplained ones."""
+        """Return (N,) labels of groups.
+
+        Connected points are one group if it is no longer than a vehicle and much of it is
+        unexplained. Elsewhere only the points close to unexplained ones are one.
+        """
         points = self.cloud.points
         num, label = link(points, _LINK_M)
         size = np.bincount(label, minlength=num)
@@ -89,7 +100,7 @@ class Unexplained:
 
 
 def _extents_m(points: Float, label: Int, num: int) -> Float:
-    """Return (num,) the diagonals of the groups' bounding boxes, seen from above."""
+    """Return (num,) the diagonals of the groups' bounding boxes from above."""
     low, high = np.full((num, 2), np.inf), np.full((num, 2), -np.inf)
     np.minimum.at(low, label, points[:, :2])
     np.maximum.at(high, label, points[:, :2])
