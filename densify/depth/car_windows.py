@@ -112,11 +112,9 @@ def _num_rays(layers: Layers, pixels: Bool) -> float:
 def _log_odds(lost: float, on_rim: float) -> float:
     """Return the mean log-likelihood ratio of a ray, for glass against a surface like the rim.
 
-    lost.
-
-    on_rim: shares of the rays without a return, in the hole and on the rim. A missing return adds
-    log(P(none | glass) / P(none | surface)). A return adds the log ratio of 1 - P(none). P(none |
-    glass) is the measured share if that is larger than the usual one.
+    The arguments are shares of the rays without a return, in the hole and on the rim. A missing
+    return adds log(P(none | glass) / P(none | surface)). A return adds the log ratio of 1 -
+    P(none). P(none | glass) is the measured share if that is larger than the usual one.
     """
     ordinary = max(on_rim, _LEAST_LOST)
     in_glass = min(max(lost, _LOST_IN_GLASS), 1 - _LEAST_LOST)

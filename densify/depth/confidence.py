@@ -83,10 +83,8 @@ def contradicted(layers: Layers, focal_px: float) -> Float32:
 def _contradicted(first, last, pixel, inverse, known, tilt, half_px, apart, share):  # type: ignore[no-untyped-def]
     """Fill ``share`` (H,W) float32 for each ``pixel`` (P,).
 
-    inverse.
-
-    known: (H,W) float32, 1/m, of the pixels and of those around, 0 none. half_px: size of the
-    surroundings, of which up to 11 pixels across are compared. apart: inverse depth, 1/m.
+    inverse and known: (H,W) float32, 1/m, of the pixels and of those around, 0 none. half_px: size
+    of the surroundings, of which up to 11 pixels across are compared. apart: inverse depth, 1/m.
     """
     height, width = known.shape
     step = max(1, -(-half_px // 5))

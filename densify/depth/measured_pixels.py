@@ -171,7 +171,7 @@ class _Visible(NamedTuple):
 
     start: of `sorted_by_pixel`. uv: (K,2) px. inverse: (K,) depth, 1/m. slope: (K,2) of it, 1/m per
     px. spacing_px: (K,2) between rays. edge_px: (K,) added to the reach of a depth discontinuity.
-    sweep: (K,) 0 to 62. hidden. moving: (K,). age_ns: (K,) from the key.
+    sweep: (K,) 0 to 62. hidden and moving: (K,). age_ns: (K,) from the key.
     """
 
     start: Int

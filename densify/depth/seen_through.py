@@ -139,11 +139,9 @@ def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Expo
 
 
 def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
-    """Return (P,) the share of the path from start to end at this depth, NaN for none.
+    """Return (P,) the share of the path at this depth, NaN for none.
 
-    start.
-
-    end: (P,3) camera frame.
+    The path is from ``start`` to ``end``, (P,3) in the camera frame.
     """
     way = end - start
     with np.errstate(divide="ignore", invalid="ignore"):

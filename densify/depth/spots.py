@@ -46,12 +46,10 @@ def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
 def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, found, nearest):  # type: ignore[no-untyped-def]
     """Find the measured pixel whose spot covers a filled one, nearest in the image.
 
-    pixel.
-
-    radius_px: (P,) of the measured ones. uv: (P,2) px of their returns. depth_m: (H,W). tilt:
-    (H,W,2) slope of inverse depth, 1/m per px. filled_m: (H,W) of the pixels that may be covered, 0
-    elsewhere. found: (H,W) int64, set to the measured pixel. nearest: (H,W) inf, squared distance
-    to its spot.
+    pixel and radius_px: (P,) of the measured ones. uv: (P,2) px of their returns. depth_m: (H,W).
+    tilt: (H,W,2) slope of inverse depth, 1/m per px. filled_m: (H,W) of the pixels that may be
+    covered, 0 elsewhere. found: (H,W) int64, set to the measured pixel. nearest: (H,W) inf, squared
+    distance to its spot.
     """
     height, width = filled_m.shape
     for i in range(len(pixel)):

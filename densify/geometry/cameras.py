@@ -123,10 +123,8 @@ def converted(camera: Camera, depth_m: Float32, given: str, wanted: str) -> Floa
 class _Lens(NamedTuple):
     """The distortion of a lens on the plane.
 
-    numerator.
-
-    denominator: of the radial factor, polynomials in the squared radius. limit: squared radius up
-    to which the distorted radius grows.
+    numerator and denominator: of the radial factor, polynomials in the squared radius. limit:
+    squared radius up to which the distorted radius grows.
     """
 
     numerator: Polynomial

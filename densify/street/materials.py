@@ -17,6 +17,7 @@ class Material(IntEnum):
     def __new__(
         cls, colour: tuple[float, float, float], reflectivity: float, gloss: float = 0.0
     ) -> Material:
+        """Return the next member, numbered from 0."""
         material = int.__new__(cls, len(cls.__members__))
         material._value_ = len(cls.__members__)
         material.row = (*colour, reflectivity, gloss)

@@ -93,7 +93,7 @@ class RigidMotion:
         return self.carry(points, self.seen_share)
 
     def carry(self, points: Float, share: float | Float) -> Float:
-        """Return (N,3) points of the object, moved by a share of the motion or by one share each."""
+        """Return (N,3) points of the object, moved by a share of the motion or by shares (N,)."""
         return apply(self.state * np.reshape(share, (-1, 1)), points, self.centre)
 
 

@@ -214,13 +214,11 @@ def _settle(
 ) -> None:
     """Move ``state`` (4,), in place, until the surfaces are thin, by Gauss-Newton steps.
 
-    points.
-
-    share: (n,3) as measured after that share (n,) of the motion. The distance of a point is that
-    from the plane of the points within ``reach_m`` whose sampling judges its own: sampling (n,),
-    judges (samplings, samplings). gates_m: for each step the distance from which on a point has no
-    weight. told: (2,) filled with the mean distance, at most ``_LIMIT_M``, and with the share of
-    points with a plane.
+    The points (n,3) are as measured after their ``share`` (n,) of the motion. The distance of a
+    point is that from the plane of the points within ``reach_m`` whose sampling judges its own:
+    sampling (n,) and judges (samplings, samplings). gates_m: for each step the distance from which
+    on a point has no weight. told: (2,) filled with the mean distance, at most ``_LIMIT_M``, and
+    with the share of points with a plane.
     """
     H, g = np.empty((4, 4)), np.empty(4)
     start, at = state.copy(), np.empty_like(points)
