@@ -161,10 +161,10 @@ def test_invalid_rows_are_dropped_and_the_rest_keep_their_row(tree):
     columns[7] = 0
     tree.bin.write_bytes(columns.tobytes())
     sweep = KittiRaw(tree.drive)[3]
-    np.testing.assert_array_equal(sweep.row, [1, 6])
-    np.testing.assert_array_equal(sweep.points, columns[[1, 6], :3])
-    np.testing.assert_array_equal(sweep.intensity, columns[[1, 6], 3])
-    assert sweep.offset_ns.shape == (2,)
+    np.testing.assert_array_equal(sweep.row, [1, 3, 6])
+    np.testing.assert_array_equal(sweep.points, columns[[1, 3, 6], :3])
+    np.testing.assert_array_equal(sweep.intensity, [2, 0, 7])  # 0 where there is none
+    assert sweep.offset_ns.shape == (3,)
 
 
 def test_cameras_project_as_the_calibration_chain_says(tree):

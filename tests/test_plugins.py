@@ -148,10 +148,10 @@ def test_a_reader_of_another_package(package, tmp_path: Path) -> None:
     data = tmp_path / "data"
     there = data / "there"
     there.mkdir(parents=True)
-    with pytest.raises(InputError, match="no known recording there; expected a KITTI raw drive"):
+    with pytest.raises(InputError, match=r"no recording: it is empty; expected .*kitti, .*, ros,"):
         densify.open_sequence(there)
     package("densify.readers", "marked", code)
-    with pytest.raises(InputError, match=", marks or a folder"):
+    with pytest.raises(InputError, match=", marked, folder"):
         densify.open_sequence(there)
     (there / "mark").touch()
     (data / "labels").mkdir()  # numbered, and named before it

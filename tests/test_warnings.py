@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 import yaml
 
+import densify
+from densify.config import resolve
+from densify.geometry import poses
 from densify.geometry.types import Camera
 from densify.outputs import write_result
+from densify.pipeline.recording import Recording
 from densify.pipeline.run import run
+from densify.pipeline.warnings import of_result
 from densify.readers.timeline import choose_cameras
+from densify.registration.compensation import find_compensated
 from tests.command import exit_code
 from tests.dataset_scenes import FRAMES, OPTIONS, copy_drive, records
 from tests.scenes import CAMERA, TinySequence, stamp_ns
@@ -81,6 +87,101 @@ def test_what_looks_wrong_is_said(sequence, says, tmp_path):
     write_result(result, tmp_path, config={}, data="tiny")
     record = yaml.safe_load((tmp_path / f"{KEY:06d}" / "run.yaml").read_text())
     assert set(result.warnings) <= set(record["warnings"])
+
+
+def test_points_that_are_left_out_are_counted(tmp_path):
+    class Cut(TinySequence):
+        def __getitem__(self, frame):
+            return replace(super().__getitem__(frame), num_untimed=700 * (frame == KEY + 1))
+
+    usual = one_car()
+    (told,) = warnings_of(Cut(usual.scene, usual.frames))
+    assert told.startswith(f"700 points of sweeps {KEY + 1} are left out: their times lie outside")
+    near = {"register": {"source": "dataset", "min_range_m": 8.0}}
+    (told,) = run(one_car(), KEY, 1, "icp", config=POSES_GIVEN | near).warnings
+    assert "register.min_range_m = 8 takes" in told and "% of the points as the own" in told
+
+
+def compensated(sweep, twist, moment):
+    """The sweep as a driver carries it to a moment of its own."""
+    since_s = 1e-9 * (sweep.offset_ns - moment(sweep.offset_ns))
+    points = poses.transform_each(since_s[:, None] * twist, sweep.points)
+    return replace(sweep, points=points)
+
+
+STAMP, FIRST, LAST = (lambda ns: 0), np.min, np.max
+
+
+@pytest.mark.parametrize(
+    ("moment", "says"), [(STAMP, "its stamp"), (FIRST, "its first point"), (LAST, "its last point")]
+)
+@pytest.mark.parametrize("source", ["dataset", "kiss-icp"])
+def test_sweeps_that_are_compensated_already_are_told(moment, says, source):
+    class Carried(TinySequence):
+        def __getitem__(self, frame):
+            return compensated(super().__getitem__(frame), [0, 0, 0, 4.0, 0, 0], moment)
+
+    usual, settings = one_car(), POSES_GIVEN | {"register": {"source": source}}
+    told = run(Carried(usual.scene, usual.frames), KEY, 1, "icp", config=settings).warnings
+    assert sum(f"compensated already, to {says}, and now a second time" in w for w in told) == 1
+    assert not any("compensated" in w for w in run(usual, KEY, 1, "icp", config=settings).warnings)
+
+
+@pytest.mark.parametrize("drive", ["2011_09_26_drive_0002_sync", "2011_09_26_drive_0013_sync"])
+def test_real_sweeps_are_told_as_they_are(drive, test_data):
+    sequence = densify.open_sequence(test_data / "kitti" / "2011_09_26" / drive)
+    key = sequence.frames[5]
+    T = [sequence.T_world_lidar(f) for f in (key - 1, key + 1)]
+    twist = poses.twist_between(
+        *T, 1e-9 * (sequence.stamp_ns(key + 1) - sequence.stamp_ns(key - 1))
+    )
+    assert find_compensated(sequence[key], twist) is None
+    for moment, says in ((STAMP, "its stamp"), (FIRST, "its first point")):
+        rings = find_compensated(compensated(sequence[key], twist, moment), twist)
+        assert rings is not None and rings.moment == says
+
+
+WRONG_POSES = {
+    "climbing": lambda T, s: shifted(0, 0, 0.3 * s) @ T,
+    "too long": lambda T, s: shifted(*(0.11 * T[:3, 3])) @ T,
+    "turning": lambda T, s: T @ poses.exp(np.array([0, 0, np.deg2rad(2) * s, 0, 0, 0])),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG_POSES)
+def test_poses_that_the_sweeps_contradict_are_told(kind):
+    class Wrong(TinySequence):
+        def T_world_lidar(self, frame):
+            T = super().T_world_lidar(frame)
+            return WRONG_POSES[kind](T, 0.1 * frame)
+
+    usual = one_car()
+    told = run(Wrong(usual.scene, usual.frames), KEY, 3, "icp", config=POSES_GIVEN).warnings
+    (found,) = [w for w in told if "the recording's poses lay sweep" in w]
+    assert "m and" in found and "--set register.source=kiss-icp does without" in found
+    own = POSES_GIVEN | {"register": {"source": "kiss-icp"}}
+    told = run(Wrong(usual.scene, usual.frames), KEY, 3, "icp", config=own).warnings
+    assert not any("poses" in w for w in told)
+
+
+def test_more_moving_points_than_there_can_be_are_told():
+    result = run(one_car(), KEY, 1, "icp", config=POSES_GIVEN)
+    moving = replace(result.cloud, moving=np.arange(len(result.cloud)) % 5 < 2)
+    stretch = Recording(one_car(), resolve(POSES_GIVEN), 1, [KEY]).window(KEY)
+    (told,) = of_result(replace(result, cloud=moving), stretch)
+    assert told.startswith("40 % of the points move, more than in any traffic")
+
+
+def test_a_run_of_empty_maps_fails(border_drive, tmp_path, capsys):
+    drive = copy_drive(border_drive, tmp_path / "2011_09_26")
+    path = drive.parent / "calib_velo_to_cam.txt"
+    R, _, _ = path.read_text().partition("T:")
+    path.write_text(f"{R}T: 0 900 0\n")
+    settings = (*OPTIONS, "--method", "icp", "--out", tmp_path / "out")
+    assert exit_code("run", drive, "--key", FRAMES[4], *settings) == 1
+    told = capsys.readouterr().err.splitlines()
+    assert told[-1].startswith("densify: every depth map is empty; are calibration and stamps")
+    assert (tmp_path / "out" / f"{FRAMES[4]:06d}" / "run.yaml").is_file()
 
 
 def shifted(*by_m: float) -> np.ndarray:

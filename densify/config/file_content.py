@@ -20,6 +20,7 @@ from densify.config.errors import InputError, how_to_install
 
 MOST_BYTES = 1 << 30
 """Largest content that is read into memory, unpacked. A sweep has 2 to 10 MB."""
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _MOST_YAML_BYTES = 1 << 22
 _MOST_ALIASES = 30  # nested aliases multiply: 30 of them make at most 60,000 values of one
 _MALFORMED = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
@@ -29,7 +30,8 @@ def open_file(path: Path) -> BinaryIO:
     """Open a file for reading; the caller closes it.
 
     Raises:
-        InputError: At once, if it is missing, unreadable, or a folder, pipe or device.
+        InputError: At once, if it is missing, unreadable, a folder, pipe or device, or a pointer to
+            a file that Git LFS has not fetched.
     """
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -38,7 +40,11 @@ def open_file(path: Path) -> BinaryIO:
     if not stat.S_ISREG(os.fstat(number).st_mode):
         os.close(number)
         raise InputError(f"{path}: cannot be read: it is no file but a folder, pipe or device")
-    return os.fdopen(number, "rb")
+    file = os.fdopen(number, "rb")
+    if file.peek(len(_LFS_POINTER)).startswith(_LFS_POINTER):
+        file.close()
+        raise InputError(f"{path}: is a Git LFS pointer, not the data; run git lfs pull")
+    return file
 
 
 def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:

@@ -12,41 +12,24 @@ from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, f
 from densify.doctor.sample import Sample
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
+from densify.registration.compensation import (
+    CLEARLY,
+    COMPENSATED_M,
+    LEAST_SHARPNESS,
+    LEAST_SPEED_M_S,
+    rings_by_motion,
+    sample_rows,
+    sharpness,
+)
 
-_NEAR_M, _FAR_M = 3.0, 60.0
-_COMPENSATED_M = 25.0  # nearer returns show a motion within the sweep
-_NUM_POINTS, _LEAST_POINTS = 20_000, 500
-_WINDOW_CELLS, _LEAST_SHARE = 100, 0.01
-_BIN_RAD = np.deg2rad(0.02)
-_LEAST_SPEED_M_S = 1.5
-_LEAST_SHARPNESS = 4.0  # of a scanner with distinct rings
-_CLEARLY = 1.25  # sharper by that factor
+_FAR_M = 60.0
+_LEAST_POINTS = 500
 _REACH_M = np.array([3.0, 0.8, 2.4])
 _GRID_M = (0.5, 0.4, 0.05)
 _COARSE_FROM_M, _COARSE_POINTS, _COARSE_BINS, _NUM_STARTS = 18.0, 3000, 3, 8
 _FINER = ((0.1, 3), (0.05, 2), (0.02, 1))  # step in metres, bins
 # KITTI's HDL-64E, whose two blocks of lasers stand apart, is sharpest from 0.2 m higher.
 _OFF_M = 0.3
-
-
-def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
-    """Return how much the elevations at an origin are concentrated in rings, 1 for an even spread.
-
-    In each window of elevation it is the chance that two returns share a cell of ``bins`` times
-    0.02 degrees, relative to an even spread. The result is the mean over the windows, each counted
-    alike, because from a place on the ground all of a flat ground is in one of them.
-    """
-    x, y, z = (points - origin_m).T
-    elevation = np.arctan2(z, np.hypot(x, y))
-    cell = ((elevation + 0.5 * np.pi) / (bins * _BIN_RAD)).astype(np.int64)
-    width = max(8, _WINDOW_CELLS // bins)
-    length = -(-int(np.pi / (bins * _BIN_RAD) + 1) // width)
-    count = np.bincount(cell, minlength=length * width).astype(np.float64).reshape(length, width)
-    held = count.sum(axis=1)
-    enough = held > _LEAST_SHARE * len(points)
-    if not enough.any():
-        return 1.0
-    return float(np.median((count[enough] ** 2).sum(axis=1) / held[enough] ** 2) * width)
 
 
 def check_rings(sample: Sample) -> list[Finding]:
@@ -75,28 +58,32 @@ def _check_compensation(
     spot = sample.fastest
     if spot is None:
         return finding(name, UNKNOWN, "no sweeps could be registered")
-    if spot.speed_m_s < _LEAST_SPEED_M_S:
-        return finding(name, UNKNOWN, spot.too_slow(_LEAST_SPEED_M_S))
+    if spot.speed_m_s < LEAST_SPEED_M_S:
+        return finding(name, UNKNOWN, spot.too_slow(LEAST_SPEED_M_S))
     sweep = spot.sweeps[spot.middle]
     sweep = sweep.select(sweep.lidar == lidar)
     is_untimed = sweep.offset_ns is None
     offset_s = _turning_s(sweep, sample) if sweep.offset_ns is None else sweep.offset_ns * 1e-9
-    near = _sample_of(sweep, _COMPENSATED_M)
-    found = _sharpness_by_motion(sweep.points[near], offset_s[near], spot.twist, R, origins_m)
-    as_stored, undone, done, moment = found
+    near = sample_rows(sweep, COMPENSATED_M)
+    points, offset_s = sweep.points[near], np.asarray(offset_s[near], np.float64)
+    rings = rings_by_motion(points, offset_s, spot.twist, R, origins_m)
+    if not rings.are_distinct:  # the origin was looked for in smeared rings
+        straight = poses.transform_each(-offset_s[:, None] * spot.twist, points) @ R.T
+        rings = rings._replace(undone=sharpness(straight, found_origin(straight, origins_m[0])))
+    as_stored, undone, done, moment = rings
     text = (
         f"at {spot.speed_m_s:.1f} m/s the rings' sharpness is {as_stored:.2f} as stored, "
         f"{undone:.2f} with a compensation undone, {done:.2f} with the motion compensated"
     )
     verdict, remedy = FINE, "--set register.deskew=false"
-    if max(as_stored, undone) < _LEAST_SHARPNESS:
+    if not rings.are_distinct:
         verdict, text = UNKNOWN, f"{text}; no distinct rings"
-    elif undone > _CLEARLY * as_stored and is_untimed:
+    elif rings.are_compensated and is_untimed:
         text += f": compensated to {moment}, without times"
-    elif undone > _CLEARLY * as_stored:
+    elif rings.are_compensated:
         verdict = WRONG
         text += f": the sweeps are compensated already, to {moment}, and would be a second time"
-    elif as_stored < _CLEARLY * undone:
+    elif as_stored < CLEARLY * undone:
         verdict, text = UNKNOWN, f"{text}: too alike to tell"
     elif is_untimed:
         stretched_m = spot.speed_m_s * sample.timeline.period_ns * 1e-9
@@ -108,47 +95,10 @@ def _check_compensation(
     return finding(name, verdict, text, remedy, as_stored=as_stored, undone=undone, done=done)
 
 
-def _sharpness_by_motion(
-    points: Float, offset_s: Float, twist: Float, R: Float, origins_m: tuple[Float, Float]
-) -> tuple[float, float, float, str]:
-    """Return the sharpness of rings as stored, with compensation undone, and with compensation.
-
-    The last result is the moment that they would be compensated to. points: (N,3) raw, fired at
-    offset_s (N,). twist: (6,) of the lidar, per second.
-    """
-
-    def sharpest(moved: Float) -> float:
-        return max(sharpness(moved, origin_m) for origin_m in origins_m)
-
-    def carried(since_s: Float) -> Float:
-        return poses.transform_each(since_s[:, None] * twist, points) @ R.T
-
-    # The moment they were compensated to may be any of the sweep's.
-    moments_s = {
-        "its stamp": 0.0,
-        "its first point": float(offset_s.min()),
-        "its last point": float(offset_s.max()),
-    }
-    as_stored = sharpest(points @ R.T)
-    undone_to = {name: sharpest(carried(at_s - offset_s)) for name, at_s in moments_s.items()}
-    moment = max(undone_to, key=lambda name: undone_to[name])
-    undone, done = undone_to[moment], sharpest(carried(offset_s))
-    if max(as_stored, undone) < _LEAST_SHARPNESS:  # the origin was looked for in smeared rings
-        straight = carried(-offset_s)
-        undone = sharpness(straight, found_origin(straight, origins_m[0]))
-    return as_stored, undone, done, moment
-
-
 def _turning_s(sweep: Sweep, sample: Sample) -> Float:
     """Return the times of a scanner that turns clockwise and faces forward at the stamp."""
     turn = -np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi)
     return turn * (sample.timeline.period_ns * 1e-9)
-
-
-def _sample_of(sweep: Sweep, far_m: float) -> np.ndarray:
-    range_m = np.linalg.norm(sweep.points, axis=1)
-    rows = np.flatnonzero((range_m > _NEAR_M) & (range_m < far_m))
-    return rows[:: len(rows) // _NUM_POINTS + 1]
 
 
 def _still_points(sample: Sample, lidar: int) -> Float:
@@ -157,7 +107,7 @@ def _still_points(sample: Sample, lidar: int) -> Float:
     for spot in sample.spots:
         sweep = spot.sweeps[spot.middle]
         sweep = sweep.select(sweep.lidar == lidar)
-        parts.append(sweep.points[_sample_of(sweep, _FAR_M)])
+        parts.append(sweep.points[sample_rows(sweep, _FAR_M)])
     return np.concatenate(parts)[:: len(parts)]
 
 
@@ -180,9 +130,9 @@ def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: 
     )
     line = f"scanner_origins: {[[round(float(v), 2) for v in found_m]]}"
     verdict, remedy = FINE, f"give the scanner's place in the points' frame ({line})"
-    if found < _LEAST_SHARPNESS:
+    if found < LEAST_SHARPNESS:
         verdict, text = UNKNOWN, f"{text}; no distinct rings"
-    elif off_m > _OFF_M and found > _CLEARLY * given:
+    elif off_m > _OFF_M and found > CLEARLY * given:
         verdict = WRONG
     return finding(name, verdict, text, remedy, **values)
 

@@ -38,6 +38,7 @@ from densify.geometry.types import (
     StandingWorld,
     Stretch,
     StretchFlow,
+    Sweep,
     Trajectory,
 )
 from densify.pipeline.costs import Watch
@@ -164,6 +165,10 @@ class Recording:
     def window(self, key: int) -> Stretch:
         """Return the registered, deskewed sweeps of a key's window. Errors as `window_frames`."""
         return self._stretch(self.cut.number_of[key], self.window_frames(key).frames)
+
+    def raw(self, frame: int) -> Sweep:
+        """Return a sweep as it was fired, without the own vehicle's returns."""
+        return self._sweeps.read(frame)
 
     def around(self, key: int) -> Stretch:
         """Return the sweeps in which the motion in a key's window is found."""

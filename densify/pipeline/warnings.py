@@ -14,11 +14,16 @@ from densify.geometry.types import LidarSequence, Result, Stretch
 from densify.pipeline.key_result import METHODS, looks_around
 from densify.pipeline.recording import Recording
 from densify.readers.timeline import format_frames
+from densify.registration.alignment import find_misfit
+from densify.registration.compensation import find_compensated
 from densify.scores.depth_metrics import image_density
 
 _LEAST_DENSITY = 0.001  # sixteen rings alone measure 0.5 % of an image
 _SLOW_S = 0.15  # from sweep to sweep; at 5 Hz trucks slide along their own sides
 _OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image
+_LIFTED_M = 0.04  # right poses lay real sweeps up to 0.03 m apart, half a second from each other
+_MUCH_NEAR = 0.2  # of the points; a car's own returns were 0 to 14 %
+_MUCH_MOVES = 1 / 3  # of the points: ground and buildings are most of what a scanner sees
 
 
 def add_warnings(
@@ -43,9 +48,10 @@ def add_warnings(
             if name not in cameras and not sequence.image_stamps_ns(name)
         ),
         *_of_sweeps(stretch, recording.settings),
+        *_of_motion(recording, key),
         *_of_images(sequence, shots),
     ]
-    told = {n: dict.fromkeys([*shared, *_of_result(r, stretch)]) for n, r in results.items()}
+    told = {n: dict.fromkeys([*shared, *of_result(r, stretch)]) for n, r in results.items()}
     return {name: replace(result, warnings=tuple(told[name])) for name, result in results.items()}
 
 
@@ -58,8 +64,48 @@ def _of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
 
 
 def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
-    if settings.register.deskew and any(s.sweep.offset_ns is None for s in stretch.sweeps):
+    sweeps = [registered.sweep for registered in stretch.sweeps]
+    if settings.register.deskew and any(sweep.offset_ns is None for sweep in sweeps):
         yield "the points have no times of their own: motion within a sweep is not undone"
+    untimed = {sweep.frame: sweep.num_untimed for sweep in sweeps if sweep.num_untimed}
+    if untimed:
+        yield (
+            f"{sum(untimed.values()):,} points of sweeps {format_frames(untimed)} are left out: "
+            f"their times lie outside their sweep, the driver wrote them wrong"
+        )
+    num_near = sum(sweep.num_near for sweep in sweeps)
+    share = num_near / max(num_near + sum(len(sweep) for sweep in sweeps), 1)
+    if share > _MUCH_NEAR:
+        yield (
+            f"register.min_range_m = {settings.register.min_range_m:g} takes {100 * share:.0f} % "
+            f"of the points as the own vehicle's; indoors and on small robots set it to the reach "
+            f"of the vehicle"
+        )
+
+
+def _of_motion(recording: Recording, key: int) -> Iterator[str]:
+    """Check the motion within the key sweep, and given poses against the sweeps themselves."""
+    settings, stretch = recording.settings.register, recording.window(key)
+    at = stretch[key]
+    rings = find_compensated(recording.raw(key), 0.5 * (at.twist_before + at.twist_after))
+    if rings is not None:
+        yield (
+            f"the sweeps are compensated already, to {rings.moment}, and now a second time: the "
+            f"rings are {rings.undone / rings.as_stored:.1f} times as sharp with a compensation "
+            f"undone; --set register.deskew=false"
+        )
+    if settings.source != "dataset":
+        return
+    ends = {s.sweep.frame: s for s in (stretch.sweeps[0], stretch.sweeps[-1]) if s is not at}
+    misfits = {frame: find_misfit(at, end) for frame, end in ends.items()}
+    frame = max(misfits, key=lambda f: misfits[f].lift_m, default=key)
+    if frame != key and misfits[frame].lift_m > _LIFTED_M:
+        off_m, off_deg, lift_m = misfits[frame]
+        yield (
+            f"the recording's poses lay sweep {frame} {off_m:.2f} m and {off_deg:.1f} deg from "
+            f"where it fits on sweep {key}, surfaces {100 * lift_m:.0f} cm apart: are they the "
+            f"lidar's, by its clock? --set register.source=kiss-icp does without them"
+        )
 
 
 def _of_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[str]:
@@ -78,7 +124,8 @@ def _of_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[s
         )
 
 
-def _of_result(result: Result, stretch: Stretch) -> Iterator[str]:
+def of_result(result: Result, stretch: Stretch) -> Iterator[str]:
+    """Yield the warnings about the result of one method, made of these sweeps."""
     stamps_ns = [s.sweep.stamp_ns for s in stretch.sweeps]
     if METHODS[result.method].engine is not None and len(stamps_ns) > 1:
         period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
@@ -87,6 +134,11 @@ def _of_result(result: Result, stretch: Stretch) -> Iterator[str]:
                 f"sweeps are {period_s:.2g} s apart: fast objects are followed less exactly than "
                 f"at 10 Hz, and lost where they turn or are occluded between two"
             )
+    if result.cloud.moving.mean() > _MUCH_MOVES:
+        yield (
+            f"{100 * result.cloud.moving.mean():.0f} % of the points move, more than in any "
+            f"traffic: are poses and times of points right? densify doctor looks into both"
+        )
     if result.far_left_out:
         yield (
             f"sweeps {format_frames(result.far_left_out)} are left out of the far range: surfaces "

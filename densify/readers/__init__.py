@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, cast
@@ -11,6 +12,8 @@ from typing import NamedTuple, Protocol, cast
 from densify.config.errors import InputError, did_you_mean
 from densify.config.plugins import READERS, Plugin
 from densify.geometry.types import LidarSequence
+from densify.readers.checks import drive_around
+from densify.readers.file_sequence import FileSequence
 
 _MOST_PLACES = 200  # are looked at for a recording, where the one named is none itself
 
@@ -89,7 +92,8 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
             ``street[:PRESET][?seed=N&sensor=NAME]``. Without ``READER:`` the files tell the reader.
 
     Raises:
-        InputError: There is nothing there, or no reader knows it.
+        InputError: There is nothing there, no reader knows it, or the first image of a camera is
+            not of the size of its calibration.
     """
     parsed = Spec.parse(spec)
     if parsed.reader == "street":
@@ -102,7 +106,10 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
             f"--data {spec}: {reader.name} recordings have no scenes; leave #{parsed.scene} out"
         )
     module = cast(ReaderModule, reader.work())
-    return module.open_recording(parsed.path, parsed.scene)
+    sequence = module.open_recording(parsed.path, parsed.scene)
+    if isinstance(sequence, FileSequence):
+        sequence.check_first_images()
+    return sequence
 
 
 def _reader_of(parsed: Spec, where: str) -> Plugin:
@@ -123,8 +130,23 @@ def _reader_of(parsed: Spec, where: str) -> Plugin:
     inside = _recording_in(parsed.path, readers)
     if inside is not None:
         raise InputError(f"{where}: no recording itself; one in it is {inside}: name that")
-    *most, last = (reader.holds for reader in readers)
-    raise InputError(f"{where}: no known recording there; expected {', '.join(most)} or {last}")
+    raise InputError(
+        f"{where}: no recording: {_what_is_there(parsed.path)}; expected one of the readers "
+        f"{', '.join(reader.name for reader in readers)} (densify info --help says what each reads)"
+    )
+
+
+def _what_is_there(path: Path) -> str:
+    """Return what a place without a recording holds, for people."""
+    if path.is_file():
+        return f"it is a {path.suffix or 'file without a suffix'} file"
+    found = Counter(entry.suffix.lower() or "other" for entry in path.iterdir() if entry.is_file())
+    parts = [f"{num} {suffix} file{'s' * (num > 1)}" for suffix, num in found.most_common(3)]
+    num_folders = sum(entry.is_dir() for entry in path.iterdir())
+    parts += [f"{num_folders} folder{'s' * (num_folders > 1)}"] * bool(num_folders)
+    text = f"it holds {', '.join(parts)}, no lidar sweeps" if parts else "it is empty"
+    drive = drive_around(path)
+    return text if drive is None else f"{text}, and is inside a KITTI drive: give {drive}"
 
 
 def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:

@@ -107,7 +107,7 @@ class Argoverse2(FileSequence):
         )
 
     def _returns(self, frame: int) -> Returns:
-        kinds = {"x": "m", "y": "m", "z": "m", "intensity": "n"}
+        kinds = {"x": "m", "y": "m", "z": "m", "intensity": "m"}
         columns = _read(self._files[frame], {**kinds, "laser_number": "i", "offset_ns": "i"})
         offset_ns = columns["offset_ns"].astype(np.int64)
         points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import needed, reason
+from densify.config.file_content import needed, open_file, reason
 
 _EXPECTED = {
     "n": "finite numbers",
@@ -69,6 +69,7 @@ def _read(
 ) -> dict[str, NDArray[Any]]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected the columns {', '.join(columns)} in it")
+    open_file(path).close()  # says what is wrong with the file itself
     try:
         table = read()
         there = table.column_names

@@ -41,6 +41,11 @@ def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
+def drive_around(path: Path) -> Path | None:
+    """Return the KITTI drive around a place, None without one."""
+    return next((p for p in path.absolute().parents[:2] if (p / "velodyne_points").is_dir()), None)
+
+
 def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
     """Return the entry of a frame.
 
@@ -84,7 +89,8 @@ def image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> Non
     if shape[:2] != (camera.height_px, camera.width_px):
         raise InputError(
             f"{where}: got an image of {shape[1]} x {shape[0]} px; expected {camera.width_px} x "
-            f"{camera.height_px}, as the calibration of {camera.name} says"
+            f"{camera.height_px}, as the calibration of {camera.name} says; correct its size "
+            f"and K, which go with the size of the images"
         )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import MOST_BYTES, check_size, read_bytes, reason
+from densify.config.file_content import MOST_BYTES, check_size, open_file, read_bytes, reason
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -137,6 +137,20 @@ def image_size_px(path: Path) -> tuple[int, int]:
     """
     height, width = read_image(path).shape[:2]
     return width, height
+
+
+def stated_size_px(path: Path) -> tuple[int, int] | None:
+    """Return width and height as the header of an image file states them, None without a header.
+
+    The rest of the file may be damaged.
+    """
+    from PIL import Image
+
+    try:
+        with open_file(path) as file, Image.open(file, formats=("PNG", "JPEG")) as image:
+            return image.size
+    except (InputError, OSError, ValueError, SyntaxError):  # said where the image is read
+        return None
 
 
 def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:

@@ -39,14 +39,14 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
     unreadable = dict(timeline.unknown)
     first = _readable(sequence, timeline.frames, unreadable)
     last = _readable(sequence, timeline.frames[::-1], unreadable)
-    num_points = {sweep.frame: len(sweep) for sweep in (first, last)}
+    num_points = {sweep.frame: _num_points(sweep) for sweep in (first, last)}
     named = sorted(unreadable)[:_MOST_NAMED]
     lines = [
         ("name", sequence.name),
         ("frames", _frames(sequence)),
         ("rate", _hertz(timeline.stamp_ns) if len(timeline.frames) > 1 else "unknown, one sweep"),
         ("stamps", f"{first.stamp_ns} to {last.stamp_ns} ns ({_seconds(first, last):.2f} s)"),
-        ("points", ", ".join(f"{num:,} in frame {f}" for f, num in num_points.items())),
+        ("points", ", ".join(f"{num} in frame {f}" for f, num in num_points.items())),
         ("point times", _point_times(first)),
         *_cameras(sequence),
         ("poses", _poses(sequence, [f for f in timeline.frames if f not in unreadable])),
@@ -84,6 +84,11 @@ def _hertz(stamps_ns: Sequence[int] | Int) -> str:
 
 def _seconds(first: Sweep, last: Sweep) -> float:
     return (last.stamp_ns - first.stamp_ns) / 1e9
+
+
+def _num_points(sweep: Sweep) -> str:
+    untimed = f" ({sweep.num_untimed:,} more left out: their times are not of the sweep)"
+    return f"{len(sweep):,}{untimed * bool(sweep.num_untimed)}"
 
 
 def _point_times(first: Sweep) -> str:

@@ -22,6 +22,7 @@ from densify.config.errors import InputError
 from densify.config.file_content import described_in, read_bytes
 from densify.geometry.types import Camera, Float, Float32, Int, Sweep, Truth
 from densify.readers import checks
+from densify.readers.decoded_files import stated_size_px
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Returns:
         scanner_origins: (S,3) metres; None if rays start at the origin of the frame.
         R_scanner_lidar: (S,3,3) to the axes of each scanner, which spins about z; None if they
             are those of the frame.
+        num_untimed: Number of those rows at 0 0 0 whose time cannot be of this sweep.
     """
 
     points: Float
@@ -44,6 +46,7 @@ class Returns:
     lidar: NDArray[np.integer[Any]] | None = None
     scanner_origins: Float | None = None
     R_scanner_lidar: Float | None = None
+    num_untimed: int = 0
 
 
 class FileSequence(ABC):
@@ -89,6 +92,10 @@ class FileSequence(ABC):
         self._exposed_ns = dict(exposed_ns or {})
         self._files = files or {}
         self._image_files = images or {}
+        if self._files and not any(path.stat().st_size for path in self._files.values()):
+            raise InputError(
+                f"{where}: all {len(self._files)} files of sweeps are empty; fetch them again"
+            )
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep without reading its points."""
@@ -113,6 +120,14 @@ class FileSequence(ABC):
         """See `LidarSequence`; empty where sweeps share files."""
         return {frame: path.stat().st_size for frame, path in self._files.items()}
 
+    def check_first_images(self) -> None:
+        """Raise InputError if the first image of a camera is not of the size of its calibration."""
+        for name, files in self._image_files.items():
+            path = next(iter(files.values()))
+            size_px = stated_size_px(path)
+            if name in self.cameras and size_px is not None:
+                checks.image_size(size_px[::-1], self.cameras[name], path)
+
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         """Return the (H,W,3) RGB of an existing image."""
         path, data = self._encoded_image(camera.name, number)
@@ -133,8 +148,8 @@ class FileSequence(ABC):
     def __getitem__(self, frame: int) -> Sweep:
         """Return the valid returns of a sweep in file order.
 
-        Rows that are not finite are dropped, and rows at the origin of the frame, with which many
-        formats pad.
+        Rows whose position is not finite are dropped, and rows at the origin of the frame, with
+        which many formats pad. An intensity that is not finite is 0.
 
         Raises:
             InputError: The frame does not exist, or its file is damaged or holds no returns.
@@ -144,11 +159,14 @@ class FileSequence(ABC):
         valid = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
         row = np.flatnonzero(valid)
         if not len(row):
+            untimed = f", {returns.num_untimed} with a time of another sweep"
             raise InputError(
-                f"{path}: holds no points (frame {frame}: {len(returns.points)} rows, none valid); "
-                f"choose a key or window without this frame"
+                f"{path}: holds no points (frame {frame}: {len(returns.points)} rows, none valid"
+                f"{untimed * bool(returns.num_untimed)}); choose a key or window without this frame"
             )
         intensity, lidar = _rows(returns.intensity, row), _rows(returns.lidar, row)
+        if intensity is not None:
+            intensity = np.where(np.isfinite(intensity), intensity, 0)
         num = 256 if returns.scanner_origins is None else len(returns.scanner_origins)
         if lidar is not None and not 0 <= lidar.min() <= lidar.max() < num:
             raise InputError(
@@ -165,6 +183,7 @@ class FileSequence(ABC):
             row=row.astype(np.int64, copy=False),
             scanner_origins=returns.scanner_origins,
             R_scanner_lidar=returns.R_scanner_lidar,
+            num_untimed=returns.num_untimed,
         )
 
     def num_rows(self, frame: int) -> int:

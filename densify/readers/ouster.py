@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import needed, read_json, reason
+from densify.config.file_content import needed, open_file, read_json, reason
 from densify.readers.file_sequence import FileSequence, Returns
 
 
@@ -64,6 +64,7 @@ class Ouster(FileSequence):
         core = needed("ouster.sdk.core", "ouster", "Ouster captures")
         pcap = needed("ouster.sdk.pcap", "ouster", "Ouster captures")
         read_json(metadata)
+        open_file(path).close()  # says what is wrong with the file itself
         try:
             self._source = pcap.PcapFrameSetSource(str(path), meta=[str(metadata)], index=True)
             index = self._source.individual_index[0]

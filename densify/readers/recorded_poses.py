@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from densify.config.errors import InputError
+from densify.config.file_content import read_text
 from densify.geometry import poses
 from densify.geometry.types import Float, Int
 from densify.readers import checks
@@ -149,6 +150,28 @@ class PoseFile:
         T = np.stack([checks.quaternion_pose(v[:4], v[4:], f"{path}: line {n}") for v, n in lines])
         stamps_ns = None if time is None else table.times_ns(time, unit)[0]
         return PoseFile(path, form, T, stamps_ns)
+
+    @staticmethod
+    def read_each(paths: Sequence[Path]) -> PoseFile:
+        """Return the poses of files with one pose each.
+
+        Raises:
+            InputError: A file is malformed.
+        """
+        T = []
+        for path in paths:
+            count = len(read_text(path).split())
+            values = checks.parse_numbers(read_text(path), str(path), count)
+            if count in (12, 16):
+                T.append(checks.rigid(values, str(path)))
+            elif count == 7:
+                T.append(checks.quaternion_pose(values[[6, 3, 4, 5]], values[:3], str(path)))
+            else:
+                raise InputError(
+                    f"{path}: got {count} numbers, expected 12 or 16 (rows of T_world_lidar) or "
+                    f"7 (x y z qx qy qz qw); write them as lines of a file poses.txt instead"
+                )
+        return PoseFile(paths[0], "one file for each sweep", np.stack(T))
 
 
 def _numbers(table: TextTable, columns: Sequence[int] | None = None) -> Float:

@@ -32,7 +32,7 @@ from densify.geometry import poses
 from densify.geometry.types import Camera, Float, Float32
 from densify.readers import checks
 from densify.readers.file_sequence import FileSequence, Returns
-from densify.readers.point_fields import PointLayout
+from densify.readers.point_fields import PointLayout, sample_columns
 from densify.readers.recorded_poses import PoseTrack
 from densify.readers.ros_bag import POSES, Bag, Entry, Topics, place_of
 from densify.readers.ros_messages import (
@@ -44,7 +44,6 @@ from densify.readers.ros_messages import (
     recorded_track,
 )
 
-_NUM_TRIED = 5  # messages, until one holds points
 _USUAL_PERIOD_NS = 100_000_000
 
 
@@ -102,6 +101,7 @@ class RosBag(FileSequence):
                     raise
                 self._left_out.append(str(error))
                 continue
+            self._check_size(camera, topic)
             cameras[camera.name], self._image_topics[camera.name] = camera, topic
         stamps = {
             name: {n: entry.stamp_ns for n, entry in enumerate(self._index[topic])}
@@ -142,6 +142,7 @@ class RosBag(FileSequence):
             np.concatenate([part.offset_ns for part in parts]) if timed else None,  # type: ignore
             np.concatenate([np.full(len(part.points), n, np.uint8) for n, part in found]),
             origins if len(self._lidars) > 1 else None,
+            num_untimed=sum(part.num_untimed for part in parts),
         )
 
     def _returns_of(self, lidar: Lidar, entry: Entry, stamp_ns: int) -> Returns:
@@ -155,6 +156,33 @@ class RosBag(FileSequence):
         if offset_ns is not None:
             offset_ns = offset_ns + (entry.stamp_ns - stamp_ns)
         return replace(found, points=points, offset_ns=offset_ns)
+
+    def gaps(self) -> list[str]:
+        """See `LidarSequence`."""
+        num = self._bag.num_unstamped
+        return [
+            f"{topic}: {num[topic]} headers have no stamp: taken is when they were recorded"
+            for topic in self._index
+            if num[topic]
+        ]
+
+    def _check_size(self, camera: Camera, topic: str) -> None:
+        """Raise InputError if the first image of a topic is not of the camera's size."""
+        where, info = f"{self._bag.path}: {topic}", f"{place_of(topic)}/camera_info"
+        message = self._bag.message(topic, self._index[topic][0])
+        if hasattr(message, "format"):
+            height, width = image_rgb(message, where).shape[:2]
+        else:
+            height, width = message.height, message.width
+        told = next(self._bag.messages(info))
+        by = max(told.binning_x, told.binning_y)
+        if by > 1 and (width, height) == (told.width, told.height):
+            raise InputError(
+                f"{where}: {info} says binning {by}, but the images have all of its {width} x "
+                f"{height} px: they are binned already; record it with binning_x and binning_y 0, "
+                f"or leave the camera out of #images="
+            )
+        checks.image_size((height, width), camera, where)
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         topic = self._image_topics[camera.name]
@@ -193,14 +221,12 @@ class RosBag(FileSequence):
 
     def _lidar(self, topic: str) -> Lidar:
         where, entries = f"{self._bag.path}: {topic}", self._index[topic]
-        for entry in entries[:_NUM_TRIED]:
-            message = self._bag.message(topic, entry)
-            columns = cloud_columns(message, where)
-            if len(next(iter(columns.values()), ())):
-                break
-        else:
-            raise InputError(f"{where}: its first messages hold no points")
-        frame = plain(message.header.frame_id)
+        found = sample_columns(
+            entries, lambda entry: cloud_columns(self._bag.message(topic, entry), where)
+        )
+        if not found:
+            raise InputError(f"{where}: the messages looked at hold no points")
+        frame = plain(self._bag.message(topic, next(iter(found))).header.frame_id)
         first = self._lidars[0].frame if self._lidars else frame
         T = self._transforms.between(first, frame)
         if T is None:
@@ -210,7 +236,8 @@ class RosBag(FileSequence):
             )
         steps = np.diff([e.stamp_ns for e in entries])
         period_ns = max(1, int(np.median(steps))) if len(steps) else _USUAL_PERIOD_NS
-        layout = PointLayout.find(columns, where, period_ns, entry.stamp_ns)
+        stamps_ns = [entry.stamp_ns for entry in found]
+        layout = PointLayout.find([*found.values()], where, period_ns, stamps_ns)
         return Lidar(topic, frame, entries, T, period_ns, layout)
 
     def _camera(self, topic: str) -> Camera:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 import re
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
 from densify.config.errors import InputError
-from densify.config.file_content import needed, reason
+from densify.config.file_content import needed, open_file, reason
 
 _MEND = "a bag that was cut off can be mended: rosbag reindex, ros2 bag reindex, mcap recover"
 
@@ -79,6 +80,7 @@ class Bag:
         path: A .bag, .db3 or .mcap file, the folder of a ROS 2 bag, or a folder of .bag files
             that are parts of one recording.
         topics: By name.
+        num_unstamped: By topic, the number of indexed messages whose header has no stamp.
     """
 
     def __init__(self, path: Path) -> None:
@@ -87,8 +89,12 @@ class Bag:
         self._files = _bag_files(path)
         self._is_ros2 = not (self._files[0].suffix == ".bag" and self._files[0].is_file())
         self._types = message_types(self._is_ros2)
+        for file in self._files:
+            for part in [file] if file.is_file() else file.glob("*.*"):
+                open_file(part).close()  # says what is wrong with the file itself
         package = needed(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
         self._lock = RLock()
+        self.num_unstamped = Counter[str]()
         try:
             self._readers = [package.Reader(file) for file in self._files]
             for reader in self._readers:
@@ -112,6 +118,7 @@ class Bag:
             except struct.error:
                 raise InputError(f"{self.path}: {topic}: a message of {len(raw)} bytes") from None
             found[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
+            self.num_unstamped[topic] += not stamp_ns
         return {topic: sorted(entries) for topic, entries in found.items()}
 
     def message(self, topic: str, entry: Entry) -> Any:

@@ -255,7 +255,10 @@ def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
     origins_m = sweep.scanner_origins
     x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T
     range_m = np.sqrt(x * x + y * y + z * z)
-    return sweep.select((range_m >= settings.min_range_m) & (range_m <= settings.max_range_m))
+    near = range_m < settings.min_range_m
+    return replace(
+        sweep.select(~near & (range_m <= settings.max_range_m)), num_near=int(near.sum())
+    )
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:

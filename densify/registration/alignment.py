@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from densify.geometry import poses
-from densify.geometry.types import Float, Sweep
+from densify.geometry.types import Float, RegisteredSweep, Sweep
 
 _MANY_POINTS = 30_000  # before they are thinned to voxels
 _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are even for any order of the rings
 _VOXEL_M, _LEAF_M, _NUM_NEIGHBORS = 0.5, 1.0, 10
 _HELD_AT_M = 10.0
+_MISFIT_M = 1.0  # farther off, poses are found by their overlap
 _NORMAL_M = 0.0447  # two surfaces' spread along the normal, as small_gicp weighs: sqrt(2 · 1e-3)
 
 
@@ -121,6 +122,31 @@ def align(target: Surface, source: Surface, T_target_source: Float, match_m: flo
         num_threads=1,
     )
     return Alignment.of(found, source)
+
+
+class Misfit(NamedTuple):
+    """The distance of a sweep from the pose at which it fits on another.
+
+    Attributes:
+        off_m: Metres.
+        off_deg: Degrees.
+        lift_m: Root mean square distance by which it lifts surfaces off those of the other.
+    """
+
+    off_m: float
+    off_deg: float
+    lift_m: float
+
+
+def find_misfit(target: RegisteredSweep, source: RegisteredSweep) -> Misfit:
+    """Return the distance of two deskewed sweeps from the poses at which their surfaces fit."""
+    onto, moved = (Surface.of(subsample(s.sweep).points) for s in (target, source))
+    T = poses.inverse(target.T_world_lidar) @ source.T_world_lidar
+    found = align(onto, moved, T, _MISFIT_M)
+    off = poses.log(poses.inverse(T) @ found.T_target_source)
+    lift_m = np.sqrt(max(float(off @ found.information @ off), 0.0))
+    off_m, off_rad = np.linalg.norm(off[3:]), np.linalg.norm(off[:3])
+    return Misfit(float(off_m), float(np.rad2deg(off_rad)), float(lift_m))
 
 
 def align_with_planes(

@@ -21,6 +21,7 @@ from densify.cli.options import (
 )
 from densify.cli.screen import Answer, progress_on_stderr
 from densify.config.errors import InputError
+from densify.config.plugins import READERS
 
 if TYPE_CHECKING:
     from densify.doctor import Diagnosis
@@ -31,7 +32,8 @@ _WIDTH = 100
 def add_info(commands: Any) -> None:
     """Add the options of ``info``."""
     about = "print what a recording holds: frames, rate, cameras, stamps, poses"
-    add_recording(add_verb(commands, "info", answer_info, about))
+    readers = "; ".join(f"{row.name}: {row.holds}" for row in READERS.built_in)
+    add_recording(add_verb(commands, "info", answer_info, about, f"Readers: {readers}."))
 
 
 def answer_info(options: argparse.Namespace) -> Iterator[Answer]:

@@ -120,6 +120,11 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
             first = first_of(paths, FIRST_OF_RUN)
             yield Answer(summary(result), {"keys": [key_facts(result)]}, paths, first)
             doubts += [(warning, "", key) for warning in result.warnings]
+            if result.depth and not any(maps.filled_m.any() for maps in result.depth.values()):
+                failed[key] = ComputationError(
+                    "every depth map is empty; are calibration and stamps right? densify doctor "
+                    "looks into both"
+                )
     tell_doubts(doubts)
     if len(keys) == 1 and failed:
         raise failed[keys[0]]

@@ -32,6 +32,8 @@ class Sweep:
             all start at the frame's origin.
         R_scanner_lidar: (S,3,3) turns the lidar frame's axes into each scanner's, z along the one
             it spins about, upwards; None where they are the frame's.
+        num_untimed: Number of returns left out because their times cannot be of this sweep.
+        num_near: Number of returns left out because they are nearer than register.min_range_m.
     """
 
     frame: int
@@ -43,6 +45,8 @@ class Sweep:
     row: Int
     scanner_origins: Float | None = None
     R_scanner_lidar: Float | None = None
+    num_untimed: int = 0
+    num_near: int = 0
 
     def __post_init__(self) -> None:
         n = len(self.points)

@@ -16,11 +16,10 @@ images: need a calibration; stamped by names, a file, or the sweeps of the same 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,15 +38,15 @@ from densify.readers.folder.series import (
     images_in,
     in_time,
 )
-from densify.readers.point_fields import PointLayout
+from densify.readers.point_fields import Columns, PointLayout, PointTimes, sample_columns
 from densify.readers.point_files import read_table
 from densify.readers.recorded_poses import PoseFile, PoseTrack
 from densify.readers.timeline import format_frames
 
-Columns = Mapping[str, NDArray[Any]]
-
 _ASSUMED_HZ = 10.0
-_NUM_TRIED = 5  # sweeps, until one can be read
+_UNTIMED = (
+    "times of points are left out: they are compensated, and no poses with stamps tell by how much"
+)
 
 
 @dataclass(frozen=True)
@@ -63,6 +62,7 @@ class SweepColumns:
     series: Series
     settings: SweepFiles
     config: Path | None
+    _own_stamps_ns: dict[int, int] = field(default_factory=dict)
 
     def returns(self, frame: int, stamp_ns: int) -> Returns:
         """Return the rows of a sweep.
@@ -82,8 +82,8 @@ class SweepColumns:
 
     @cached_property
     def layout(self) -> PointLayout:
-        """The meaning of the columns, found in the first sweep that can be read."""
-        frame, columns = self._sample
+        """The meaning of the columns, found in a few sweeps."""
+        frame, columns = next(iter(self._samples.items()))
         path, known = self.series.paths[frame], self.settings
         named = {
             part: name for part in ("intensity", "time", "lidar") if (name := getattr(known, part))
@@ -94,17 +94,67 @@ class SweepColumns:
                     f"{self.config}: sweeps.{part}: got {name!r}, expected a column of "
                     f"{path.name}: {', '.join(columns)}"
                 )
+        stamps_ns = self.series.stamps_ns
         return PointLayout.find(
-            columns,
+            [*self._samples.values()],
             path,
             self.period_ns,
-            (self.series.stamps_ns or {}).get(frame),
+            None if stamps_ns is None else [stamps_ns[frame] for frame in self._samples],
             named,
             known.intensity_scale,
             unit=known.time_unit,
             absolute=known.time_is == "absolute" if known.time_is else None,
             reference=known.reference,
         )
+
+    def stamp_ns(self, frame: int) -> int:
+        """Return the reference time of a sweep (ns).
+
+        It is that of the series, or else the absolute times of the points tell it, or the number.
+
+        Raises:
+            InputError: Its points have to be read and cannot be.
+        """
+        if self.series.stamps_ns is not None:
+            return self.series.stamps_ns[frame]
+        if self._own_clock is None:
+            return frame * self.period_ns
+        if frame not in self._own_stamps_ns:
+            path, times = self.series.paths[frame], self._own_clock
+            columns = self._columns(path)
+            stamp_ns = times.own_stamp_ns(columns[times.field]) if times.field in columns else None
+            if stamp_ns is None:
+                raise InputError(f"{path}: no time of a point in {times.field}, which others have")
+            self._own_stamps_ns[frame] = stamp_ns
+        return self._own_stamps_ns[frame]
+
+    @cached_property
+    def _own_clock(self) -> PointTimes | None:
+        """The absolute times of points, which stamp the sweeps; None if there are none."""
+        try:
+            times = self.layout.times
+        except InputError:  # raised again where a sweep is read
+            return None
+        return times if times is not None and times.absolute else None
+
+    @property
+    def stamped_by(self) -> str:
+        """The source of the stamps, for people."""
+        if self.series.told_by:
+            return self.series.told_by
+        if self._own_clock is not None:
+            return f"the times of the points ({self._own_clock.field})"
+        how = "the" if self.settings.rate_hz else "an assumed"
+        return f"number, at {how} {1e9 / self.period_ns:g} Hz (rate_hz)"
+
+    def assumed(self) -> list[str]:
+        """Return the assumptions about the stamps, a sentence each."""
+        if self.series.stamps_ns or self._own_clock is not None or self.settings.rate_hz:
+            return []
+        return [
+            f"the sweeps have no stamps: they are taken for {1e9 / self.period_ns:g} Hz by their "
+            f"numbers; give rate_hz or stamps in densify.yaml"
+        ]
 
     @cached_property
     def period_ns(self) -> int:
@@ -118,20 +168,15 @@ class SweepColumns:
         """Return the unused columns, with their ranges, for people."""
         return [
             f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
-            for name, column in self._sample[1].items()
+            for name, column in next(iter(self._samples.values())).items()
             if name not in vars(self.layout.fields).values()
         ]
 
     @cached_property
-    def _sample(self) -> tuple[int, Columns]:
-        """The number and the columns of the first sweep that can be read."""
-        errors = []
-        for number, path in list(self.series.paths.items())[:_NUM_TRIED]:
-            try:
-                return number, self._columns(path)
-            except InputError as error:
-                errors.append(error)
-        raise errors[0]
+    def _samples(self) -> dict[int, Columns]:
+        """The columns of sweeps from all over the recording, by number."""
+        paths = self.series.paths
+        return sample_columns([*paths], lambda frame: self._columns(paths[frame]))
 
     def _columns(self, path: Path) -> Columns:
         """Read all columns of numbers, (N,) each, also those beside the points of an .npz file."""
@@ -181,39 +226,46 @@ class Folder(FileSequence):
             files=self._sweeps.paths,
             images={name: series.paths for name, series in images.items()},
         )
-        by_number = {frame: self.stamp_ns(frame) for frame in self.frames} if images else {}
+        self._by_sweeps: dict[str, str] = {}
         for name, series in images.items():
             shift_ns = round(cameras[name][1].clock_offset_s * 1e9)
-            own = series.stamps_ns or {n: ns for n, ns in by_number.items() if n in series.paths}
+            own = series.stamps_ns
+            if own is None:
+                own = {n: self.stamp_ns(n) for n in self.frames if n in series.paths}
+                self._by_sweeps |= _stamped_by_sweeps(name, series, self.frames, cameras[name][1])
             self._exposed_ns[name] = {number: ns + shift_ns for number, ns in own.items()}
         self._read_poses()
+        self._is_untimed = known.compensated and self._track is None
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep."""
         self.check_frame(frame)
-        if self._sweeps.stamps_ns is None:
-            return int(frame) * self._columns.period_ns
-        return self._sweeps.stamps_ns[frame]
+        return self._columns.stamp_ns(int(frame))
+
+    def gaps(self) -> list[str]:
+        """See `LidarSequence`."""
+        told, drive = self._columns.assumed(), checks.drive_around(self.where)
+        if drive is not None:
+            told.append(
+                f"{self.where} is a part of the KITTI drive {drive}: read alone it has no times of "
+                f"points, images and poses; give the drive"
+            )
+        if self._is_untimed:
+            told.append(_UNTIMED)
+        return told + [f"{name}: {text}" for name, text in self._by_sweeps.items()]
 
     def findings(self) -> Sequence[tuple[str, str]]:
         """See `LidarSequence`."""
         layout, first = self._columns.layout, self._sweeps.paths[self.frames[0]]
         fields = [f"{part} = {name}" for part, name in vars(layout.fields).items() if name]
         unused = ", ".join(self._columns.unused())
-        times, told_by = layout.time_words, self._sweeps.told_by
-        if self._config.sweeps.compensated and self._track is None:
-            times = (
-                "left out: the points are compensated, and no poses with stamps tell by how much"
-            )
-        if not told_by:
-            how = "the" if self._config.sweeps.rate_hz else "an assumed"
-            told_by = f"number, at {how} {1e9 / self._columns.period_ns:g} Hz (rate_hz)"
         lines = [
             ("files", f"{(first.parent / '*').relative_to(self.where)}{first.suffix}"),
             ("fields", ", ".join(fields) + (f"; not used: {unused}" if unused else "")),
             ("intensity", f"divided by {layout.intensity_scale:g}"),
-            ("times", times),
-            ("stamped by", told_by),
+            ("times", _UNTIMED if self._is_untimed else layout.time_words),
+            ("stamped by", self._columns.stamped_by),
+            *self._by_sweeps.items(),
         ]
         if self._poses is not None:
             lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
@@ -229,7 +281,7 @@ class Folder(FileSequence):
         found = self._columns.returns(frame, stamp_ns)
         if not self._config.sweeps.compensated or found.offset_ns is None:
             return found
-        if self._track is None:
+        if self._track is None:  # _is_untimed
             return replace(found, offset_ns=None)
         points = self._track.as_fired(found.points, stamp_ns, found.offset_ns)
         return replace(found, points=points)
@@ -247,9 +299,14 @@ class Folder(FileSequence):
         self._poses: PoseFile | None = None
         self._track: PoseTrack | None = None
         path = find_pose_file(self.where, known.file)
-        if path is None:
+        each = {f: p for f in frames if (p := self._files[f].with_suffix(".pose")).is_file()}
+        if path is None and not each:
             return
-        self._poses = found = PoseFile.read(path, known.stamps_unit)
+        if path is None:
+            path, frames = next(iter(each.values())), [*each]
+            self._poses = found = PoseFile.read_each([*each.values()])
+        else:
+            self._poses = found = PoseFile.read(path, known.stamps_unit)
         T = poses.inverse(found.T) if known.inverse else found.T
         T = T if known.T_frame_lidar is None else T @ known.T_frame_lidar
         if found.stamps_ns is not None:
@@ -262,6 +319,24 @@ class Folder(FileSequence):
             )
         numbers = frames if len(T) == len(frames) else range(len(T))
         self._T_world_lidar = dict(zip(numbers, T, strict=True))
+
+
+def _stamped_by_sweeps(
+    name: str, images: Series, frames: Sequence[int], given: CameraFiles
+) -> dict[str, str]:
+    """Return the assumption about images without stamps, by the name of the camera.
+
+    There is none if densify.yaml asks for it.
+    """
+    if given.stamps == "sweeps":
+        return {}
+    text = (
+        f"{len(images.paths)} images without stamps beside {len(frames)} sweeps: each is taken as "
+        f"exposed when the sweep of its number is stamped"
+    )
+    if images.paths.keys() != set(frames):
+        text += "; if their rates differ, give the images' times (stamps in densify.yaml)"
+    return {name: text}
 
 
 def _images(folder: Path, name: str, given: CameraFiles) -> Series:

@@ -64,7 +64,7 @@ class Drive(FileSequence):
 
 
 def read_points(path: Path) -> tuple[Float, np.ndarray]:
-    """Return (N,3) metres and (N,) reflectance; zeros where a row is not finite."""
+    """Return (N,3) metres, zeros where a position is not finite, and (N,) reflectance."""
     data = read_bytes(path)
     if len(data) % 16:
         raise InputError(
@@ -72,7 +72,7 @@ def read_points(path: Path) -> tuple[Float, np.ndarray]:
             f"reflectance as float32); fetch the file again"
         )
     columns = np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)
-    columns[~np.isfinite(columns).all(axis=1)] = 0
+    columns[~np.isfinite(columns[:, :3]).all(axis=1)] = 0
     return columns[:, :3].astype(np.float64), columns[:, 3]
 
 

@@ -95,6 +95,11 @@ class KittiOdometry(Drive):
             for name, files in self._image_files.items()
         }
 
+    def gaps(self) -> list[str]:
+        """See `LidarSequence`."""
+        told = f"{self.where} has no times.txt: sweeps are taken for 100 ms apart"
+        return [] if self._times_ns else [told]
+
     def stamp_ns(self, frame: int) -> int:
         """Return the time at which the scanner faced forward, since the first frame."""
         self.check_frame(frame)
@@ -144,11 +149,10 @@ class KittiOdometry(Drive):
 
     @cached_property
     def _pose_lines(self) -> tuple[Path | None, dict[int, str]]:
-        sequence = self.where.resolve()
-        for path in (
-            sequence / "poses.txt",
-            sequence.parent.parent / "poses" / f"{sequence.name}.txt",
-        ):
+        here = [self.where.absolute(), self.where.resolve()]  # a link, and its target
+        paths = [place / "poses.txt" for place in here]
+        paths += [place.parent.parent / "poses" / f"{place.name}.txt" for place in here]
+        for path in paths:
             if path.is_file():
                 return path, dict(enumerate(read_text(path).splitlines()))
         return None, {}

@@ -157,7 +157,16 @@ class KittiRaw(Drive):
 
     @cached_property
     def _T_lidar_imu(self) -> Float:
-        return Calibration.read(self.where.resolve().parent / "calib_imu_to_velo.txt").pose()
+        return Calibration.read(_beside(self.where) / "calib_imu_to_velo.txt").pose()
+
+
+def _beside(drive: Path) -> Path:
+    """Return the folder of the calibration.
+
+    It lies beside the drive as it is named, or beside the target of a link without any.
+    """
+    named, target = drive.absolute().parent, drive.resolve().parent
+    return named if any(named.glob("calib_*.txt")) else target
 
 
 def _camera_folders(drive: Path) -> list[str]:
@@ -170,7 +179,7 @@ def _read_cameras(drive: Path) -> dict[str, Camera]:
     Of a drive without image folders all calibrated cameras are returned. ``T_cam_lidar`` is camera
     0's rectification after ``calib_velo_to_cam``, moved by the camera's offset in ``P_rect``.
     """
-    folder, names = drive.resolve().parent, _camera_folders(drive)
+    folder, names = _beside(drive), _camera_folders(drive)
     files = [folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"]
     if not names and not all(file.is_file() for file in files):
         return {}

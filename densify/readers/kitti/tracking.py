@@ -87,6 +87,10 @@ class KittiTracking(Drive):
             for name, files in self._image_files.items()
         }
 
+    def gaps(self) -> list[str]:
+        """See `LidarSequence`."""
+        return ["KITTI tracking has no stamps: sweeps are taken for 100 ms apart"]
+
     def _pose(self, frame: int) -> Float:
         path = self.where / "oxts" / self._scene_file
         if not path.exists():

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: MIT
+"""Times that drivers write: broken ones cost their points, odd ones are read as they are meant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from densify.config.errors import InputError
+from densify.readers import open_sequence
+from densify.readers.describe import describe
+from densify.readers.timeline import Timeline
+from tests.ros_bags import PERIOD_NS, STAMP_NS, Maker, scan
+
+NUM = 400
+FIRED_NS = np.arange(NUM) * (PERIOD_NS // NUM)
+Change = Callable[[np.ndarray], np.ndarray]
+
+
+def bag(folder: Path, times: Callable[[int], np.ndarray], num: int = 7, **options) -> Path:
+    """A bag of ``num`` sweeps; times: (NUM,) of the points of sweep i."""
+    maker = Maker()
+    for i in range(num):
+        columns = scan(NUM) | {"t": times(i)}
+        maker.cloud(columns, STAMP_NS + i * PERIOD_NS, **options)
+    return maker.write(folder)
+
+
+def pcd(folder: Path, times: Callable[[int], np.ndarray], num: int = 7) -> Path:
+    """A folder of numbered .pcd files with a float64 ``timestamp``."""
+    folder.mkdir(exist_ok=True)
+    for i in range(num):
+        kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")]
+        rows = np.zeros(NUM, kinds)
+        for axis in "xyz":
+            rows[axis] = scan(NUM)[axis]
+        rows["timestamp"] = times(i)
+        header = (
+            "VERSION 0.7\nFIELDS x y z timestamp\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+            f"WIDTH {NUM}\nHEIGHT 1\nPOINTS {NUM}\nDATA binary\n"
+        )
+        (folder / f"{i:06d}.pcd").write_bytes(header.encode() + rows.tobytes())
+    return folder
+
+
+def broken(sweep: int, share: float, time_s: float) -> Callable[[int], np.ndarray]:
+    """Relative times (s) of which one sweep has a share of wrong ones."""
+
+    def times(i: int) -> np.ndarray:
+        fired_s = FIRED_NS * 1e-9
+        wrong = np.arange(NUM) % 100 < 100 * share
+        return np.where(wrong & (i == sweep), time_s, fired_s).astype("f4")
+
+    return times
+
+
+@pytest.mark.parametrize("sweep", [0, 3, 6])
+@pytest.mark.parametrize(("share", "time_s"), [(0.3, 3.6), (0.6, 3.6), (0.3, -0.5), (0.02, 4.29)])
+def test_points_with_times_of_another_sweep_are_left_out(sweep, share, time_s, tmp_path):
+    sequence = open_sequence(bag(tmp_path, broken(sweep, share, time_s)))
+    for frame in sequence.frames:
+        found = sequence[frame]
+        num_wrong = round(NUM * share) * (frame == sweep)
+        assert (len(found), found.num_untimed) == (NUM - num_wrong, num_wrong)
+        np.testing.assert_allclose(found.offset_ns, FIRED_NS[found.row], atol=10)
+    wrong = f"{round(NUM * share)} more left out"
+    assert (wrong in describe(sequence)) == (sweep in (0, 6))
+
+
+def test_a_sweep_of_wrong_times_alone_is_named(tmp_path):
+    sequence = open_sequence(bag(tmp_path, broken(2, 1.0, 3.6)))
+    # all alike, they tell nothing: the sweep has no times
+    assert sequence[2].offset_ns is None and sequence[3].offset_ns is not None
+    times = broken(9, 0, 0)
+    place = bag(tmp_path / "again", lambda i: times(i) + np.float32(3.6 * (i == 2)))
+    with pytest.raises(InputError, match=r"none valid, 400 with a time of another sweep"):
+        _ = open_sequence(place)[2]
+
+
+def test_offsets_that_wrapped_are_left_out_of_every_sweep(tmp_path):
+    wrapped_ns = (FIRED_NS - 5_000_000).astype(np.int64) % 2**32  # 4.29 s
+    sequence = open_sequence(bag(tmp_path, lambda i: wrapped_ns.astype("u4")))
+    sweep = sequence[4]
+    assert sweep.num_untimed == 20 and sweep.offset_ns.max() == FIRED_NS[-1] - 5_000_000
+
+
+@pytest.mark.parametrize("frame", [0, 2])
+def test_a_time_that_is_not_finite_is_its_points_problem(frame, tmp_path):
+    times = broken(frame, 0.01, np.nan)
+    found = open_sequence(bag(tmp_path, times))[frame]
+    assert (len(found), found.num_untimed) == (NUM - 4, 4)
+
+
+ODD: dict[str, tuple[Change, float]] = {  # what is written, ms of the first point after the stamp
+    "half revolutions": (lambda t: (t // 2 * 1e-9).astype("f4"), 0),
+    "end-referenced": (lambda t: (t * 1e-9 - 0.1).astype("f4"), -100),
+    "around the stamp": (lambda t: (t * 1e-9 - 0.05).astype("f4"), -50),
+    "whole ns before the end": (lambda t: (t - PERIOD_NS).astype("i4"), -100),
+}
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_odd_times_are_read_as_they_are_meant(kind, tmp_path):
+    make, first_ms = ODD[kind]
+    sequence = open_sequence(bag(tmp_path, lambda i: make(FIRED_NS), num=3))
+    share = 0.5 if kind == "half revolutions" else 1
+    for frame in sequence.frames:
+        expected_ns = share * FIRED_NS + 1e6 * first_ms
+        np.testing.assert_allclose(sequence[frame].offset_ns, expected_ns, atol=10)
+
+
+def test_zeros_are_no_times(tmp_path):
+    sequence = open_sequence(bag(tmp_path, lambda i: np.zeros(NUM, "u4"), num=3))
+    assert sequence[1].offset_ns is None
+    assert "the same for all points" in dict(sequence.findings())["times"]
+
+
+@pytest.mark.parametrize("height", [8, NUM // 8])
+def test_times_go_with_their_points_whatever_the_rows_are(height, tmp_path):
+    """A scan of 8 rings, written ring by ring (each row goes all around) or firing by firing."""
+    ring, firing = (
+        np.divmod(np.arange(NUM), NUM // 8) if height == 8 else np.divmod(np.arange(NUM), 8)[::-1]
+    )
+    fired_ns = firing * (PERIOD_NS // (NUM // 8)) + 1000 * ring
+    sequence = open_sequence(bag(tmp_path, lambda i: fired_ns.astype("u4"), 3, height=height))
+    np.testing.assert_array_equal(sequence[1].offset_ns, fired_ns)
+
+
+def test_stamps_are_those_of_the_points_where_nothing_else_tells(tmp_path):
+    def times(i: int) -> np.ndarray:
+        at_s = 1_700_000_000 + 0.05 * i + FIRED_NS * 0.5e-9
+        return np.where(np.arange(NUM) == 7, 0.0, at_s)  # one without a time
+
+    place = pcd(tmp_path / "drive", times)
+    rows = [f"{1_700_000_000 + 0.05 * i:.9f} {i} 0 0 0 0 0 1" for i in range(-1, 10)]  # 20 m/s
+    (place / "poses.txt").write_text("\n".join(rows))
+    sequence = open_sequence(place)
+    stamps_ns = [sequence.stamp_ns(frame) for frame in sequence.frames]
+    np.testing.assert_allclose(np.diff(stamps_ns), 50_000_000, atol=600)
+    assert abs(stamps_ns[0] - STAMP_NS) < 600
+    found = sequence[3]
+    assert found.num_untimed == 1
+    np.testing.assert_allclose(found.offset_ns, 0.5 * FIRED_NS[found.row], atol=600)
+    np.testing.assert_allclose(sequence.T_world_lidar(3)[0, 3], 3, atol=1e-4)
+    assert dict(sequence.findings())["stamped by"] == "the times of the points (timestamp)"
+    assert not sequence.gaps()
+
+
+def test_times_since_the_start_of_the_log_are_stamps_too(tmp_path):
+    place = pcd(tmp_path / "drive", lambda i: 0.1 * i + FIRED_NS * 1e-9)
+    sequence = open_sequence(place)
+    assert np.diff([sequence.stamp_ns(f) for f in sequence.frames]).tolist() == [10**8] * 6
+    np.testing.assert_allclose(sequence[5].offset_ns, FIRED_NS, atol=10)
+
+
+def test_the_stamp_may_be_the_end_of_the_points_times(tmp_path):
+    place = pcd(tmp_path / "drive", lambda i: 1.7e9 + 0.1 * i + FIRED_NS * 1e-9)
+    (place / "densify.yaml").write_text("sweeps: {reference: end}")
+    sequence = open_sequence(place)
+    last_ns = FIRED_NS[-1]
+    assert abs(sequence.stamp_ns(2) - (STAMP_NS + 2 * 10**8 + last_ns)) < 600
+    np.testing.assert_allclose(sequence[2].offset_ns, FIRED_NS - last_ns, atol=600)
+
+
+def test_a_file_that_cannot_be_read_costs_its_sweep_alone(tmp_path):
+    place = pcd(tmp_path / "drive", lambda i: 1.7e9 + 0.1 * i + FIRED_NS * 1e-9)
+    (place / "000002.pcd").write_bytes(b"")
+    assert list(Timeline.of(open_sequence(place)).unknown) == [2]
+
+
+def test_a_rate_that_is_assumed_is_told(tmp_path):
+    place = pcd(tmp_path / "drive", lambda i: FIRED_NS * 1e-9)
+    (told,) = open_sequence(place).gaps()
+    assert "no stamps: they are taken for 10 Hz by their numbers" in told
+    (place / "densify.yaml").write_text("sweeps: {rate_hz: 20}")
+    assert not open_sequence(place).gaps()
