@@ -127,6 +127,20 @@ def test_the_readme_is_short_and_links_lead_somewhere() -> None:
             assert link.startswith("https://") or (page.parent / link).exists(), f"{page}: {link}"
 
 
+# Words that readers found riddling; docs/glossary.md has the field's words for the same.
+RIDDLES = (
+    r"\bwhat (?:stands|moves)\b|\bwho walks\b|\bin whose\b|\bof theirs\b|\bthe like of\b|"
+    r"registration alone|falsely moving|\bdepth edges?\b|\bego motion\b|standing still"
+)
+
+
+def test_pages_and_code_use_the_words_of_the_field() -> None:
+    code = [p for end in ("py", "js", "html") for p in (CHECKOUT / "densify").rglob(f"*.{end}")]
+    for path in (*PAGES, *code, *(CHECKOUT / "configs").iterdir()):
+        riddle = re.search(RIDDLES, path.read_text("utf-8"))
+        assert riddle is None, f"{path}: {riddle[0]}"
+
+
 def test_messages_and_pages_name_what_can_be_installed() -> None:
     """``densify`` on the package index is another project."""
     extras = set(re.findall(r"^(\w+) = \[", (CHECKOUT / "pyproject.toml").read_text(), re.M))

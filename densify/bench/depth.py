@@ -32,7 +32,7 @@ PRODUCTS = ("measured", "filled")
 _PARTS = ("all", "moving")
 _REACH_M = 80.0
 _TOP_QUANTILE = 0.999
-_HIDING_PX = 11  # a second scanner stands elsewhere: its returns behind a near one may be hidden
+_HIDING_PX = 11  # returns of a second scanner behind a near one may be occluded
 _HIDING_FRACTION, _HIDING_M = 0.03, 0.2
 _WRONG_M, _WRONG_FRACTION = 0.3, 0.05
 

@@ -307,7 +307,7 @@ def _flows(
         still = {f: FlowField.zero(len(window.stretch[f].sweep)) for f in frames}
         return still, still, 0.0
     config = resolve(as_mapping(config), changes)
-    if method == "ours":  # what is compiled must not count
+    if method == "ours":  # compilation must not count
         here = frames.index(window.key)
         _motion(Stretch(window.stretch.sweeps[max(0, here - 1) : here + 2]), config)
     start = time.perf_counter()

@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             return shown.end(INTERRUPTED, "interrupted; what was unfinished is not kept")
         except BrokenPipeError:
-            _let_go_of(sys.stdout)  # its reader has seen enough
+            _let_go_of(sys.stdout)  # its reader has closed it
             return DONE
         except OSError as error:
             _let_go_of(sys.stdout)
@@ -67,8 +67,10 @@ def script() -> NoReturn:
     """Run `main` as a process of its own: the console script and ``python -m densify``."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # what a terminal's encoding lacks
-    # Work is shared out among our own threads; OpenBLAS's would wait beside them in busy loops.
+            stream.reconfigure(
+                errors="backslashreplace"
+            )  # characters that the terminal's encoding lacks
+    # Work is shared among our own threads. Those of OpenBLAS would wait in busy loops.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     keep_freed_memory()
     logging.getLogger("densify.progress").setLevel(logging.INFO)
@@ -76,7 +78,7 @@ def script() -> NoReturn:
         if signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored
             signal.signal(number, signal.default_int_handler)
     code: int | None = None
-    # The last function called at exit: Python would search all that it is about to give back, half
+    # The last function called at exit, because Python would collect garbage for half
     # a second after a run.
     atexit.register(lambda: None if code is None else os._exit(code))
     code = main()

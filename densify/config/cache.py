@@ -28,8 +28,8 @@ from densify.config.errors import InputError
 
 T = TypeVar("T")
 _log = logging.getLogger("densify")
-# Raise a step's number when it makes something else of the same inputs. Steps build on each other,
-# so an entry depends on all of them.
+# Raise a step's number when its result for the same inputs changes. Steps build on each other,
+# and an entry depends on all of them.
 _STEP_VERSIONS = "digests 1, registration 2, motion 4, far 2"
 _MOST_ENTRIES = 10_000
 
@@ -177,7 +177,7 @@ def own_folder(name: str) -> Path:
     named = os.environ.get("DENSIFY_CACHE_DIR")
     root = Path(named or platformdirs.user_cache_dir("densify"))
     for folder in (root, root / name):
-        with suppress(OSError):  # whoever writes to it reports that
+        with suppress(OSError):  # a writer reports the error
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if others_can_write(folder):
             raise InputError(

@@ -188,7 +188,7 @@ def _open_dask(scheduler: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
     try:
         from distributed import Client
 
-        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # no help for users
+        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # of no use to users
         client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except ImportError as error:
         raise InputError(

@@ -112,7 +112,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
             except InputError as error:
                 raise InputError(
                     f"{error}; run densify dataset again with --verify, as the set was made: it "
-                    f"makes missing and damaged files in {self._root} anew"
+                    f"makes missing and damaged files in {self._root} again"
                 ) from None
 
         dense_m = read(self._dense, read_depth_png)

@@ -96,7 +96,7 @@ def make_dataset(
 ) -> Summary:
     """Make every key of whole recordings, as a training set.
 
-    Run again, it goes on where it was stopped: finished keys are kept, failed ones are tried again.
+    Run again, it continues: finished keys are kept, and failed ones are tried again.
     The files do not depend on the number of processes, on shards or on interruptions. The manifest
     says what became of every key.
 

@@ -16,8 +16,8 @@ from densify.geometry.types import Cloud, Float, FlowField, ObjectTrack, Stretch
 
 _CONFIDENCE_PER_S = 0.7
 _CONFIDENCE_MOVED = 0.8
-_LEAST_SEEN = 3  # points of an object in one sweep: fewer do not tell how it is turned
-_BEYOND_PERCENT = 1.0  # of its points that lie outside its box on each side
+_LEAST_SEEN = 3  # points of an object in one sweep; fewer do not determine its rotation
+_BEYOND_PERCENT = 1.0  # percent of its points outside its box, on each side
 
 
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:

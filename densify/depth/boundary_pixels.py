@@ -24,20 +24,20 @@ from densify.geometry.compiled import Kernel, inlined
 MOST_CONFIDENCE = 0.2
 """A boundary pixel has no more, any other measured pixel no less."""
 _NUM_ROUNDS = 2
-_RIM_WEIGHT = 0.5  # of a boundary pixel's own vote, at most
-_LEAST_SHARE = 0.97  # of the votes for a pixel that is kept
-_FEW = 100  # boundary pixels, of which nothing can be told
-_SUREST = 2.5  # -log10 of the share against
+_RIM_WEIGHT = 0.5  # greatest weight of the vote of a boundary pixel
+_LEAST_SHARE = 0.97  # share of the votes for a pixel that is kept
+_FEW = 100  # number of boundary pixels below which the image is not aligned
+_SUREST = 2.5  # greatest -log10 of the share of the votes against
 VOTERS_REACH = 6.0
 """Gaps between rays within which pixels vote."""
 _DECAY = 1.2  # gaps between rays at which a vote counts half
-_SAME_M, _SAME_FRACTION = 0.2, 0.05  # within which a surface agrees with a depth
-_COLOURS = 6.0  # standard deviation of a surface's, in L*a*b*
-_THROUGH = 0.001  # what is left of a vote across an edge of the image
-_DOUBT = 0.04  # a vote that is always there, half of it for
-_ASIDE = 0.6  # gaps by which the image may lie beside the depth
-_STRIDE = 3.0  # colours looked at on the way to a voter, by gap between rays
-_ROUNDED = 1 - 1e-6  # just the share needed is enough, whatever the rounding
+_SAME_M, _SAME_FRACTION = 0.2, 0.05  # tolerance within which a surface agrees with a depth
+_COLOURS = 6.0  # standard deviation of the colours of a surface, in L*a*b*
+_THROUGH = 0.001  # weight of a vote across an edge of the image
+_DOUBT = 0.04  # constant vote, half of it for
+_ASIDE = 0.6  # gaps by which the image may be shifted against the depth
+_STRIDE = 3.0  # compared colours for each gap between rays, on the way to a voter
+_ROUNDED = 1 - 1e-6  # tolerance for rounding of a share
 _MISFIT = (
     "image edges do not lie where depth has edges (calibration, clock, blur?): pixels at depth "
     "edges are left out as with project.rims=strict"

@@ -24,10 +24,10 @@ from densify.geometry import cameras, poses
 from densify.geometry.arrays import Bool, Float, Float32
 
 # Shares of rays without a return: in the window bands of 207 cars of KITTI's stereo benchmark, and
-# at the least on ordinary surfaces.
+# the least on ordinary surfaces.
 _LOST_IN_GLASS, _LEAST_LOST = 0.4, 0.03
-_LEAST_LOG_ODDS = 3.0  # one hole in twenty is a window
-_IN_PLANE = 0.75  # share of the rim
+_LEAST_LOG_ODDS = 3.0  # odds of 20 to 1, because one hole in twenty is a window
+_IN_PLANE = 0.75  # share of the rim that must be in the plane
 _NUM_ROUNDS = 5  # of the robust fit
 _EIGHT, _CROSS = np.ones((3, 3), bool), ndimage.generate_binary_structure(2, 1)
 
@@ -44,7 +44,7 @@ def share_lost(key_image: RangeImage) -> Callable[[Float], Float] | None:
     anywhere_m = (-np.inf, -np.inf)
 
     def share(points: Float) -> Float:
-        # Returns in a point's cell and its eight neighbours, at whatever range.
+        # Returns in a point's cell and its eight neighbours, at any range.
         around = turning.num_beyond(points, anywhere_m, least=0).max(axis=0)
         return 1 - around / _EIGHT.size
 

@@ -51,10 +51,10 @@ NUM_MEASURED = sum(not group.startswith("filled") for group in GROUPS)
 """Groups of measured pixels; the others are of filled ones."""
 
 _FILE = Path(__file__).with_name("confidence.json")
-_AROUND = 4.0  # gaps between rays to all sides
-_TILT = 0.01  # decades over all ranks: pixels of different rank keep a different confidence
+_AROUND = 4.0  # size of the surroundings, in gaps between rays to all sides
+_TILT = 0.01  # decades over all ranks, for different confidences at different ranks
 _NUM_STEPS = 20
-_GIVEN = 2.0  # pixels around that are taken to agree: few do not tell
+_GIVEN = 2.0  # number of pixels around that are assumed to agree, as a prior
 
 
 def contradicted(layers: Layers, focal_px: float) -> Float32:

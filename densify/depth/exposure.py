@@ -32,7 +32,7 @@ from densify.geometry.types import (
 _log = logging.getLogger("densify")
 _USUAL = ProjectSettings()
 _JITTER = 1.5  # half a period is at most this much longer than half the shorter one beside it
-_NUM_ROW_STEPS = 4  # of the search for the row that sees a point
+_NUM_ROW_STEPS = 4  # of the search for the row that observes a point
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
     for frame in frames[max(0, at - 1) : at + 2]:
         try:
             stamps_ns[frame] = sequence.stamp_ns(frame)
-        except InputError:  # not this key's matter
+        except InputError:  # the image of another key
             if frame == key:
                 raise
     if len(stamps_ns) < 2:

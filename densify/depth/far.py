@@ -32,14 +32,14 @@ from densify.geometry.types import (
 )
 
 _MOST_RANGE_M = 60.0
-_MOST_SPACING_M = 0.05  # surfaces are met by many sweeps' rays; larger patches hide edges
-_GROUP_M = 2.5  # of travel: what is nearer sees the same, and errs alike
+_MOST_SPACING_M = 0.05  # many sweeps measure a surface, and larger patches hide edges
+_GROUP_M = 2.5  # travel within which sweeps observe the same, with the same errors
 _CONFIDENCE = 0.5
 _SLACK_M = 0.5
-_SAME_DEPTH = 0.05  # of the depth: a pixel needs one point of each such step
-_PRIME = 2_654_435_761  # its multiples go through any smaller number of points in a mixed order
-_FEW_FILLED = 3  # of nine cells of a sweep beyond the window
-# Of travel, between witnesses, and from the sweep that asks: most of a car, or its rear half.
+_SAME_DEPTH = 0.05  # step of depth, as a share; a pixel needs one point in each
+_PRIME = 2_654_435_761  # its multiples visit any smaller number of points in mixed order
+_FEW_FILLED = 3  # of nine cells that must be filled, for a sweep beyond the window
+# Travel between witnesses and from the tested sweep: most of a car, or its rear half.
 _WITNESSES_M, _WITNESS_M, _LEAST_WITNESS_M = 5.0, 3.5, 2.0
 
 
@@ -73,7 +73,7 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
         points, free = one.sweep.points, np.zeros(len(one.sweep), bool)
         whose = np.zeros(len(points), np.int64)
         T = [poses.inverse(sweeps[w].T_world_lidar) @ one.T_world_lidar for w in witnesses]
-        if len(witnesses) == 2:  # what lies ahead is the later one's
+        if len(witnesses) == 2:  # points ahead belong to the later witness
             whose[points @ poses.inverse(T[1])[:3, 3] > 0] = 1
         for number, witness in enumerate(witnesses):
             rows = np.flatnonzero(whose == number)
@@ -234,7 +234,7 @@ def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
     depth = exposure.depth_m(sight.points_cam[sight.inside])
     place = np.column_stack([sight.uv[sight.inside], np.log(depth) / _SAME_DEPTH])
     cell = np.rint(place.astype(np.float32))
-    # Neighbouring pixels are to be from many sweeps: these have to agree.
+    # Neighbouring pixels must be from many sweeps, which have to agree.
     mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
     return rows[thinned(cell, mixed, 1.0, 1)]
 

@@ -23,16 +23,16 @@ from densify.geometry.compiled import Kernel, inlined
 FILL_CONFIDENCE = 0.5
 """Confidence of a pixel filled from afar, as a share of the least around it."""
 _GROWTH = (1 / 3, 2 / 3, 1.0)  # half sizes of the windows, in spacings of rays
-_EDGE_M, _EDGE_FRACTION = 0.2, 0.05  # most deviation from a plane; the larger counts
-_LEAST_SHARE, _LEAST_STAR_SHARE = 0.9, 0.8  # of the votes
+_EDGE_M, _EDGE_FRACTION = 0.2, 0.05  # greatest deviation from a plane; the larger one counts
+_LEAST_SHARE, _LEAST_STAR_SHARE = 0.9, 0.8  # share of the votes
 _AROUND, _LEAST_KNOWN = 0.35, 0.3  # gaps between rays to all sides; share of the pixels there
 _RIDGE_PX2 = 1e-7
-_MIN_PLANE_PX = 6  # fewer do not tell a plane from a step
-_MOST_PX = 120  # half a window's size
+_MIN_PLANE_PX = 6  # fewer do not distinguish a plane from a step
+_MOST_PX = 120  # greatest half size of a window
 _ROWS = 8  # rows that are skipped together if they hold no measured pixel
-_STAR_REACH = 1.0  # spacings of rays
+_STAR_REACH = 1.0  # reach in spacings of rays
 _STAR_MET, _STAR_GAP = 8, 7  # directions with a known pixel; neighbouring ones without
-_STAR_SPREAD = 0.1  # of the inverse depth, between the predictions
+_STAR_SPREAD = 0.1  # greatest difference between the predictions, as a share of inverse depth
 _STRIP_PX = 6  # height of an empty strip along the image's lower border
 _ABOVE = 12  # index of the direction upwards
 

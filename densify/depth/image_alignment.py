@@ -17,20 +17,20 @@ from numpy.typing import NDArray
 from densify.depth.layers import Layers
 from densify.geometry.types import Float, Float32, Int
 
-_BLUR_PX = 0.6  # standard deviation; noise and the colour filter's pattern
+_BLUR_PX = 0.6  # standard deviation; it removes noise and the pattern of the colour filter
 _LEAST_LIGHT = 70.0  # L of the lightest hundredth; a darker image is lightened
 _REACH = 14  # steps to all sides
-_ASIDE, _ELSEWHERE = 3.2, 6.0  # steps; nearer and it fits, farther and it cannot
-# Standard deviations of the shifts elsewhere. Right images reach 3.1 to 11 where they are, and at
-# most 1.9 more beside that; mirrored ones reach 3.0.
+_ASIDE, _ELSEWHERE = 3.2, 6.0  # steps: greatest offset of a fit, least of a comparison
+# In standard deviations of the shifts elsewhere. Good images have 3.1 to 11 at no shift, and at
+# most 1.9 more nearby. Mirrored images reach 3.0.
 _LEAST, _LEAST_ASIDE, _CLEARLY = 3.05, 5.0, 1.9
-_TREND = 3  # degree of what changes slowly with the shift
-_MOST = 6000  # edges of each kind that are looked at
-_JUMPS_COUNT = 0.4  # of what boundary pixels count, each kind
+_TREND = 3  # degree of the polynomial of the slow trend
+_MOST = 6000  # number of compared edges of each kind
+_JUMPS_COUNT = 0.4  # weight of each kind of jumps, relative to boundary pixels
 _ONE_SURFACE, _JUMP = (0.1, 0.02), (0.3, 0.05)  # metres plus share of the depth
 _GAP, _STRICT_GAP = 3, 10  # steps between neighbouring pixels, without boundary pixels
-_EDGE_PX = 1.5  # standard deviation of the blur that tells which way depth changes
-_AROUND_PX, _STRONG = 20.0, 4.0  # over which image edges are compared; stronger ones count no more
+_EDGE_PX = 1.5  # standard deviation of the blur for the direction of a discontinuity
+_AROUND_PX, _STRONG = 20.0, 4.0  # surroundings of an edge; greatest relative strength
 _REBLUR_PX, _MOST_BLUR, _EDGES_LOOKED_AT = 1.5, 2.0, 0.03  # px; steps; share of the pixels
 
 

@@ -18,11 +18,11 @@ from densify.geometry.types import Bool, Camera, Cloud, Float, Float32, Int, Pat
 HIDDEN_M, HIDDEN_FRACTION = 0.2, 0.06
 """A point this much behind the nearest surface, both added, is hidden."""
 _FOOTPRINT = 0.4  # half size of a patch, in spacings of rays
-_SLACK_M = 0.05  # added to it, for errors of registration and flow
-_MAX_HALF_PX = 24.0  # a point just before the lens must not hide the whole image
-_MAX_TILT = 0.25  # of the inverse depth per pixel; a plane seen edge-on has no slope
+_SLACK_M = 0.05  # added to the footprint, for errors of registration and flow
+_MAX_HALF_PX = 24.0  # a point close to the lens must not occlude the whole image
+_MAX_TILT = 0.25  # of the inverse depth per pixel; a plane edge-on has no slope
 _SAME_AGE_NS = 10_000_000
-_MOST_SWEEPS = np.iinfo(np.int64).bits - 1  # that are told apart when they are counted
+_MOST_SWEEPS = np.iinfo(np.int64).bits - 1  # number of sweeps that are counted separately
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _any_lens(
             slope = -(across[:, 2] + along * z) / z**2
         else:
             slope = -along / np.linalg.norm(points_cam, axis=1, keepdims=True)
-    # Rays of a scanner lie apart in azimuth and in elevation, about the key's upward axis.
+    # Rays of a scanner are spaced in azimuth and in elevation, about the key's upward axis.
     level = np.cross(exposure.T_cam_key[:3, 2], points_cam)
     level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
     rise = np.cross(points_cam, level)

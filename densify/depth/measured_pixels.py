@@ -29,21 +29,21 @@ from densify.geometry.types import Camera, Reason
 
 AGREE_M, AGREE_FRACTION = 0.1, 0.01
 """Points on one surface deviate less than this, both added."""
-_SUPPORT_REACH, _PLANE_REACH = 0.8, 0.5  # of sweeps that agree, of the plane; in spacings of rays
-_EDGE_REACH, _EDGE_SLACK_M = 0.35, 0.015  # of a depth edge: spacings along the azimuth, both added
-_EDGE_WINDOW_PX = 1.5  # beyond the edge, where points must show that a surface goes on
-# Points beyond the window make a surface go on where something nearer begins: both are stricter.
+_SUPPORT_REACH, _PLANE_REACH = 0.8, 0.5  # of agreeing sweeps, of the plane; spacings of rays
+_EDGE_REACH, _EDGE_SLACK_M = 0.35, 0.015  # of a discontinuity: spacings along the azimuth
+_EDGE_WINDOW_PX = 1.5  # width beyond the edge in which points must continue the surface
+# Points beyond the window continue a surface behind a nearer one. Therefore both are stricter.
 _FAR_SUPPORT, _FAR_EDGE = 6, 1.5
-# Most confidence lost by few sweeps, few points, a near edge, a rough fit, being nearly hidden.
+# Greatest loss of confidence by few sweeps, few points, a near edge, a rough fit, occlusion.
 _DOUBTS = np.array([0.45, 0.25, 0.20, 0.10, 0.10])
 _MANY_POINTS, _ROUGH_M = 20, 0.10
 _RIDGE_PX2 = 0.02
 _LEAST_WINDOW_PX, _LEAST_FIT_PX, _MOST_PX = 3, 2.0, 24
 _MOVING_SLACK = 4.0  # motion is known less well than static surfaces
-_MOVING_WITNESS_NS = 120_000_000  # from the key
-_GOES_ON = 1.2  # spacings within which a surface shows again
-_ALL_ROUND = 3.0  # edges' reaches: no edge near
-_LEAST_ALONE = 5  # returns of the key sweep that agree around one, itself among them, of nine
+_MOVING_WITNESS_NS = 120_000_000  # greatest time from the key
+_GOES_ON = 1.2  # spacings within which a surface must continue
+_ALL_ROUND = 3.0  # in reaches of edges; farther than this no edge is near
+_LEAST_ALONE = 5  # agreeing returns of the key sweep around one, itself included, of nine
 _NEVER_NS = int(np.iinfo(np.int64).max)
 
 
@@ -276,7 +276,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
     moving = witness_ns < _NEVER_NS
     far = (HIDDEN_M + HIDDEN_FRACTION / w0) * w0 * w0
     outer = inner + _EDGE_WINDOW_PX
-    # Sweeps see a moving object in the same rings.
+    # Sweeps measure a moving object with the same rings.
     on_v = max(outer, _GOES_ON * along) if moving else outer
     support_u, support_v = _window(_SUPPORT_REACH * across), _window(_SUPPORT_REACH * along)
     wide_u, wide_v = max(support_u, _window(outer)), max(support_v, _window(on_v))
@@ -342,7 +342,7 @@ def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-u
         edge_px = points.edge_px[i] * (_MOVING_SLACK if points.moving[i] else 1.0)
         inner = _EDGE_REACH * points.spacing_px[i, 0] + edge_px
         m[:], reach[:] = 0.0, 0.0
-        # Other sweeps saw the background where the moving object was not yet, or no more.
+        # Other sweeps measured the background before and after the moving object was here.
         witness_ns = _MOVING_WITNESS_NS if points.moving[i] else _NEVER_NS
         seen, youngest, num, squares, behind, num_now = _look_round(
             points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach

@@ -36,16 +36,16 @@ from densify.geometry import cameras, poses
 from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.types import Cloud
 
-_AROUND_M, _LEAST_AROUND = 0.25, 6  # a point of the body has six others of it around
+_AROUND_M, _LEAST_AROUND = 0.25, 6  # a point of the body has six others of the body around
 _POSE_M = 0.03  # standard deviation of the pose of the body
-_LIMBS_S = 0.1  # from the key, over which limbs keep their places
-_PRIOR = 0.05  # rays that end on the body, assumed everywhere
+_LIMBS_S = 0.1  # time from the key within which limbs keep their positions
+_PRIOR = 0.05  # number of rays that end on the body, assumed everywhere
 _WHOLE = 0.8  # share of its front at which a body is closed as a whole, as a car is
-_LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # rays that end on it: a third do at a pane
-_VOTES_OF_WHOLE, _VOTES_OF_OPEN = 0.75, 0.97  # along the outline
-_DEEP_M = 0.6  # farther behind the front of the hull lie seats, axles and the far side
+_LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # share of rays that end on it; at glass it is a third
+_VOTES_OF_WHOLE, _VOTES_OF_OPEN = 0.75, 0.97  # share of the votes along the silhouette
+_DEEP_M = 0.6  # farther behind the front of the hull are seats, axles and the far side
 _STIFF, _HELD = 3.0, 0.01  # weights of a smooth and of a small offset, against one return
-_AGREES = 2.0  # times what two static points of a surface may deviate
+_AGREES = 2.0  # tolerance, in those of two static points of a surface
 
 
 class MovingBody(NamedTuple):
@@ -108,7 +108,7 @@ def without_sweep(
 
 def _corners(points: Float) -> Float:
     """Return (V,3) corners of the convex hull of the points (N,3) that have others around."""
-    away_m, _ = KDTree(points).query(points, [_LEAST_AROUND + 1])  # itself is the first
+    away_m, _ = KDTree(points).query(points, [_LEAST_AROUND + 1])  # the first is the point
     points = points[np.ravel(away_m) <= _AROUND_M]
     try:
         return points[ConvexHull(points).vertices]

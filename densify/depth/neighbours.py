@@ -15,7 +15,7 @@ from densify.geometry.compiled import Kernel, inlined
 
 NONE = int(np.iinfo(np.uint8).max)
 """Steps where there is no known pixel within 254."""
-_LEAST, _MOST = 0.7, 1.4  # of the inverse depth: how far a slope is followed
+_LEAST, _MOST = 0.7, 1.4  # range of the extended inverse depth, relative to the start
 
 
 def _directions() -> NDArray[np.int64]:

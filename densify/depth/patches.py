@@ -22,10 +22,10 @@ from densify.geometry.types import Bool, Cloud, Float, Float32, Patches
 FREE = 0.3, 0.015
 """A point is seen through if it is nearer than all returns around by this much: the larger of a
 distance in metres and a share of the range."""
-_STEEP = 5.7  # metres farther per metre across, 10 degrees: a surface steeper on one side is a step
-_BEND_M, _BEND = 0.10, 0.25  # most change of the slope, and as a share of the change itself
+_STEEP = 5.7  # greatest slope, 10 degrees of incidence; a steeper surface on one side is a step
+_BEND_M, _BEND = 0.10, 0.25  # greatest change of the slope, in metres and as a share
 _AROUND, _MOST_CELLS = 5.0, 20  # spacings within which rays without order have neighbours
-_RIDGE = 0.005  # of the neighbours' mean square distance
+_RIDGE = 0.005  # share of the mean square distance of the neighbours
 
 
 def patches(

@@ -28,12 +28,12 @@ pixels, each step of depth counted alike. Good ones had up to 0.11, those of oth
 _FORMS = {"auto": ("depth", "log", "inverse"), "depth": ("depth", "log"), "inverse": ("inverse",)}
 _MIN_FITTED = 100
 _WRONG = np.log(1.25)
-_USUAL = 0.05  # error of a prior in the logarithm of depth; its edges are steps of more than twice
+_USUAL = 0.05  # error of a prior in the logarithm of depth; a step of more than twice is an edge
 _MAX_CELLS = 40_000
-_SMOOTHNESS = 10.0  # against 1 for a cell all of whose pixels are known
-_TOWARDS_NONE = 0.002  # pull to no correction and the mean error, where nothing is known around
+_SMOOTHNESS = 10.0  # relative to 1 for a cell with all pixels known
+_TOWARDS_NONE = 0.002  # pull to no correction and the mean error, far from known pixels
 _AROUND = np.ones((5, 5), np.uint8)
-_EMPTY = 2 * np.log(FAR_M)  # logarithm of a depth that is farther than all
+_EMPTY = 2 * np.log(FAR_M)  # logarithm of a depth beyond all others
 
 
 def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
@@ -239,7 +239,7 @@ def _correction(
         weight: Float = 1 / (1 + (off.astype(np.float64) / (2 * _USUAL)) ** 2)
         return weight
 
-    # Where the prior is steep it may be blurred, and a difference there says little.
+    # A steep prior may be blurred. Differences there have little weight.
     flat = trusted(steepness[near])
     mean = float(np.average(np.abs(lacking), weights=flat)) if len(flat) else 0.0
     trust = flat * trusted(lacking - at_rest(flat, lacking, 0.0)[cell])

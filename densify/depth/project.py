@@ -28,10 +28,10 @@ from densify.depth.seen_through import Rays, without_seen_through
 from densify.depth.spots import measure_spots
 from densify.geometry.types import Camera, Cloud, DepthMap, Float, Float32, Patches, Ranked, Reason
 
-_BLOCK_PX = 16  # over which rays lie about equally dense
-_JUMP = 1.6  # by which rays lie farther apart beyond the last of a scanner's denser rings
-_MOST_CONTRADICTED = 0.7  # of the pixels around; of what more contradicted, half or more was wrong
-_LEAST_CONFIDENCE = np.float32(1) / np.iinfo(np.uint8).max  # 0 means no depth once written
+_BLOCK_PX = 16  # blocks within which the density of rays is about constant
+_JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
+_MOST_CONTRADICTED = 0.7  # share of the pixels around; of those above, at least half are outliers
+_LEAST_CONFIDENCE = np.float32(1) / np.iinfo(np.uint8).max  # stored as 1; 0 is no depth
 
 
 def project(

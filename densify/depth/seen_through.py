@@ -23,7 +23,7 @@ from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
 from densify.geometry import poses
 from densify.geometry.types import Bool, Cloud, Float, Float32, Reason, Stretch
 
-_SHARE = 0.25  # of the rays that went through a pixel that is taken out
+_SHARE = 0.25  # share of rays that pass through a pixel which is rejected
 RAY_BLUR = 0.35
 """Standard deviation of the place at which a ray counts, in gaps between rays."""
 _NUM_STEPS = 6

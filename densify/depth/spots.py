@@ -16,7 +16,7 @@ from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
 from densify.geometry.compiled import Kernel
 
 _SPOT = 0.35  # half width, in spacings of rays along the azimuth
-_MOST_PX = 4  # of it
+_MOST_PX = 4  # greatest half width
 
 
 def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
@@ -55,7 +55,7 @@ def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, found, nearest):  # ty
     for i in range(len(pixel)):
         v, u = pixel[i] // width, pixel[i] % width
         here = depth_m[v, u]
-        reach = int(radius_px[i] + 0.5)  # a spot's middle lies in its pixel
+        reach = int(radius_px[i] + 0.5)  # the centre of a spot is in its pixel
         for row in range(max(v - reach, 0), min(v + reach + 1, height)):
             for column in range(max(u - reach, 0), min(u + reach + 1, width)):
                 z = filled_m[row, column]

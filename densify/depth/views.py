@@ -330,7 +330,7 @@ class HeldOut:
         Args:
             cloud: Has the moving points of the key sweep and their velocities.
         """
-        views = replace(views, key_image=None)  # what is held out must not help
+        views = replace(views, key_image=None)  # the held-out sweep must not help
         settings = replace(views.settings, rims="strict", visibility=True)
         own = cloud.select(cloud.frame == views.key)
 

@@ -27,13 +27,13 @@ from densify.readers.timeline import format_frames
 _EDGE_M, _EDGE_SHARE = 0.6, 0.08
 _NEAREST_M, _FARTHEST_M = 3.0, 50.0
 _BESIDE_RAD = np.deg2rad(0.6)
-_STEEPLY = 4.0  # a neighbour above or below counts as so many times farther
+_STEEPLY = 4.0  # a neighbour above or below counts as farther by this factor
 _BLUR_PX, _AROUND_PX = 1.5, 25.0  # at a focal length of 700 px
 _FOCAL_PX = 700.0
 _NUM_OTHERS, _LEAST_SEEN = 20_000, 50
 _CLEAR, _CLEARLY = 5.0, 1.25
 _LEAST_PAIRS = 2
-_AS_MANY = 0.5  # edges as with the given calibration; one object may lie on an edge by chance
+_AS_MANY = 0.5  # share of the edges at the given calibration; one object may match by chance
 _SHIFT_DEG, _SHIFT_STEP_DEG, _OFF_DEG = 2.0, 0.1, 0.4
 _CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.2, 0.01, 0.02
 _LEAST_SPEED_M_S = 3.0
@@ -211,8 +211,8 @@ def alternatives(T: Float) -> dict[str, Float]:
 def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
     """Compare the calibration and the clock as given with others. The best of all explains most."""
     given, num_given = score(camera, pairs)
-    name, text = f"{camera.name}: calibration", f"depth edges lie on image edges by {given:.1f}"
-    text += " standard errors as given"
+    name, text = f"{camera.name}: calibration", f"depth is on image edges by {given:.1f} standard"
+    text += " errors as given"
     if len(pairs) < _LEAST_PAIRS:
         is_clear = given >= _CLEAR
         text += ": one image is too little to tell" * (not is_clear)
@@ -222,7 +222,7 @@ def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
         at_mended, num_edges = score(replace(camera, T_cam_lidar=T_cam_lidar), pairs)
         others[what] = at_mended if num_edges > _AS_MANY * num_given else 0.0
     best = max(others, key=lambda what: others[what])
-    # Edges of depth between returns of one ring are upright: up and down cannot be told as well.
+    # Discontinuities within one ring are upright. Vertical shifts are hardly observable.
     shifts_deg = np.arange(-_SHIFT_DEG, _SHIFT_DEG + 1e-9, _SHIFT_STEP_DEG)
     px_per_deg = camera.focal_px * np.pi / 180
     at_shifts = [score(camera, pairs, 0.0, shift * px_per_deg)[0] for shift in shifts_deg]

@@ -19,7 +19,7 @@ _LEAST_WAY_M = 1.0
 _OFF_M, _OFF_PER_M, _OFF_DEG = 0.3, 0.1, 2.0  # over a spot of five sweeps
 _CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.3, 0.02, 0.04
 _NOISE_M, _NOISE_RAD, _EVEN_COST = 0.05, 1.5e-3, 4.0
-_MUCH_BETTER, _EXACT = 0.4, 0.15  # of what is allowed
+_MUCH_BETTER, _EXACT = 0.4, 0.15  # of the tolerance
 CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 

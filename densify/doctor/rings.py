@@ -28,7 +28,7 @@ _REACH_M = np.array([3.0, 0.8, 2.4])
 _GRID_M = (0.5, 0.4, 0.05)
 _COARSE_FROM_M, _COARSE_POINTS, _COARSE_BINS, _NUM_STARTS = 18.0, 3000, 3, 8
 _FINER = ((0.1, 3), (0.05, 2), (0.02, 1))  # step in metres, bins
-# KITTI's HDL-64E, whose two blocks of lasers stand apart, is sharpest from 0.2 m higher.
+# KITTI's HDL-64E, with two separate blocks of lasers, is sharpest 0.2 m higher.
 _OFF_M = 0.3
 
 

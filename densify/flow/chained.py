@@ -13,7 +13,7 @@ from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Float, FlowField, Int, Stretch
 
 _NUM_NEIGHBORS = 3
-_LINE_M = 0.05  # points that scatter less about a line lie on it
+_LINE_M = 0.05  # points with less scatter about a line are on it
 _MAX_GAP_M = 0.5
 
 
@@ -47,7 +47,7 @@ class ChainedMotion:
 
     def _flow(self, here: int, there: int) -> FlowField:
         num_sweeps = len(self.stretch.sweeps)
-        if here == there and num_sweeps > 1:  # a step to a neighbour tells what moves
+        if here == there and num_sweeps > 1:  # a step to a neighbour has the moving points
             step = self._flow(here, here + 1 if here + 1 < num_sweeps else here - 1)
             return replace(step, displacement=np.zeros_like(step.displacement))
         if here == there:

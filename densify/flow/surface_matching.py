@@ -13,13 +13,13 @@ from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, step by step
-MAX_WEIGHT = 60.0  # of all matches together: neighbours on a surface do not err independently
+MAX_WEIGHT = 60.0  # of all matches; the errors of neighbours on a surface are not independent
 NUM_NEAR = 12  # neighbours that span a surface
 MIN_FIT = 5  # matches
 _SURFACE_M = 0.05  # noise of a surface point
 _RIDGE = 0.02  # of the mean variance, for points on a line
 _MAX_MODEL_POINTS = 1500
-_LOOSE = 10.0  # of the covariance: sliding along a surface must not be held up by its own points
+_LOOSE = 10.0  # of the covariance, because points of a surface must not stop a slide along it
 
 
 def apply(state: Float, points: Float, centre: Float) -> Float:

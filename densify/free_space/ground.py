@@ -17,10 +17,10 @@ ABOVE_GROUND_M = 0.2
 """Points lower than this above the ground are part of it: they start no motion."""
 CELL_M = 1.0  # smaller cells follow kerbs, larger ones bridge holes
 MAX_SLOPE = 0.15  # rise per metre; steeper surfaces are objects
-_WINDOW = 7  # cells; a hump that is narrower is not ground, nor a pit
+_WINDOW = 7  # cells; a narrower hump or pit is not ground
 
 _NUM_POINTS, _NUM_TRIES = 2000, 200
-_LEAST_SHARE = 0.1  # on a ground plane, beyond those below it
+_LEAST_SHARE = 0.1  # share of points on a ground plane, less those below it
 
 
 def ground(stretch: Stretch) -> HeightMap:
@@ -174,7 +174,7 @@ def _ground_normal(points: Float) -> Float | None:
     a, b, c = points[rng.integers(len(points), size=(_NUM_TRIES, 3))].transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     normal *= np.where(normal[:, 2:] < 0, -1, 1)
-    level = normal[:, 2] > np.hypot(*normal[:, :2].T)  # rather a floor than a wall
+    level = normal[:, 2] > np.hypot(*normal[:, :2].T)  # a floor and not a wall
     normal = normal[level] / np.linalg.norm(normal[level], axis=1, keepdims=True)
     from_origin = np.einsum("ij,ij->i", normal, a[level])
     above = points @ normal.T - from_origin

@@ -27,16 +27,16 @@ from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
 _CELLS_PER_LINE = 1.14  # the even step of lines is 1 % longer than the usual one
 _MIN_ROW_RAD = np.deg2rad(0.45)
-# Closer rings share a row everywhere. Other rings have a row of their own from the range on at
+# Closer rings always share a row. Other rings have rows of their own from the range at
 # which three of them span more than the error of registration.
 _MIN_FAR_ROW_RAD, _SLACK_M = np.deg2rad(0.15), 0.1
-# A ring this far from all others sees free space right at its rays; three full cells are enough.
+# A ring this far from all others observes free space at its rays. Three full cells are enough.
 _LONE_RAD, _ON_RING_RAD, _OF_ONE_RING = np.deg2rad(1.0), np.deg2rad(0.15), 2
-_SETTLED = 0.1  # of a turn
+_SETTLED = 0.1  # share of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
-_DENSEST = 10  # percent of an unordered scanner's returns: the finest cells
+_DENSEST = 10  # percent of the returns of an unordered scanner that set its finest cells
 MIN_FILLED = 6  # of the 3 x 3 cells around a direction
-_VOUCHED, _MAX_SIZES = 0.8, 5  # share of returns with so many cells; sizes that are tried
+_VOUCHED, _MAX_SIZES = 0.8, 5  # share of returns with enough filled cells; number of cell sizes
 _PI = np.float32(np.pi)
 
 
@@ -193,7 +193,7 @@ def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) 
     num_filled = _over_3x3(np.add, np.isfinite(nearest_m).astype(np.uint8), 0)
     if cells.lone:
         num_filled[::2] *= _OF_ONE_RING
-        num_filled[1::2] = 0  # a cell between two lone rings says nothing
+        num_filled[1::2] = 0  # a cell between two single rings is no evidence
     if fires_by_azimuth(rays):
         offset_s = _offset_per_column(column, rays.offset_s, cells.num_columns)[None]
         spread_s = np.zeros_like(offset_s)

@@ -44,7 +44,7 @@ def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
     """Return the column. Columns start behind, and a point without a direction is in the first."""
     if not abs(azimuth) <= _PI:
         return np.int32(0)
-    # 32 bits: many at once where it is called in a loop.
+    # 32 bits, because more of them fit into a vector instruction.
     column = np.int32((azimuth + _PI) * (np.float32(num_columns) / (_PI + _PI)))
     return column - np.int32(num_columns) if column >= num_columns else column
 
@@ -191,7 +191,7 @@ def see_beyond(begin, end, points, velocity, image, margins, least, beyond):  # 
     settled_s = np.float32(image.settled_s)
     x, y, z, time_s, elevation = np.empty((5, _BLOCK), np.float32)
     row, column = np.zeros((2, _BLOCK), np.int32)
-    # Each point is a long chain of steps; a block of them takes every step side by side.
+    # Each point needs a long chain of steps. A block of points takes every step in parallel.
     for start in range(begin, end, _BLOCK):
         size = min(_BLOCK, end - start)
         _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column)
@@ -204,7 +204,7 @@ def see_beyond(begin, end, points, velocity, image, margins, least, beyond):  # 
             margin_m = max(margins[0], margins[1] * range_m)
             away_s = abs(image.offset_s[0 if by_azimuth else r, c] - time_s[k])
             if by_azimuth:
-                # Where a turning scanner begins and ends its turn it skips or repeats a sector.
+                # Between two turns a spinning scanner skips or repeats a sector.
                 if away_s > settled_s:
                     continue
             else:

@@ -28,18 +28,18 @@ _RING_BIN_RAD, _LINE_BIN_RAD, _CELL_RAD = np.deg2rad([0.02, 0.5, 1.0])
 _MIN_PROMINENCE = 0.5
 _MIN_RETURNS_PER_RING = 30
 _MIN_RING_SHARE = 0.8
-_NEAR_RING = 0.2  # of the gap to the next
+_NEAR_RING = 0.2  # share of the gap to the next ring
 _LEAST_STEP_RAD = np.deg2rad(0.02)
 _BEYOND_RAD = np.deg2rad(1.0)
 
 _BAND_RAD, _COLUMN_RAD = np.deg2rad([0.1, 1.0])
 _LEAST_GAP_RAD, _MAX_GAP_RAD = 1e-4, np.deg2rad(4.0)
-_EVEN, _MIN_EVEN_SHARE = 0.2, 0.5  # of the usual gap, of the returns
+_EVEN, _MIN_EVEN_SHARE = 0.2, 0.5  # share of the usual gap; share of the returns
 _MIN_GAPS_PER_BIN = 30
 _MIN_PER_COLUMN = 5
-_AT_ONCE = 0.03  # of a sweep's duration
+_AT_ONCE = 0.03  # share of the duration of a sweep
 
-_MIN_COUNT = 24  # returns that tell a density
+_MIN_COUNT = 24  # least number of returns for a density
 _WINDOWS = (1, 3, 5, 9, 17, 33)  # cells
 
 
@@ -197,7 +197,7 @@ def _gaps(group: NDArray[Any], angle: Float32) -> Float:
 
     group: (N,) whole numbers.
     """
-    apart = 4 * np.pi  # more than angles of one group can be
+    apart = 4 * np.pi  # more than the greatest difference within a group
     found: Float = np.diff(np.sort(group * apart + angle.astype(np.float64)))
     return found[found < 2 * np.pi]
 

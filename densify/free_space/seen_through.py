@@ -18,8 +18,8 @@ from densify.geometry.types import Bool, Float, RegisteredSweep, Stretch
 
 REACH_S = 1.0
 """Sweeps up to this long before and after a sweep are tested against its points."""
-_MOST_TESTED = 10  # sweeps on each side; more cost more and find the same
-_MARGIN_M, _MARGIN_FRACTION = 0.4, 0.015  # the larger one; forgives errors of registration
+_MOST_TESTED = 10  # sweeps on each side; a larger number costs more and finds the same
+_MARGIN_M, _MARGIN_FRACTION = 0.4, 0.015  # the larger one; tolerates errors of registration
 
 
 def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
@@ -106,7 +106,7 @@ class FreeSpace:
                     None if velocity_m_s is None else poses.rotate(T_lidar_world, velocity_m_s),
                 )
             )
-        # Sweeps that lack a scanner cannot be added up with the others.
+        # Sweeps without this scanner cannot be added to the others.
         together = [num for num in num_beyond if len(num) == len(num_beyond[0])]
         free: Bool = (np.sum(together, axis=0) >= MIN_FILLED).any(axis=0)
         return free

@@ -14,9 +14,9 @@ from densify.free_space.rings import Layout, aimed, measure
 from densify.geometry.arrays import Bool, Float, Float32
 from densify.geometry.types import RegisteredSweep
 
-_NUM_SWEEPS = 3  # that a scanner is measured from
-_BEAM_RAD = np.deg2rad(1 / 6)  # 3 mrad, as most have
-_HOLE_RAD = np.deg2rad(45.0)  # a building may hide as much
+_NUM_SWEEPS = 3  # number of sweeps in which a scanner is measured
+_BEAM_RAD = np.deg2rad(1 / 6)  # 3 mrad, the width of most beams
+_HOLE_RAD = np.deg2rad(45.0)  # width of a gap that a building can cause
 
 
 class RayGrid(NamedTuple):

@@ -29,10 +29,10 @@ from densify.geometry.types import Bool, Camera, Float, Float32
 
 NEAREST_M = 0.1
 _COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
-_RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # any others are 0
+_RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # all others are 0
 _NUM_ANGLES = 4096
 _NUM_STEPS = 10  # of Newton's method
-_STEP_RAD = np.cbrt(np.finfo(float).eps)  # of differences, where rounding costs least
+_STEP_RAD = np.cbrt(np.finfo(float).eps)  # step of differences with the least rounding error
 _CONVERGED = np.sqrt(np.finfo(float).eps)  # the next step of Newton's method is exact
 
 
@@ -181,7 +181,7 @@ def _stops_growing(n: Polynomial, d: Polynomial) -> float:
 def _in_view(camera: Camera, lens: _Lens, points_cam: Float) -> Bool:
     """Return (N,) True for directions in the view of the lens, in the image or not."""
     x, y, z = points_cam.T
-    range_m = np.sqrt(x * x + y * y + z * z)  # norm takes three times as long over rows of three
+    range_m = np.sqrt(x * x + y * y + z * z)  # norm takes three times as long
     seen: Bool = z >= range_m * np.cos(np.radians(camera.max_angle_deg))
     if camera.model == "pinhole":
         seen &= z > 0
@@ -248,7 +248,7 @@ def _unbent(lens: _Lens, wanted: Float) -> Float:
 
     The radial part is looked up. Newton's method adds the rest.
     """
-    # Evenly in angle, since the plane of a lens that sees half of all directions has no end.
+    # Evenly in angle, because the plane of a lens with a half-space view is infinite.
     radius = np.tan(np.linspace(0, np.arctan(np.sqrt(lens.limit)), _NUM_ANGLES))
     radius = radius[radius < 1e3]
     bent = radius * lens.numerator(radius**2) / lens.denominator(radius**2)

@@ -34,11 +34,11 @@ _log = logging.getLogger("densify")
 _progress = logging.getLogger("densify.progress")
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-# No fastmath, and divisions as numpy has them: a result is the same on every machine. Wrappers for
-# callers that there are none of would take a tenth of the time that compiling takes.
+# No fastmath, and divisions as in numpy: results are the same on every machine. Wrappers for
+# unused kinds of callers would take a tenth of the compile time.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _NOT_FROM_PYTHON: dict[str, Any] = {"no_cpython_wrapper": True}
-_LEAST_ROWS = 4096  # to hand fewer to a second thread takes longer than most kernels do for them
+_LEAST_ROWS = 4096  # a second thread for fewer rows takes longer than most kernels
 
 
 class _Compiling(event.Listener):
@@ -104,7 +104,7 @@ class Kernel:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.__doc__ = function.__doc__
-        function.__qualname__ += _imported_code(function)  # a part of the cache file's name
+        function.__qualname__ += _imported_code(function)  # part of the name of the cache file
         self._function = function
         try:
             self._compiled = numba.njit(function, cache=True, **_OPTIONS)

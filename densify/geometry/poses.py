@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.arrays import Float, Int
 
-_ROWS = 8192  # at once: for more, OpenBLAS wakes threads that spin longer than the work takes
-_HOLD = 1e-9  # against turning about a line that the points lie on
+_ROWS = 8192  # at once; for more rows OpenBLAS wakes threads that spin longer than the work takes
+_HOLD = 1e-9  # keeps points on a line from turning about it
 
 
 def inverse(T_a_b: Float) -> Float:
@@ -94,7 +94,7 @@ def fit_rigid(source: Float, target: Float) -> Float:
     Points on a line do not turn about it, and a single point does not turn.
     """
     from_m, to_m = source.mean(axis=0), target.mean(axis=0)
-    # einsum and not BLAS: the same sums whatever the number of threads.
+    # einsum and not BLAS: its sums do not depend on the number of threads.
     spread = np.einsum("ni,nj->ij", target - to_m, source - from_m)
     spread += _HOLD * np.square(source - from_m).sum() * np.eye(3)
     left, _, right = np.linalg.svd(spread)

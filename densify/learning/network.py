@@ -47,7 +47,7 @@ _WIDTHS = (32, 48, 64, 96)
 _LARGEST_HEIGHT_M = 4.0
 
 
-# Its input, the same in training and inference: points above the ground, the ego motion undone
+# Its input, the same in training and inference: points above the ground, ego-motion removed
 
 
 class NetworkCloud(NamedTuple):
@@ -122,7 +122,7 @@ class Voxels(nn.Module):
             nn.Linear(widths[1] + _WIDTH + 3, 48), nn.ReLU(), nn.Linear(48, 32), nn.ReLU(),
             nn.Linear(32, 3),
         )  # fmt: skip
-        with torch.no_grad():  # to begin with little moves, as in the world
+        with torch.no_grad():  # little moves at first, as in the world
             self.decode[-1].weight.mul_(0.1)  # type: ignore[operator, union-attr]
             self.decode[-1].bias.zero_()  # type: ignore[operator, union-attr]
 
@@ -147,7 +147,7 @@ class Voxels(nn.Module):
         if first is None or not len(first.row):
             return flow
         image = torch.cat(grids, dim=1).view(1, NUM_CELLS, NUM_CELLS, -1).permute(0, 3, 1, 2)
-        # Where in its cell a point is tells more about it than the cell's mean.
+        # The position of a point in its cell says more than the mean of the cell.
         at_points = _at(self._unet(image), first)
         decoded = self.decode(torch.cat([at_points, encoded, first.features[:, :3]], dim=1))
         return flow.index_copy(0, first.row, decoded)

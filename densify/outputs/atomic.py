@@ -81,7 +81,7 @@ def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
 
     A folder younger than ``age_s`` seconds stays, because another process may be writing there.
     """
-    for folder, names, _ in os.walk(root):  # passes over what others remove meanwhile
+    for folder, names, _ in os.walk(root):  # skips files that others remove meanwhile
         for name in names:
             hidden = Path(folder, name)
             with suppress(OSError):

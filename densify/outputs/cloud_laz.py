@@ -19,7 +19,7 @@ from densify.readers.decoded_files import read_las
 
 _SCALE_M = 0.001
 _UNIX_DAY_0, _DAY_NS = datetime.date(1970, 1, 1), 86400 * 10**9
-_LAS_EPOCH_NS = (315_964_800 + 10**9) * 10**9  # 1980-01-06, and what LAS takes off
+_LAS_EPOCH_NS = (315_964_800 + 10**9) * 10**9  # 1980-01-06, and the offset of LAS
 _MAX_COORDINATE_M = _SCALE_M * np.iinfo(np.int32).max
 _EXTRA_DIMENSIONS = (
     ("frame", "int32", "source sweep"),

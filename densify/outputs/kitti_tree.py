@@ -145,8 +145,8 @@ The folders and files are those of KITTI's depth completion benchmark, whose loa
   <train|val>/<drive>/proj_depth/<product>/<camera>/<frame, 10 digits>.png
 
   velodyne_raw        input: depth of the sweep of that frame alone
-  groundtruth         target: depth measured by all the sweeps. Method flow moves what moves to
-                      where it was at the exposure; icp leaves it where it was measured
+  groundtruth         target: depth measured by all the sweeps. Method flow moves moving points to
+                      the exposure; icp leaves them where they were measured
   groundtruth_filled  groundtruth, and pixels interpolated between measured ones
   confidence          of groundtruth_filled, and so of groundtruth too
 

@@ -26,7 +26,7 @@ Curve = Sequence[Mapping[str, Any]]
 """`densify.scores.depth_metrics.precision_density`."""
 
 _DPI = 100
-# Fixed, so that the pictures of different keys compare.
+# Fixed, to compare the pictures of different keys.
 _NEAR_M, _FAR_M = 3.0, 80.0
 _TICKS_M = (3, 5, 10, 20, 40, 80)
 _NO_DEPTH_M = np.float32(1e6)
@@ -36,7 +36,7 @@ _POINT_SIZE_PX = 3
 _TITLE_PX, _SCALE_PX = 36, 60
 _FONT_PT, _LETTER_PX = 13.0, 0.85  # width of a letter, per point of the font
 _FEWEST_OUTLIERS = 1e-4  # below, the scale is linear down to 0
-_MEDIAN_SHARE = 20  # the running median covers one part in so many of all steps
+_MEDIAN_SHARE = 20  # the running median covers this part of all steps
 
 
 def write_plot(path: Path, figure: Figure) -> None:

@@ -32,7 +32,7 @@ _OUTPUTS: Mapping[tuple[str, ...], Callable[[Result, Context, Path], None]] = {
     ("figure.png",): plots.write_key_figure,
     ("curve.png",): plots.write_curve,
     ("run.yaml",): key_outputs.write_run_yaml,
-    ("report.html",): write_report,  # last, because it reads what the others wrote
+    ("report.html",): write_report,  # last, because it reads the files of the others
 }
 """The entries of a key's folder, and what writes them where the result has something for them. The
 same result and context give the same bytes."""

@@ -16,7 +16,7 @@ def keep_freed_memory() -> None:
     """Let all threads of this process share one heap, which keeps freed memory of large arrays.
 
     Otherwise each thread has a heap of its own, and the system takes and clears the pages of every
-    large array anew. Call this before threads are started. It does nothing if the C library is not
+    large array again. Call this before threads are started. It does nothing if the C library is not
     glibc.
     """
     with suppress(OSError, AttributeError, TypeError):  # another library, or none by that name

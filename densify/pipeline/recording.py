@@ -67,7 +67,7 @@ class Piece(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """All points around a key at the key's moment. flow: where asked for. tracks: of what moves."""
+    """All points around a key at the key's time. flow: if asked for. tracks: of moving objects."""
 
     cloud: Cloud
     flow: StretchFlow | None

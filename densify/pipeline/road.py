@@ -34,10 +34,10 @@ from densify.registration.deskew import deskew_sweep, twists
 from densify.registration.road_poses import follow_road, num_in_submap, relax_poses
 
 _STEP_M = 2.0
-_MOST_S = 15.0  # on each side: a vehicle that stands or crawls sees nothing new
+_MOST_S = 15.0  # on each side; a standing vehicle observes nothing new
 _LEAST_STEP_M = 0.5 * _STEP_M
 _SAME_VIEW_M = 3.0
-_SLACK_M = 4.0  # that a lidar moves within a sweep, and a camera until its exposure
+_SLACK_M = 4.0  # motion of a lidar within a sweep, and of a camera until its exposure
 
 _View = tuple[Camera, Float]
 """A camera and its ``T_cam_world``."""
@@ -171,7 +171,7 @@ class Road:
                 if travel_m - last_m >= _LEAST_STEP_M:
                     last_m = travel_m
                     yield self.sweeps.read(frame), T, twist
-        except InputError:  # the road ends where there is no pose or sweep
+        except InputError:  # the road ends without a pose or a sweep
             return
 
     def _pose(self, frame: int) -> Float:

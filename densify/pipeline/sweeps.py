@@ -20,7 +20,7 @@ from densify.pipeline.costs import Watch
 from densify.readers.timeline import Timeline, check_key, check_window, read_sweep
 
 BLOCK_S = 2.0
-AROUND_S = 1.0  # what moves is looked for at least this far around a block of a whole recording
+AROUND_S = 1.0  # least time around a block in which moving objects are searched
 
 
 class Sweeps:

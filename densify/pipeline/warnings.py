@@ -60,7 +60,7 @@ def _of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
     for cut in window.cuts:
         yield f"the window is cut to frames {format_frames(window.frames)}: {cut}"
     if follows and recording.is_pair(key):
-        yield "two sweeps show what moves less well than three or more, which can be followed"
+        yield "in two sweeps moving objects are found less well than in three or more"
 
 
 def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:

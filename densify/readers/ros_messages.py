@@ -47,7 +47,7 @@ _PACKED = {  # channels, and OpenCV's conversion to RGB
     "yuv422_yuy2": (2, "COLOR_YUV2RGB_YUYV"),
     "yuyv": (2, "COLOR_YUV2RGB_YUYV"),
 }
-_FIXED_M = 1e-6  # what moves less, in metres or radians, is fixed
+_FIXED_M = 1e-6  # frames that move less, in metres or radians, are fixed
 
 
 def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:

@@ -15,7 +15,7 @@ import numpy as np
 from densify.geometry import poses
 from densify.geometry.types import Float, RegisteredSweep, Sweep
 
-_MANY_POINTS = 30_000  # before they are thinned to voxels
+_MANY_POINTS = 30_000  # number of points before thinning to voxels
 _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are even for any order of the rings
 _VOXEL_M, _LEAF_M, _NUM_NEIGHBORS = 0.5, 1.0, 10
 _HELD_AT_M = 10.0

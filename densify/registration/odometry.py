@@ -19,17 +19,17 @@ from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
 from densify.registration.deskew import deskew
 
-_NUM_CATCHING_UP = 3  # sweeps registered, however far apart in time
+_NUM_CATCHING_UP = 3  # sweeps that are registered at any distance in time
 # Change of a sweep's pose (rad and m) below which KISS-ICP stops. The first pass only has to find
 # the motion within a sweep: 3 mm over 0.1 s bend its ends by 1.5 mm. The second pass is the start
 # of `densify.registration.surfaces`: with 3 mm there too, a highway of 32 rings slides by 0.1 m.
 _FIRST_PASS, _SECOND_PASS = 3e-3, 5e-4
 
 MAX_SPEED_M_S = 60.0  # a faster step between two sweeps is an error of registration
-_STEP_M, _STEP_S = 0.5, 0.1  # of the search for it; in a shorter time smaller in proportion
+_STEP_M, _STEP_S = 0.5, 0.1  # steps of the speed search; smaller in proportion for shorter times
 _NUM_SAMPLES = 800
 _CLOSE_M = 1.0
-_RAYS_RAD = 0.01  # between rays: objects along the road are met by the same rays at any speed
+_RAYS_RAD = 0.01  # angle between rays; objects along the road meet the same rays at any speed
 _ABOVE_GROUND_M = 0.4
 
 

@@ -26,15 +26,15 @@ from densify.registration.deskew import deskew_sweep
 from densify.registration.trajectory import MIN_NUM_POINTS, MIN_OVERLAP, find_jump
 
 _CHAIN_MATCH_M = 2.0
-_MAP_NS = 550_000_000  # the known sweeps within it make the first map
-_LONGEST_GAP_S = 0.4  # between two sweeps of the chain
-_TOGETHER = 6  # sweeps that are chosen at the same speed
+_MAP_NS = 550_000_000  # known sweeps within this time make the first map
+_LONGEST_GAP_S = 0.4  # greatest time between two sweeps of the chain
+_TOGETHER = 6  # sweeps that are chosen together, at one speed
 
-_LEAST_POINTS = 80_000  # of a submap: rings of fewer slide onto each other
+_LEAST_POINTS = 80_000  # points of a submap; rings of fewer points slide onto each other
 _MOST_SWEEPS = 5
-_APART = (1, 2, 4, 8)  # submaps from one to the other of a pair
+_APART = (1, 2, 4, 8)  # distances of the pairs, in submaps
 _MATCH_M = 0.6
-_USUAL_M = 0.02  # between pairs; a pair that is far more off counts less
+_USUAL_M = 0.02  # usual error of a pair; a pair with a much larger error has less weight
 _MOST_STEPS, _CONVERGED = 10, 1e-6
 _LEAST_OVERLAP, _MOST_LEFT_M, _MOST_WRONG = 0.5, 0.1, 0.25
 
@@ -122,7 +122,7 @@ def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: 
     gap_ns = 1e9 * min(_LONGEST_GAP_S, step_m / max(speed_m_s, 1e-3))
     rows: list[int] = []
     for r in range(row, len(stamp_ns)):
-        # One more sweep would be nearer to the gap wanted than this one.
+        # The next sweep is nearer to the wanted gap.
         beyond = abs(int(stamp_ns[min(r + 1, len(stamp_ns) - 1)]) - last_ns)
         if (abs(int(stamp_ns[r]) - last_ns) + beyond) / 2 >= gap_ns:
             rows.append(r)
@@ -278,7 +278,7 @@ class _Graph:
         slope = np.zeros((len(apart), 6, 12))  # by the motions of target and source
         slope[:, :, :6], slope[:, :, 6:] = -adjoint.transpose(0, 2, 1), np.eye(6)
         pull = slope.transpose(0, 2, 1) @ (weight[:, None, None] * self._information)
-        # A fixed submap's unknowns are put behind all others, and cut off.
+        # Unknowns of fixed submaps come after all others, and are cut off.
         num = 6 * int((~self._fixed).sum())
         first = np.where(self._fixed, num, 6 * (np.cumsum(~self._fixed) - 1))
         at = (first[self._ends][:, :, None] + np.arange(6)).reshape(-1, 12)

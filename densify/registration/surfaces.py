@@ -22,19 +22,19 @@ from densify.registration.deskew import deskew_sweep
 from densify.registration.odometry import search_twist
 
 _REACH_NS = 1_050_000_000
-_NUM_IN_REACH = 10  # sweeps; of more, every second one, third, ...
-_START_NS = 850_000_000  # in which the speed at the start is found
-_NUM_START = 3  # sweeps that make the first surfaces, placed as expected
-_NUM_POINTS = 15_000  # of a sweep
+_NUM_IN_REACH = 10  # sweeps; of a larger number every second, third, ... one
+_START_NS = 850_000_000  # time in which the start speed is found
+_NUM_START = 3  # sweeps of the first surfaces, at their expected poses
+_NUM_POINTS = 15_000  # number of points of a sweep
 _VOXEL_M = 0.25
-# The normal of points of one ring is that of their noise, which leans towards the scanner and tips
-# the vehicle by 0.03 degrees a sweep. Neighbours have to reach the next rings.
+# The normal of points of one ring is that of their noise. It leans towards the scanner and tips
+# the vehicle by 0.03 degrees a sweep. Neighbours must include the next rings.
 _NUM_NEIGHBORS, _NUM_NEIGHBORS_OF_FEW = 20, 50
-# In turn. Narrow at the end, since a point beyond all that was measured has no partner.
+# For each round. Narrow at the end, because a point beyond all others has no partner.
 _MATCH_M = (0.5, 0.2)
 _MATCH_GUESSED_M = (0.9, *_MATCH_M)  # constant velocity is up to 0.3 m off after 0.1 s
-_MOST_M = 0.3  # from the odometry; farther off, wrong partners are as near as right ones
-_HOLD = 0.01  # along highways one plane in fifty tells
+_MOST_M = 0.3  # from the odometry; at larger distances wrong partners are as near as right ones
+_HOLD = 0.01  # along highways one plane in fifty constrains the motion
 
 
 def refine(sweeps: Sequence[Sweep], rough: Trajectory) -> Trajectory:
@@ -96,7 +96,7 @@ class _SweepRow:
         self.stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
         self._num_neighbors, self._match_m, self._most_m = num_neighbors, match_m, most_m
         self._T: Float = np.tile(np.eye(4), (len(sweeps), 1, 1))
-        self._points: list[Float] = []  # of those placed so far, in the world
+        self._points: list[Float] = []  # of the sweeps aligned so far, in the world
 
     def register(self, twist: Float, expected: Callable[[int, Float], Float]) -> Float:
         """Return ``T_first_lidar`` (S,4,4).

@@ -26,13 +26,13 @@ MIN_OVERLAP = 0.55
 """Share of the points above the ground that must lie on the sweeps of a third of a second before.
 Right poses gave 0.73 (16 beams, 25 m/s) to 0.98, wrong ones of a rosette 0.42."""
 MIN_NUM_POINTS = 1000  # a sweep with fewer cannot be registered
-_MAX_ACCELERATION_M_S2 = 30.0  # three times what tyres can do; the rest is noise of the stamps
+_MAX_ACCELERATION_M_S2 = 30.0  # three times the grip of tyres, for noise of the stamps
 _POSE_NOISE_M = 0.5
 _MAX_TURN_RATE_DEG_S = 150.0
-_MANY_POINTS = 30_000  # in a sweep; fewer are matched with the pattern they were scanned in
+_MANY_POINTS = 30_000  # points in a sweep; fewer would be matched with the scan pattern
 _OVERLAP_POINTS = 2000
 _OVERLAP_M = 0.5
-_OVERLAP_NS = 350_000_000  # within it a pattern that does not repeat fills its view
+_OVERLAP_NS = 350_000_000  # time in which a pattern that does not repeat fills its field of view
 
 
 class LeftOut(NamedTuple):

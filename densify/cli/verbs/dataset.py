@@ -93,7 +93,7 @@ def _so_far(options: argparse.Namespace) -> Iterator[Answer]:
     if files:
         raise ComputationError(
             f"--verify: {len(files)} damaged or missing files in {options.status}; run the "
-            f"command that made the set again with --verify, which makes them anew"
+            f"command that made the set again with --verify, which makes them again"
         )
 
 

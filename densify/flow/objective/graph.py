@@ -58,11 +58,11 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
         raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
     points = checked_cloud(points, "points")
     num = len(points)
-    num_listed = min(num_neighbors, num - 1) + 1  # the point itself is among them
+    num_listed = min(num_neighbors, num - 1) + 1  # with the point itself
     nearest = cKDTree(points).query(points, np.arange(1, num_listed + 1))
     distance_m, column = (np.ravel(found) for found in nearest)
     row = np.repeat(np.arange(num), num_listed)
-    other = column != row  # among more than k duplicates a point may not find itself
+    other = column != row  # with more than k duplicates the point itself may be missing
     listed = csr_array(
         (np.exp(-(distance_m[other] ** 2)), (row[other], column[other])), shape=(num, num)
     )

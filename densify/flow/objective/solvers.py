@@ -23,11 +23,14 @@ from densify.geometry.types import Float
 SOLVERS = ("pcg", "adam")
 _LEARNING_RATE_M = 0.1  # of Adam, as published
 _FIRST_ALPHA = 1000.0  # at which whole surfaces slide
-_LEVEL_FACTOR = 10 ** (2 / 3)  # the most that alpha falls from one level to the next
-_LEAST_ALPHA = 0.1  # where the levels end for alpha = 0
+_LEVEL_FACTOR = 10 ** (2 / 3)  # greatest factor between the alphas of two levels
+_LEAST_ALPHA = 0.1  # last level for alpha = 0
 _LEVEL_TOLERANCE = 2e-3  # a level ends when an alternation lowers its energy by less, relatively
 _MAX_ALTERNATIONS, _MAX_LAST_ALTERNATIONS = 4, 100  # before the last level, and on it
-_MAX_PRODUCTS, _RESIDUAL_DROP = 20, 0.2  # the matches are provisional: a full solve is wasted
+_MAX_PRODUCTS, _RESIDUAL_DROP = (
+    20,
+    0.2,
+)  # matches are provisional, and a full solution is not needed
 
 
 @dataclass(frozen=True)

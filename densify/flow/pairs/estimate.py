@@ -37,7 +37,7 @@ _MIN_GAIN_M = 0.07
 _MAX_EXTENT_M = 400.0
 _MIN_LOW_M = 0.04
 _BELOW_M = 0.3
-_MIDDLE_M = 3.0  # nearer, the direction is not that from a scanner
+_MIDDLE_M = 3.0  # closer points have no direction from a scanner
 _MIN_AGREEMENT, _MAX_SINGLE = 0.8, 0.3
 
 
@@ -314,7 +314,7 @@ def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowFiel
     displacement = field.displacement @ R_lidar_world.T
     to_reference = None
     if field.to_reference is not None and times_ns[0] is not None:
-        # It leads to the middle of the firing times, on which sweeps need not be stamped.
+        # It leads to the middle of the firing times, which need not be the stamp of a sweep.
         late = int(times_ns[0].min()) + np.ptp(times_ns[0]) / 2
         apart_ns = sweeps[1].stamp_ns - sweeps[0].stamp_ns
         to_reference = field.to_reference @ R_lidar_world.T - displacement * (late / apart_ns)

@@ -27,17 +27,17 @@ from densify.geometry.types import Float, Int
 
 _EVEN_M = 0.06
 _MAX_SPEED_M_S = 38.0
-_USUAL_S, _LONGEST_S = 0.1, 0.4  # between the clouds where nothing is known of it; at the most
+_USUAL_S, _LONGEST_S = 0.1, 0.4  # time between the clouds if unknown; greatest time
 _VOTE_STEP_M = 0.2
 _VOTE_SLACK_M = 0.3  # vertical
 _VOTE_POINTS, _VOTE_TARGETS = 60, 800
 _NUM_VOTED = 5
 _APART_M = 0.5
 _ALIGN_POINTS = 150
-_PRECISION = 1 / np.array([1.0, 1.0, 0.01, 0.06]) ** 2  # of m from the start; of rad from zero
+_PRECISION = 1 / np.array([1.0, 1.0, 0.01, 0.06]) ** 2  # per m from the start, per rad from zero
 _FROM_START = np.array([1.0, 1.0, 1.0, 0.0])
 _SLOPE_STEP_M, _SLOPE_STEPS = 2.0, 4  # of a grid around a place
-_ROUGH_M = 0.1  # off a plane: no ground to tell a slope
+_ROUGH_M = 0.1  # a ground rougher than this has no slope
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ def _vote(points: Float, there: Float, n: int) -> Float:
     voter = np.nonzero(inside)[0]
     ballot = np.zeros((len(points), 2 * n + 1, 2 * n + 1), np.float32)
     ballot[voter, cell[inside][:, 0], cell[inside][:, 1]] = 1.0
-    for axis in (1, 2):  # who misses a place by one cell votes for it by half
+    for axis in (1, 2):  # a position one cell away gets half a vote
         ballot = np.maximum(
             ballot, 0.5 * np.maximum(np.roll(ballot, 1, axis), np.roll(ballot, -1, axis))
         )

@@ -5,7 +5,7 @@ The rings of a scanner are elsewhere on an object that has moved. Nearest points
 Therefore they hold the motion back. If two scanners share a sweep, an object appears twice, half of
 the motion apart. Planes through several rings let a surface slide along itself, and the other
 surfaces fix the slide (as in Stückler, Behnke, "Multi-Resolution Surfel Maps", JVCI 2014). Here the
-planes are made anew in every step, from all other points of the object, each at its own time.
+planes are fitted again in every step, from all other points of the object, each at its own time.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Int
 
-_MIN_POINTS = 40  # fewer show no surfaces
-_MAX_POINTS = 600  # of each cloud; of 400 the thickness hangs on how the axes lie
+_MIN_POINTS = 40  # fewer points have no surfaces
+_MAX_POINTS = 600  # of each cloud; with 400 the thickness depends on the axes
 _SIDE_M = 0.06
 _REACH_M, _MAX_REACH_M, _WIDER = 0.4, 1.0, 1.5
 _MIN_PLANES = 0.6  # share of points that must have one
@@ -36,17 +36,17 @@ _GATES_M, _LAST_GATES_M = np.array([0.3, 0.3, 0.3, 0.2, 0.2]), np.array([0.15, 0
 _NO_GATES = np.zeros(0)
 _STANDING = np.zeros(4)
 _LIMIT_M = 0.15
-_MAX_THICK_M = 0.09  # thicker ones are sparse or no surfaces: nothing is learnt from them
+_MAX_THICK_M = 0.09  # thicker ones are sparse or no surfaces, and no evidence
 _MAX_WEIGHT = 60.0
 _MIN_NEIGHBORS = 6
 _MIN_WIDTH_M2 = 0.05**2  # neighbours on one ring alone span no plane
 _SIGMA_M2 = 0.02**2  # noise of a surface point
 _PRECISION = np.array([1e3, 1e3, 3e5, 1e4])  # 1/m² from where it starts; 1/rad²
 _SHIFTS_M = (0.3, -0.3)
-_FACTORS = (2.0, 2 / 3)  # where one appearance was taken for the other
-_CLEARLY = 0.9  # how much thinner another start must come out,
-_SURELY = 0.95  # and the refined motion where times are not known
-_NEAR_M = 0.5  # of where the object may arrive
+_FACTORS = (2.0, 2 / 3)  # starts for two confused appearances of an object
+_CLEARLY = 0.9  # how much thinner another start must be,
+_SURELY = 0.95  # and the refined motion without known times
+_NEAR_M = 0.5  # of the positions at which the object may arrive
 _ARRIVED_POINTS = 300
 
 
@@ -316,7 +316,7 @@ def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told):  
         if abs(off_m) >= gate_m:
             continue
         weight = (1 - (off_m / gate_m) ** 2) ** 2 * _SIGMA_M2 / (_SIGMA_M2 + thick)
-        # The more of the motion the plane was seen after than the point, the farther it is back.
+        # The later the plane was measured than the point, the farther back it is.
         later = t - when[k]
         J[0], J[1], J[2] = a * later, b * later, c * later
         J[3] = (b * (x - centre[0]) - a * (y - centre[1])) * later

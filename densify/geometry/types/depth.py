@@ -169,14 +169,14 @@ _COLUMNS_OF_STANDING = ("points", "normal", "spacing_m", "source", "row", "lidar
 class Reason(IntEnum):
     """Why a point is not in a depth map; the first reason that applies."""
 
-    KEPT = 0  # its pixel's depth is from it
-    VETOED = 1  # the key sweep saw through its place
+    KEPT = 0  # it gives its pixel the depth
+    VETOED = 1  # the key sweep saw through its position
     OUTSIDE = 2  # not in the image
     HIDDEN = 3  # behind another point's patch
-    NOT_CHOSEN = 4  # its pixel's depth is from a point nearer in time to the key, or nearer
+    NOT_CHOSEN = 4  # a point nearer in time to the key, or nearer, gives its pixel the depth
     UNSUPPORTED = 5  # too few sweeps agree with it, or not the one nearest to the key
-    EDGE = 6  # so close to a depth edge that its pixel may lie beyond it
-    GLASS = 7  # inside a vehicle, seen through a window
+    EDGE = 6  # so close to a depth discontinuity that its pixel may be beyond it
+    GLASS = 7  # inside a vehicle, measured through a car window
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ void main() {
   bool hidden = (far && !withFar) || (!far && (place.w < sweeps.x || place.w > sweeps.y))
     || (onlyMoving && mover == 0);
   gl_Position = hidden ? vec4(2., 2., 2., 1.) : viewProjection * vec4(p, 1.);
-  // Kept points are about so many radians apart as seen from the key.
+  // Approximate angle in radians between kept points, from the key.
   float across = max(.05, .0042 * length(p));
   gl_PointSize = hidden ? 0. : clamp(pointScale * across / gl_Position.w, leastSize, 30.);
   if (colouring == 0) shade = colour.rgb;
