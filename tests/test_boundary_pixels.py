@@ -70,7 +70,7 @@ def test_what_a_patch_veils_is_kept_by_the_image_alone():
     behind = (layers.rim_m > 0) & ((u + v) % 2 == 0)
     seen = behind & (truth == WALL_M)
     layers = replace(
-        layers, rim_m=np.where(behind, np.float32(WALL_M), layers.rim_m), veiled=behind
+        layers, rim_m=np.where(behind, np.float32(WALL_M), layers.rim_m), behind_patch=behind
     )
     kept = decided(layers, image).depth_m > 0
     assert (kept & seen).sum() > 0.15 * seen.sum()  # the image may lie 2 of the 3 px aside

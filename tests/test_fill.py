@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from densify.depth import fill as stage
-from densify.depth.fill import FILL_CONFIDENCE, fill, fill_stars, without_shreds
+from densify.depth.fill import FILL_CONFIDENCE, fill, fill_stars, without_isolated
 from densify.depth.neighbours import DIRECTIONS, first_known
 from tests.depth_layers import layers_of
 
@@ -63,7 +63,7 @@ def test_streaks_go_and_surfaces_stay():
     filled[38:, 20:60] = 10
     filled[35, 5] = filled[50, 75] = 10
     measured = np.isin(ROW, [35, 50]) & np.isin(COLUMN, [5, 75])
-    kept = without_shreds(layers_of(filled, measured, spacing_px=(12, 12)))
+    kept = without_isolated(layers_of(filled, measured, spacing_px=(12, 12)))
     assert not kept.filled_m[:31].any()
     assert (kept.filled_m[38:, 20:60] > 0).all()
     assert kept.depth_m[35, 5] and kept.filled_m[50, 75]  # a measured pixel may stand alone
@@ -79,8 +79,10 @@ def test_a_pillar_with_few_measured_pixels_is_not_filled_over():
     inside, pillar = np.s_[10:50, 41:44], np.s_[10:50, 42]
     assert (fill(plain, 1.5).filled_m[inside] > 0).all()
     assert not fill(replace(plain, rim_m=rims), 1.5).filled_m[pillar].any()
-    veiled = replace(plain, rim_m=rims, veiled=rims > 0)  # nobody knows which of the two it is
-    assert (fill(veiled, 1.5).filled_m[inside] > 0).all()
+    behind_patch = replace(
+        plain, rim_m=rims, behind_patch=rims > 0
+    )  # nobody knows which of the two it is
+    assert (fill(behind_patch, 1.5).filled_m[inside] > 0).all()
 
 
 def star(depth_m, **more):

@@ -214,7 +214,7 @@ def pairs_of_files(folder: Path, most: int) -> Iterator[PaperPair]:
     """Yield the first ``most`` files of a folder, by name; 0 for all.
 
     Raises:
-        InputError: For a folder without any, or a file of another form.
+        InputError: The folder has no files, or a file has another form.
     """
     paths = sorted(folder.glob("*.npz"))
     if not paths:

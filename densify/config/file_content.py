@@ -51,7 +51,7 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     """Return the content of a file.
 
     Raises:
-        InputError: If it is unreadable or larger than that.
+        InputError: It is unreadable or larger than that.
     """
     with open_file(path) as file:
         check_size(os.fstat(file.fileno()).st_size, path, most_bytes)
@@ -65,7 +65,7 @@ def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> b
     """Return unpacked gzip data.
 
     Raises:
-        InputError: If it is damaged or larger than that.
+        InputError: It is damaged or larger than that.
     """
     unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
@@ -96,7 +96,7 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
     """Return the text of a file.
 
     Raises:
-        InputError: If it is unreadable, too large or no text.
+        InputError: It is unreadable, too large or no text.
     """
     try:
         return read_bytes(path, most_bytes).decode("utf-8")
@@ -108,7 +108,7 @@ def read_json(path: Path) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        InputError: If it is unreadable or broken.
+        InputError: It is unreadable or broken.
     """
     return parse_json(read_bytes(path), path)
 

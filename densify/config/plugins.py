@@ -172,7 +172,7 @@ def engine(spec: str) -> tuple[Plugin, str]:
     """Return row and argument of ``NAME[:ARGUMENT]``.
 
     Raises:
-        InputError: For no such engine.
+        InputError: There is no such engine.
     """
     name, argument = check_engine_spec(spec)
     return ENGINES.row(name, "flow.engine"), argument

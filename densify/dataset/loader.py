@@ -99,7 +99,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
         """Return a sample, see the class.
 
         Raises:
-            InputError: For missing or damaged files.
+            InputError: A file is missing or damaged.
         """
         name, camera_name, frame = self._samples[index]
         drive = self._drives[name]

@@ -163,7 +163,7 @@ def status(out: Path) -> Summary:
     """Return how far a set is, finished or not.
 
     Raises:
-        InputError: If ``out`` holds none.
+        InputError: ``out`` holds none.
     """
     table = read_plan(out)
     if table is None:

@@ -218,7 +218,7 @@ def read_plan(out: Path) -> dict[str, Any] | None:
     """Return dataset.json, None if there is none.
 
     Raises:
-        InputError: For a damaged one.
+        InputError: It is damaged.
     """
     path = out / _FILE
     if not path.is_file():

@@ -69,7 +69,7 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
     return Cloud(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
 
 
-class _Sighting(NamedTuple):
+class _ObjectPoints(NamedTuple):
     """The points of an object in one sweep, key frame.
 
     They are (N,3) at the reference time of the sweep and at that of the key, with their velocity
@@ -94,7 +94,7 @@ def object_tracks(
     Args:
         fields: Scene flow of each sweep to the key.
     """
-    seen: dict[int, dict[int, _Sighting]] = {}
+    seen: dict[int, dict[int, _ObjectPoints]] = {}
     for registered, flow in zip(stretch.sweeps, fields, strict=True):
         follows = flow.moving & ~flow.lost & (flow.instance >= 0)
         if not follows.any():
@@ -112,7 +112,7 @@ def object_tracks(
         for k in np.unique(instance).tolist():
             own = instance == k
             middle_m_s = np.median(velocity_m_s[own], axis=0)
-            seen.setdefault(k, {})[registered.frame] = _Sighting(
+            seen.setdefault(k, {})[registered.frame] = _ObjectPoints(
                 there[own], at_key[own], middle_m_s
             )
     stamps_ns = {s.frame: s.sweep.stamp_ns for s in stretch.sweeps}
@@ -124,7 +124,7 @@ def object_tracks(
 
 
 def _track(
-    instance: int, seen: dict[int, _Sighting], key: int, stamps_ns: dict[int, int]
+    instance: int, seen: dict[int, _ObjectPoints], key: int, stamps_ns: dict[int, int]
 ) -> ObjectTrack:
     at_key = np.concatenate([s.at_key for s in seen.values()])
     T_there_key = {

@@ -76,7 +76,7 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
     if rims == "strict":
         believed[:] = False
     elif rims == "keep":
-        believed |= ~layers.veiled.flat[pixel]
+        believed |= ~layers.behind_patch.flat[pixel]
     kept = pixel[believed]
     depth_m = layers.depth_m.copy()
     depth_m.flat[kept] = layers.rim_m.flat[kept]

@@ -61,7 +61,7 @@ def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     filled = (layers.filled_m > 0) & (before_m == 0)
     pixel = np.flatnonzero(filled)
     accepted_m = layers.depth_m
-    with_rims_m = np.where(layers.veiled, accepted_m, np.maximum(accepted_m, layers.rim_m))
+    with_rims_m = np.where(layers.behind_patch, accepted_m, np.maximum(accepted_m, layers.rim_m))
     for known_m in (with_rims_m, accepted_m):
         depth_m = layers.filled_m.flat[pixel]
         pixel = pixel[voted_for(layers, known_m, pixel, depth_m, least_share)]
@@ -69,7 +69,7 @@ def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     return layers.without(filled)
 
 
-def without_shreds(layers: Layers) -> Layers:
+def without_isolated(layers: Layers) -> Layers:
     """Drop filled pixels if fewer than three tenths of the pixels around are known."""
     known = layers.filled_m > 0
     row, column = np.nonzero(known & (layers.depth_m == 0))

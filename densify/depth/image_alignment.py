@@ -64,11 +64,12 @@ class Aligned(NamedTuple):
 def align_image(layers: Layers) -> Aligned | None:
     """Return the image of the layers, shifted to fit, None if it does not fit or is blurred.
 
-    The sum of changes on depth discontinuities must be largest at most 3.2 steps away. In standard
-    deviations of the sums elsewhere, an image with 3.05 at no shift stays, unless the maximum is
-    more than 1.9 larger. It is shifted if the maximum is at least 5. It is blurred if its edges
-    have a blur of more than two steps: the sharper an edge, the more another blur lowers its
-    gradient (Zhuo and Sim, "Defocus map estimation from a single image", 2011).
+    The score of a shift is the change of the image on depth discontinuities, in standard deviations
+    of the scores far away. The best shift must be at most 3.2 steps away. With a score of 3.05 or
+    more the image stays in place, unless the best score is more than 1.9 higher. Otherwise it is
+    shifted if the best score is at least 5. An image whose edges have a blur of more than two steps
+    is not used: the sharper an edge, the more another blur lowers its gradient (Zhuo and Sim,
+    "Defocus map estimation from a single image", 2011).
     """
     lab, step_px = layers.lab, max(1, round(0.3 * float(np.median(layers.gap_px))))
     if lab is None or _blur_px(lab) > _MOST_BLUR * step_px:
@@ -111,7 +112,7 @@ def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
     """
     known_m = np.maximum(layers.depth_m, layers.rim_m)
     strict_m = np.where(layers.rim_m == 0, layers.depth_m, np.float32(0))
-    clear_m = np.where(layers.veiled, np.float32(0), known_m)
+    clear_m = np.where(layers.behind_patch, np.float32(0), known_m)
     row, column = (_some(f) // step_px for f in np.nonzero((clear_m > 0) & (layers.rim_m > 0)))
     changes = _changes(_reduced(lab, step_px))
     changes = np.pad(changes, ((0, 0), (_REACH, _REACH), (_REACH, _REACH)), "edge")

@@ -20,7 +20,7 @@ class Layers:
         depth_m: Accepted as measured.
         rim_m: Boundary pixels: measured so close to a depth discontinuity that they may show
             the background. A pixel stays here when it is accepted.
-        veiled: This boundary pixel is measured behind the patch of a nearer point.
+        behind_patch: This boundary pixel is measured behind the patch of a nearer point.
         filled_m: Accepted and interpolated pixels.
         confidence: 0 to 1.
         point: Row of the cloud that measured the pixel, -1 none.
@@ -35,7 +35,7 @@ class Layers:
 
     depth_m: Float32
     rim_m: Float32
-    veiled: Bool
+    behind_patch: Bool
     filled_m: Float32
     confidence: Float32
     point: NDArray[np.int32]

@@ -55,14 +55,14 @@ class MeasuredPixels(NamedTuple):
         depth_m: float32.
         confidence: float32.
         inside: No depth discontinuity is near.
-        veiled: As in `densify.depth.layers.Layers`; key_only too.
+        behind_patch: As in `densify.depth.layers.Layers`; key_only too.
     """
 
     winner: Int
     depth_m: Float32
     confidence: Float32
     inside: Bool
-    veiled: Bool
+    behind_patch: Bool
     key_only: Bool
 
     @staticmethod
@@ -139,7 +139,7 @@ def _settled(
     reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
     pixel, winner, found = _found(points, hidden, own, camera, least, taken)
     depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge, num_now = found
-    veiled = hidden[winner]
+    behind_patch = hidden[winner]
     key_only = num_now >= _LEAST_ALONE
     if taken is None:
         supported = num_sweeps >= least
@@ -148,8 +148,8 @@ def _settled(
         inside = edge >= 1
     else:
         many, supported, inside = 2 * _FAR_SUPPORT, num_sweeps >= _FAR_SUPPORT, edge >= _FAR_EDGE
-        reason[winner[~inside & ~veiled]] = Reason.EDGE
-    reason[winner[~supported & ~veiled]] = Reason.UNSUPPORTED
+        reason[winner[~inside & ~behind_patch]] = Reason.EDGE
+    reason[winner[~supported & ~behind_patch]] = Reason.UNSUPPORTED
     doubts = np.stack(
         [
             1 - np.minimum(num_sweeps / many, 1),
@@ -160,8 +160,8 @@ def _settled(
         ]
     )
     confidence = np.maximum(own[winner] * (1 - _DOUBTS @ doubts), MOST_CONFIDENCE)
-    inside &= ~veiled
-    columns = winner, depth_m, confidence.astype(np.float32), inside, veiled, key_only
+    inside &= ~behind_patch
+    columns = winner, depth_m, confidence.astype(np.float32), inside, behind_patch, key_only
     kept = [column[supported] for column in columns]
     return MeasuredPixels.at(camera, pixel[supported], *kept), reason
 

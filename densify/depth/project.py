@@ -19,7 +19,7 @@ from densify.depth.boundary_pixels import accept_boundary_pixels
 from densify.depth.car_windows import close_windows
 from densify.depth.confidence import calibrated, contradicted, rank_pixels
 from densify.depth.exposure import Exposure
-from densify.depth.fill import fill, fill_stars, without_shreds
+from densify.depth.fill import fill, fill_stars, without_isolated
 from densify.depth.image_points import PointsInImage, points_in_image
 from densify.depth.layers import Layers
 from densify.depth.measured_pixels import MeasuredPixels, nearest_pixels, visible_pixels
@@ -74,7 +74,7 @@ def project(
         layers = fill(layers, settings.fill_reach)
         if visible and share_lost is not None and settings.glass == "plane":
             layers = close_windows(layers, exposure, share_lost)
-        layers = without_shreds(fill_stars(layers))
+        layers = without_isolated(fill_stars(layers))
         if visible and bodies:
             layers = close_bodies(layers, cloud, exposure, bodies)
     rank = None
@@ -115,7 +115,7 @@ def _layers_of(
     return Layers(
         depth_m=depth_m,
         rim_m=np.where(inside, np.float32(0), pixels.depth_m).reshape(shape),
-        veiled=pixels.veiled.reshape(shape),
+        behind_patch=pixels.behind_patch.reshape(shape),
         filled_m=depth_m,
         confidence=np.maximum(pixels.confidence, least).reshape(shape),
         point=image(points.index.astype(np.int32), -1),
@@ -153,7 +153,7 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
 
 def _set_reasons(layers: Layers, reason: NDArray[np.uint8]) -> None:
     """Set the ``reason`` of points in the map, and of those removed from it."""
-    reason[layers.point[(layers.rim_m > 0) & ~layers.veiled]] = Reason.EDGE
+    reason[layers.point[(layers.rim_m > 0) & ~layers.behind_patch]] = Reason.EDGE
     reason[layers.point[layers.depth_m > 0]] = Reason.KEPT
     if layers.glass is not None:
         reason[layers.point[layers.glass]] = Reason.GLASS

@@ -37,7 +37,7 @@ def changed(
 
 
 def _rolled(by: int) -> Callable[[Float], Float]:
-    """Return the change of rotations whose quaternion was read in another order."""
+    """Return a change of rotations, as if their quaternions were read in another order."""
     return lambda R: Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), by)).as_matrix()
 
 

@@ -114,9 +114,7 @@ def _still_points(sample: Sample, lidar: int) -> Float:
 def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: Float) -> Finding:
     """Compare the given and the found position of a scanner.
 
-    points, given_m.
-
-    found_m: in the scanner's axes, into which R turns those of the lidar frame.
+    All are in the scanner's axes, into which R turns those of the lidar frame.
     """
     name = "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
     given, found = sharpness(points, given_m), sharpness(points, found_m)

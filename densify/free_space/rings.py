@@ -210,10 +210,10 @@ def _step_along(azimuth: Float32, ring: NDArray[Any]) -> float:
 
 
 def _even_step(rays: Aimed) -> tuple[float, float]:
-    """Return the usual azimuth between returns of about the same elevation, and their share.
+    """Return the usual azimuth between consecutive returns of about the same elevation.
 
-    More than half of the returns of a spinning scanner follow at that distance, and a fifth of
-    scattered ones.
+    Also return the share of returns at that distance. It is more than half for a spinning scanner,
+    and a fifth for scattered returns.
     """
     gap = _gaps(np.floor(rays.elevation / _BAND_RAD), rays.azimuth)
     gap = gap[gap > _LEAST_GAP_RAD]

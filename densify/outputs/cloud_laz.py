@@ -144,7 +144,7 @@ def read_cloud(path: Path) -> StoredCloud:
     """Return a cloud that `write_cloud` wrote.
 
     Raises:
-        InputError: For any other file.
+        InputError: It is another file.
     """
     las = read_las(path)
     known = {*_STANDARD_DIMENSIONS, *(name for name, _, _ in _EXTRA_DIMENSIONS)}

@@ -130,7 +130,7 @@ def read_depth_png(path: Path) -> Float32:
     """Return (H,W) metres, 0 none.
 
     Raises:
-        InputError: For all but a 16-bit gray PNG.
+        InputError: It is no 16-bit gray PNG.
     """
     return metres(read_stored(path, np.uint16, "a depth map"))
 

@@ -36,7 +36,7 @@ def read_scene(path: Path) -> SceneFile:
     """Read scene.json.
 
     Raises:
-        InputError: If it is missing or damaged.
+        InputError: It is missing or damaged.
     """
     with damage_named(path):
         table = read_json(path)

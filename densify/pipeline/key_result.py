@@ -61,7 +61,7 @@ def with_baselines(method: str) -> tuple[str, ...]:
     """Return a method of `RUN` after the simpler ones.
 
     Raises:
-        InputError: For another one.
+        InputError: It is another one.
     """
     if method not in RUN:
         raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")

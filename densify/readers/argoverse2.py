@@ -70,7 +70,7 @@ class Argoverse2(FileSequence):
         """Read poses and calibration.
 
         Raises:
-            InputError: If there are no sweeps, or a table is missing or malformed.
+            InputError: There are no sweeps, or a table is missing or malformed.
         """
         sweeps = checks.numbered_files(log / "sensors" / "lidar", ".feather")
         if not sweeps:
@@ -127,7 +127,7 @@ class Argoverse2(FileSequence):
         """See `LidarSequence`; the test split has none.
 
         Raises:
-            InputError: For a malformed table.
+            InputError: The table is malformed.
         """
         if self._annotations is None:
             return None

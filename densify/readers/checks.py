@@ -76,7 +76,7 @@ def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.
     """Return (H,W,3) uint8 RGB of an image file's bytes, gray in three equal channels.
 
     Raises:
-        InputError: If it is no whole image or not of the camera's size. The message names the
+        InputError: It is no whole image or not of the camera's size. The message names the
             place.
     """
     bgr = decode_image(data, where)
@@ -108,8 +108,8 @@ def pinhole(
         lens: Further arguments of `Camera`, such as its distortion.
 
     Raises:
-        InputError: Unless the numbers are finite and the focal lengths and the size (width,
-            height) are positive. The message starts with ``where``.
+        InputError: The numbers are not finite, or the focal lengths or the size (width, height) are
+            not positive. The message starts with ``where``.
     """
     fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):

@@ -133,7 +133,7 @@ def image_size_px(path: Path) -> tuple[int, int]:
     """Return width and height of an image file.
 
     Raises:
-        InputError: If it is no whole image.
+        InputError: It is no whole image.
     """
     height, width = read_image(path).shape[:2]
     return width, height

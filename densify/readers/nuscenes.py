@@ -70,7 +70,7 @@ def read_table(path: Path) -> dict[str, Record]:
     """Return all records by token.
 
     Raises:
-        InputError: If the file is missing or no such table.
+        InputError: The file is missing or no such table.
     """
     with described_in(path, _EXPECTED):
         return {str(record["token"]): record for record in read_json(_existing(path))}
@@ -80,7 +80,7 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
     """Return the records, by token, whose ``key`` is one of ``wanted``; others are not parsed.
 
     Raises:
-        InputError: If the file is missing or cut off, or one of the records is malformed.
+        InputError: The file is missing or cut off, or one of the records is malformed.
     """
     pattern = re.compile(rb'"%s"\s*:\s*"([^"]*)"' % key.encode())
     names = frozenset(name.encode() for name in wanted)
@@ -367,7 +367,7 @@ class NuScenes(FileSequence):
         """See `LidarSequence`; the test split has none.
 
         Raises:
-            InputError: For a malformed table.
+            InputError: The table is malformed.
         """
         self.check_frame(frame)
         if self._annotations is None:

@@ -161,7 +161,7 @@ class PandaSet(FileSequence):
         """See `LidarSequence`; None without the frame's file.
 
         Raises:
-            InputError: For a malformed file.
+            InputError: The file is malformed.
         """
         self.check_frame(frame)
         path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"

@@ -77,7 +77,7 @@ class PriorFiles:
         return PriorFiles(place, values, sky)
 
     def said_of(self, camera: str) -> str:
-        """Return the numbers of a camera's images that have a prior, for messages."""
+        """Return the numbers of a camera's images with a prior, as text for messages."""
         return f"there are {format_frames(self.values[camera])}"
 
     def prior(self, camera: Camera, number: int) -> Prior | None:
@@ -86,7 +86,7 @@ class PriorFiles:
         A prior of another size is resized if its aspect agrees.
 
         Raises:
-            InputError: For files that cannot be read or are something else.
+            InputError: A file cannot be read or is something else.
         """
         path = self.values[camera.name].get(number)
         if path is None:

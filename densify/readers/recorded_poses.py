@@ -53,7 +53,7 @@ class PoseTrack:
         """Return (4,4) T_world_ego, interpolated between two poses.
 
         Raises:
-            InputError: For a time more than 0.2 s before the first pose or after the last.
+            InputError: The time is more than 0.2 s before the first pose or after the last.
         """
         begin, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
         beyond_ns = max(begin - time_ns, time_ns - end)

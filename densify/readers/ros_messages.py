@@ -96,7 +96,7 @@ def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
     """Return the (H,W,3) of an Image or CompressedImage.
 
     Raises:
-        InputError: If its encoding is not known, or it is damaged.
+        InputError: Its encoding is not known, or it is damaged.
     """
     import cv2
 

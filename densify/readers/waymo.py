@@ -246,7 +246,7 @@ class Waymo(FileSequence):
         """Read stamps, poses and calibration.
 
         Raises:
-            InputError: If a component is missing or malformed.
+            InputError: A component is missing or malformed.
         """
         parts = self._parts = Components(root, context)
         self._starts_us = np.unique(parts.read("lidar", {STAMP: "i"})[STAMP])
@@ -281,7 +281,7 @@ class Waymo(FileSequence):
         """See `LidarSequence`; the test split has none.
 
         Raises:
-            InputError: If they are malformed.
+            InputError: They are malformed.
         """
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))

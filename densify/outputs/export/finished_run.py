@@ -239,8 +239,8 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
         runs: Ascending by key.
 
     Raises:
-        InputError: The windows of two consecutive keys share no key sweep. Their relative pose
-            is then unknown.
+        InputError: Neither of two consecutive keys is in the window of the other. Their
+            relative pose is then unknown.
     """
     T_world_key = np.eye(4)
     for before, run in zip([None, *runs], runs, strict=False):

@@ -59,7 +59,7 @@ class KeyFiles:
         """Return the files of a run.
 
         Raises:
-            InputError: If run.yaml is missing or damaged.
+            InputError: Run.yaml is missing or damaged.
         """
         files = KeyFiles(folder, _mapping(read_yaml(folder / "run.yaml")[0]), {})
         metrics = _mapping(files.read(read_json, "metrics.json"))

@@ -57,7 +57,7 @@ class KittiRaw(Drive):
             path: The drive's folder, ``.../2011_09_26/2011_09_26_drive_0013_sync``.
 
         Raises:
-            InputError: If it holds no sweeps, or calibration or stamps are malformed.
+            InputError: It holds no sweeps, or calibration or stamps are malformed.
         """
         drive = Path(path)
         velodyne = drive / "velodyne_points"
@@ -88,7 +88,7 @@ class KittiRaw(Drive):
         """Return a sweep's reference time.
 
         Raises:
-            InputError: For a frame without a stamp.
+            InputError: The frame has no stamp.
         """
         return self._recorded_ns("", frame) if self._recorded else frame * NOMINAL_PERIOD_NS
 

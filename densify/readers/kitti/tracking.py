@@ -110,7 +110,7 @@ class KittiTracking(Drive):
         Without images the smallest size of KITTI's is assumed.
 
         Raises:
-            InputError: For labels or a calibration that are missing or malformed.
+            InputError: Labels or the calibration are missing or malformed.
         """
         self.check_frame(frame)
         path = self.where / "label_02" / self._scene_file
