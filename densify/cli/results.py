@@ -67,7 +67,7 @@ def summary(result: Result) -> str:
                 lines.append(f"{name}, key held out: outliers{where}: {outliers}")
         if unjudged := look_up(result.metrics, "held_out", name, "unjudged"):
             lines.append(
-                f"{name}, not judged, as the key sweep has no return there: "
+                f"{name}, not judged, because the key sweep has no return there: "
                 f"{percent(unjudged['static'])} of static, {percent(unjudged['moving'])} of moving "
                 "pixels"
             )

@@ -211,8 +211,8 @@ def alternatives(T: Float) -> dict[str, Float]:
 def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
     """Compare the calibration and the clock as given with others. The best of all explains most."""
     given, num_given = score(camera, pairs)
-    name, text = f"{camera.name}: calibration", f"depth is on image edges by {given:.1f} standard"
-    text += " errors as given"
+    name, text = f"{camera.name}: calibration", "depth discontinuities are on image edges by"
+    text += f" {given:.1f} standard errors as given"
     if len(pairs) < _LEAST_PAIRS:
         is_clear = given >= _CLEAR
         text += ": one image is too little to tell" * (not is_clear)
