@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -37,12 +38,14 @@ COLUMNS = {
     **dict.fromkeys(("red", "green", "blue", "moving", "far"), np.uint8),
     "gps_time": np.float64,
 }
-PACKAGES = {"exr": "OpenEXR", "rrd": "rerun", "mcap": "foxglove"}
+PACKAGES = {"exr": "OpenEXR", "wai": "OpenEXR", "rrd": "rerun", "mcap": "foxglove"}
+
+EXTRAS = {"rrd": "rerun", "wai": "exr"}
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    return write_views(tmp_path / "run", {"image_02": "plain", "image_03": "bent"})[0]
+    return write_views(tmp_path / "run", {"image_02": "plain", "image_03": "plain"})[0]
 
 
 def stored(folder: Path, product: str, camera: str = "image_02") -> np.ndarray:
@@ -76,14 +79,14 @@ def test_a_form_is_whole_repeatable_and_leaves_the_run_alone(to: str, run: Path)
     again = tree(run)
     assert again.pop(f"export/{to}/notes.txt") == b"mine"
     assert set(again) == set(after)
-    if to not in ("exr", "rrd"):  # may hold the moment or the process that wrote it
+    if to not in ("exr", "rrd", "wai"):  # may hold the moment or the process that wrote it
         assert again == after
 
 
 @pytest.mark.parametrize("to", PACKAGES)
 def test_a_package_that_is_not_installed_is_named(to: str, run: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, PACKAGES[to], None)
-    refused(f"pip install 'densify-lidar[{'rerun' if to == 'rrd' else to}]'", run=run, to=to)
+    refused(f"pip install 'densify-lidar[{EXTRAS.get(to, to)}]'", run=run, to=to)
 
 
 def test_the_record(run: Path) -> None:
@@ -179,6 +182,26 @@ def test_kitti_is_what_readers_of_the_benchmark_expect(tmp_path: Path) -> None:
         np.testing.assert_array_equal(image, cv2.imread(str(run / f"scene/image/{view}.jpg")))
         K = np.loadtxt(drive / "intrinsics" / camera / f"{file}.txt").reshape(3, 3)
         np.testing.assert_allclose(K, result.views[view].camera.K, atol=1e-6)
+
+
+def test_lists_by_the_readers_of_depth_networks(run: Path) -> None:
+    """files.txt as Depth-Anything V2 (metric_depth/dataset/kitti.py), UniDepth and Marigold (with
+    the filled map third) split it; annotations.json as Metric3D (mono/utils/custom_data.py)."""
+    export_run(run, "kitti")
+    folder = run / "export" / "kitti"
+    lines = (folder / "files.txt").read_text().splitlines()
+    files = json.loads((folder / "annotations.json").read_text())["files"]
+    for line, entry, camera in zip(lines, files, CAMERAS, strict=True):
+        image, depth, filled = line.split(" ")
+        assert [entry["rgb"], entry["depth"]] == [image, depth]
+        assert len(image.split("/")) >= 3  # Metric3D takes the third from the right
+        for path, product in ((depth, "depth"), (filled, "depth_filled")):
+            stored = cv2.imread(str(folder / path), cv2.IMREAD_UNCHANGED).astype("float32")
+            depth_m = read_depth_png(run / product / f"{camera}.png")
+            np.testing.assert_array_equal(stored / 256.0, depth_m)
+            np.testing.assert_array_equal(stored / entry["depth_scale"], depth_m)
+        assert cv2.imread(str(folder / image)).shape == (*stored.shape, 3)
+        assert entry["cam_in"] == [17.25, 18.5, 9.125, 5.75]
 
 
 def test_kitti_has_the_key_sweep_alone(tmp_path: Path) -> None:

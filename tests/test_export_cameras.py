@@ -15,15 +15,18 @@ from scipy.ndimage import map_coordinates
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
 from densify.geometry.types import ObjectTrack, Result
-from densify.outputs import export_run, read_cloud, read_depth_png
+from densify.outputs import export_run, read_cloud, read_depth_png, write_result
+from densify.pipeline.run import run as run_key
 from tests.exported import (
     STAMPS_NS,
     H,
     W,
     refused,
+    street_result,
     write_street,
     write_views,
 )
+from tests.small_street import KEY, POSES_GIVEN, one_car
 
 TWO = {"image_02": "plain", "image_03": "bent"}
 
@@ -204,6 +207,107 @@ def test_splats_keep_objects_apart_in_their_own_frames(tracked) -> None:
     rest = cloud.moving & ~of_tracks
     np.testing.assert_array_equal(others["x"], cloud.points[rest, 0].astype(np.float32))
     assert (folder / "tracks.json").read_bytes() == (run / "movers.json").read_bytes()
+
+
+def test_depths_by_the_reader_of_gaussian_splatting(put) -> None:
+    """As its loadCam and Camera read ``--depths depths``: inverse depth is value / 2^16 * scale +
+    offset unless the scale is far from the median; where it is 0, the image is transparent."""
+    run, _ = put({"image_02/0000000241": "plain", "image_03": "plain"})
+    colmap(run, "splats")
+    folder = run / "export" / "splats"
+    params = json.loads((folder / "sparse" / "0" / "depth_params.json").read_text())
+    median = np.median([value["scale"] for value in params.values()])
+    assert set(params) == {"image_02_0000000241", "image_03"}
+    for name, value in params.items():
+        assert 0.2 * median <= value["scale"] <= 5 * median
+        stored = cv2.imread(str(folder / "depths" / f"{name}.png"), -1)
+        assert stored.dtype == np.uint16
+        inverse = stored.astype(np.float32) / float(2**16) * value["scale"] + value["offset"]
+        map_name = name.replace("image_02_", "image_02/")
+        filled_m = read_depth_png(run / "depth_filled" / f"{map_name}.png")
+        known = filled_m > 0
+        assert (stored[~known] == 0).all() and not known.all()
+        np.testing.assert_allclose(1 / inverse[known], filled_m[known], rtol=0.02)
+        near = known & (filled_m < 30)
+        np.testing.assert_allclose(1 / inverse[near], filled_m[near], rtol=2e-3)
+        image = cv2.imread(str(folder / "images" / f"{name}.png"), -1)
+        np.testing.assert_array_equal(image[..., 3] == 255, known)
+        assert not image[~known].any()
+
+
+# --- training sets --------------------------------------------------------------------------------
+
+
+def test_a_scene_by_the_format_of_map_anything(put) -> None:
+    """As data_processing/README.md of map-anything describes scene_meta.json."""
+    exr = pytest.importorskip("OpenEXR")
+    run, result = put({"image_02": "plain", "image_03": "plain"})
+    export_run(run, "wai")
+    folder = run / "export" / "wai"
+    meta = json.loads((folder / "scene_meta.json").read_text())
+    assert (meta["camera_model"], meta["camera_convention"]) == ("PINHOLE", "opencv")
+    assert meta["frame_modalities"]["depth"] == {"frame_key": "depth", "format": "depth"}
+    for frame, (name, view) in zip(meta["frames"], result.views.items(), strict=True):
+        assert cv2.imread(str(folder / frame["file_path"])).shape == (frame["h"], frame["w"], 3)
+        T_cam_world = np.linalg.inv(frame["transform_matrix"])
+        np.testing.assert_allclose(T_cam_world, view.T_cam_key, atol=1e-12)
+        (depth_m,) = (c.pixels for c in exr.File(str(folder / frame["depth"])).channels().values())
+        np.testing.assert_array_equal(depth_m, read_depth_png(run / "depth" / f"{name}.png"))
+
+
+def test_a_set_by_the_reader_of_moge(put) -> None:
+    """As read_depth of its moge/utils/io.py: 16 bit, logarithmic from near to far, 0 unknown."""
+    image = pytest.importorskip("PIL.Image")
+    run, result = put({"image_02": "plain", "image_03": "plain"})
+    export_run(run, "moge")
+    folder = run / "export" / "moge"
+    instances = (folder / ".index.txt").read_text().splitlines()
+    for place, (name, view) in zip(instances, result.views.items(), strict=True):
+        stored = image.open(folder / place / "depth.png")
+        near, far = float(stored.info["near"]), float(stored.info["far"])
+        share = (np.array(stored).astype(np.float32) - 1) / 65533
+        depth_m = np.where(np.array(stored) == 0, 0, near ** (1 - share) * far**share)
+        true_m = read_depth_png(run / "depth" / f"{name}.png")
+        np.testing.assert_allclose(depth_m, true_m, rtol=1e-4)
+        K = np.array(json.loads((folder / place / "meta.json").read_text())["intrinsics"])
+        pixel = view.camera.K @ [0.1, 0.2, 1]
+        u, v, _ = K @ [0.1, 0.2, 1]  # of 0 to 1 over the image, whose first pixel is 1 / W wide
+        np.testing.assert_allclose([u * W - 0.5, v * H - 0.5], pixel[:2])
+        assert (folder / place / "image.jpg").is_file()
+
+
+@pytest.mark.parametrize("to", ["wai", "moge", "nerfstudio", "splats"])
+def test_training_sets_take_camera_z(put, to: str) -> None:
+    pytest.importorskip("OpenEXR")
+    run, _ = put({"image_02": "plain"}, measure="range")
+    refused("image_02: its depth is the range", "project.depth=z", run=run, to=to)
+    if to in ("wai", "moge"):
+        bent, _ = write_views(run.parent / "bent", {"image_02": "bent"})
+        refused("image_02: --to", "without distortion", run=bent, to=to)
+
+
+@pytest.mark.parametrize("to", ["nerfstudio", "splats", "wai", "moge"])
+def test_several_keys_share_one_world(street: Path, tmp_path: Path, to: str) -> None:
+    pytest.importorskip("OpenEXR")
+    second = run_key(one_car(), KEY + 1, 1, "icp", config=POSES_GIVEN)
+    for result in (street_result(), second):
+        write_result(result, tmp_path / "set", config={}, data="tiny street")
+    export_run(tmp_path / "set", to, tmp_path / "out")
+    out = tmp_path / "out"
+    if to == "moge":
+        assert len((out / ".index.txt").read_text().split()) == 2
+        return
+    if to == "splats":
+        assert len([*(out / "depths").iterdir()]) == len([*(out / "images").iterdir()]) == 2
+        assert (out / "movers" / f"{KEY:06d}" / "tracks.json").is_file()
+        return
+    table = json.loads((out / {"wai": "scene_meta.json"}.get(to, "transforms.json")).read_text())
+    axes = np.eye(4) if to == "wai" else np.diag([1, -1, -1, 1])
+    T_world_cam = [np.array(frame["transform_matrix"]) @ axes for frame in table["frames"]]
+    truth = [one_car().T_world_lidar(key) for key in (KEY, KEY + 1)]
+    T_lidar_cam = np.linalg.inv(one_car().cameras["front"].T_cam_lidar)
+    moved = np.linalg.inv(truth[0] @ T_lidar_cam) @ truth[1] @ T_lidar_cam
+    np.testing.assert_allclose(np.linalg.inv(T_world_cam[0]) @ T_world_cam[1], moved, atol=0.02)
 
 
 # --- damaged runs ---------------------------------------------------------------------------------

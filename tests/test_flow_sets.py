@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from writers import write_street
 
 from densify.bench.flow import bench_flow
@@ -146,6 +148,62 @@ def test_labels_score_as_the_truth_they_are_made_of(log, tmp_path, capsys):
     assert rigid["bucketed"]["CAR"]["dynamic"] == pytest.approx(1.0)
     assert rigid["three_way"]["foreground_dynamic_m"] > 0.3
     assert ours["three_way"]["foreground_static_m"] < 1e-4
+
+
+def test_moving_masks_by_the_reader_of_semantic_kitti_api(log, tmp_path):
+    """As its evaluate_mos.py reads and scores them: semantic-kitti-mos.yaml maps 251 to moving and
+    9 to static, and both count."""
+    assert flow(log, tmp_path, "--all", "--format", "semantickitti") == 0
+    folder = tmp_path / "sequences" / log.name / "predictions"
+    assert sorted(p.name for p in folder.iterdir()) == [f"{f:06d}.label" for f in range(3)]
+    truth, counts = open_sequence(log).truth, np.zeros((3, 3), int)
+    look_up = np.zeros(360, int)
+    look_up[[9, 251]] = 1, 2
+    for frame, sweep in enumerate(sweep_files(log)):
+        label = np.fromfile(folder / f"{frame:06d}.label", dtype=np.int32)
+        assert len(label) == len(feather.read_table(sweep))
+        found, moving = look_up[label & 0xFFFF], truth.sweep(frame).moving
+        assert set(np.unique(found)) == {1, 2}
+        assert ((label >> 16 > 0) <= (found == 2)).all()
+        np.add.at(counts, (found[: len(moving)], 1 + moving), 1)
+    iou = counts[2, 2] / (counts[2].sum() + counts[:, 2].sum() - counts[2, 2])
+    assert iou > 0.6, counts
+
+
+def test_doc_depths_exchange_format(tmp_path):
+    """Read as DOC-Depth's FORMAT.md and renderer do: classes up to 50 ground, up to 100 static,
+    then dynamic; poses bring frames together."""
+    plyfile = pytest.importorskip("plyfile")
+    assert main(["flow", "street?sensor=vlp16", "--keys", "59:62", "--format", "doc-depth", *GIVEN,
+                 "--out", str(tmp_path)]) == 0  # fmt: skip
+    (run,) = tmp_path.iterdir()
+    street = Street("street", 0, "vlp16")
+    path = plyfile.PlyData.read(run / "traj_odometry.ply")["vertex"].data
+    assert path["indices"].tolist() == [59, 60, 61]
+    clouds, dynamic = [], 0
+    for row in path:
+        quaternion = [row[name] for name in ("q_x", "q_y", "q_z", "q_w")]
+        assert quaternion == [row[name] for name in ("qx", "qy", "qz", "qw")]
+        np.testing.assert_allclose(row["timestamp"], street.stamp_ns(int(row["indices"])) * 1e-9)
+        ply = plyfile.PlyData.read(run / "frames" / f"frame_{row['indices']:06d}.ply")["vertex"]
+        assert [p.val_dtype for p in ply.properties] == ["f4", "f4", "f4", "u2"]
+        points = np.stack([ply[axis] for axis in "xyz"], axis=1).astype(float)
+        static = (ply["classid"] >= 50) & (ply["classid"] < 100)
+        dynamic += int((ply["classid"] >= 100).sum())
+        assert (ply["classid"] < 50).mean() > 0.2
+        turn = Rotation.from_quat(quaternion).as_matrix()
+        place = [row[axis] for axis in "xyz"]
+        clouds.append(points[static] @ turn.T + place)
+    assert dynamic > 50
+    apart_m, _ = cKDTree(clouds[0]).query(clouds[2])
+    assert np.median(apart_m) < 0.15
+    camera = street.cameras["image_02"]
+    np.testing.assert_array_equal(json.loads((run / "calib.json").read_text())["mtx"], camera.K)
+    np.testing.assert_array_equal(np.loadtxt(run / "calib_lidar_ref_cam.txt"), camera.T_cam_lidar)
+    seen = plyfile.PlyData.read(run / "traj_camera.ply")["vertex"].data
+    exposed_ns = np.array([*street.image_stamps_ns("image_02").values()])
+    beside_s = np.abs(seen["timestamp"][:, None] - exposed_ns * 1e-9).min(axis=1)
+    assert len(seen) > 1 and beside_s.max() < 1e-6
 
 
 # --- what is refused ------------------------------------------------------------------------------

@@ -279,10 +279,18 @@ EXPORTS = {
     "exr": Form("maps_and_clouds", ("depth", "depth_filled", "confidence")),
     "ply": Form("maps_and_clouds", ("cloud.ply",)),
     "pcd": Form("maps_and_clouds", ("cloud.pcd",)),
-    "nerfstudio": Form("camera_files", ("transforms.json", "images", "depth", "cloud.ply")),
-    "colmap": Form("camera_files", ("images", "sparse")),
-    "splats": Form("camera_files", ("images", "sparse", "movers", "tracks.json")),
-    "kitti": Form("maps_and_clouds", ("train", "val"), of_drive=True),
+    "nerfstudio": Form(
+        "camera_files", ("transforms.json", "images", "depth", "cloud.ply"), of_drive=True
+    ),
+    "colmap": Form("camera_files", ("images", "sparse"), of_drive=True),
+    "splats": Form(
+        "camera_files", ("images", "depths", "sparse", "movers", "tracks.json"), of_drive=True
+    ),
+    "moge": Form("camera_files", (".index.txt", "keys"), of_drive=True),
+    "wai": Form("camera_files", ("scene_meta.json", "images", "depth"), of_drive=True),
+    "kitti": Form(
+        "maps_and_clouds", ("train", "val", "files.txt", "annotations.json"), of_drive=True
+    ),
     "rrd": Form("rrd", ("recording.rrd",), of_drive=True),
     "mcap": Form("mcap", ("recording.mcap",), of_drive=True),
 }

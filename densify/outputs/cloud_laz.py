@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import datetime
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,12 @@ class StoredCloud:
     far: Bool
     displacement: Float32
     gps_time: Float
+
+    @staticmethod
+    def joined(parts: Sequence[StoredCloud]) -> StoredCloud:
+        """Return the points of all parts, one after another."""
+        columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(StoredCloud)}
+        return StoredCloud(**{name: np.concatenate(part) for name, part in columns.items()})
 
     @property
     def rigid_points(self) -> Float:

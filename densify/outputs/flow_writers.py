@@ -11,6 +11,11 @@ NAME is that of the recording::
                    its stamp in ns: lidar (N,4) deskewed to the stamp, pose (4,4), lidar_id,
                    ground_mask (all False), row (N,) in the sweep's file; with the ego-motion, where
                    known: flow (N,3), flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
+    semantickitti  OUT/sequences/NAME/predictions/000120.label, as semantic-kitti-api scores them
+                   (https://github.com/PRBonn/semantic-kitti-api, evaluate_mos.py): uint32 for each
+                   row of the sweep's file, below 251 moving or 9 static, above the object, 0 none
+    doc-depth      OUT/NAME, the exchange format of DOC-Depth (de Moreau et al., "DOC-Depth", IV
+                   2025; https://github.com/SimondeMoreau/DOC-Depth, Preprocessing/FORMAT.md)
 
 The challenge takes every fifth sweep, zipped as NAME/0000000000.feather, NAME/0000000005.feather….
 """
@@ -24,17 +29,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
 from densify.config.file_content import needed
+from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.geometry import poses
-from densify.geometry.types import FlowField, LidarSequence, Result, StretchFlow
-from densify.outputs.atomic import file_aside, write_file
+from densify.geometry.types import Float, FlowField, Int, LidarSequence, Result, StretchFlow
+from densify.outputs.atomic import file_aside, write_file, write_json
+from densify.outputs.export.maps_and_clouds import save_ply
 from densify.outputs.key_outputs import Context
+from densify.readers.recorded_poses import PoseTrack
+
+MOVING, STATIC = 251, 9
+_GROUND, _STANDING, _DYNAMIC = 0, 50, 100  # DOC-Depth's classes
 
 FlowWriter = Callable[[int, StretchFlow], Path]
-"""Writes a sweep and its flow to the next, the only step it is given (none: the last sweep), and
-returns the folder of its file."""
+"""Writes a sweep and its flow to the next, the only step it is given (the last sweep: to the one
+before), and returns the folder of its file."""
 
 
 def write_flow(result: Result, context: Context, folder: Path) -> None:
@@ -113,7 +125,7 @@ def flow_writer(
     """Yield a writer for these sweeps. Each file appears when it is complete.
 
     Args:
-        form: npz, av2 or opensceneflow, whose file has all sweeps.
+        form: One of those above. The file of opensceneflow has all sweeps.
 
     Raises:
         InputError: A package is missing, or a file exists and must not be overwritten.
@@ -121,11 +133,16 @@ def flow_writer(
     """
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)
     following = dict(zip(sequence.frames[:-1], sequence.frames[1:], strict=True))
+    labels = out / "sequences" / name / "predictions"
     if form == "av2":
         paths = {f: out / name / f"{sequence.stamp_ns(f)}.feather" for f in frames}
         needed("pyarrow.feather", "argoverse", "Argoverse 2's flow files")
     elif form == "opensceneflow":
         paths = dict.fromkeys(frames, out / f"{name}.h5")
+    elif form == "semantickitti":
+        paths = {f: labels / f"{f:06d}.label" for f in frames}
+    elif form == "doc-depth":
+        paths = {f: out / name / "frames" / f"frame_{f:06d}.ply" for f in frames}
     else:
         paths = {f: out / f"{f:06d}_{following[f]:06d}.npz" for f in frames if f in following}
     there = sorted({path.name for path in paths.values() if path.exists()})
@@ -134,6 +151,7 @@ def flow_writer(
             f"--out {out}: {there[0]} already there and kept ({len(there)} such files); give "
             f"--overwrite to replace them or another --out DIR"
         )
+    T_world_lidar: dict[int, Float] = {}
     with ExitStack() as stack:
         if form == "opensceneflow":
             h5py = needed("h5py", "opensceneflow", "OpenSceneFlow's files")
@@ -141,21 +159,90 @@ def flow_writer(
             file = stack.enter_context(h5py.File(aside, "w"))
 
         def write(frame: int, flow: StretchFlow) -> Path:
+            T_world_lidar[frame] = flow.stretch[frame].T_world_lidar
+            ahead = StretchFlow(flow.stretch, {p: f for p, f in flow.steps.items() if p[1] > p[0]})
             if form == "opensceneflow":
-                _add_sweep(file, frame, flow)
+                _add_sweep(file, frame, ahead)
             elif form == "av2":
-                _write_feather(paths[frame], sequence, frame, flow)
+                _write_feather(paths[frame], sequence, frame, ahead)
+            elif form == "semantickitti":
+                _write_labels(paths[frame], sequence, frame, flow)
+            elif form == "doc-depth":
+                _write_classes(paths[frame], frame, flow)
             else:
-                write_flow_npz(out, flow)
-            return out / name if form == "av2" else out
+                write_flow_npz(out, ahead)
+            return paths[frame].parent if form == "semantickitti" else _place(form, out, name)
 
         yield write
+    if form == "doc-depth" and T_world_lidar:
+        _write_paths(out / name, sequence, T_world_lidar)
+
+
+def _place(form: str, out: Path, name: str) -> Path:
+    return out / name if form in ("av2", "doc-depth") else out
+
+
+def _num_rows(sequence: LidarSequence, frame: int) -> int:
+    """Return how many rows the sweep's file has."""
+    return sequence.num_rows(frame) if hasattr(sequence, "num_rows") else len(sequence[frame])
+
+
+def _write_labels(path: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> None:
+    """Write a label for each row; rows without a valid return, or too near to be used, are static."""
+    label = np.full(_num_rows(sequence, frame), STATIC, np.uint32)
+    for field in flow.steps.values():
+        own = np.where(field.moving, MOVING | (field.instance.astype(np.int64) + 1) << 16, STATIC)
+        label[flow.stretch[frame].sweep.row] = own
+    write_file(path, label.astype("<u4").tobytes())
+
+
+def _write_classes(path: Path, frame: int, flow: StretchFlow) -> None:
+    """Write a sweep, deskewed to its stamp, with the class of each point."""
+    registered = flow.stretch[frame]
+    points = registered.sweep.points
+    on_world = poses.transform(registered.T_world_lidar, points)
+    height_m = ground(flow.stretch).above(on_world)
+    classes = np.where(height_m < ABOVE_GROUND_M, _GROUND, _STANDING)
+    for field in flow.steps.values():
+        classes[field.moving] = _DYNAMIC
+    columns = dict(zip("xyz", points.T.astype(np.float32), strict=True))
+    save_ply(path, columns | {"classid": classes.astype(np.uint16)})
+
+
+def _write_paths(folder: Path, sequence: LidarSequence, T_world_lidar: dict[int, Float]) -> None:
+    """Write the poses of the lidar, and the calibration and poses of the first camera.
+
+    traj_camera.ply has the lidar's poses at the camera's images. The format's document names the
+    quaternion qx qy qz qw, its reader q_x q_y q_z q_w: both are there.
+    """
+    stamp_ns = np.array([sequence.stamp_ns(f) for f in T_world_lidar], np.int64)
+    track = PoseTrack(sequence.name, stamp_ns, np.stack([*T_world_lidar.values()]))
+    _save_path(folder / "traj_odometry.ply", track, stamp_ns, list(T_world_lidar))
+    for camera in [*sequence.cameras.values()][:1]:
+        exposed_ns = np.array([*sequence.image_stamps_ns(camera.name).values()], np.int64)
+        inside = exposed_ns[(exposed_ns >= stamp_ns[0]) & (exposed_ns <= stamp_ns[-1])]
+        _save_path(folder / "traj_camera.ply", track, inside, range(len(inside)))
+        write_json(folder / "calib.json", {"mtx": camera.K.tolist()})
+        rows = "".join(" ".join(map(repr, row)) + "\n" for row in camera.T_cam_lidar.tolist())
+        write_file(folder / "calib_lidar_ref_cam.txt", rows.encode())
+
+
+def _save_path(path: Path, track: PoseTrack, stamps_ns: Int, numbers: Sequence[int]) -> None:
+    T = np.stack([track.at(int(ns)) for ns in stamps_ns]) if len(stamps_ns) else np.zeros((0, 4, 4))
+    turns = Rotation.from_matrix(T[:, :3, :3]).as_quat().T if len(T) else np.zeros((4, 0))
+    columns = dict(zip("xyz", T[:, :3, 3].T, strict=True))
+    for names in (("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w")):
+        columns |= dict(zip(names, turns, strict=True))
+    save_ply(
+        path,
+        {**columns, "timestamp": stamps_ns * 1e-9, "indices": np.array(numbers, np.int32)},
+    )
 
 
 def _write_feather(path: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> None:
     """Write the flow of one sweep. Rows without a valid return are static."""
     arrow, feather = (needed(m, "argoverse", "") for m in ("pyarrow", "pyarrow.feather"))
-    num_rows = sequence.num_rows(frame) if hasattr(sequence, "num_rows") else len(sequence[frame])
+    num_rows = _num_rows(sequence, frame)
     residual = np.zeros((num_rows, 3), np.float16)
     for field in flow.steps.values():
         residual[flow.stretch[frame].sweep.row] = field.displacement

@@ -203,15 +203,16 @@ class Recording:
         return motion.with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
-        """Return the flow of a sweep to the next; no step where none follows.
+        """Return the flow of a sweep to the next; to the one before it where none follows; no step
+        where it is alone.
 
         Errors as `window_frames`, but a sweep may be alone.
         """
         window = self.window(frame)
-        following = [f for f in window.frames if f > frame][:1]
-        motion = self.motion(frame) if following else None
+        beside = [f for f in window.frames if f > frame] or [f for f in window.frames if f < frame]
+        motion = self.motion(frame) if beside else None
         return StretchFlow(
-            window, {(frame, f): motion.flow(frame, f) for f in following if motion is not None}
+            window, {(frame, f): motion.flow(frame, f) for f in beside[:1] if motion is not None}
         )
 
     def moment(

@@ -167,7 +167,7 @@ def flow_steps(
 ) -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
     """Yield sweeps of a whole recording with their flow to the next sweep, or with their error.
 
-    The last sweep, and one before a hole in time, have no step.
+    The last sweep, and one before a hole in time, have a step to the sweep before.
 
     Args:
         frames: Ascending.

@@ -43,7 +43,9 @@ def add_flow(commands: Any) -> None:
         "'moving' (N,) bool, 'instance' (N,) int32 (-1 none), 'lost' (N,) bool. A recording, with "
         "--all or --keys, gives the flow of each sweep to the next one. npz writes "
         "DIR/FRAME_NEXT.npz for --flow npz:DIR. av2 writes DIR/NAME/STAMP.feather of the Argoverse "
-        "2 scene flow challenge. opensceneflow writes DIR/NAME.h5.",
+        "2 scene flow challenge. opensceneflow writes DIR/NAME.h5. semantickitti writes "
+        "DIR/sequences/NAME/predictions/FRAME.label, 251 moving and 9 static. doc-depth writes "
+        "DIR/NAME, the poses and classes that DOC-Depth renders.",
     )
     parser.add_argument(
         "source", metavar="SOURCE|SPEC", nargs="?", help="earlier points, or a recording"
@@ -52,7 +54,7 @@ def add_flow(commands: Any) -> None:
     option(parser, "--data SPEC", "the recording, as an option")
     option(parser, "--all", "take every sweep of the recording")
     option(parser, "--keys A:B[:S]", "take sweeps A to B-1, every S-th", type=key_range)
-    formats = ("npz", "av2", "opensceneflow")
+    formats = ("npz", "av2", "opensceneflow", "semantickitti", "doc-depth")
     parser.add_argument(
         "--format", choices=formats, help="form of a recording's flow (default: npz)"
     )

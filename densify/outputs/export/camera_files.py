@@ -1,40 +1,63 @@
 # SPDX-License-Identifier: MIT
-"""Write images with cameras and points, for COLMAP, Gaussian splatting and nerfstudio.
+"""Write images with cameras, depth and points for splatting, nerfstudio and training sets.
 
 COLMAP's text model: https://colmap.github.io/format.html. nerfstudio's folder: ``ns-train
-depth-nerfacto --data DIR``.
+depth-nerfacto --data DIR``. The sets of map-anything and MoGe: see their functions.
 
-The world is the key frame. The centre of the upper left pixel is (0.5, 0.5). Lenses are OpenCV's.
-COLMAP's poses are world to camera. nerfstudio's are camera to world with OpenGL's axes: x right, y
-up, the camera looks along -z. Its depth is in millimetres.
+The world is the first key frame. The centre of the upper left pixel is (0.5, 0.5). Lenses are
+OpenCV's. COLMAP's poses are world to camera. nerfstudio's are camera to world with OpenGL's axes: x
+right, y up, the camera looks along -z. Its depth is in millimetres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_bytes
+from densify.config.file_content import needed, read_bytes
 from densify.geometry import poses
-from densify.geometry.types import Camera, CameraView, Float
+from densify.geometry.types import Camera, Float, Float32
 from densify.outputs.atomic import write_file, write_json
 from densify.outputs.cloud_laz import StoredCloud
-from densify.outputs.depth_png import map_path, metres
-from densify.outputs.export.finished_run import FinishedRun
+from densify.outputs.depth_png import encode_png, map_path, metres
+from densify.outputs.export.finished_run import FinishedRun, key_poses
 from densify.outputs.export.maps_and_clouds import save_ply
+from densify.outputs.kitti_tree import drive_folder
+from densify.readers.decoded_files import decode_image
 
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
+_INVERSE_STEPS, _LOG_STEPS = 65536, 65533  # of 16 bits, as splatting and MoGe divide them
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def write_colmap(run: FinishedRun, folder: Path) -> None:
+class _Picture(NamedTuple):
+    """An image of a finished run.
+
+    Attributes:
+        name: Of its files.
+        run, map: The finished run, and the name of its map.
+        T_cam_world: (4,4).
+        jpeg: The image as it is stored.
+    """
+
+    name: str
+    run: FinishedRun
+    map: str
+    camera: Camera
+    T_cam_world: Float
+    jpeg: bytes
+
+
+def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``images/`` and ``sparse/0/`` with cameras.txt, images.txt and points3D.txt.
 
     The points are those that a camera observed.
@@ -42,20 +65,61 @@ def write_colmap(run: FinishedRun, folder: Path) -> None:
     Raises:
         InputError: COLMAP has no model of the lens.
     """
-    _write_model(run, _observed(run.cloud()), folder)
+    pictures = _write_images(runs, folder)
+    _write_model(pictures, _observed(_world_cloud(runs)), folder)
 
 
-def write_splats(run: FinishedRun, folder: Path) -> None:
+def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write the input of 3-D Gaussian splatting (Kerbl et al., SIGGRAPH 2023).
 
-    It is a COLMAP model of the static world, also as points3D.ply, and each moving object in its
-    own frame. ``movers/0003.ply`` has all points of object 3, ``movers/others.ply`` moving points
-    without a track, in the key frame. ``tracks.json`` is the movers.json of the run.
+    It is a COLMAP model of the static world, also as points3D.ply, with depth maps, and each moving
+    object in its own frame.
+
+    ``depths/NAME.png`` and ``sparse/0/depth_params.json`` are read with ``-d depths``: inverse depth
+    is ``value / 65536 * scale + offset``. That training takes an empty pixel as one at infinity.
+    Images are therefore transparent where there is no depth, neither filled nor of a prior, and
+    these pixels are not trained.
+
+    ``movers/0003.ply`` has all points of object 3, ``movers/others.ply`` moving points without a
+    track, in the key frame. ``tracks.json`` is the movers.json of the run. Several keys have
+    ``movers/000120/`` with ``tracks.json`` each.
+
+    Raises:
+        InputError: The maps hold ranges, or COLMAP has no model of the lens.
     """
-    whole = run.cloud()
-    static = _observed(whole.select(~whole.moving))
-    _write_model(run, static, folder)
+    pictures = _pictures(runs, flat=True)
+    static = _world_cloud(runs)
+    static = _observed(static.select(~static.moving))
+    _write_depths(pictures, folder)
+    _write_model(pictures, static, folder, ".png")
     _save_splats(folder / "sparse" / "0" / "points3D.ply", static.points, static.rgb)
+    for run in runs:
+        several = len(runs) > 1
+        movers = folder / "movers" / f"{run.key:06d}" if several else folder / "movers"
+        _write_movers(run, movers)
+        tracks = (movers if several else folder) / "tracks.json"
+        write_file(tracks, read_bytes(run.folder / "movers.json"))
+
+
+def _write_depths(pictures: Sequence[_Picture], folder: Path) -> None:
+    depths_m = {picture.name: picture.run.full_m(picture.map) for picture in pictures}
+    nearest_m = min(float(d[d > 0].min(initial=np.inf)) for d in depths_m.values())
+    scale = 1 / nearest_m if np.isfinite(nearest_m) else 1.0
+    for picture in pictures:
+        depth_m = depths_m[picture.name]
+        inverse = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
+        steps = np.minimum(np.rint(inverse * (_INVERSE_STEPS / scale)), _INVERSE_STEPS - 1)
+        write_file(folder / "depths" / f"{picture.name}.png", encode_png(steps.astype(np.uint16)))
+        image = decode_image(picture.jpeg, picture.name)
+        clear = np.dstack([image, np.full(image.shape[:2], 255, np.uint8)])
+        clear[depth_m == 0] = 0
+        write_file(folder / "images" / f"{picture.name}.png", encode_png(clear))
+    params = {picture.name: {"scale": scale, "offset": 0.0} for picture in pictures}
+    write_json(folder / "sparse" / "0" / "depth_params.json", params)
+
+
+def _write_movers(run: FinishedRun, folder: Path) -> None:
+    whole = run.cloud()
     moving = [whole.select(whole.moving), *run.mover_clouds()]
     points, rgb, instance = (
         np.concatenate([getattr(cloud, name) for cloud in moving])
@@ -68,13 +132,12 @@ def write_splats(run: FinishedRun, folder: Path) -> None:
         if own.any():
             T_object_key = poses.inverse(track.T_key_object[track.frames.index(run.key)])
             in_object = poses.transform(T_object_key, points[own])
-            _save_splats(folder / "movers" / f"{track.instance:04d}.ply", in_object, rgb[own])
+            _save_splats(folder / f"{track.instance:04d}.ply", in_object, rgb[own])
     if not tracked.all():
-        _save_splats(folder / "movers" / "others.ply", points[~tracked], rgb[~tracked])
-    write_file(folder / "tracks.json", read_bytes(run.folder / "movers.json"))
+        _save_splats(folder / "others.ply", points[~tracked], rgb[~tracked])
 
 
-def write_nerfstudio(run: FinishedRun, folder: Path) -> None:
+def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``transforms.json``, ``images/``, ``depth/CAMERA.npy`` and ``cloud.ply``.
 
     Depth is the measured one, float32 millimetres, 0 none. The cloud has the points that a camera
@@ -84,69 +147,195 @@ def write_nerfstudio(run: FinishedRun, folder: Path) -> None:
         InputError: The maps hold ranges, a lens is not OpenCV's with k1 k2 k3 p1 p2, or
             fisheyes are together with other cameras.
     """
-    views = _write_images(run, folder)
-    fisheyes = {view.camera.model == "fisheye" for view in views.values()}
+    pictures = _write_images(runs, folder)
+    fisheyes = {picture.camera.model == "fisheye" for picture in pictures}
     if len(fisheyes) > 1:
         raise InputError(
             "--to nerfstudio: it has one camera model for all images, and there are fisheyes and "
             "others; choose among them with --camera"
         )
-    for name in views:
-        path = map_path(folder, "depth", name, ".npy")
+    for picture in pictures:
+        picture.run.full_m(picture.map)
+        path = map_path(folder, "depth", picture.name, ".npy")
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, metres(run.maps(name)["depth"]) * np.float32(1000))
-    columns = _observed(run.cloud()).columns()
+        np.save(path, metres(picture.run.maps(picture.map)["depth"]) * np.float32(1000))
+    columns = _observed(_world_cloud(runs)).columns()
     vertex = ("x", "y", "z", "red", "green", "blue")
     save_ply(folder / "cloud.ply", {name: columns[name] for name in vertex})
     transforms = {
         "camera_model": "OPENCV_FISHEYE" if fisheyes.pop() else "OPENCV",
         "ply_file_path": "cloud.ply",
-        "frames": [_frame(run, name, view) for name, view in views.items()],
+        "frames": [_frame(picture) for picture in pictures],
     }
     write_json(folder / "transforms.json", transforms)
 
 
-def _frame(run: FinishedRun, name: str, view: CameraView) -> dict[str, Any]:
-    if run.measure(name) != "z":
-        raise InputError(
-            f"{name}: its depth is the range from the lens, and nerfstudio takes camera z; densify "
-            f"it with --set project.depth=z, or leave it out by naming the others with --camera"
-        )
-    camera, lens = view.camera, _intrinsics(view.camera)
+def _frame(picture: _Picture) -> dict[str, Any]:
+    camera, lens = picture.camera, _intrinsics(picture.camera)
     K = {"fl_x": lens.pop("fx"), "fl_y": lens.pop("fy"), "cx": lens.pop("cx"), "cy": lens.pop("cy")}
     known = _FISHEYE_LENS if camera.model == "fisheye" else _LENS[:5]
     if unknown := [n for n, value in lens.items() if value and n not in known]:
         raise InputError(
-            f"{name}: nerfstudio has no lens with {', '.join(unknown)}; leave it out by naming the "
-            f"others with --camera"
+            f"{picture.name}: nerfstudio has no lens with {', '.join(unknown)}; leave it out by "
+            f"naming the others with --camera"
         )
     return {
-        "file_path": f"images/{name}.jpg",
-        "depth_file_path": f"depth/{name}.npy",
+        "file_path": f"images/{picture.name}.jpg",
+        "depth_file_path": f"depth/{picture.name}.npy",
         **K,
         "w": camera.width_px,
         "h": camera.height_px,
         **{n: lens.get(n, 0.0) for n in known},
-        "transform_matrix": poses.inverse(view.T_cam_key) @ _OPENGL,
+        "transform_matrix": poses.inverse(picture.T_cam_world) @ _OPENGL,
     }
 
 
-def _write_images(run: FinishedRun, folder: Path) -> Mapping[str, CameraView]:
-    """Write the images of the run's maps as ``images/CAMERA.jpg``; return their cameras and poses.
+def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
+    """Write a scene as map-anything reads it (its data_processing/README.md).
 
-    Raises InputError if there is none.
+    scene_meta.json has poses with OpenCV's axes. Beside it are ``images/`` and ``depth/NAME.exr``,
+    measured metres, 0 none.
+
+    Raises:
+        InputError: The maps hold ranges, a lens has distortion, or OpenEXR is missing.
     """
-    views = {}
-    for name in run.cameras:
-        if (data := run.jpeg(name)) is not None:
-            write_file(map_path(folder, "images", name, ".jpg"), data)
-            views[name] = run.views[name]
-    if not views:
-        raise InputError(
-            f"{run.folder}: no images in scene/image of {', '.join(run.cameras)}; densify the key "
-            f"with a camera that has images"
+    library = needed("OpenEXR", "exr", "EXR files")
+    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
+    frames = []
+    for picture in _write_images(runs, folder, flat=True):
+        picture.run.full_m(picture.map)
+        _require_pinhole(picture, "wai")
+        lens, depth = _intrinsics(picture.camera), f"depth/{picture.name}.exr"
+        (folder / depth).parent.mkdir(parents=True, exist_ok=True)
+        depth_m = metres(picture.run.maps(picture.map)["depth"])
+        library.File(header, {"Y": depth_m}).write(str(folder / depth))
+        frames.append(
+            {
+                "frame_name": picture.name,
+                "file_path": f"images/{picture.name}.jpg",
+                "image": f"images/{picture.name}.jpg",
+                "depth": depth,
+                "transform_matrix": poses.inverse(picture.T_cam_world),
+                **{f"fl_{axis}": lens[f"f{axis}"] for axis in "xy"},
+                **{f"c{axis}": lens[f"c{axis}"] for axis in "xy"},
+                "w": picture.camera.width_px,
+                "h": picture.camera.height_px,
+            }
         )
-    return views
+    modalities = {name: {"frame_key": name, "format": name} for name in ("image", "depth")}
+    meta = {
+        "scene_name": drive_folder(f"{runs[0].data}-{runs[0].key:06d}".rpartition("/")[2]),
+        "dataset_name": "densify",
+        "version": "0.1",
+        "shared_intrinsics": False,
+        "camera_model": "PINHOLE",
+        "camera_convention": "opencv",
+        "frames": frames,
+        "scene_modalities": {},
+        "frame_modalities": modalities,
+    }
+    write_json(folder / "scene_meta.json", meta)
+
+
+def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
+    """Write a training set as MoGe reads it (its docs/train.md and moge/utils/io.py).
+
+    .index.txt lists the folders of the images. Each has image.jpg, meta.json (K of an image of
+    width and height 1) and depth.png: 16 bit, measured, 0 none, else logarithmic from ``near`` to
+    ``far``.
+
+    Raises:
+        InputError: The maps hold ranges, or a lens has distortion.
+    """
+    names = []
+    for run in runs:
+        drive = drive_folder(run.data.rstrip("/").rpartition("/")[2])
+        for picture in _pictures([run], flat=True):
+            picture.run.full_m(picture.map)
+            _require_pinhole(picture, "moge")
+            name = f"keys/{drive}/{run.key:06d}_{picture.name}"
+            names.append(name)
+            camera = picture.camera
+            K = (camera.K + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]) / np.array(
+                [[camera.width_px], [camera.height_px], [1]]
+            )
+            write_file(folder / name / "image.jpg", picture.jpeg)
+            write_json(folder / name / "meta.json", {"intrinsics": K})
+            depth_m = metres(run.maps(picture.map)["depth"])
+            write_file(folder / name / "depth.png", _logarithmic_png(depth_m))
+    write_file(folder / ".index.txt", "".join(f"{name}\n" for name in names).encode())
+
+
+def _logarithmic_png(depth_m: Float32) -> bytes:
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    known, steps = depth_m > 0, np.zeros(depth_m.shape, np.uint16)
+    near, far = (float(f(depth_m[known], initial=1.0)) for f in (np.min, np.max))
+    far = max(far, 1.1 * near)
+    share = np.log(depth_m[known] / near) / np.log(far / near)
+    steps[known] = 1 + np.rint(share * _LOG_STEPS)
+    info, file = PngInfo(), io.BytesIO()
+    info.add_text("near", repr(near))
+    info.add_text("far", repr(far))
+    Image.fromarray(steps).save(file, "PNG", pnginfo=info)
+    return file.getvalue()
+
+
+def _require_pinhole(picture: _Picture, to: str) -> None:
+    if not picture.camera.is_rectified:
+        raise InputError(
+            f"{picture.name}: --to {to} takes images without distortion; leave the camera out by "
+            f"naming the others with --camera"
+        )
+
+
+def _pictures(runs: Sequence[FinishedRun], flat: bool = False) -> list[_Picture]:
+    """Return the images of the runs' maps in one world.
+
+    Args:
+        runs: Ascending by key.
+        flat: Names without folders, since the reader of Gaussian splatting leaves folders out.
+
+    Raises:
+        InputError: There is no image.
+    """
+    pictures = []
+    for T_world_key, run in zip(key_poses(runs), runs, strict=True):
+        for name in run.cameras:
+            if (data := run.jpeg(name)) is not None:
+                view, file = run.views[name], name
+                if len(runs) > 1:
+                    file = f"{run.key:06d}/{name}"
+                T_cam_world = view.T_cam_key @ poses.inverse(T_world_key)
+                file = file.replace("/", "_") if flat else file
+                pictures.append(_Picture(file, run, name, view.camera, T_cam_world, data))
+    if not pictures:
+        raise InputError(
+            f"{runs[0].folder}: no images in scene/image of {', '.join(runs[0].cameras)}; densify "
+            f"the key with a camera that has images"
+        )
+    return pictures
+
+
+def _write_images(runs: Sequence[FinishedRun], folder: Path, flat: bool = False) -> list[_Picture]:
+    """Write the images as ``images/NAME.jpg`` and return them."""
+    pictures = _pictures(runs, flat)
+    for picture in pictures:
+        write_file(map_path(folder, "images", picture.name, ".jpg"), picture.jpeg)
+    return pictures
+
+
+def _world_cloud(runs: Sequence[FinishedRun]) -> StoredCloud:
+    """Return the cloud of a key; of several keys the points of each key's own sweep, in the world."""
+    if len(runs) == 1:
+        return runs[0].cloud()
+    parts = []
+    for T_world_key, run in zip(key_poses(runs), runs, strict=True):
+        cloud = run.cloud()
+        own = cloud.select(cloud.frame == run.key)
+        parts.append(replace(own, points=poses.transform(T_world_key, own.points)))
+    return StoredCloud.joined(parts)
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
@@ -173,11 +362,13 @@ def _observed(cloud: StoredCloud) -> StoredCloud:
     return cloud.select(np.any(cloud.rgb, axis=1))
 
 
-def _write_model(run: FinishedRun, cloud: StoredCloud, folder: Path) -> None:
-    """Write the images and COLMAP's text model with these points, which no image refers to."""
+def _write_model(
+    pictures: Sequence[_Picture], cloud: StoredCloud, folder: Path, suffix: str = ".jpg"
+) -> None:
+    """Write COLMAP's text model with these points, which no image refers to."""
     cameras, images, number_of = "", "", dict[str, int]()
-    for number, (name, view) in enumerate(_write_images(run, folder).items(), 1):
-        camera, T_cam_world = view.camera, view.T_cam_key
+    for number, picture in enumerate(pictures, 1):
+        camera, T_cam_world = picture.camera, picture.T_cam_world
         if camera.name not in number_of:
             number_of[camera.name] = len(number_of) + 1
             model, params = _model(camera)
@@ -185,7 +376,7 @@ def _write_model(run: FinishedRun, cloud: StoredCloud, folder: Path) -> None:
             cameras += f"{number_of[camera.name]} {model} {size} {_text(params)}\n"
         x, y, z, w = Rotation.from_matrix(T_cam_world[:3, :3]).as_quat(canonical=True)
         pose = _text([w, x, y, z, *T_cam_world[:3, 3]])
-        images += f"{number} {pose} {number_of[camera.name]} {name}.jpg\n\n"
+        images += f"{number} {pose} {number_of[camera.name]} {picture.name}{suffix}\n\n"
     sparse = folder / "sparse" / "0"
     write_file(sparse / "cameras.txt", cameras.encode())
     write_file(sparse / "images.txt", images.encode())

@@ -148,6 +148,27 @@ class FinishedRun:
         }
         return {kind: stored * keep for kind, stored in maps.items()}
 
+    def full_m(self, camera: str) -> Float32:
+        """Return (H,W) metres, 0 none: measured and filled pixels, and those of a prior if given.
+
+        Raises:
+            InputError: Depth is not camera z.
+        """
+        if self.measure(camera) != "z":
+            raise InputError(
+                f"{camera}: its depth is the range from the lens, and the form takes camera z; "
+                f"densify it with --set project.depth=z, or leave it out by naming the others with "
+                f"--camera"
+            )
+        stored, path = (
+            self.maps(camera)["depth_filled"],
+            map_path(self.folder, "depth_full", camera),
+        )
+        if path.is_file():
+            full = read_stored(path, np.uint16, "a map of depth_full")
+            stored = np.where(stored > 0, stored, full)
+        return metres(stored)
+
     def cloud(self) -> StoredCloud:
         """Return the accumulated points within the thresholds."""
         return self._select(read_cloud(self.folder / "cloud.laz"))
@@ -179,12 +200,14 @@ def finished_runs(
     max_age_ms: float | None = None,
     cameras: Sequence[str] | None = None,
 ) -> list[FinishedRun]:
-    """Return the run in a folder, or those of several keys in its subfolders, ascending."""
-    places = sorted(path.parent for path in folder.glob("*/run.yaml"))
+    """Return the run in a folder, or those of several keys below it, ascending by recording."""
+    places = sorted(
+        path.parent for level in ("*", "*/*") for path in folder.glob(f"{level}/run.yaml")
+    )
     if (folder / "run.yaml").is_file() or not places:
         places = [folder]
     runs = [FinishedRun(place, min_confidence, max_age_ms, cameras) for place in places]
-    return sorted(runs, key=lambda run: run.key)
+    return sorted(runs, key=lambda run: (run.folder.parent, run.key))
 
 
 class ShownSweep(NamedTuple):
@@ -242,10 +265,7 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
         InputError: Neither of two consecutive keys is in the window of the other. Their
             relative pose is then unknown.
     """
-    T_world_key = np.eye(4)
-    for before, run in zip([None, *runs], runs, strict=False):
-        if before is not None:
-            T_world_key = T_world_key @ _relative_pose(before, run)
+    for T_world_key, run in zip(key_poses(runs), runs, strict=True):
         cloud, sweeps = run.cloud(), []
         for sweep in run.scene.table["sweeps"]:
             frame, since_s, T = sweep["frame"], sweep["since_key_s"], sweep["T_key_lidar"]
@@ -255,6 +275,19 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
                 sweeps.append(ShownSweep(frame, stamp_ns, np.array(T), own))
         shots = [_shot(run, name) for name in run.views]
         yield Timeline(run, T_world_key, cloud, sweeps, shots)
+
+
+def key_poses(runs: Sequence[FinishedRun]) -> Iterator[Float]:
+    """Yield ``T_world_key`` (4,4) of each run; the world is the first key frame.
+
+    Raises:
+        InputError: As `timelines`.
+    """
+    T_world_key = np.eye(4)
+    for before, run in zip([None, *runs], runs, strict=False):
+        if before is not None:
+            T_world_key = T_world_key @ _relative_pose(before, run)
+        yield T_world_key
 
 
 def colours(cloud: StoredCloud) -> NDArray[np.uint8]:

@@ -14,14 +14,14 @@ from densify.config.errors import InputError
 from densify.config.file_content import needed
 from densify.geometry.arrays import table
 from densify.geometry.types import Float32
-from densify.outputs.atomic import write_file
+from densify.outputs.atomic import write_file, write_json
 from densify.outputs.depth_png import encode_png, map_path, metres
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.kitti_tree import drive_folder, split_of
 from densify.readers.decoded_files import decode_image
 
 _TREE = {"groundtruth": "depth", "groundtruth_filled": "depth_filled", "confidence": "confidence"}
-_PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
+_PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar", "u2": "ushort"}
 
 
 def write_npy(run: FinishedRun, folder: Path) -> None:
@@ -71,17 +71,24 @@ def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
 
     KIND is groundtruth (measured), groundtruth_filled, confidence, and velodyne_raw, the single
     sweep, if the run has it. Recordings that the benchmark lacks are in train.
+    files.txt has image, measured and filled depth of each map that has an image, a line each.
+    annotations.json has the same with ``cam_in`` (fx fy cx cy) and ``depth_scale``, for Metric3D.
     """
+    files: list[dict[str, Any]] = []
     for run in runs:
         name = run.data.rstrip("/").rpartition("/")[2]
         if not name:
             raise InputError(f"{run.folder}/run.yaml: data: expected the recording's name")
         drive = folder / split_of(name) / drive_folder(name)
         for view in run.cameras:
-            _write_view(run, view, drive)
+            files += _write_view(run, view, drive, folder)
+    lines = [f"{file['rgb']} {file['depth']} {file['depth_filled']}\n" for file in files]
+    write_file(folder / "files.txt", "".join(lines).encode())
+    write_json(folder / "annotations.json", {"files": files})
 
 
-def _write_view(run: FinishedRun, view: str, drive: Path) -> None:
+def _write_view(run: FinishedRun, view: str, drive: Path, root: Path) -> list[dict[str, Any]]:
+    """Write the files of a map and return its entry of annotations.json, if it has an image."""
     camera, _, number = view.partition("/")
     file, maps = number or f"{run.key:010d}", run.maps(view)
     for kind, product in _TREE.items():
@@ -90,12 +97,19 @@ def _write_view(run: FinishedRun, view: str, drive: Path) -> None:
     if sweep.is_file():
         raw = map_path(drive / "proj_depth" / "velodyne_raw", camera, file)
         write_file(raw, sweep.read_bytes())
-    if (jpeg := run.jpeg(view)) is not None:
-        write_file(map_path(drive / camera, "data", file), encode_png(decode_image(jpeg, view)))
     if view in run.views:
         numbers = " ".join(f"{value:.6f}" for value in run.views[view].camera.K.ravel())
         path = map_path(drive / "intrinsics", camera, file, ".txt")
         write_file(path, f"{numbers}\n".encode())
+    if (jpeg := run.jpeg(view)) is None:
+        return []
+    image = map_path(drive / camera, "data", file)
+    write_file(image, encode_png(decode_image(jpeg, view)))
+    depth, filled = (map_path(drive / "proj_depth" / k, camera, file) for k in list(_TREE)[:2])
+    paths = {"rgb": image, "depth": depth, "depth_filled": filled}
+    entry: dict[str, Any] = {n: p.relative_to(root).as_posix() for n, p in paths.items()}
+    fx, fy, cx, cy = run.views[view].camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return [entry | {"cam_in": [fx, fy, cx, cy], "depth_scale": 256.0}]
 
 
 def write_ply(run: FinishedRun, folder: Path) -> None:
@@ -107,7 +121,7 @@ def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write vertices as PLY (Turk, 1994), binary, little-endian.
 
     Args:
-        columns: (N,) float32, float64, int32 or uint8 each.
+        columns: (N,) float32, float64, int32, uint8 or uint16 each.
     """
     rows = table(columns)
     rows = rows.astype(rows.dtype.newbyteorder("<"), copy=False)
