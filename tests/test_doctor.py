@@ -8,10 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
+from densify.bench import doctor as bench
 from densify.config import Config
 from densify.config.errors import InputError
 from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, clocks, paths, points, rings
+from densify.doctor.edge_fit import best_fit, turned
+from densify.doctor.paths import changed
 from densify.geometry import poses
 from densify.geometry.types import RegisteredSweep, Sweep, Trajectory
 from densify.readers.street import Street
@@ -111,15 +115,64 @@ def test_where_a_scanner_stands_is_found(good: Sample) -> None:
 
 def test_the_clock_of_a_camera_is_measured(good: Sample) -> None:
     camera = good.sequence.cameras["fast"]
-    pairs, broken = cameras.image_pairs(good, camera)
-    assert not broken and len(pairs) == 2
-    late_s = np.arange(-0.2, 0.21, 0.05)
-    scores = [cameras.score(camera, pairs, t)[0] for t in late_s]
-    assert abs(late_s[int(np.argmax(scores))]) < 0.06
-    assert max(scores) > 5 * abs(scores[-1]) or max(scores) > scores[-1] + 3
-    shifted = [replace(p, exposed_s=p.exposed_s + 0.15) for p in pairs]
-    again = [cameras.score(camera, shifted, t)[0] for t in late_s]
-    assert abs(late_s[int(np.argmax(again))] + 0.15) < 0.06
+    views, broken = cameras.camera_views(good, camera, {})
+    assert not broken and len(views) == 8
+    for late_s in (0.0, 0.04, -0.04, 0.15):
+        early = [v._replace(exposed_s=v.exposed_s - late_s) for v in views]
+        assert abs(best_fit(camera, early, True).offset[3] - late_s) < 0.02
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_turned_camera_is_told_with_the_line_that_mends_it(good: Sample, axis: int) -> None:
+    camera = good.sequence.cameras["fast"]
+    views, _ = cameras.camera_views(good, camera, {})
+    for turn_deg in (1.5, -1.5):
+        wrong = turned(camera, turn_deg * np.eye(4)[axis])
+        told = cameras.check_calibration(wrong, views)[0]
+        assert told.verdict >= Verdict.SUSPICIOUS and " deg" in told.evidence
+        if axis < 2:  # sixteen rings tell little of a roll
+            mended = np.eye(4)
+            mended[:3] = yaml.safe_load(told.remedy)["T_cam_lidar"]
+            left = mended @ poses.inverse(camera.T_cam_lidar)
+            assert np.rad2deg(np.linalg.norm(poses.log(left)[:3])) < 0.6
+
+
+def test_images_of_another_place_are_not_fine(good: Sample) -> None:
+    camera = good.sequence.cameras["fast"]
+    views, _ = cameras.camera_views(good, camera, {})
+    mirrored = [v._replace(strength=np.ascontiguousarray(v.strength[:, :, ::-1])) for v in views]
+    assert cameras.check_calibration(camera, mirrored)[0].verdict >= Verdict.SUSPICIOUS
+    assert cameras.check_calibration(camera, views[:1])[0].verdict == Verdict.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("words", "scale", "climb"),
+    [("% too long", 1.03, 0), ("% too short", 0.97, 0), ("m/s up beside", 1, 0.03)],
+)
+def test_poses_that_are_slightly_off_are_told_by_how_much(
+    good: Sample, street: Faulty, words: str, scale: float, climb: float
+) -> None:
+    first = street.T_world_lidar(112)
+
+    def pose(T: np.ndarray) -> np.ndarray:
+        T = first @ changed(scale=scale)(poses.inverse(first) @ T)
+        T[2, 3] += climb * np.linalg.norm((T - first)[:2, 3])
+        return T
+
+    found = paths.check_poses(with_fault(good, street, pose=pose))[0]
+    assert found.verdict == Verdict.SUSPICIOUS and words in found.evidence, found
+    assert "register.source=kiss-icp" in found.remedy
+
+
+def test_the_bench_puts_cameras_and_poses_out(street: Faulty, monkeypatch) -> None:
+    few = {"_TURNS_DEG": (2.0,), "_SHIFTS_M": (), "_CLOCKS_S": (), "_SCALES": (0.1,)}
+    for name, sizes in few.items():
+        monkeypatch.setattr(bench, name, sizes)
+    found = bench.bench_doctor([street], CONFIG)
+    assert found["cameras as they are"]["fine"] == found["poses as they are"]["fine"] == 1
+    assert found["yaw 2 deg"] == {"of": 2, "fine": 0, "unknown": 0, "suspicious": 0, "wrong": 1}
+    assert found["poses 10 % too long or short"]["wrong"] == 1
+    assert found["poses climb 0.2 m/s"]["fine"] == 0
 
 
 def with_points(sweep: Sweep, points: np.ndarray) -> Sweep:

@@ -286,8 +286,8 @@ EXPORTS = {
     "splats": Form(
         "camera_files", ("images", "depths", "sparse", "movers", "tracks.json"), of_drive=True
     ),
-    "moge": Form("camera_files", (".index.txt", "keys"), of_drive=True),
-    "wai": Form("camera_files", ("scene_meta.json", "images", "depth"), of_drive=True),
+    "moge": Form("training_sets", (".index.txt", "keys"), of_drive=True),
+    "wai": Form("training_sets", ("scene_meta.json", "images", "depth"), of_drive=True),
     "kitti": Form(
         "maps_and_clouds", ("train", "val", "files.txt", "annotations.json"), of_drive=True
     ),

@@ -104,7 +104,7 @@ class Diagnosis:
 def examine(sequence: LidarSequence, config: Config) -> Diagnosis:
     """Check a recording.
 
-    At most fifteen of its sweeps and three images of each camera are read, whatever its length.
+    At most fifteen of its sweeps and some forty images are read, whatever its length.
 
     Raises:
         InputError: None of these sweeps can be read.

@@ -1,67 +1,38 @@
 # SPDX-License-Identifier: MIT
-"""Check cameras: existing images, and whether depth discontinuities are on image edges.
-
-The score of a calibration compares the strength of the image's edges at depth discontinuities of
-the sweep with that at its other returns, in standard errors (after Levinson and Thrun, "Automatic
-Online Calibration of Cameras and Lasers", RSS 2013).
-"""
+"""Check cameras: existing images, and whether depth discontinuities are on image edges."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
-from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
+from densify.doctor.edge_fit import (
+    Fit,
+    Silhouettes,
+    View,
+    best_fit,
+    depth_edges,
+    image_edges,
+    score,
+    turned,
+)
+from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Verdict, finding
 from densify.doctor.paths import CAM_AXES, changed
-from densify.doctor.sample import Sample, Spot
+from densify.doctor.sample import Sample
 from densify.geometry import poses
-from densify.geometry.cameras import image_points
-from densify.geometry.types import Bool, Camera, Float, Float32
+from densify.geometry.types import Camera, Float, RegisteredSweep
 from densify.readers.timeline import format_frames
 
-_EDGE_M, _EDGE_SHARE = 0.6, 0.08
-_NEAREST_M, _FARTHEST_M = 3.0, 50.0
-_BESIDE_RAD = np.deg2rad(0.6)
-_STEEPLY = 4.0  # a neighbour above or below counts as farther by this factor
-_BLUR_PX, _AROUND_PX = 1.5, 25.0  # at a focal length of 700 px
-_FOCAL_PX = 700.0
-_NUM_OTHERS, _LEAST_SEEN = 20_000, 50
-_CLEAR, _CLEARLY = 5.0, 1.25
-_LEAST_PAIRS = 2
+_NEAREST_M, _FARTHEST_M = 3.0, 100.0
+_MOST_IMAGES, _LEAST_IMAGES = 36, 4  # of all cameras; of one, to tell
+_CLEARLY = 1.25
 _AS_MANY = 0.5  # share of the edges at the given calibration; one object may match by chance
-_SHIFT_DEG, _SHIFT_STEP_DEG, _OFF_DEG = 2.0, 0.1, 0.4
-_CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.2, 0.01, 0.02
+_OFF_DEG, _WRONG_DEG, _UNSURE_DEG = 0.5, 0.75, 0.25  # an offset of 1 degree is 4 standard errors
+_CLOCK_OFF_S, _CLOCK_WRONG_S = 0.02, 0.05
 _LEAST_SPEED_M_S = 3.0
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A sweep and an image taken near it.
-
-    Attributes:
-        points: (N,3) lidar frame, deskewed.
-        edge: (N,) on the near side of a depth discontinuity.
-        twist: (6,) of the lidar, per second.
-        exposed_s: Since the reference time of the sweep.
-        strength: (H,W) of image edges, relative to those around.
-    """
-
-    points: Float
-    edge: Bool
-    twist: Float
-    exposed_s: float
-    strength: Float32
-
-    def seen_at(self, later_s: float) -> Float:
-        """Return (N,3) in the lidar frame at the exposure and ``later_s``."""
-        return poses.transform(
-            poses.inverse(poses.exp((self.exposed_s + later_s) * self.twist)), self.points
-        )
 
 
 def check_cameras(sample: Sample) -> list[Finding]:
@@ -69,14 +40,15 @@ def check_cameras(sample: Sample) -> list[Finding]:
     if not sample.sequence.cameras:
         return [finding("cameras", FINE, "none: the cloud and the scores alone")]
     findings = []
+    silhouettes: dict[int, Silhouettes] = {}
     for camera in sample.sequence.cameras.values():
         findings.append(_check_images(sample, camera))
-        pairs, broken = image_pairs(sample, camera)
+        views, broken = camera_views(sample, camera, silhouettes)
         if broken:
             remedy = "fetch the image again, or give size and calibration of images like it"
             findings.append(finding(f"{camera.name}: images", WRONG, broken, remedy))
-        if pairs:
-            findings += _check_calibration(camera, pairs)
+        if views:
+            findings += check_calibration(camera, views)
     return findings
 
 
@@ -101,100 +73,50 @@ def _check_images(sample: Sample, camera: Camera) -> Finding:
     return finding(name, verdict, text, remedy, **values)
 
 
-def image_pairs(sample: Sample, camera: Camera) -> tuple[list[Pair], str]:
-    """Return a sweep of each registered spot with its nearest image, and why one cannot be read."""
+def camera_views(
+    sample: Sample, camera: Camera, silhouettes: dict[int, Silhouettes]
+) -> tuple[list[View], str]:
+    """Return sweeps of all registered spots with the nearest image, and why one cannot be read.
+
+    Args:
+        silhouettes: Of the sweeps by frame, completed here.
+    """
     exposed_ns = sample.sequence.image_stamps_ns(camera.name)
-    pairs: list[Pair] = []
-    for spot in sample.registered:
-        row, number = min(
-            ((r, n) for r in range(1, len(spot.sweeps)) for n in exposed_ns),
-            key=lambda rn: abs(exposed_ns[rn[1]] - spot.sweeps[rn[0]].stamp_ns),
-            default=(0, -1),
-        )
-        if number < 0:
-            break
-        apart_s = (exposed_ns[number] - spot.sweeps[row].stamp_ns) * 1e-9
-        if abs(apart_s) > sample.timeline.period_ns * 1e-9:
-            continue
+    numbers, stamps_ns = list(exposed_ns), np.array([*exposed_ns.values()], np.int64)
+    near: list[tuple[RegisteredSweep, int, float]] = []
+    for registered in (r for spot in sample.registered for r in spot.stretch.sweeps[1:]):
+        if len(numbers):
+            row = int(np.argmin(np.abs(stamps_ns - registered.sweep.stamp_ns)))
+            apart_ns = int(stamps_ns[row] - registered.sweep.stamp_ns)
+            if abs(apart_ns) <= sample.timeline.period_ns:
+                near.append((registered, numbers[row], apart_ns * 1e-9))
+    most = max(_LEAST_IMAGES, _MOST_IMAGES // len(sample.sequence.cameras))
+    views: list[View] = []
+    for place in np.unique(np.linspace(0, len(near) - 1, min(most, len(near))).astype(int)):
+        registered, number, apart_s = near[place]
         try:
             image = sample.sequence.image(camera.name, number)
         except InputError as error:
-            return pairs, str(error)
-        pairs.append(_pair(spot, row, image, apart_s, camera))
-    return pairs, ""
+            return views, str(error)
+        frame = registered.sweep.frame
+        if frame not in silhouettes:
+            silhouettes[frame] = _silhouettes(registered)
+        twist = registered.twist_after if apart_s > 0 else registered.twist_before
+        edges = image_edges(image, camera.focal_px)
+        views.append(View(silhouettes[frame], *edges, twist, apart_s))
+    return views, ""
 
 
-def _pair(spot: Spot, row: int, image: NDArray[np.uint8], apart_s: float, camera: Camera) -> Pair:
-    registered = spot.stretch.sweeps[row]
-    range_m = np.linalg.norm(registered.sweep.points, axis=1)
-    sweep = registered.sweep.select((range_m > _NEAREST_M) & (range_m < 2 * _FARTHEST_M))
-    points, edge = sweep.points, np.zeros(len(sweep), bool)
-    for lidar in np.unique(sweep.lidar):
-        mine = sweep.lidar == lidar
-        edge[mine] = depth_edges(
-            (points[mine] - sweep.origin_m(int(lidar))) @ sweep.axes(int(lidar)).T
-        )
-    some = edge.copy()
-    some[:: len(points) // _NUM_OTHERS + 1] = True
-    twist = registered.twist_after if apart_s > 0 else registered.twist_before
-    strength = edge_strength(image, camera.focal_px)
-    return Pair(points[some], edge[some], twist, apart_s, strength)
-
-
-def depth_edges(points: Float) -> Bool:
-    """Return (N,) True where a return right beside the point is much farther.
-
-    Args:
-        points: (N,3) of one scanner, in its frame.
-    """
-    x, y, z = points.T
-    range_m = np.linalg.norm(points, axis=1)
-    seen = np.column_stack([np.arctan2(y, x), _STEEPLY * np.arcsin(z / range_m)])
-    _, beside = cKDTree(seen).query(seen, k=5, distance_upper_bound=_BESIDE_RAD, workers=-1)
-    far_m = np.append(range_m, 0.0)[beside].max(axis=1)
-    edge: Bool = (far_m - range_m > np.maximum(_EDGE_M, _EDGE_SHARE * range_m)) & (
-        range_m < _FARTHEST_M
-    )
-    return edge
-
-
-def edge_strength(image: NDArray[np.uint8], focal_px: float) -> Float32:
-    """Return (H,W) the size of the gradient relative to that around, at most 4, of an image."""
-    scale = focal_px / _FOCAL_PX
-    gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), max(0.8, scale))
-    x, y = (cv2.Sobel(gray, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))
-    size = cv2.blur(cv2.magnitude(x, y), (2 * round(_BLUR_PX * scale) + 1,) * 2)
-    around = cv2.GaussianBlur(size, (0, 0), _AROUND_PX * scale)
-    strength: Float32 = np.minimum(size / (around + 4.0), 4.0)
-    return strength
-
-
-def score(
-    camera: Camera, pairs: list[Pair], later_s: float = 0.0, right_px: float = 0.0
-) -> tuple[float, int]:
-    """Return the score of a calibration over all pairs, and the number of depth discontinuities.
-
-    The score is in standard errors. It is 0 if too few points are in view.
-
-    Args:
-        later_s: Delay of the images' clock.
-        right_px: Shift of the depth in the images.
-    """
-    on, off, num_edges = [], [], 0
-    for pair in pairs:
-        points = poses.transform(camera.T_cam_lidar, pair.seen_at(later_s))
-        uv, seen = image_points(camera, points)
-        column, line = np.rint(uv[seen] + (right_px, 0.0)).astype(np.int64).T
-        inside, edge = (column >= 0) & (column < camera.width_px), pair.edge[seen]
-        num_edges += int(edge.sum())
-        value = pair.strength[line[inside], column[inside]]
-        on.append(value[edge[inside]])
-        off.append(value[~edge[inside]])
-    edged, other = np.concatenate(on), np.concatenate(off)
-    if min(len(edged), len(other)) < _LEAST_SEEN:
-        return 0.0, num_edges
-    error = other.std() / np.sqrt(len(edged)) + 1e-9
-    return float((edged.mean() - other.mean()) / error), num_edges
+def _silhouettes(registered: RegisteredSweep) -> Silhouettes:
+    """Return the depth edges that each scanner observes, in the lidar frame."""
+    sweep, parts = registered.sweep, []
+    for lidar in map(int, np.unique(sweep.lidar)):
+        origin_m, axes = sweep.origin_m(lidar), sweep.axes(lidar)
+        points = (sweep.points[sweep.lidar == lidar] - origin_m) @ axes.T
+        range_m = np.linalg.norm(points, axis=1)
+        edges = depth_edges(points[(range_m > _NEAREST_M) & (range_m < _FARTHEST_M)])
+        parts.append(edges._replace(places=edges.places @ axes + origin_m))
+    return Silhouettes(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def alternatives(T: Float) -> dict[str, Float]:
@@ -208,70 +130,71 @@ def alternatives(T: Float) -> dict[str, Float]:
     }
 
 
-def _check_calibration(camera: Camera, pairs: list[Pair]) -> list[Finding]:
-    """Compare the calibration and the clock as given with others. The best of all explains most."""
-    given, num_given = score(camera, pairs)
-    name, text = f"{camera.name}: calibration", "depth discontinuities are on image edges by"
-    text += f" {given:.1f} standard errors as given"
-    if len(pairs) < _LEAST_PAIRS:
-        is_clear = given >= _CLEAR
-        text += ": one image is too little to tell" * (not is_clear)
-        return [finding(name, FINE if is_clear else UNKNOWN, text, given=given)]
+def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
+    """Compare calibration and clock as given with the best around them and with usual mistakes."""
+    name, num = f"{camera.name}: calibration", len(views)
+    if num < _LEAST_IMAGES:
+        text = f"{num} images near registered sweeps, {_LEAST_IMAGES} are needed to tell"
+        return [finding(name, UNKNOWN, text)]
+    with_clock = any(np.linalg.norm(v.twist[3:]) > _LEAST_SPEED_M_S for v in views)
+    fit, (_, num_given) = best_fit(camera, views, with_clock), score(camera, views)
     others = {}
     for what, T_cam_lidar in alternatives(camera.T_cam_lidar).items():
-        at_mended, num_edges = score(replace(camera, T_cam_lidar=T_cam_lidar), pairs)
-        others[what] = at_mended if num_edges > _AS_MANY * num_given else 0.0
+        other, num_edges = score(replace(camera, T_cam_lidar=T_cam_lidar), views)
+        others[what] = other if num_edges > _AS_MANY * num_given else 0.0
     best = max(others, key=lambda what: others[what])
-    # Discontinuities within one ring are upright. Vertical shifts are hardly observable.
-    shifts_deg = np.arange(-_SHIFT_DEG, _SHIFT_DEG + 1e-9, _SHIFT_STEP_DEG)
-    px_per_deg = camera.focal_px * np.pi / 180
-    at_shifts = [score(camera, pairs, 0.0, shift * px_per_deg)[0] for shift in shifts_deg]
-    row = int(np.argmax(at_shifts))
-    shift_deg, at_shift = float(shifts_deg[row]), at_shifts[row]
-    at_clock, clock = _check_clock(
-        camera, pairs, max(_CLEAR, _CLEARLY * given, *others.values(), at_shift)
+    values = {"score": fit.score, "clearness": fit.clearness, "other": others[best]}
+    values |= dict(zip(("pitch_deg", "yaw_deg", "roll_deg"), fit.offset.tolist(), strict=False))
+    if others[best] > _CLEARLY * max(fit.score, fit.rival, 0.0):
+        text = f"depth edges lie on image edges with {best}, and not as given"
+        return [finding(name, WRONG, text, f"give {best}", **values)]
+    off_deg, error_deg = np.abs(fit.offset[:3]), fit.error[:3]
+    if fit.clearness < _CLEARLY or error_deg.max() > _UNSURE_DEG:
+        text = (
+            f"no turn of up to 2.7 deg lays the depth edges of {num} sweeps on image edges better "
+            f"than others do: images and sweeps do not show the same, or too little"
+        )
+        verdict = SUSPICIOUS if num > 2 * _LEAST_IMAGES - 1 else UNKNOWN
+        remedy = "check T_cam_lidar, K and the clocks, and that the images are the camera's"
+        return [finding(name, verdict, text, remedy, **values)]
+    worst = int(np.argmax(off_deg))
+    verdict = FINE
+    if off_deg[worst] > max(_OFF_DEG, 2 * error_deg[worst]):
+        verdict = WRONG if off_deg[worst] - 2 * error_deg[worst] > _WRONG_DEG else SUSPICIOUS
+    text, remedy = _described(camera, fit, verdict, num)
+    calibration = finding(name, verdict, text, remedy, **values)
+    if with_clock:
+        return [calibration, _check_clock(camera, fit, num)]
+    text = f"the vehicle is slower than {_LEAST_SPEED_M_S:g} m/s where it was looked at"
+    return [calibration, finding(f"{camera.name}: clock", UNKNOWN, text)]
+
+
+def _described(camera: Camera, fit: Fit, verdict: Verdict, num: int) -> tuple[str, str]:
+    """Return by how much the calibration is off, and the corrected line."""
+    ways = (("up", "down"), ("right", "left"), ("clockwise", "anticlockwise"))
+    turns = [
+        f"{abs(turn):.2f} ± {error:.2f} deg {way[int(turn < 0)]}"
+        for turn, error, way in zip(fit.offset, fit.error, ways, strict=False)
+    ]
+    if verdict == FINE:
+        return f"right to {', '.join(turns)} (best fit of {num} images)", ""
+    text = f"{num} images fit best with what the sweeps show moved by {', '.join(turns)}"
+    rows = ", ".join(
+        str([round(float(v), 5) for v in row]) for row in turned(camera, fit.offset).T_cam_lidar[:3]
     )
-    most, clearly = max(others[best], at_shift, at_clock), max(_CLEAR, _CLEARLY * given)
-    verdict, remedy = SUSPICIOUS, "correct T_cam_lidar or K"
-    if others[best] == most > clearly:
-        verdict, remedy = WRONG, "correct T_cam_lidar"
-        text += f", by {most:.1f} with {best}"
-    elif at_shift == most > clearly and abs(shift_deg) > _OFF_DEG:
-        side = "right" if shift_deg > 0 else "left"
-        text += f", by {most:.1f} if they were {abs(shift_deg):.1f} deg farther to the {side}"
-    elif most < _CLEAR:
-        remedy = "check T_cam_lidar, K and the clocks"
-        text += f", and nowhere around by more than {most:.1f}: images and sweeps do not show the"
-        text += " same, or too little"
-    else:
-        verdict = FINE
-        text += f", by {at_shift:.1f} {abs(shift_deg):.1f} deg beside"
-    values = {"given": given, "best_other": others[best], "shift_deg": shift_deg}
-    values |= {"at_shift": at_shift, "at_clock": at_clock}
-    return [finding(name, verdict, text, remedy, **values), *clock]
+    return text, f"T_cam_lidar: [{rows}]"
 
 
-def _check_clock(camera: Camera, pairs: list[Pair], clearly: float) -> tuple[float, list[Finding]]:
-    """Measure the difference between the clocks of camera and lidar.
-
-    Return the score with the best clock, 0 without one, and the finding. There is none if the
-    vehicle is too slow, or too few images exist. clearly: the least score of the best clock at
-    which it is said to be off.
-    """
-    moving = [p for p in pairs if np.linalg.norm(p.twist[3:]) > _LEAST_SPEED_M_S]
-    if len(moving) < _LEAST_PAIRS:
-        return 0.0, []
-    times_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
-    scores = np.array([score(camera, moving, later_s=t)[0] for t in times_s])
-    best = float(scores.max())
-    good = times_s[scores > best - max(1.0, 0.05 * best)]
-    late_s, low_s, high_s = (float(t) for t in (times_s[np.argmax(scores)], good.min(), good.max()))
+def _check_clock(camera: Camera, fit: Fit, num: int) -> Finding:
+    """Report the difference between the clocks of camera and lidar."""
+    late_s, error_s = float(fit.offset[3]), float(fit.error[3])
     text = (
-        f"depth and image fit best {late_s * 1e3:+.0f} ms ({low_s * 1e3:+.0f} to "
-        f"{high_s * 1e3:+.0f}) after the image's stamp"
+        f"the images were exposed {abs(late_s) * 1e3:.0f} ± {max(error_s * 1e3, 1):.0f} ms "
+        f"{'after' if late_s > 0 else 'before'} their stamps (best fit of {num} images)"
     )
-    is_off = best > clearly and (low_s > _CLOCK_OFF_S or high_s < -_CLOCK_OFF_S)
-    verdict = SUSPICIOUS if is_off else FINE
-    remedy = f"shift the stamps of {camera.name} by {late_s * 1e3:+.0f} ms"
-    values = {"late_s": late_s, "low_s": low_s, "high_s": high_s, "best": best}
-    return best, [finding(f"{camera.name}: clock", verdict, text, remedy, **values)]
+    verdict = FINE
+    if abs(late_s) > max(_CLOCK_OFF_S, 2 * error_s):
+        verdict = WRONG if abs(late_s) - 2 * error_s > _CLOCK_WRONG_S else SUSPICIOUS
+    remedy = f"add {late_s:+.3f} s to the stamps of {camera.name}"
+    values = {"late_s": late_s, "error_s": error_s}
+    return finding(f"{camera.name}: clock", verdict, text, remedy, **values)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,11 +16,13 @@ from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 from densify.readers.recorded_poses import PoseTrack
 
-_LEAST_WAY_M = 1.0
-_OFF_M, _OFF_PER_M, _OFF_DEG = 0.3, 0.1, 2.0  # over a spot of five sweeps
+# Of registration over a spot of five sweeps; 1 % of the way doubles surfaces by 0.1 m in 10 m.
+_OFF_M, _OFF_PER_M, _OFF_DEG = 0.03, 0.01, 0.3
+_LEAST_WAY_M = 1.5  # 3 % of it are more than is allowed
+_WRONG = 4.0  # times what is allowed
 _CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.3, 0.02, 0.04
 _NOISE_M, _NOISE_RAD, _EVEN_COST = 0.05, 1.5e-3, 4.0
-_MUCH_BETTER, _EXACT = 0.4, 0.15  # of the tolerance
+_MUCH_BETTER = 0.4
 CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
@@ -65,28 +68,44 @@ def check_poses(sample: Sample) -> list[Finding]:
     if not spots:
         return [finding("poses", UNKNOWN, "no sweeps could be registered to compare with")]
     found = [_between([s.stretch.sweeps[row].T_world_lidar for row in (0, -1)]) for s in spots]
-    way_m = max(float(np.linalg.norm(T[:3, 3])) for T in found)
-    off = _off([_between(T) for T in given], found)
-    values = {"off_m": off[0], "off_deg": off[1], "way_m": way_m}
-    text = f"off by {off[0]:.2f} m and {off[1]:.2f} deg from odometry over {way_m:.1f} m"
+    between = [_between(pair) for pair in given]
+    off = _Off.of(between, found)
+    text = f"off by {off.m:.2f} m and {off.deg:.2f} deg from odometry over {off.way_m:.1f} m"
+    values = {"off_m": off.m, "off_deg": off.deg, "way_m": off.way_m}
     others = {
-        name: _off([_between([change(T) for T in pair]) for pair in given], found)
+        name: _Off.of([_between([change(T) for T in pair]) for pair in given], found)
         for name, change in HYPOTHESES.items()
     }
-    best = min(others, key=lambda name: _cost(others[name], way_m))
-    cost, other = _cost(off, way_m), _cost(others[best], way_m)
+    best = min(others, key=lambda name: others[name].cost)
     remedy = "leave them out with --set register.source=kiss-icp"
-    if other < _MUCH_BETTER * cost and cost > _EXACT and other < 1:
-        text += f", but only by {others[best][0]:.2f} m and {others[best][1]:.2f} deg if {best}"
+    if off.cost > 1 and others[best].cost < min(_MUCH_BETTER * off.cost, _WRONG):
+        text += f", but only by {others[best].m:.2f} m and {others[best].deg:.2f} deg if {best}"
         return [finding("poses", WRONG, text, f"correct the poses, or {remedy}", **values)]
-    verdict = FINE if way_m >= _LEAST_WAY_M else UNKNOWN
-    if cost > 1:
-        verdict = SUSPICIOUS
-        text += "; no usual mistake explains it (another frame than the points', another clock, or"
-        text += " noise)"
+    verdict = FINE if off.way_m >= _LEAST_WAY_M else UNKNOWN
+    if off.cost > 1:
+        verdict = WRONG if off.cost > _WRONG else SUSPICIOUS
+        told, mended = _described(between, found, spots)
+        text, remedy = text + told, mended + remedy
     elif verdict == UNKNOWN:
         text += "; the vehicle hardly moves"
     return [finding("poses", verdict, text, remedy, **values), *_check_clock(sample, found)]
+
+
+def _described(given: list[Float], found: list[Float], spots: list[Spot]) -> tuple[str, str]:
+    """Return the main error of the poses over the spots, scale or drift, and its correction."""
+    given_m, found_m = (np.array([T[:3, 3] for T in steps]) for steps in (given, found))
+    off_m, way_m = (given_m - found_m).mean(axis=0), found_m.mean(axis=0)
+    if np.linalg.norm(off_m) < 0.5 * np.linalg.norm(given_m - found_m, axis=1).mean():
+        told = "; no usual mistake explains it (another frame than the points', another clock, or"
+        return f"{told} noise)", ""
+    longer = float(off_m @ way_m / (way_m @ way_m))
+    if abs(longer) * np.linalg.norm(way_m) > 0.7 * np.linalg.norm(off_m):
+        told = f": their ways are {abs(longer) * 100:.1f} % too {'long' if longer > 0 else 'short'}"
+        return told, f"divide their translations by {1 + longer:.3f}, or "
+    axis = int(np.argmax(np.abs(off_m)))
+    way = (("forward", "back"), ("left", "right"), ("up", "down"))[axis][int(off_m[axis] < 0)]
+    seconds = np.mean([(b.stamp_ns - a.stamp_ns) * 1e-9 for a, b in map(_ends, spots)])
+    return f": they go {abs(off_m[axis]) / seconds:.2f} m/s {way} beside the sweeps", ""
 
 
 def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
@@ -147,15 +166,25 @@ def _between(pair: list[Float]) -> Float:
     return poses.inverse(pair[0]) @ pair[1]
 
 
-def _off(given: list[Float], found: list[Float]) -> tuple[float, float]:
-    """Return metres and degrees, the median over the spots."""
-    apart = [poses.log(poses.inverse(a) @ b) for a, b in zip(given, found, strict=True)]
-    return (
-        float(np.median([np.linalg.norm(d[3:]) for d in apart])),
-        float(np.rad2deg(np.median([np.linalg.norm(d[:3]) for d in apart]))),
-    )
+class _Off(NamedTuple):
+    """Errors of relative poses against those found.
 
+    Attributes:
+        m, deg: The median over the spots.
+        cost: Their larger share of the tolerance.
+        way_m: The longest way.
+    """
 
-def _cost(off: tuple[float, float], way_m: float) -> float:
-    """Return the larger of both errors, as a share of its tolerance."""
-    return max(off[0] / (_OFF_M + _OFF_PER_M * way_m), off[1] / _OFF_DEG)
+    m: float
+    deg: float
+    cost: float
+    way_m: float
+
+    @staticmethod
+    def of(given: list[Float], found: list[Float]) -> _Off:
+        apart = [poses.log(poses.inverse(a) @ b) for a, b in zip(given, found, strict=True)]
+        way_m = np.array([np.linalg.norm(T[:3, 3]) for T in found])
+        off_m = np.array([np.linalg.norm(d[3:]) for d in apart])
+        off_deg = float(np.rad2deg(np.median([np.linalg.norm(d[:3]) for d in apart])))
+        cost = max(float(np.median(off_m / (_OFF_M + _OFF_PER_M * way_m))), off_deg / _OFF_DEG)
+        return _Off(float(np.median(off_m)), off_deg, cost, float(way_m.max()))

@@ -188,7 +188,7 @@ def _num_rows(sequence: LidarSequence, frame: int) -> int:
 
 
 def _write_labels(path: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> None:
-    """Write a label for each row; rows without a valid return, or too near to be used, are static."""
+    """Write a label for each row. Rows without a valid return, or too near, are static."""
     label = np.full(_num_rows(sequence, frame), STATIC, np.uint32)
     for field in flow.steps.values():
         own = np.where(field.moving, MOVING | (field.instance.astype(np.int64) + 1) << 16, STATIC)

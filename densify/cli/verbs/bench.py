@@ -19,7 +19,7 @@ from densify.cli.options import (
     recordings_of,
     words,
 )
-from densify.cli.screen import Answer, numbers_table, progress_on_stderr
+from densify.cli.screen import Answer, aligned, numbers_table, progress_on_stderr
 from densify.config import as_mapping, resolve
 from densify.config.errors import InputError
 
@@ -42,6 +42,7 @@ def add(commands: Any) -> None:
     _add_flow(benches)
     _add_depth(benches)
     _add_paper(benches)
+    _add_doctor(benches)
     about = "make the tables of docs/results.md again, as Markdown on stdout; all take an hour"
     parser = add_verb(benches, "readme", _answer_readme, about)
     names = "depth, flow, registration"
@@ -131,6 +132,20 @@ def _add_paper(benches: Any) -> None:
     option(parser, "--pairs N", "pairs of a set (default: 0, all)", type=natural, default=0)
 
 
+def _add_doctor(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "doctor",
+        _answer_doctor,
+        "measure how often densify doctor finds wrong cameras, clocks and poses",
+        "Each camera and the poses of each recording get one error after another, in both "
+        "directions. The table has the shares that the doctor calls fine, unknown, suspicious and "
+        "wrong.",
+    )
+    add_recording(parser, several=True)
+    add_common(parser, "config")
+
+
 def _add_common(parser: argparse.ArgumentParser) -> None:
     about = "key frame; may be given several times (default: 120)"
     option(parser, "--key K", about, type=natural, action="append", dest="keys")
@@ -154,6 +169,22 @@ def _answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
             text = f"{title}\n{numbers_table(measured['methods'])}\n"
             yield Answer(text, {"runs": [measured]})
     yield Answer(facts={"config": as_mapping(config)})
+
+
+def _answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
+    config = config_of(options)
+    from densify.bench.doctor import bench_doctor
+    from densify.readers import open_sequence
+
+    sequences = [open_sequence(spec) for spec in recordings_of(options)]
+    with progress_on_stderr() as progress:
+        found = bench_doctor(sequences, config, progress)
+    titles = list(next(iter(found.values())))
+    rows = [
+        [mistake, *(format(row[title], "d" if title == "of" else ".0%") for title in titles)]
+        for mistake, row in found.items()
+    ]
+    yield Answer(aligned([["", *titles], *rows]), {"mistakes": found})
 
 
 def _answer_depth(options: argparse.Namespace) -> Iterator[Answer]:

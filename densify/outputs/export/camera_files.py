@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Write images with cameras, depth and points for splatting, nerfstudio and training sets.
+"""Write images with cameras, depth and points, for COLMAP, Gaussian splatting and nerfstudio.
 
 COLMAP's text model: https://colmap.github.io/format.html. nerfstudio's folder: ``ns-train
-depth-nerfacto --data DIR``. The sets of map-anything and MoGe: see their functions.
+depth-nerfacto --data DIR``.
 
 The world is the first key frame. The centre of the upper left pixel is (0.5, 0.5). Lenses are
 OpenCV's. COLMAP's poses are world to camera. nerfstudio's are camera to world with OpenGL's axes: x
@@ -11,7 +11,6 @@ right, y up, the camera looks along -z. Its depth is in millimetres.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,24 +21,23 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.config.file_content import needed, read_bytes
+from densify.config.file_content import read_bytes
 from densify.geometry import poses
-from densify.geometry.types import Camera, Float, Float32
+from densify.geometry.types import Camera, Float
 from densify.outputs.atomic import write_file, write_json
 from densify.outputs.cloud_laz import StoredCloud
 from densify.outputs.depth_png import encode_png, map_path, metres
 from densify.outputs.export.finished_run import FinishedRun, key_poses
 from densify.outputs.export.maps_and_clouds import save_ply
-from densify.outputs.kitti_tree import drive_folder
 from densify.readers.decoded_files import decode_image
 
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
-_INVERSE_STEPS, _LOG_STEPS = 65536, 65533  # of 16 bits, as splatting and MoGe divide them
+_INVERSE_STEPS = 65536  # of 16 bits, as that training divides them
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-class _Picture(NamedTuple):
+class Picture(NamedTuple):
     """An image of a finished run.
 
     Attributes:
@@ -65,7 +63,7 @@ def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:
     Raises:
         InputError: COLMAP has no model of the lens.
     """
-    pictures = _write_images(runs, folder)
+    pictures = write_images(runs, folder)
     _write_model(pictures, _observed(_world_cloud(runs)), folder)
 
 
@@ -75,10 +73,10 @@ def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
     It is a COLMAP model of the static world, also as points3D.ply, with depth maps, and each moving
     object in its own frame.
 
-    ``depths/NAME.png`` and ``sparse/0/depth_params.json`` are read with ``-d depths``: inverse depth
-    is ``value / 65536 * scale + offset``. That training takes an empty pixel as one at infinity.
-    Images are therefore transparent where there is no depth, neither filled nor of a prior, and
-    these pixels are not trained.
+    ``depths/NAME.png`` and ``sparse/0/depth_params.json`` are read with ``-d depths``. Inverse
+    depth is ``value / 65536 * scale + offset``. That training takes an empty pixel as infinitely
+    far. Images are therefore transparent where there is no depth, neither filled nor of a prior,
+    and these pixels are not trained.
 
     ``movers/0003.ply`` has all points of object 3, ``movers/others.ply`` moving points without a
     track, in the key frame. ``tracks.json`` is the movers.json of the run. Several keys have
@@ -87,7 +85,7 @@ def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
     Raises:
         InputError: The maps hold ranges, or COLMAP has no model of the lens.
     """
-    pictures = _pictures(runs, flat=True)
+    pictures = pictures_of(runs, flat=True)
     static = _world_cloud(runs)
     static = _observed(static.select(~static.moving))
     _write_depths(pictures, folder)
@@ -101,7 +99,7 @@ def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
         write_file(tracks, read_bytes(run.folder / "movers.json"))
 
 
-def _write_depths(pictures: Sequence[_Picture], folder: Path) -> None:
+def _write_depths(pictures: Sequence[Picture], folder: Path) -> None:
     depths_m = {picture.name: picture.run.full_m(picture.map) for picture in pictures}
     nearest_m = min(float(d[d > 0].min(initial=np.inf)) for d in depths_m.values())
     scale = 1 / nearest_m if np.isfinite(nearest_m) else 1.0
@@ -147,7 +145,7 @@ def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
         InputError: The maps hold ranges, a lens is not OpenCV's with k1 k2 k3 p1 p2, or
             fisheyes are together with other cameras.
     """
-    pictures = _write_images(runs, folder)
+    pictures = write_images(runs, folder)
     fisheyes = {picture.camera.model == "fisheye" for picture in pictures}
     if len(fisheyes) > 1:
         raise InputError(
@@ -170,8 +168,8 @@ def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
     write_json(folder / "transforms.json", transforms)
 
 
-def _frame(picture: _Picture) -> dict[str, Any]:
-    camera, lens = picture.camera, _intrinsics(picture.camera)
+def _frame(picture: Picture) -> dict[str, Any]:
+    camera, lens = picture.camera, intrinsics(picture.camera)
     K = {"fl_x": lens.pop("fx"), "fl_y": lens.pop("fy"), "cx": lens.pop("cx"), "cy": lens.pop("cy")}
     known = _FISHEYE_LENS if camera.model == "fisheye" else _LENS[:5]
     if unknown := [n for n, value in lens.items() if value and n not in known]:
@@ -190,107 +188,7 @@ def _frame(picture: _Picture) -> dict[str, Any]:
     }
 
 
-def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write a scene as map-anything reads it (its data_processing/README.md).
-
-    scene_meta.json has poses with OpenCV's axes. Beside it are ``images/`` and ``depth/NAME.exr``,
-    measured metres, 0 none.
-
-    Raises:
-        InputError: The maps hold ranges, a lens has distortion, or OpenEXR is missing.
-    """
-    library = needed("OpenEXR", "exr", "EXR files")
-    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
-    frames = []
-    for picture in _write_images(runs, folder, flat=True):
-        picture.run.full_m(picture.map)
-        _require_pinhole(picture, "wai")
-        lens, depth = _intrinsics(picture.camera), f"depth/{picture.name}.exr"
-        (folder / depth).parent.mkdir(parents=True, exist_ok=True)
-        depth_m = metres(picture.run.maps(picture.map)["depth"])
-        library.File(header, {"Y": depth_m}).write(str(folder / depth))
-        frames.append(
-            {
-                "frame_name": picture.name,
-                "file_path": f"images/{picture.name}.jpg",
-                "image": f"images/{picture.name}.jpg",
-                "depth": depth,
-                "transform_matrix": poses.inverse(picture.T_cam_world),
-                **{f"fl_{axis}": lens[f"f{axis}"] for axis in "xy"},
-                **{f"c{axis}": lens[f"c{axis}"] for axis in "xy"},
-                "w": picture.camera.width_px,
-                "h": picture.camera.height_px,
-            }
-        )
-    modalities = {name: {"frame_key": name, "format": name} for name in ("image", "depth")}
-    meta = {
-        "scene_name": drive_folder(f"{runs[0].data}-{runs[0].key:06d}".rpartition("/")[2]),
-        "dataset_name": "densify",
-        "version": "0.1",
-        "shared_intrinsics": False,
-        "camera_model": "PINHOLE",
-        "camera_convention": "opencv",
-        "frames": frames,
-        "scene_modalities": {},
-        "frame_modalities": modalities,
-    }
-    write_json(folder / "scene_meta.json", meta)
-
-
-def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write a training set as MoGe reads it (its docs/train.md and moge/utils/io.py).
-
-    .index.txt lists the folders of the images. Each has image.jpg, meta.json (K of an image of
-    width and height 1) and depth.png: 16 bit, measured, 0 none, else logarithmic from ``near`` to
-    ``far``.
-
-    Raises:
-        InputError: The maps hold ranges, or a lens has distortion.
-    """
-    names = []
-    for run in runs:
-        drive = drive_folder(run.data.rstrip("/").rpartition("/")[2])
-        for picture in _pictures([run], flat=True):
-            picture.run.full_m(picture.map)
-            _require_pinhole(picture, "moge")
-            name = f"keys/{drive}/{run.key:06d}_{picture.name}"
-            names.append(name)
-            camera = picture.camera
-            K = (camera.K + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]) / np.array(
-                [[camera.width_px], [camera.height_px], [1]]
-            )
-            write_file(folder / name / "image.jpg", picture.jpeg)
-            write_json(folder / name / "meta.json", {"intrinsics": K})
-            depth_m = metres(run.maps(picture.map)["depth"])
-            write_file(folder / name / "depth.png", _logarithmic_png(depth_m))
-    write_file(folder / ".index.txt", "".join(f"{name}\n" for name in names).encode())
-
-
-def _logarithmic_png(depth_m: Float32) -> bytes:
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
-
-    known, steps = depth_m > 0, np.zeros(depth_m.shape, np.uint16)
-    near, far = (float(f(depth_m[known], initial=1.0)) for f in (np.min, np.max))
-    far = max(far, 1.1 * near)
-    share = np.log(depth_m[known] / near) / np.log(far / near)
-    steps[known] = 1 + np.rint(share * _LOG_STEPS)
-    info, file = PngInfo(), io.BytesIO()
-    info.add_text("near", repr(near))
-    info.add_text("far", repr(far))
-    Image.fromarray(steps).save(file, "PNG", pnginfo=info)
-    return file.getvalue()
-
-
-def _require_pinhole(picture: _Picture, to: str) -> None:
-    if not picture.camera.is_rectified:
-        raise InputError(
-            f"{picture.name}: --to {to} takes images without distortion; leave the camera out by "
-            f"naming the others with --camera"
-        )
-
-
-def _pictures(runs: Sequence[FinishedRun], flat: bool = False) -> list[_Picture]:
+def pictures_of(runs: Sequence[FinishedRun], flat: bool = False) -> list[Picture]:
     """Return the images of the runs' maps in one world.
 
     Args:
@@ -309,7 +207,7 @@ def _pictures(runs: Sequence[FinishedRun], flat: bool = False) -> list[_Picture]
                     file = f"{run.key:06d}/{name}"
                 T_cam_world = view.T_cam_key @ poses.inverse(T_world_key)
                 file = file.replace("/", "_") if flat else file
-                pictures.append(_Picture(file, run, name, view.camera, T_cam_world, data))
+                pictures.append(Picture(file, run, name, view.camera, T_cam_world, data))
     if not pictures:
         raise InputError(
             f"{runs[0].folder}: no images in scene/image of {', '.join(runs[0].cameras)}; densify "
@@ -318,16 +216,16 @@ def _pictures(runs: Sequence[FinishedRun], flat: bool = False) -> list[_Picture]
     return pictures
 
 
-def _write_images(runs: Sequence[FinishedRun], folder: Path, flat: bool = False) -> list[_Picture]:
+def write_images(runs: Sequence[FinishedRun], folder: Path, flat: bool = False) -> list[Picture]:
     """Write the images as ``images/NAME.jpg`` and return them."""
-    pictures = _pictures(runs, flat)
+    pictures = pictures_of(runs, flat)
     for picture in pictures:
         write_file(map_path(folder, "images", picture.name, ".jpg"), picture.jpeg)
     return pictures
 
 
 def _world_cloud(runs: Sequence[FinishedRun]) -> StoredCloud:
-    """Return the cloud of a key; of several keys the points of each key's own sweep, in the world."""
+    """Return the cloud of a key, or the points of each key's own sweep in the world of several."""
     if len(runs) == 1:
         return runs[0].cloud()
     parts = []
@@ -338,7 +236,7 @@ def _world_cloud(runs: Sequence[FinishedRun]) -> StoredCloud:
     return StoredCloud.joined(parts)
 
 
-def _intrinsics(camera: Camera) -> dict[str, float]:
+def intrinsics(camera: Camera) -> dict[str, float]:
     """Return fx, fy, cx, cy in pixels and the coefficients of the lens.
 
     They are k1 k2 p1 p2 and the existing ones of k3 k4 k5 k6, or k1 to k4 of a fisheye. Raises
@@ -363,7 +261,7 @@ def _observed(cloud: StoredCloud) -> StoredCloud:
 
 
 def _write_model(
-    pictures: Sequence[_Picture], cloud: StoredCloud, folder: Path, suffix: str = ".jpg"
+    pictures: Sequence[Picture], cloud: StoredCloud, folder: Path, suffix: str = ".jpg"
 ) -> None:
     """Write COLMAP's text model with these points, which no image refers to."""
     cameras, images, number_of = "", "", dict[str, int]()
@@ -386,7 +284,7 @@ def _write_model(
 
 
 def _model(camera: Camera) -> tuple[str, list[float]]:
-    params = list(_intrinsics(camera).values())
+    params = list(intrinsics(camera).values())
     if camera.model == "fisheye":
         return "OPENCV_FISHEYE", params
     if len(params) in (4, 8):

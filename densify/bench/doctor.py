@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: MIT
+"""Measure how often the doctor finds wrong calibrations, poses and clocks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from densify.config import Config
+from densify.config.errors import InputError
+from densify.doctor import Sample, Verdict
+from densify.doctor.cameras import camera_views, check_calibration
+from densify.doctor.edge_fit import Silhouettes, View, turned
+from densify.doctor.findings import Finding
+from densify.doctor.paths import check_poses
+from densify.geometry.types import Camera, Float, LidarSequence, Progress
+from densify.readers.recorded_poses import PoseTrack
+
+_TURNS_DEG, _SHIFTS_M = (0.5, 1.0, 2.0), (0.02, 0.05, 0.1)
+_CLOCKS_S, _SCALES, _CLIMBS_M_S = (0.01, 0.03, 0.1), (0.01, 0.03, 0.1), (0.2,)
+_AXES = ("pitch", "yaw", "roll")
+
+
+def bench_doctor(
+    sequences: Sequence[LidarSequence], config: Config, progress: Progress | None = None
+) -> dict[str, dict[str, Any]]:
+    """Return the verdicts of the doctor on cameras and poses with an error that is made on purpose.
+
+    Each error is made in both directions, on each camera and recording as it is.
+
+    Returns:
+        For each error the number of cameras or recordings (``of``) and the shares that are called
+            fine, unknown, suspicious and wrong, by the worst of the findings.
+    """
+    counts: dict[str, Counter[Verdict]] = {}
+    for number, sequence in enumerate(sequences):
+        if progress:
+            progress("recordings", number, len(sequences))
+        sample = Sample.of(sequence, config.register)
+        for mistake, findings in (*_cameras(sample), *_poses(sample)):
+            worst = max((f.verdict for f in findings), default=Verdict.UNKNOWN)
+            counts.setdefault(mistake, Counter())[worst] += 1
+    return {
+        mistake: {"of": count.total()} | {str(v): count[v] / count.total() for v in Verdict}
+        for mistake, count in counts.items()
+    }
+
+
+def _cameras(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
+    silhouettes: dict[int, Silhouettes] = {}
+    for camera in sample.sequence.cameras.values():
+        views = camera_views(sample, camera, silhouettes)[0]
+        if views:
+            for mistake, other, moved in _put_out(camera, views):
+                yield mistake, check_calibration(other, moved)
+
+
+def _put_out(camera: Camera, views: list[View]) -> Iterator[tuple[str, Camera, list[View]]]:
+    yield "cameras as they are", camera, views
+    for size in _TURNS_DEG:
+        for row, axis in enumerate(_AXES):
+            for turn in (size, -size):
+                yield f"{axis} {size:g} deg", turned(camera, turn * np.eye(4)[row]), views
+    for size in _SHIFTS_M:
+        for shift in (*size * np.eye(3), *-size * np.eye(3)):
+            T_cam_lidar = camera.T_cam_lidar.copy()
+            T_cam_lidar[:3, 3] += shift
+            yield f"shift {100 * size:g} cm", replace(camera, T_cam_lidar=T_cam_lidar), views
+    for size in _CLOCKS_S:
+        for late_s in (size, -size):
+            late = [view._replace(exposed_s=view.exposed_s + late_s) for view in views]
+            yield f"camera's clock {1000 * size:g} ms", camera, late
+
+
+class _OtherPoses:
+    """A recording with other poses."""
+
+    def __init__(self, sequence: LidarSequence, T_world_lidar: Callable[[int], Float]) -> None:
+        self._sequence, self.T_world_lidar = sequence, T_world_lidar
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sequence, name)
+
+
+def _poses(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
+    sequence = sample.sequence
+    stamp_ns, at = sample.timeline.stamp_ns, {f: i for i, f in enumerate(sample.timeline.frames)}
+    try:
+        T_world_lidar = np.stack([sequence.T_world_lidar(f) for f in sample.timeline.frames])
+    except InputError:  # it has none
+        return
+    track = PoseTrack(sequence.name, stamp_ns, T_world_lidar)
+
+    def checked(scale: float = 1.0, climb_m_s: float = 0.0, late_s: float = 0.0) -> list[Finding]:
+        def pose(frame: int) -> Float:
+            moment_ns = int(stamp_ns[at[frame]]) - round(1e9 * late_s)
+            T = track.at(int(np.clip(moment_ns, stamp_ns[0], stamp_ns[-1]))).copy()
+            T[:3, 3] = scale * (T[:3, 3] - T_world_lidar[0, :3, 3]) + T_world_lidar[0, :3, 3]
+            T[2, 3] += climb_m_s * (stamp_ns[at[frame]] - stamp_ns[0]) * 1e-9
+            return T
+
+        other: Any = _OtherPoses(sequence, pose)
+        return check_poses(replace(sample, sequence=other))
+
+    yield "poses as they are", checked()
+    for sign in (1, -1):
+        for size in _SCALES:
+            yield f"poses {100 * size:g} % too long or short", checked(scale=1 + sign * size)
+        for size in _CLIMBS_M_S:
+            yield f"poses climb {size:g} m/s", checked(climb_m_s=sign * size)
+        for size in _CLOCKS_S:
+            yield f"clock of poses {1000 * size:g} ms", checked(late_s=sign * size)

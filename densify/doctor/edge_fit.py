@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: MIT
+"""Fit the direction and the clock of a camera: depth edges of sweeps to edges of images.
+
+Levinson and Thrun, "Automatic Online Calibration of Cameras and Lasers", RSS 2013, with two
+additions. Upright silhouettes are compared with changes of the image to the side, level ones with
+changes up and down, so pitch is observable as well as yaw. The error of the best fit is that of an
+M-estimator (Huber, "The behavior of maximum likelihood estimates under nonstandard conditions",
+1967): the curvature of the score, and the spread of its slope over the images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.geometry import poses
+from densify.geometry.cameras import image_points
+from densify.geometry.types import Bool, Camera, Float, Float32
+
+_NEAREST_M, _FARTHEST_M = 3.0, 50.0
+_EDGE_M, _EDGE_SHARE = 0.6, 0.08
+_ROW_RAD = np.deg2rad(0.1)  # finer than any scanner's rings
+_APART_RAD = np.deg2rad(1.5)  # of neighbouring returns, at most, to tell the edge between them
+_FOCAL_PX = 700.0  # of images as they are compared
+_NOISE_PX, _BLUR_PX, _AROUND_PX = 0.8, 2.0, 25.0
+_MOST_STRENGTH = 4.0
+_REACH, _STEP = (2.7, 2.7, 2.0, 0.2), (0.3, 0.3, 1.0, 0.05)  # degrees and seconds of the grid
+_BLURRED = np.array([0.15, 0.15, 0.3, 0.015])  # an offset that moves edges by the blur
+_NUM_ON_GRID, _NUM_STARTS, _NUM_HALVINGS = 4000, 4, 4
+
+
+class Silhouettes(NamedTuple):
+    """Depth edges of a sweep.
+
+    Attributes:
+        places: (E,3) metres, on the near surface, half way to the far one as the scanner sees it.
+        is_level: (E,) the far surface is above or below, else beside.
+    """
+
+    places: Float
+    is_level: Bool
+
+
+class View(NamedTuple):
+    """An image and the depth edges of a sweep near it.
+
+    Attributes:
+        silhouettes: The depth edges.
+        strength: (2,H,W) of image edges beyond the mean: changes to the side, then up and down.
+        scale: Of the image that is compared.
+        twist: (6,) of the lidar, per second.
+        exposed_s: Since the reference time of the sweep.
+    """
+
+    silhouettes: Silhouettes
+    strength: Float32
+    scale: float
+    twist: Float
+    exposed_s: float
+
+
+class Fit(NamedTuple):
+    """The offset of a camera with which its views fit best.
+
+    Attributes:
+        offset: (4,) degrees about the camera's x (pitch), y (yaw) and z (roll), and seconds from
+            the stamps of the images to their exposure.
+        error: (4,) its standard error, infinite if the views do not determine it.
+        score: Sum of the image's edges on depth edges there.
+        rival: Best score more than a degree or 0.1 s beside.
+        usual: Median score of all offsets.
+    """
+
+    offset: Float
+    error: Float
+    score: float
+    rival: float
+    usual: float
+
+    @property
+    def clearness(self) -> float:
+        """The height of the best score above the usual one, as a multiple of the rival's."""
+        return (self.score - self.usual) / max(self.rival - self.usual, 1e-9)
+
+
+def depth_edges(points: Float) -> Silhouettes:
+    """Return the depth edges of one scanner's points (N,3), in its frame.
+
+    A point is on an edge if its inverse range is above the line through both neighbours'. Along a
+    plane inverse range is linear at any slant, so neither the far road nor a fence has edges.
+    """
+    x, y, z = points.T
+    range_m = np.linalg.norm(points, axis=1)
+    azimuth, elevation = np.arctan2(y, x), np.arcsin(z / range_m)
+    places, is_level = [], []
+    step_rad = _ROW_RAD
+    for level, along, across in ((False, azimuth, elevation), (True, elevation, azimuth)):
+        line = np.floor(across / step_rad)
+        order = np.lexsort((along, line))
+        gap = np.diff(along[order])
+        joined = (np.diff(line[order]) == 0) & (gap < _APART_RAD)
+        row = 1 + np.flatnonzero(joined[:-1] & joined[1:])
+        before, at, after = order[row - 1], order[row], order[row + 1]
+        share = gap[row - 1] / np.maximum(gap[row - 1] + gap[row], 1e-12)
+        straight = (1 - share) / range_m[before] + share / range_m[after]
+        beside = np.where(range_m[before] > range_m[after], before, after)
+        deeper_m = np.maximum(_EDGE_M, _EDGE_SHARE * range_m[at])
+        on = (range_m[beside] - range_m[at] > deeper_m) & (range_m[at] < _FARTHEST_M)
+        on &= 1 - straight * range_m[at] > _EDGE_SHARE
+        at, beside = at[on], beside[on]
+        ray = points[at] / range_m[at, None] + points[beside] / range_m[beside, None]
+        places.append(ray * (range_m[at] / np.linalg.norm(ray, axis=1))[:, None])
+        is_level.append(np.full(len(at), level))
+        if joined.any():
+            step_rad = max(step_rad, float(np.median(gap[joined])))
+    return Silhouettes(np.concatenate(places), np.concatenate(is_level))
+
+
+def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, float]:
+    """Return `View.strength` and `View.scale` of an image (H,W,3)."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    scale = _FOCAL_PX / focal_px
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    resized = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=how)
+    smooth = cv2.GaussianBlur(resized, (0, 0), _NOISE_PX)
+    both = []
+    for order in ((1, 0), (0, 1)):
+        change = np.abs(cv2.Sobel(smooth, cv2.CV_32F, *order))
+        around = cv2.GaussianBlur(change, (0, 0), _AROUND_PX) + _MOST_STRENGTH
+        change = cv2.GaussianBlur(np.minimum(change / around, _MOST_STRENGTH), (0, 0), _BLUR_PX)
+        both.append(change - change.mean())
+    return np.stack(both), smooth.shape[1] / image.shape[1]
+
+
+def turned(camera: Camera, offset: Float) -> Camera:
+    """Return the camera with the turn of an offset (4,) put right."""
+    turn = poses.exp(np.append(np.deg2rad(offset[:3]), np.zeros(3)))
+    return replace(camera, T_cam_lidar=turn @ camera.T_cam_lidar)
+
+
+def score(camera: Camera, views: Sequence[View]) -> tuple[float, int]:
+    """Return the sum of the image's edges on depth edges, and the number of depth edges in view."""
+    lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
+    total = sum(float(line.scores(np.zeros((1, 4)))[0]) for line in lines)
+    return total, sum(len(line.uv) for line in lines)
+
+
+def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
+    """Return the best fit of two or more views.
+
+    Args:
+        with_clock: Else the delay is taken as 0.
+    """
+    free = np.array([True, True, True, with_clock])
+    lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
+    grid = _grid(free)
+    thin = sum(len(line.uv) for line in lines) // _NUM_ON_GRID + 1
+    on_grid = np.sum([line.scores(grid, thin) for line in lines], axis=0)
+    starts = [np.zeros(4)]
+    for row in np.argsort(-on_grid):
+        if len(starts) == _NUM_STARTS:
+            break
+        if all(_is_beside(grid[row], start) for start in starts):
+            starts.append(grid[row])
+    best = max((_climbed(lines, start, free) for start in starts), key=lambda at: _sum(lines, at))
+    beside = grid[_is_beside(grid, best)]
+    rival = beside[np.argmax(on_grid[_is_beside(grid, best)])]
+    others = [_sum(lines, rival), float(np.median(on_grid)) * thin]
+    lines = [_Lines.of(camera, view, best) for view in views]
+    more = _climbed(lines, np.zeros(4), free)
+    return Fit(best + more, _error(lines, more, free), _sum(lines, more), *others)
+
+
+def _grid(free: Bool) -> Float:
+    """Return (M,4) all pitches and yaws with each roll, and with each delay."""
+    axes = [np.arange(-r, r + s / 2, s) for r, s in zip(_REACH, _STEP, strict=True)]
+    parts = []
+    for axis in (2, 3):
+        only = [values if i in (0, 1, axis) else np.zeros(1) for i, values in enumerate(axes)]
+        if free[axis]:
+            parts.append(np.stack(np.meshgrid(*only, indexing="ij"), axis=-1).reshape(-1, 4))
+    return np.concatenate(parts)
+
+
+class _Lines(NamedTuple):
+    """The depth edges of a view in the image that is compared.
+
+    Attributes:
+        uv: (E,2) px.
+        slope: (E,2,4) px for a degree and a second.
+        is_level: (E,) as of `Silhouettes`.
+        strength: (2,H+2,W+2), 0 around.
+    """
+
+    uv: Float
+    slope: Float
+    is_level: Bool
+    strength: Float32
+
+    @staticmethod
+    def of(camera: Camera, view: View, offset: Float) -> _Lines:
+        """Return the edges in the image with an offset (4,)."""
+
+        def project(more: Float) -> tuple[Float, Bool]:
+            seen_s = view.exposed_s + offset[3] + more[3]
+            T_then_lidar = poses.inverse(poses.exp(seen_s * view.twist))
+            T_cam_then = turned(turned(camera, offset), more).T_cam_lidar
+            return image_points(camera, poses.transform(T_cam_then @ T_then_lidar, places))
+
+        places, is_level = view.silhouettes
+        inside = project(np.zeros(4))[1]
+        places, is_level = places[inside], is_level[inside]
+        uv, slope = project(np.zeros(4))[0], np.zeros((len(places), 2, 4))
+        for axis, step in enumerate(0.2 * _BLURRED):
+            ends = [project(sign * step * np.eye(4)[axis])[0] for sign in (1, -1)]
+            slope[:, :, axis] = (ends[0] - ends[1]) / (2 * step)
+        known = np.isfinite(slope).all(axis=(1, 2))
+        return _Lines(
+            (uv[known] + 0.5) * view.scale - 0.5,
+            slope[known] * view.scale,
+            is_level[known],
+            np.pad(view.strength, ((0, 0), (1, 1), (1, 1))),
+        )
+
+    def scores(self, offsets: Float, thin: int = 1) -> Float:
+        """Return (M,) the sum of the image's edges on the depth edges moved by offsets (M,4).
+
+        Args:
+            offsets: (M,4) as of `Fit`.
+            thin: Every so many depth edges are used.
+        """
+        height, width = self.strength.shape[1:]
+        uv, slope = self.uv[::thin], self.slope[::thin]
+        moved = np.rint(uv + np.einsum("ma,eda->med", offsets, slope)).astype(np.int32) + 1
+        column, row = np.clip(moved[..., 0], 0, width - 1), np.clip(moved[..., 1], 0, height - 1)
+        place = (self.is_level[::thin] * height + row) * width + column
+        return self.strength.reshape(-1).take(place).sum(axis=1, dtype=np.float64)
+
+
+def _sum(lines: Sequence[_Lines], offset: Float) -> float:
+    return float(sum(line.scores(offset[None])[0] for line in lines))
+
+
+def _is_beside(offsets: Float, other: Float) -> Any:
+    """Return where offsets are more than a degree of pitch or yaw, or 0.1 s, from another one."""
+    return (np.abs(offsets - other)[..., [0, 1, 3]] > (1.0, 1.0, 0.1)).any(axis=-1)
+
+
+def _climbed(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
+    """Return the offset (4,) of the highest score near one."""
+    sides = np.concatenate([np.eye(4)[free], -np.eye(4)[free]])
+    best = _sum(lines, offset)
+    for halving in range(_NUM_HALVINGS):
+        while True:
+            around = offset + sides * _BLURRED / 2**halving
+            found = np.sum([line.scores(around) for line in lines], axis=0)
+            if found.max() <= best or np.abs(offset[0]) > 2 * _REACH[0]:
+                break
+            offset, best = around[int(np.argmax(found))], float(found.max())
+    return offset
+
+
+def _error(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
+    """Return (4,) the standard error of the best offset, 0 where nothing is free."""
+    axes = np.flatnonzero(free)
+    steps = np.eye(4)[axes] * _BLURRED
+    num, pairs = len(axes), [(i, j) for i in range(len(axes)) for j in range(i)]
+    corners = [s * steps[i] + t * steps[j] for i, j in pairs for s in (1, -1) for t in (1, -1)]
+    offsets = offset + np.concatenate([np.zeros((1, 4)), steps, -steps, np.array(corners)])
+    found = np.stack([line.scores(offsets) for line in lines])
+    slope = 0.5 * (found[:, 1 : num + 1] - found[:, num + 1 : 2 * num + 1])
+    total = found.sum(axis=0)
+    curved = np.diag(total[1 : num + 1] + total[num + 1 : 2 * num + 1] - 2 * total[0])
+    for row, (i, j) in enumerate(pairs):
+        of = total[2 * num + 1 + 4 * row :][:4]
+        curved[i, j] = curved[j, i] = 0.25 * (of[0] - of[1] - of[2] + of[3])
+    error = np.zeros(4)
+    error[axes] = np.inf
+    if np.linalg.eigvalsh(curved).max() < 0:
+        slope = slope - slope.mean(axis=0)
+        spread = np.linalg.solve(curved, slope.T)
+        error[axes] = np.sqrt(np.einsum("av,av->a", spread, spread)) * _BLURRED[axes]
+    return error
