@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from writers import write_street
 
@@ -102,6 +101,10 @@ def test_other_forms_hold_the_same(log, submission, tmp_path):
         group = groups[sweep_files(log)[0].stem]
         rows, ids = np.asarray(group["row"]), np.asarray(group["flow_instance_id"])
         total = np.asarray(group["flow"])
+        pose = [np.asarray(groups[name.stem]["pose"]) for name in sweep_files(log)[:2]]
+        np.testing.assert_allclose(
+            np.linalg.inv(pose[1]) @ pose[0], np.asarray(group["ego_motion"]), atol=1e-5
+        )
     with np.load(tmp_path / "000000_000001.npz") as file:
         residual, moving = file["residual_flow"], file["moving"]
         np.testing.assert_array_equal(file["row"], rows)
@@ -180,7 +183,7 @@ def test_doc_depths_exchange_format(tmp_path):
     street = Street("street", 0, "vlp16")
     path = plyfile.PlyData.read(run / "traj_odometry.ply")["vertex"].data
     assert path["indices"].tolist() == [59, 60, 61]
-    clouds, dynamic = [], 0
+    T_world_lidar, dynamic = [], 0
     for row in path:
         quaternion = [row[name] for name in ("q_x", "q_y", "q_z", "q_w")]
         assert quaternion == [row[name] for name in ("qx", "qy", "qz", "qw")]
@@ -191,12 +194,15 @@ def test_doc_depths_exchange_format(tmp_path):
         static = (ply["classid"] >= 50) & (ply["classid"] < 100)
         dynamic += int((ply["classid"] >= 100).sum())
         assert (ply["classid"] < 50).mean() > 0.2
-        turn = Rotation.from_quat(quaternion).as_matrix()
-        place = [row[axis] for axis in "xyz"]
-        clouds.append(points[static] @ turn.T + place)
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+        T[:3, 3] = [row[axis] for axis in "xyz"]
+        T_world_lidar.append(T)
+        assert 0.05 < static.mean() < 0.8 and np.abs(points).max() < 130
     assert dynamic > 50
-    apart_m, _ = cKDTree(clouds[0]).query(clouds[2])
-    assert np.median(apart_m) < 0.15
+    truth = [street.T_world_lidar(frame) for frame in (59, 61)]
+    step = np.linalg.inv(T_world_lidar[0]) @ T_world_lidar[2]
+    np.testing.assert_allclose(step, np.linalg.inv(truth[0]) @ truth[1], atol=1e-6)
     camera = street.cameras["image_02"]
     np.testing.assert_array_equal(json.loads((run / "calib.json").read_text())["mtx"], camera.K)
     np.testing.assert_array_equal(np.loadtxt(run / "calib_lidar_ref_cam.txt"), camera.T_cam_lidar)

@@ -108,7 +108,7 @@ def camera_views(
 
 
 def _silhouettes(registered: RegisteredSweep) -> Silhouettes:
-    """Return the depth edges that each scanner observes, in the lidar frame."""
+    """Return the depth discontinuities that each scanner observes, in the lidar frame."""
     sweep, parts = registered.sweep, []
     for lidar in map(int, np.unique(sweep.lidar)):
         origin_m, axes = sweep.origin_m(lidar), sweep.axes(lidar)
@@ -146,13 +146,13 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
     values = {"score": fit.score, "clearness": fit.clearness, "other": others[best]}
     values |= dict(zip(("pitch_deg", "yaw_deg", "roll_deg"), fit.offset.tolist(), strict=False))
     if others[best] > _CLEARLY * max(fit.score, fit.rival, 0.0):
-        text = f"depth edges lie on image edges with {best}, and not as given"
+        text = f"depth discontinuities lie on image edges with {best}, and not as given"
         return [finding(name, WRONG, text, f"give {best}", **values)]
     off_deg, error_deg = np.abs(fit.offset[:3]), fit.error[:3]
     if fit.clearness < _CLEARLY or error_deg.max() > _UNSURE_DEG:
         text = (
-            f"no turn of up to 2.7 deg lays the depth edges of {num} sweeps on image edges better "
-            f"than others do: images and sweeps do not show the same, or too little"
+            f"no turn of up to 2.7 deg puts the depth discontinuities of {num} sweeps on image "
+            f"edges better than others do: images and sweeps do not show the same, or too little"
         )
         verdict = SUSPICIOUS if num > 2 * _LEAST_IMAGES - 1 else UNKNOWN
         remedy = "check T_cam_lidar, K and the clocks, and that the images are the camera's"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fit the direction and the clock of a camera: depth edges of sweeps to edges of images.
+"""Fit the direction and the clock of a camera: depth discontinuities of sweeps to edges of images.
 
 Levinson and Thrun, "Automatic Online Calibration of Cameras and Lasers", RSS 2013, with two
 additions. Upright silhouettes are compared with changes of the image to the side, level ones with
@@ -35,7 +35,7 @@ _NUM_ON_GRID, _NUM_STARTS, _NUM_HALVINGS = 4000, 4, 4
 
 
 class Silhouettes(NamedTuple):
-    """Depth edges of a sweep.
+    """Depth discontinuities of a sweep.
 
     Attributes:
         places: (E,3) metres, on the near surface, half way to the far one as the scanner sees it.
@@ -47,10 +47,10 @@ class Silhouettes(NamedTuple):
 
 
 class View(NamedTuple):
-    """An image and the depth edges of a sweep near it.
+    """An image and the depth discontinuities of a sweep near it.
 
     Attributes:
-        silhouettes: The depth edges.
+        silhouettes: The depth discontinuities.
         strength: (2,H,W) of image edges beyond the mean: changes to the side, then up and down.
         scale: Of the image that is compared.
         twist: (6,) of the lidar, per second.
@@ -71,7 +71,7 @@ class Fit(NamedTuple):
         offset: (4,) degrees about the camera's x (pitch), y (yaw) and z (roll), and seconds from
             the stamps of the images to their exposure.
         error: (4,) its standard error, infinite if the views do not determine it.
-        score: Sum of the image's edges on depth edges there.
+        score: Sum of the image's edges on depth discontinuities there.
         rival: Best score more than a degree or 0.1 s beside.
         usual: Median score of all offsets.
     """
@@ -89,7 +89,7 @@ class Fit(NamedTuple):
 
 
 def depth_edges(points: Float) -> Silhouettes:
-    """Return the depth edges of one scanner's points (N,3), in its frame.
+    """Return the depth discontinuities of one scanner's points (N,3), in its frame.
 
     A point is on an edge if its inverse range is above the line through both neighbours'. Along a
     plane inverse range is linear at any slant, so neither the far road nor a fence has edges.
@@ -144,7 +144,7 @@ def turned(camera: Camera, offset: Float) -> Camera:
 
 
 def score(camera: Camera, views: Sequence[View]) -> tuple[float, int]:
-    """Return the sum of the image's edges on depth edges, and the number of depth edges in view."""
+    """Return the sum of image edges at depth discontinuities, and the number of those in view."""
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
     total = sum(float(line.scores(np.zeros((1, 4)))[0]) for line in lines)
     return total, sum(len(line.uv) for line in lines)
@@ -188,7 +188,7 @@ def _grid(free: Bool) -> Float:
 
 
 class _Lines(NamedTuple):
-    """The depth edges of a view in the image that is compared.
+    """The depth discontinuities of a view in the image that is compared.
 
     Attributes:
         uv: (E,2) px.
@@ -228,11 +228,11 @@ class _Lines(NamedTuple):
         )
 
     def scores(self, offsets: Float, thin: int = 1) -> Float:
-        """Return (M,) the sum of the image's edges on the depth edges moved by offsets (M,4).
+        """Return (M,) the sum of image edges at the depth discontinuities moved by offsets.
 
         Args:
             offsets: (M,4) as of `Fit`.
-            thin: Every so many depth edges are used.
+            thin: Every ``thin``-th discontinuity is used.
         """
         height, width = self.strength.shape[1:]
         uv, slope = self.uv[::thin], self.slope[::thin]

@@ -35,7 +35,15 @@ from densify.config.errors import InputError
 from densify.config.file_content import needed
 from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.geometry import poses
-from densify.geometry.types import Float, FlowField, Int, LidarSequence, Result, StretchFlow
+from densify.geometry.types import (
+    Float,
+    FlowField,
+    Int,
+    LidarSequence,
+    Result,
+    Stretch,
+    StretchFlow,
+)
 from densify.outputs.atomic import file_aside, write_file, write_json
 from densify.outputs.export.maps_and_clouds import save_ply
 from densify.outputs.key_outputs import Context
@@ -94,13 +102,21 @@ def flow_npz(field: FlowField, **beside: Any) -> bytes:
     return buffer.getvalue()
 
 
-def _add_sweep(file: Any, frame: int, flow: StretchFlow) -> None:
+def _followed(known: dict[int, Float], frame: int, stretch: Stretch) -> Float:
+    """Return the pose of a sweep in one world, from that of the last sweep before it."""
+    before = next((f for f in reversed(known) if f in stretch.frames), None)
+    if before is None:
+        return stretch[frame].T_world_lidar
+    return known[before] @ stretch.T_target_source(before, frame)
+
+
+def _add_sweep(file: Any, frame: int, flow: StretchFlow, T_world_lidar: Float) -> None:
     """Add a sweep to an open file, with its flow to the next one if known."""
     registered = flow.stretch[frame]
     sweep = registered.sweep
     arrays = {
         "lidar": np.column_stack([sweep.points, 255 * sweep.intensity]).astype(np.float32),
-        "pose": registered.T_world_lidar,
+        "pose": T_world_lidar,
         "lidar_id": sweep.lidar,
         "ground_mask": np.zeros(len(sweep), bool),
         "row": sweep.row,
@@ -159,10 +175,10 @@ def flow_writer(
             file = stack.enter_context(h5py.File(aside, "w"))
 
         def write(frame: int, flow: StretchFlow) -> Path:
-            T_world_lidar[frame] = flow.stretch[frame].T_world_lidar
+            T_world_lidar[frame] = _followed(T_world_lidar, frame, flow.stretch)
             ahead = StretchFlow(flow.stretch, {p: f for p, f in flow.steps.items() if p[1] > p[0]})
             if form == "opensceneflow":
-                _add_sweep(file, frame, ahead)
+                _add_sweep(file, frame, ahead, T_world_lidar[frame])
             elif form == "av2":
                 _write_feather(paths[frame], sequence, frame, ahead)
             elif form == "semantickitti":
