@@ -141,7 +141,7 @@ def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
 
 
 def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the value of `_packed`'s parts.
+    """Return the value whose JSON and arrays `_packed` returned.
 
     Its classes are dataclasses and named tuples of already imported modules. They are filled
     without calling their code.

@@ -180,9 +180,10 @@ def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 @inlined
 def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill the steps to the voter in each direction, 0 without one, and whether it agrees.
+    """Fill the steps to the voter in each direction (0 without one), and whether it votes for.
 
-    It agrees if its surface, extended, has the pixel's depth. Return the numbers for and against.
+    A voter votes for the depth of the pixel if its surface, extended to the pixel, has that depth.
+    Return the numbers of votes for and against.
     """
     same = _SAME_M + _SAME_FRACTION * depth
     num_for, num_against = 0, 0

@@ -76,8 +76,8 @@ def _grouped(
 ) -> tuple[Candidates, Float]:
     """Return the points of sweep i that may start a track, and their (n,3) velocities, m/s.
 
-    Clusters of points that move by the network may start one. Clusters of the evidence alone may
-    only join a track that was started elsewhere.
+    Clusters that move according to the network may start a track. Clusters of the free-space
+    evidence alone may only join a track that was started elsewhere.
     """
     moves = np.linalg.norm(velocity_m_s, axis=1) >= MOVES_M_S
     registered = scene.stretch.sweeps[i]

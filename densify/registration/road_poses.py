@@ -271,7 +271,7 @@ class _Graph:
         return np.sqrt(np.maximum(square, 0))
 
     def _step(self, T: Float) -> Float:
-        """Return the (free,6) next motion of every free submap, in its own frame."""
+        """Return (free,6) the next Gauss-Newton step of every free submap, in its own frame."""
         apart = self._apart(T)
         weight = 1 / (1 + (self.off_m(apart) / _USUAL_M) ** 2)
         adjoint = poses.carried(poses.inverse(self._between(T))[:, None], np.eye(6))

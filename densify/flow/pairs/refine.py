@@ -70,7 +70,9 @@ def refined(
     ground: HeightMap,
     timed: bool,
 ) -> Refined:
-    """Return the refined motion of the source's ``members``, or the motion itself if thinner.
+    """Return the refined motion of the source's ``members``.
+
+    If the surfaces are thinner with the motion as it is, that is returned.
 
     Args:
         candidates: Rows of the target that may be the object's.
