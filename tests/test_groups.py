@@ -197,6 +197,16 @@ def test_a_car_that_passes_behind_a_pillar():
     assert not np.concatenate(on_pillar).any()
 
 
+def test_two_walkers_who_meet_are_both_followed():
+    """While they meet, they are one cluster, larger than before, that no rigid motion explains."""
+    size_m = (0.5, 0.5, 1.7)
+    there = car(9.25, -5.5, 1.5, 1, size_m=size_m)
+    back = car(10.7, -4.5, 1.4, 2, yaw=np.pi, size_m=size_m)
+    meeting = Found.of([there, back], size=5)
+    assert meeting.share_moving(1) > 0.95 and meeting.share_moving(2) > 0.95
+    assert meeting.false_share() == 0
+
+
 def test_a_stretch_of_one_sweep_has_no_flow():
     found = Found.of([car(14, -1.6, 10, 1)], size=0)
     assert len(found.fields) == 1

@@ -15,7 +15,7 @@ from densify.config.errors import InputError
 from densify.config.plugins import check_engine_spec
 
 _FEW_POINTS_PER_S = 800_000  # 64 rings have 1.2 million, 32 have 700,000
-_AROUND_FEW_S = 0.5
+_AROUND_FEW_S, _AROUND_S = 0.5, 0.3
 
 
 def within(default: float | None, low: float, high: float) -> Any:
@@ -101,14 +101,18 @@ class FlowSettings(Section):
         super().__post_init__()
         check_engine_spec(self.engine)
 
-    def around_s(self, points_per_s: float) -> float:
-        """Return ``look_around_s``, for a scanner of ``points_per_s`` if it is null.
+    def around(self, points_per_s: float) -> tuple[float, float]:
+        """Return the time around the window, and the time between the sweeps to search there.
 
-        With few points, moving objects are observed too rarely within a window.
+        With few points, a single sweep shows little of a moving object, and every sweep counts.
+
+        points_per_s: of the scanner.
+
+        Returns ``look_around_s``, where null as the scanner needs it; and seconds, 0 for all.
         """
-        if self.look_around_s is not None:
-            return self.look_around_s
-        return _AROUND_FEW_S if points_per_s < _FEW_POINTS_PER_S else 0.0
+        few = points_per_s < _FEW_POINTS_PER_S
+        needed_s, step_s = (_AROUND_FEW_S, 0.0) if few else (_AROUND_S, _AROUND_S)
+        return needed_s if self.look_around_s is None else self.look_around_s, step_s
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,8 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar, cast
 
+import numpy as np
+
 from densify.config import Config
 from densify.config.cache import Cache, kept
 from densify.config.errors import InputError, SweepError, UnfitSweepError
@@ -49,7 +51,8 @@ from densify.registration.deskew import deskew
 from densify.registration.trajectory import LeftOut, Registration, find_trajectory
 
 T = TypeVar("T")
-LEAD_IN_S = 0.5  # sweeps before a block from which odometry learns the speed
+LEAD_IN_S = 0.5  # before a window or a block, in which odometry settles
+_TELL_SPEED = 2  # sweeps
 
 
 class Piece(NamedTuple):
@@ -107,15 +110,19 @@ class Recording:
         self.sequence, self.settings = sequence, settings
         self.timeline = timeline = Timeline.of(sequence)
         self._num_around, self._watch, self._cache = window, watch or Watch(), cache
+        self._step_around, self._num_lead_in = 1, timeline.num_in(LEAD_IN_S)
         if keys is None:
             self.cut = Cut.whole(timeline, window)
         else:
-            self.cut = Cut.around(timeline, window, keys)
-            if looks_around and engine_row(settings.flow.engine)[0].shared:
-                self.cut = Cut.around(timeline, window, keys, self._look_around_s(keys))
+            looks_around &= engine_row(settings.flow.engine)[0].shared
+            around_s, step_s = self._look_around(keys) if looks_around else (0.0, 0.0)
+            self.cut = Cut.around(timeline, window, keys, around_s)
+            self._step_around = max(1, timeline.num_in(step_s))
+            # The sweeps around a window lead in, too.
+            self._num_lead_in = max(_TELL_SPEED, timeline.num_in(LEAD_IN_S - around_s))
         self._is_whole = keys is None
         most = max((len(block) for block in self.cut.blocks), default=0)
-        num_raw = most + timeline.num_in(LEAD_IN_S)
+        num_raw = most + self._num_lead_in
         self._sweeps = Sweeps(
             sequence, timeline, settings.register, num_raw, cache, run, self._watch
         )
@@ -124,20 +131,20 @@ class Recording:
         # By the number of a block and the row of a piece, because a piece cannot be hashed.
         self._deskewed = lru_cache(maxsize=most)(self._deskew)
         self._stretch = lru_cache(maxsize=1)(self._make_stretch)
+        self._searched = lru_cache(maxsize=2)(self._find_searched)
         self._ground = lru_cache(maxsize=2)(self._find_ground)
         self._motion = lru_cache(maxsize=2)(self._find_motion)
         self._far = lru_cache(maxsize=1)(self._find_far)
 
-    def _look_around_s(self, keys: Collection[int]) -> float:
-        """Return how far beyond the windows to look, by the number of points of the first key."""
-        settings = self.settings.flow
-        if settings.look_around_s is not None or not keys:
-            return settings.look_around_s or 0.0
+    def _look_around(self, keys: Collection[int]) -> tuple[float, float]:
+        """Return `FlowSettings.around`, by the number of points of the first key."""
+        if not keys or self.settings.flow.look_around_s == 0:
+            return 0.0, 0.0
         try:
             num_points = len(self.sequence[min(keys)])
         except InputError:  # raised again where the key is made
-            return 0.0
-        return settings.around_s(num_points / (self.timeline.period_ns * 1e-9))
+            return 0.0, 0.0
+        return self.settings.flow.around(num_points / (self.timeline.period_ns * 1e-9))
 
     # A key
 
@@ -173,11 +180,12 @@ class Recording:
     def around(self, key: int) -> Stretch:
         """Return the sweeps in which the motion in a key's window is found."""
         piece = self._piece(key)
-        return self._stretch(piece.number, piece.frames)
+        return self._stretch(piece.number, self._searched(piece.number, piece.row))
 
     def is_pair(self, key: int) -> bool:
         """Return True if there are two sweeps around a key: a track needs three."""
-        return len(self._piece(key).frames) == 2
+        piece = self._piece(key)
+        return len(self._searched(piece.number, piece.row)) == 2
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
         """Return the motion of everything in a key's window.
@@ -197,7 +205,8 @@ class Recording:
         # All poses, but the points of the window only.
         at_hand = {s.frame: s for s in window.sweeps}
         sweeps = [
-            at_hand.get(f) or RegisteredSweep.without_points(piece.poses, f) for f in piece.frames
+            at_hand.get(f) or RegisteredSweep.without_points(piece.poses, f)
+            for f in self._searched(piece.number, piece.row)
         ]
         motion = self._motion(piece.number, piece.row, engine)
         return motion.with_stretch(Stretch(tuple(sweeps)))
@@ -294,7 +303,7 @@ class Recording:
     def _registered_together(self, number: int) -> list[int]:
         """Return the frames of a block, behind those of its lead-in."""
         block = self.cut.blocks[number]
-        return [*self.timeline.before(block[0], self.timeline.num_in(LEAD_IN_S)), *block]
+        return [*self.timeline.before(block[0], self._num_lead_in), *block]
 
     def _find_pieces(self, number: int) -> list[Piece]:
         """Return the pieces of a block."""
@@ -318,15 +327,25 @@ class Recording:
         """Return these sweeps of one piece, deskewed, in its world."""
         return Stretch(tuple(self._deskewed(number, f) for f in frames))
 
+    def _find_searched(self, number: int, row: int) -> tuple[int, ...]:
+        """Return the frames of a piece in which motion is searched: those of the windows, and from
+        there every so many."""
+        frames, inside = self._pieces(number)[row].frames, self._in_windows(number)
+        at = np.flatnonzero([frame in inside for frame in frames])
+        if self._step_around == 1 or not len(at):
+            return frames
+        away = np.abs(np.arange(len(frames))[:, None] - at).min(axis=1)
+        return tuple(f for f, n in zip(frames, away, strict=True) if n % self._step_around == 0)
+
     def _find_ground(self, number: int, row: int) -> HeightMap:
         """Return the ground under a piece."""
-        stretch = self._stretch(number, self._pieces(number)[row].frames)
+        stretch = self._stretch(number, self._searched(number, row))
         with self._watch.stage("ground"):
             return ground(stretch)
 
     def _find_motion(self, number: int, row: int, engine: str) -> SharedMotion:
         """Return the motion in a piece, without its points."""
-        asked, frames = self._in_windows(number), self._pieces(number)[row].frames
+        asked, frames = self._in_windows(number), self._searched(number, row)
 
         def make() -> SharedMotion:
             stretch, heights = self._stretch(number, frames), self._ground(number, row)

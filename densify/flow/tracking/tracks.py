@@ -87,29 +87,47 @@ class _Search:
         return [np.ones(len(c.points), bool) for c in self._obstacles]
 
     def tracks(self) -> list[Track]:
-        """Return the confirmed tracks, the best starts first."""
-        untried = self._all_points()
-        for n, cluster in find_starts([batch.obstacles for batch in self.batches], self.clock):
-            batch = self.batches[n]
-            untaken = batch.gather(self._free)[cluster] & batch.gather(untried)[cluster]
-            members = cluster[untaken]
-            if len(members) < MIN_POINTS:
-                continue
-            track, left = self._track_of(members, n)
-            for j, rows in track.claimed.items():
-                untried[j][rows] = False
-            if np.isinf(left):
-                continue
-            self._gather(track)
-            # A piece of a guard rail is recognised by the rest of it.
-            if is_rail(track, self._obstacles, self._space, self._objects):
-                continue
-            _refine(track, self._obstacles, self._ground)
-            self._claim_in_line(track)
-            for j, rows in track.claimed.items():
-                self._free[j][rows] = False
-            self._objects.append(MovingObject(track, self._shape_of(track)))
+        """Return the confirmed tracks, the best starts first.
+
+        The points of a rejected track start none, at first. Then they may: while two walkers meet
+        they are one cluster, whose track claims both wherever they are alone. Such a track must
+        travel farther than it is long, as no side does that seems to slide along itself.
+        """
+        starts = find_starts([batch.obstacles for batch in self.batches], self.clock)
+        untried, not_started = self._all_points(), self._all_points()
+        for may_start in (untried, not_started):
+            for n, cluster in starts:
+                batch = self.batches[n]
+                untaken = batch.gather(self._free)[cluster] & batch.gather(may_start)[cluster]
+                members = cluster[untaken]
+                if len(members) < MIN_POINTS:
+                    continue
+                track, left = self._track_of(members, n)
+                for j, rows in batch.split(members).items():
+                    not_started[j][rows] = False
+                for j, rows in track.claimed.items():
+                    untried[j][rows] = False
+                if np.isinf(left) or (may_start is not_started and not self._leaves_itself(track)):
+                    continue
+                self._keep(track)
         return [track for track, _ in self._objects]
+
+    def _leaves_itself(self, track: Track) -> bool:
+        """Return True if the object travels farther than it is long."""
+        points = track.points_in(self._obstacles, sorted(track.claimed))
+        return track.path.travelled_m() > np.linalg.norm(np.ptp(points[:, :2], axis=0))
+
+    def _keep(self, track: Track) -> None:
+        """Keep a confirmed track, unless it is a piece of a guard rail."""
+        self._gather(track)
+        # A piece of a guard rail is recognised by the rest of it.
+        if is_rail(track, self._obstacles, self._space, self._objects):
+            return
+        _refine(track, self._obstacles, self._ground)
+        self._claim_in_line(track)
+        for j, rows in track.claimed.items():
+            self._free[j][rows] = False
+        self._objects.append(MovingObject(track, self._shape_of(track)))
 
     def _shape_of(self, track: Track) -> Shape:
         return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
