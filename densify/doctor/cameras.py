@@ -171,18 +171,19 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
 
 def _described(camera: Camera, fit: Fit, verdict: Verdict, num: int) -> tuple[str, str]:
     """Return by how much the calibration is off, and the corrected line."""
-    ways = (("up", "down"), ("right", "left"), ("clockwise", "anticlockwise"))
+    ways = (("higher", "lower"), ("farther right", "farther left"), ("clockwise", "anticlockwise"))
     turns = [
         f"{abs(turn):.2f} ± {error:.2f} deg {way[int(turn < 0)]}"
         for turn, error, way in zip(fit.offset, fit.error, ways, strict=False)
     ]
+    text = f"points belong {', '.join(turns)} in the image (best fit of {num} images)"
     if verdict == FINE:
-        return f"right to {', '.join(turns)} (best fit of {num} images)", ""
-    text = f"{num} images fit best with what the sweeps show moved by {', '.join(turns)}"
+        return f"right within {_OFF_DEG} deg: {text}", ""
     rows = ", ".join(
         str([round(float(v), 5) for v in row]) for row in turned(camera, fit.offset).T_cam_lidar[:3]
     )
-    return text, f"T_cam_lidar: [{rows}]"
+    where = f"cameras.{camera.name} in densify.yaml, or the recording's own calibration file"
+    return text, f"T_cam_lidar: [{rows}]  # {where}"
 
 
 def _check_clock(camera: Camera, fit: Fit, num: int) -> Finding:

@@ -25,7 +25,8 @@ def add_export(commands: Any) -> None:
         "Nothing is computed again, and the run does not change. A filled pixel has the age of the "
         "nearest measured pixel.",
     )
-    parser.add_argument("run", metavar="RUN", type=Path, help=_ONE)
+    about = f"{_ONE}, or of several keys (all forms but npy, exr, ply, pcd)"
+    parser.add_argument("run", metavar="RUN", type=Path, help=about)
     about = f"{', '.join(EXPORTS)}: see docs/formats/writing.md"
     option(parser, "--to FORMAT", about, required=True)
     about = "leave out pixels and points of lower confidence, 0 to 1 (default: 0, keep all)"
