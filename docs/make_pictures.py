@@ -61,7 +61,7 @@ class Key(NamedTuple):
         folder = runs / self.name / f"{self.key:06d}"
         if not (folder / "metrics.json").is_file():
             spec = self.spec.replace("PANDASET", f"pandaset:{pandaset}")
-            options = ["--key", str(self.key), "--camera", self.camera, "--overwrite"]
+            options = ["--key", str(self.key), "--camera", self.camera, "--score", "--overwrite"]
             # A process of its own, for the seconds and the memory that a user has.
             command = [sys.executable, "-m", "densify", "run", spec, *options]
             if subprocess.run([*command, "--out", str(folder.parent)]).returncode:

@@ -119,8 +119,8 @@ def write_views(
 
 @cache
 def street_result() -> Result:
-    """A street with a car that moves, densified from three sweeps."""
-    return run(one_car(), KEY, 1, config=POSES_GIVEN)
+    """A street with a car that moves, densified from three sweeps, and scored."""
+    return run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": {"score": True}})
 
 
 def write_street(out: Path) -> Path:

@@ -55,7 +55,7 @@ def test_run_writes_the_tree_and_names_every_file(
     files = set(files_in(densified.out))
     key = f"{BORDER:06d}"
     maps = ("depth", "depth_filled", "confidence", "age")
-    others = ("cloud.laz", "metrics.json", "figure.png", "curve.png", "run.yaml", "movers.json")
+    others = ("cloud.laz", "metrics.json", "figure.png", "run.yaml", "movers.json")
     expected = {f"{key}/{name}" for name in (*others, "scene/scene.json")}
     expected |= {f"{key}/{kind}/image_02.png" for kind in maps}
     assert expected <= files

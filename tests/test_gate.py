@@ -73,7 +73,9 @@ def flow_figures(recording: Recording) -> dict[str, float]:
 
 
 def densified(spec: str, *methods: str, key: int = KEY) -> tuple[Recording, dict[str, Result]]:
-    recording = Recording(open_sequence(spec), resolve(None), WINDOW, [key], looks_around=True)
+    recording = Recording(
+        open_sequence(spec), resolve(None).scored(), WINDOW, [key], looks_around=True
+    )
     return recording, densify_key(recording, key, methods, [CAMERA])
 
 

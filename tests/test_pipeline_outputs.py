@@ -28,7 +28,7 @@ NPZ = {"output": {"flow": "npz"}}
 @pytest.fixture(scope="module")
 def kept() -> Result:
     """With its baselines."""
-    return run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": {"movers": "keep"}})
+    return run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": {"score": True}})
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +111,17 @@ def test_an_exact_static_scene_predicts_its_key():
     assert scores["all"]["num_compared"] > 2000 and scores["all"]["coverage"] > 0.5
     assert scores["all"]["outliers"] < 0.001 and scores["all"]["mae_m"] < 0.2
     assert scores["moving"]["num_pixels"] == 0 and scores["moving"]["mae_m"] is None
+
+
+def test_scores_change_no_map(kept):
+    plain = run(one_car(), KEY, 1, config=POSES_GIVEN)
+    assert not plain.baselines and plain.metrics["held_out"] is None
+    for name, maps in plain.depth.items():
+        for product in ("depth_m", "filled_m", "confidence", "age_s"):
+            mine, scored = getattr(maps, product), getattr(kept.depth[name], product)
+            np.testing.assert_array_equal(mine, scored)
+    same = ("num_points", "num_moving", "density", "ghosts", "expected_outliers")
+    assert all(plain.metrics[score] == kept.metrics[score] for score in same)
 
 
 def test_flow_predicts_movers_better_than_registration(kept):

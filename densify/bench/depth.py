@@ -93,7 +93,7 @@ def bench_depth(
                 truths["scanner"] = _returns_of(scanner, sequence, key, window, shots, config)
             watch = Watch()
             looks = looks_around([method])
-            recording = Recording(used, config, window, [key], None, None, watch, looks)
+            recording = Recording(used, config.scored(), window, [key], None, None, watch, looks)
             made = pipeline.densify(recording, key, [method], cameras, watch)[method]
             key_sweep = recording.window(key)[key].sweep
             truths["truth"] = _exact_truth(used, key_sweep, shots, config)

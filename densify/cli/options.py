@@ -127,10 +127,12 @@ def recording_of(options: argparse.Namespace) -> str:
 
 
 def config_of(options: argparse.Namespace) -> Config:
-    """Return the settings of ``--config``, ``--set``, ``--flow`` and ``--report``."""
+    """Return the settings of ``--config``, ``--set``, ``--flow``, ``--score`` and ``--report``."""
     short = []
     if getattr(options, "flow", None) is not None:
         short.append(f"flow.engine={options.flow}")
+    if getattr(options, "score", False):
+        short.append("output.score=true")
     if getattr(options, "report", False):
         short += ["output.report=true", "output.rejected=true"]
     return resolve(options.config, [*options.overrides, *short])

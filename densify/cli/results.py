@@ -59,6 +59,12 @@ def summary(result: Result) -> str:
         line = f"{name}: depth in {share['measured']} of the pixels, {share['filled']} with filled"
         line += f" ones, {share['full']} with those from the prior" if "full" in share else " ones"
         lines.append(line)
+        if expected := look_up(result.metrics, "expected_outliers", name):
+            share = {product: percent(of_all) for product, of_all in expected.items()}
+            lines.append(
+                f"{name}, expected outliers by confidence: {share['measured']} of the measured, "
+                f"{share['filled']} of all pixels with a depth"
+            )
     if ghosts := _beside_icp(result, "ghosts", "all"):
         lines.append(f"ghosts of the accumulated points: {ghosts}")
     for name in result.depth:

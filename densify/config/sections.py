@@ -8,7 +8,7 @@ it. To add a section, add its class and one line in `Config`.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from densify.config.errors import InputError
@@ -169,6 +169,7 @@ class OutputSettings(Section):
     flow: str = one_of("none", "npz")
     optical_flow: bool = False
     rejected: bool = False
+    score: bool = False
     report: bool = False
     movers: str = one_of("keep", "drop", "separate")
 
@@ -184,3 +185,12 @@ class Config:
     project: ProjectSettings = ProjectSettings()
     prior: PriorSettings = PriorSettings()
     output: OutputSettings = OutputSettings()
+
+    @property
+    def is_scored(self) -> bool:
+        """Return True if results have baselines and are scored with the key held out."""
+        return self.output.score or self.output.report
+
+    def scored(self) -> Config:
+        """Return the configuration with ``output.score``."""
+        return replace(self, output=replace(self.output, score=True))

@@ -23,7 +23,7 @@ from densify.geometry.types import Result
 from densify.outputs.kitti_tree import FileRecord, write_key
 from densify.outputs.store import write_result
 from densify.pipeline import run as pipeline
-from densify.pipeline.key_result import with_baselines
+from densify.pipeline.key_result import methods_of_run
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
 
@@ -77,8 +77,8 @@ def _made(job: Job, key: int) -> KeyRecord:
     recipe = job.recipe
     recording, cache = _opened(job)
     is_tree = recipe.layout == "kitti-depth"
-    # The tree's sparse input is the key sweep alone; the figure of a run shows all baselines.
-    methods = ["none", recipe.method] if is_tree else with_baselines(recipe.method)
+    # The tree's sparse input is the key sweep alone.
+    methods = ["none", recipe.method] if is_tree else methods_of_run(recipe.method, recipe.config)
     results = pipeline.densify(
         recording, key, tuple(dict.fromkeys(methods)), job.cameras, with_images=not is_tree
     )

@@ -91,7 +91,7 @@ class Recipe:
         layout: ``kitti-depth``, KITTI's depth tree, or ``densify``, what ``densify run`` writes.
         cameras: Names; None for all.
         gate: Limits of the scores, and the split of the tree.
-        config: Settings, from `densify.config.resolve`.
+        config: Settings, from `densify.config.resolve`; scored if the gate limits outliers.
     """
 
     window: int = 5
@@ -103,6 +103,8 @@ class Recipe:
 
     def __post_init__(self) -> None:
         check_window(self.window)
+        if self.gate.max_outliers is not None:
+            object.__setattr__(self, "config", self.config.scored())
         if self.layout == "kitti-depth" and self.config.project.per == "image":
             raise InputError(
                 "--layout kitti-depth: has one map of a camera for each sweep; got "

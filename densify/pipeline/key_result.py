@@ -52,20 +52,20 @@ METHODS = {
 scene flow without visibility; the published scene flow; ours."""
 
 RUN = ("none", "icp", "flow")
-"""The methods of `run`, each with those before it as its baselines."""
+"""The methods of `run`; where scores are wanted, each with those before it as its baselines."""
 COMPARED = ("none", "icp", "icp-far", "paper", "flow")
 """The methods that `compare` shows by default."""
 
 
-def with_baselines(method: str) -> tuple[str, ...]:
-    """Return a method of `RUN` after the simpler ones.
+def methods_of_run(method: str, settings: Config) -> tuple[str, ...]:
+    """Return a method of `RUN`, after the simpler ones if it is scored.
 
     Raises:
         InputError: It is another one.
     """
     if method not in RUN:
         raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
-    return RUN[: RUN.index(method) + 1]
+    return RUN[: RUN.index(method) + 1] if settings.is_scored else (method,)
 
 
 def looks_around(methods: Sequence[str]) -> bool:
@@ -83,7 +83,7 @@ class KeyScene(NamedTuple):
         views: Views of the maps.
         images: (H,W,3) RGB of the coloured maps.
         truth: True depth and moving pixels, by map.
-        held_out: The key sweep as the truth of a map made without it.
+        held_out: The key sweep as the truth of a map made without it; None without scores.
     """
 
     settings: Config
@@ -94,15 +94,16 @@ class KeyScene(NamedTuple):
     views: Views
     images: Mapping[str, NDArray[np.uint8]]
     truth: Mapping[str, tuple[Float32, Bool]]
-    held_out: HeldOut
+    held_out: HeldOut | None
     watch: Watch
 
 
-def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
+def result_of_method(scene: KeyScene, name: str, moment: Moment, filled: bool) -> Result:
     """Return the result of one method, without its baselines.
 
     Args:
         moment: The points at the key's time, as the method accumulates them.
+        filled: Fill the maps.
     """
     method, output = METHODS[name], scene.settings.output
     views, watch, stretch = scene.views, scene.watch, scene.stretch
@@ -113,8 +114,10 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
         seen = views.see(moment.cloud, visible).joined(far)
         if visible:
             seen = seen._replace(bodies=views.bodies(moment.cloud))
-    with watch.stage("held out"):
-        held_out = scene.held_out.scores(seen, visible)
+    held_out = None
+    if scene.held_out is not None:
+        with watch.stage("held out"):
+            held_out = scene.held_out.scores(seen, visible)
     with watch.stage("project"):
         movers = {}
         if output.movers == "separate":
@@ -122,7 +125,7 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment) -> Result:
         if output.movers != "keep":
             static = moment.cloud.select(~moment.cloud.moving)
             seen = views.see(static, visible).joined(far)
-        depth = _add_ages(scene, method, views.depth(seen, visible))
+        depth = _add_ages(scene, method, views.depth(seen, visible, filled))
     cloud = seen.cloud
     if scene.images:
         with watch.stage("colour"):

@@ -38,8 +38,8 @@ from densify.pipeline.key_result import (
     METHODS,
     KeyScene,
     looks_around,
+    methods_of_run,
     result_of_method,
-    with_baselines,
 )
 from densify.pipeline.recording import Recording
 from densify.pipeline.warnings import add_warnings
@@ -77,15 +77,18 @@ def run(
         prior: A folder of depth images that complete the maps where nothing is measured or filled.
 
     Returns:
-        The result, with the simpler methods as its ``baselines``.
+        The result; with ``output.score`` it has the simpler methods as its ``baselines``, and the
+        scores of the key held out.
 
     Raises:
         InputError: The recording or the settings cannot be used.
         ComputationError: Registration fails.
     """
-    methods = with_baselines(method)
-    made = compare(sequence, key, window, cameras, config, progress, methods, prior=prior)
-    return made[method]
+    methods = methods_of_run(method, resolve(config))
+    watch = Watch(progress)
+    recording = _open(sequence, [key], window, methods, cameras, config, None, watch)
+    priors = _open_prior(prior, sequence, cameras)
+    return densify(recording, key, methods, cameras, watch, priors=priors)[method]
 
 
 def run_keys(
@@ -110,7 +113,7 @@ def run_keys(
     Raises:
         InputError: At once, if no key can be made.
     """
-    methods, watch = with_baselines(method), Watch(progress)
+    methods, watch = methods_of_run(method, resolve(config)), Watch(progress)
     recording = _open(sequence, keys, window, methods, cameras, config, cache, watch)
     priors = _open_prior(prior, sequence, cameras)
 
@@ -131,7 +134,7 @@ def compare(
     cache: Cache | None = None,
     prior: str | Path | None = None,
 ) -> dict[str, Result]:
-    """Densify one key with several methods, on the same registration.
+    """Densify one key with several methods on the same registration, and score them.
 
     Args:
         sequence: The recording.
@@ -152,7 +155,7 @@ def compare(
         InputError: The recording or the settings cannot be used.
         ComputationError: Registration fails.
     """
-    watch = Watch(progress)
+    watch, config = Watch(progress), resolve(config).scored()
     recording = _open(sequence, [key], window, methods, cameras, config, cache, watch)
     priors = _open_prior(prior, sequence, cameras)
     return densify(recording, key, methods, cameras, watch, priors=priors)
@@ -198,6 +201,8 @@ def densify(
 ) -> dict[str, Result]:
     """Return the results of one key by method, each with those before as its baselines.
 
+    Without scores, only the maps of the last method are filled.
+
     Args:
         methods: Of `METHODS`.
         with_images: Colour the cloud, and compare depth with the truth if there is one. The
@@ -227,13 +232,17 @@ def densify(
         key_image = RangeImage.of(stretch[key])
         views = Views.of(sequence, stretch, key, key_image, shots, images, settings)
         truth = views.truth(sequence.truth) if with_images and sequence.truth else {}
-        with watch.stage("held out"):
-            held_out = HeldOut.of(views, moments[methods[-1]].cloud)
+        held_out = None
+        if settings.is_scored:
+            with watch.stage("held out"):
+                held_out = HeldOut.of(views, moments[methods[-1]].cloud)
         shown = images if with_images else {}
         scene = KeyScene(
             settings, key, stretch, beyond, key_image, views, shown, truth, held_out, watch
         )
-        made = list(pool.map(partial(result_of_method, scene), methods, moments.values()))
+        filled = [settings.is_scored or name == methods[-1] for name in methods]
+        make = partial(result_of_method, scene)
+        made = list(pool.map(make, methods, moments.values(), filled))
 
     if priors is not None:
         from densify.pipeline.prior import complete_with_prior

@@ -41,6 +41,11 @@ def add_run(commands: Any) -> None:
     _add_key_options(parser)
     add_common(parser, "method")
     about = (
+        "score the key from its neighbours alone, and make the maps of the single sweep and of "
+        "rigid accumulation too (short for --set output.score=true; --report includes it)"
+    )
+    option(parser, "--score", about)
+    about = (
         "your own depth images, for example of a monocular network, for pixels without a "
         "measurement: DIR/CAMERA/FRAME.npy, .exr or .png, of any scale. See docs/outputs.md"
     )

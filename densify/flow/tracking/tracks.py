@@ -115,7 +115,7 @@ class _Search:
     def _leaves_itself(self, track: Track) -> bool:
         """Return True if the object travels farther than it is long."""
         points = track.points_in(self._obstacles, sorted(track.claimed))
-        return track.path.travelled_m() > np.linalg.norm(np.ptp(points[:, :2], axis=0))
+        return track.path.travelled_m() > float(np.linalg.norm(np.ptp(points[:, :2], axis=0)))
 
     def _keep(self, track: Track) -> None:
         """Keep a confirmed track, unless it is a piece of a guard rail."""
