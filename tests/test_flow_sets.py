@@ -210,6 +210,7 @@ def test_doc_depths_exchange_format(tmp_path):
     exposed_ns = np.array([*street.image_stamps_ns("image_02").values()])
     beside_s = np.abs(seen["timestamp"][:, None] - exposed_ns * 1e-9).min(axis=1)
     assert len(seen) > 1 and beside_s.max() < 1e-6
+    np.testing.assert_allclose(exposed_ns[seen["indices"]] * 1e-9, seen["timestamp"], atol=1e-6)
 
 
 # --- what is refused ------------------------------------------------------------------------------

@@ -228,16 +228,17 @@ def _write_classes(path: Path, frame: int, flow: StretchFlow) -> None:
 def _write_paths(folder: Path, sequence: LidarSequence, T_world_lidar: dict[int, Float]) -> None:
     """Write the poses of the lidar, and the calibration and poses of the first camera.
 
-    traj_camera.ply has the lidar's poses at the camera's images. The format's document names the
-    quaternion qx qy qz qw, its reader q_x q_y q_z q_w: both are there.
+    traj_camera.ply has the lidar's poses at the camera's images, with their places among all of
+    them. The format's document names the quaternion qx qy qz qw, its reader q_x q_y q_z q_w: both
+    are there.
     """
     stamp_ns = np.array([sequence.stamp_ns(f) for f in T_world_lidar], np.int64)
     track = PoseTrack(sequence.name, stamp_ns, np.stack([*T_world_lidar.values()]))
     _save_path(folder / "traj_odometry.ply", track, stamp_ns, list(T_world_lidar))
     for camera in [*sequence.cameras.values()][:1]:
         exposed_ns = np.array([*sequence.image_stamps_ns(camera.name).values()], np.int64)
-        inside = exposed_ns[(exposed_ns >= stamp_ns[0]) & (exposed_ns <= stamp_ns[-1])]
-        _save_path(folder / "traj_camera.ply", track, inside, range(len(inside)))
+        inside = np.flatnonzero((exposed_ns >= stamp_ns[0]) & (exposed_ns <= stamp_ns[-1]))
+        _save_path(folder / "traj_camera.ply", track, exposed_ns[inside], inside.tolist())
         write_json(folder / "calib.json", {"mtx": camera.K.tolist()})
         rows = "".join(" ".join(map(repr, row)) + "\n" for row in camera.T_cam_lidar.tolist())
         write_file(folder / "calib_lidar_ref_cam.txt", rows.encode())
