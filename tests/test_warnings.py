@@ -11,6 +11,7 @@ import yaml
 
 import densify
 from densify.config import resolve
+from densify.free_space.lone_returns import without_lone
 from densify.geometry import poses
 from densify.geometry.types import Camera
 from densify.outputs import write_result
@@ -107,6 +108,41 @@ def compensated(sweep, twist, moment):
     since_s = 1e-9 * (sweep.offset_ns - moment(sweep.offset_ns))
     points = poses.transform_each(since_s[:, None] * twist, sweep.points)
     return replace(sweep, points=points)
+
+
+class Snowy(TinySequence):
+    """The small street in snow: a share of the returns comes from flakes before the surfaces."""
+
+    share = 0.08
+
+    def __getitem__(self, frame):
+        rng, sweep = np.random.default_rng(frame), super().__getitem__(frame)
+        flake = rng.random(len(sweep)) < self.share
+        before = np.where(flake, rng.random(len(sweep)), 1.0)
+        return replace(sweep, points=sweep.points * before[:, None])
+
+
+def test_snow_is_no_motion_and_is_told():
+    usual = one_car()
+    clear, snowy = (
+        run(sequence, KEY, 2, "flow", config=POSES_GIVEN)
+        for sequence in (usual, Snowy(usual.scene, usual.frames))
+    )
+    assert not any("snow" in warning for warning in clear.warnings)
+    (told,) = [warning for warning in snowy.warnings if "snow" in warning]
+    assert "% of the points are lone returns, as of snow, rain or dust" in told
+    moving = clear.cloud.moving.sum()
+    assert 0.6 * moving < snowy.cloud.moving.sum() < 1.2 * moving
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["kitti/2011_09_26/2011_09_26_drive_0013_sync", "pandaset/002", "nuscenes", "ddad"],
+)
+def test_good_weather_is_left_as_it_is(place, test_data):
+    sequence = densify.open_sequence(test_data / place)
+    sweep = sequence[sequence.frames[0]]
+    assert without_lone(sweep) is sweep
 
 
 STAMP, FIRST, LAST = (lambda ns: 0), np.min, np.max

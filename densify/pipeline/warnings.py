@@ -73,6 +73,13 @@ def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
             f"{sum(untimed.values()):,} points of sweeps {format_frames(untimed)} are left out: "
             f"their times lie outside their sweep, the driver wrote them wrong"
         )
+    num_lone = sum(sweep.num_lone for sweep in sweeps)
+    if num_lone:
+        share = num_lone / (num_lone + sum(len(sweep) for sweep in sweeps))
+        yield (
+            f"{100 * share:.0f} % of the points are lone returns, as of snow, rain or dust; they "
+            f"are left out, and what moves is less certain"
+        )
     num_near = sum(sweep.num_near for sweep in sweeps)
     share = num_near / max(num_near + sum(len(sweep) for sweep in sweeps), 1)
     if share > _MUCH_NEAR:

@@ -16,6 +16,7 @@ import numpy as np
 
 from densify.config import RegisterSettings
 from densify.config.errors import InputError
+from densify.free_space.lone_returns import without_lone
 from densify.geometry.types import Camera, Int, LidarSequence, Sweep, Trajectory
 
 _HOLE_PERIODS = 3.1  # three periods and some jitter
@@ -250,15 +251,14 @@ def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) 
 def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
     """Return the sweep without returns of the own vehicle and without very far returns.
 
-    Both are measured from the scanner.
+    Both are measured from the scanner. In snow, rain and dust it is without lone returns too.
     """
     origins_m = sweep.scanner_origins
     x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T
     range_m = np.sqrt(x * x + y * y + z * z)
     near = range_m < settings.min_range_m
-    return replace(
-        sweep.select(~near & (range_m <= settings.max_range_m)), num_near=int(near.sum())
-    )
+    inside = sweep.select(~near & (range_m <= settings.max_range_m))
+    return without_lone(replace(inside, num_near=int(near.sum())))
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:

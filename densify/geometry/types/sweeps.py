@@ -34,6 +34,7 @@ class Sweep:
             it spins about, upwards; None where they are the frame's.
         num_untimed: Number of returns left out because their times cannot be of this sweep.
         num_near: Number of returns left out because they are nearer than register.min_range_m.
+        num_lone: Number of returns left out as snow, rain or dust.
     """
 
     frame: int
@@ -47,6 +48,7 @@ class Sweep:
     R_scanner_lidar: Float | None = None
     num_untimed: int = 0
     num_near: int = 0
+    num_lone: int = 0
 
     def __post_init__(self) -> None:
         n = len(self.points)
