@@ -11,6 +11,7 @@ import pytest
 from densify.depth import confidence as scale
 from densify.depth import project as stage
 from densify.geometry.types import DepthMap, Ranked
+from densify.scores.depth_metrics import is_outlier_depth
 from tests.depth_layers import layers_of
 from tests.scenes import CAMERA
 
@@ -90,6 +91,19 @@ def test_reliability_counts_what_is_wrong():
     shares = scale.expected_outliers(maps)
     assert shares["filled"] == pytest.approx(bad.mean(), rel=0.03)
     assert shares["measured"] == pytest.approx(scale.wrong(confidence[:, ::2]).mean())
+
+
+def test_without_times_a_depth_may_be_moved_by_any_amount_up_to_the_smear():
+    rng, smear_m = np.random.default_rng(6), 0.5
+    for depth_m in (3.0, 6.0, 9.0, 30.0):
+        filled_m = np.full((300, 400), depth_m, np.float32)
+        maps = made(np.full(filled_m.shape, 0.6, np.float32), filled_m)
+        truth_m = filled_m + rng.uniform(-smear_m, smear_m, filled_m.shape).astype(np.float32)
+        bad = is_outlier_depth(filled_m, truth_m, CAMERA.focal_px).mean()
+        for share in (1.0, 0.4):
+            found = scale.without_times(maps, smear_m, CAMERA, share)
+            expected = scale.expected_outliers(found)["filled"]
+            assert expected == pytest.approx(share * bad + 10**-3, abs=0.03)
 
 
 FOCAL_PX, GAP_PX, WALL_M = 700.0, 3.0, 12.0

@@ -11,6 +11,7 @@ import yaml
 
 import densify
 from densify.config import resolve
+from densify.depth.confidence import expected_outliers
 from densify.free_space.lone_returns import without_lone
 from densify.geometry import poses
 from densify.geometry.types import Camera
@@ -22,7 +23,7 @@ from densify.readers.timeline import choose_cameras
 from densify.registration.compensation import find_compensated
 from tests.command import exit_code
 from tests.dataset_scenes import FRAMES, OPTIONS, copy_drive, records
-from tests.scenes import CAMERA, TinySequence, stamp_ns
+from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, stamp_ns, street
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 
@@ -171,9 +172,9 @@ def test_real_sweeps_are_told_as_they_are(drive, test_data):
     twist = poses.twist_between(
         *T, 1e-9 * (sequence.stamp_ns(key + 1) - sequence.stamp_ns(key - 1))
     )
-    assert find_compensated(sequence[key], twist) is None
+    assert find_compensated(sequence[key], twist, 0.1) is None
     for moment, says in ((STAMP, "its stamp"), (FIRST, "its first point")):
-        rings = find_compensated(compensated(sequence[key], twist, moment), twist)
+        rings = find_compensated(compensated(sequence[key], twist, moment), twist, 0.1)
         assert rings is not None and rings.moment == says
 
 
@@ -198,6 +199,26 @@ def test_poses_that_the_sweeps_contradict_are_told(kind):
     own = POSES_GIVEN | {"register": {"source": "kiss-icp"}}
     told = run(Wrong(usual.scene, usual.frames), KEY, 3, "icp", config=own).warnings
     assert not any("poses" in w for w in told)
+
+
+@pytest.mark.parametrize("is_compensated", [False, True])
+def test_maps_of_sweeps_without_times_know_it(is_compensated):
+    """They are smeared, unless the sweeps are compensated already."""
+
+    class Untimed(TinySequence):
+        def __getitem__(self, frame):
+            sweep = super().__getitem__(frame)
+            if is_compensated:
+                sweep = compensated(sweep, [0, 0, 0, 30.0, 0, 0], STAMP)
+            return replace(sweep, offset_ns=None)
+
+    fast = Scene(World(street(50.0)), Arc(0, -1.5, 0, 30.0), Scanner(48, 720))
+    timed, untimed = (
+        expected_outliers(run(sequence, KEY, 1, "flow", config=POSES_GIVEN).depth["front"])
+        for sequence in (TinySequence(fast, range(7)), Untimed(fast, range(7)))
+    )
+    more = untimed["measured"] / timed["measured"]
+    assert more < 2 if is_compensated else more > 10
 
 
 def test_more_moving_points_than_there_can_be_are_told():

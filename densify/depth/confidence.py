@@ -14,6 +14,7 @@ probability of the map's own pixels at that rank, made to fall with the rank.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -226,6 +227,25 @@ def wrong(confidence: Float | Float32) -> Float:
     """Return the probability of an outlier at a confidence."""
     probability: Float = 10.0 ** (-DECADES * np.asarray(confidence, np.float64))
     return probability
+
+
+def without_times(maps: DepthMap, smear_m: float, camera: Camera, share: float = 1.0) -> DepthMap:
+    """Return a map of sweeps without times of points, less confident where it is near.
+
+    The motion within these sweeps moves a depth by an unknown amount, any up to ``smear_m`` either
+    way. Near pixels tolerate less of it than far ones.
+
+    Args:
+        smear_m: Half the way along the camera's axis from sweep to sweep.
+        share: Share of the sweeps that have no times.
+    """
+    depth_m, shown = maps.filled_m.astype(np.float64), maps.filled_m > 0
+    px_m = depth_m**2 / (camera.focal_px * KITTI_BASELINE_M)
+    tolerated_m = np.maximum(OUTLIER_PX * px_m, OUTLIER_FRACTION * depth_m)
+    smeared = share * np.clip(1 - tolerated_m / max(smear_m, 1e-9), 0, 1)
+    either = 1 - (1 - wrong(maps.confidence)) * (1 - smeared)
+    confidence = np.clip(-np.log10(np.maximum(either, 10.0**-DECADES)) / DECADES, 0, 1)
+    return replace(maps, confidence=np.where(shown, confidence, 0).astype(np.float32))
 
 
 def expected_outliers(maps: DepthMap) -> dict[str, float | None]:

@@ -11,7 +11,7 @@ import numpy as np
 from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
 from densify.doctor.sample import Sample
 from densify.geometry import poses
-from densify.geometry.types import Float, Sweep
+from densify.geometry.types import Float
 from densify.registration.compensation import (
     CLEARLY,
     COMPENSATED_M,
@@ -20,6 +20,7 @@ from densify.registration.compensation import (
     rings_by_motion,
     sample_rows,
     sharpness,
+    turning_s,
 )
 
 _FAR_M = 60.0
@@ -63,9 +64,12 @@ def _check_compensation(
     sweep = spot.sweeps[spot.middle]
     sweep = sweep.select(sweep.lidar == lidar)
     is_untimed = sweep.offset_ns is None
-    offset_s = _turning_s(sweep, sample) if sweep.offset_ns is None else sweep.offset_ns * 1e-9
     near = sample_rows(sweep, COMPENSATED_M)
-    points, offset_s = sweep.points[near], np.asarray(offset_s[near], np.float64)
+    points = sweep.points[near]
+    if sweep.offset_ns is None:
+        offset_s = turning_s(points, sample.timeline.period_ns * 1e-9)
+    else:
+        offset_s = np.asarray(sweep.offset_ns[near] * 1e-9, np.float64)
     rings = rings_by_motion(points, offset_s, spot.twist, R, origins_m)
     if not rings.are_distinct:  # the origin was looked for in smeared rings
         straight = poses.transform_each(-offset_s[:, None] * spot.twist, points) @ R.T
@@ -93,12 +97,6 @@ def _check_compensation(
     else:
         text += ": as they were fired"
     return finding(name, verdict, text, remedy, as_stored=as_stored, undone=undone, done=done)
-
-
-def _turning_s(sweep: Sweep, sample: Sample) -> Float:
-    """Return the times of a scanner that turns clockwise and faces forward at the stamp."""
-    turn = -np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi)
-    return turn * (sample.timeline.period_ns * 1e-9)
 
 
 def _still_points(sample: Sample, lidar: int) -> Float:

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from densify.config import Config
 from densify.config.errors import InputError
-from densify.depth.confidence import expected_outliers, reliability
+from densify.depth.confidence import expected_outliers, reliability, without_times
 from densify.depth.views import HeldOut, SeenCloud, Views, with_ages
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Bool, Cloud, DepthMap, Float32, Result, Stretch
 from densify.pipeline.costs import Watch
 from densify.pipeline.recording import Beyond, Moment
+from densify.registration.compensation import find_compensated
 from densify.scores import depth_metrics
 from densify.scores.cloud_scores import ghost_scores
 
@@ -126,6 +127,8 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment, filled: bool) -
             static = moment.cloud.select(~moment.cloud.moving)
             seen = views.see(static, visible).joined(far)
         depth = _add_ages(scene, method, views.depth(seen, visible, filled))
+        if visible:
+            depth = _without_times(scene, depth)
     cloud = seen.cloud
     if scene.images:
         with watch.stage("colour"):
@@ -173,6 +176,30 @@ def _add_ages(
     exposures = scene.views.exposures
     return {
         name: with_ages(maps, stamps_ns, scene.key, exposures[name].late_s)
+        for name, maps in depth.items()
+    }
+
+
+def _without_times(scene: KeyScene, depth: dict[str, DepthMap]) -> dict[str, DepthMap]:
+    """Return maps that are less confident where sweeps have no times of points.
+
+    Sweeps that are compensated already need none.
+    """
+    sweeps, at = [s.sweep for s in scene.stretch.sweeps], scene.stretch[scene.key]
+    untimed = np.mean([sweep.offset_ns is None for sweep in sweeps])
+    if len(sweeps) < 2 or not untimed or not scene.settings.register.deskew:
+        return depth
+    period_s = float(np.median(np.diff([sweep.stamp_ns for sweep in sweeps]))) * 1e-9
+    if at.sweep.offset_ns is None and find_compensated(at.sweep, at.twist, period_s) is not None:
+        return depth
+    exposures = scene.views.exposures
+    return {
+        name: without_times(
+            maps,
+            0.5 * period_s * abs(float(exposures[name].twist[5])),
+            exposures[name].camera,
+            float(untimed),
+        )
         for name, maps in depth.items()
     }
 

@@ -78,7 +78,7 @@ def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
         share = num_lone / (num_lone + sum(len(sweep) for sweep in sweeps))
         yield (
             f"{100 * share:.0f} % of the points are lone returns, as of snow, rain or dust; they "
-            f"are left out, and what moves is less certain"
+            f"are left out, and motion is less certain"
         )
     num_near = sum(sweep.num_near for sweep in sweeps)
     share = num_near / max(num_near + sum(len(sweep) for sweep in sweeps), 1)
@@ -94,7 +94,10 @@ def _of_motion(recording: Recording, key: int) -> Iterator[str]:
     """Check the motion within the key sweep, and given poses against the sweeps themselves."""
     settings, stretch = recording.settings.register, recording.window(key)
     at = stretch[key]
-    rings = find_compensated(recording.raw(key), 0.5 * (at.twist_before + at.twist_after))
+    rings = None
+    if at.sweep.offset_ns is not None:
+        period_s = recording.timeline.period_ns * 1e-9
+        rings = find_compensated(recording.raw(key), at.twist, period_s)
     if rings is not None:
         yield (
             f"the sweeps are compensated already, to {rings.moment}, and now a second time: the "

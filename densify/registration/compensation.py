@@ -110,20 +110,30 @@ def sample_rows(sweep: Sweep, far_m: float) -> Int:
     return rows[:: len(rows) // _NUM_POINTS + 1]
 
 
-def find_compensated(sweep: Sweep, twist: Float) -> Rings | None:
+def turning_s(points: Float, period_s: float) -> Float:
+    """Return (N,) firing times of a scanner that turns clockwise and faces forward at the stamp."""
+    turn: Float = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
+    return turn * period_s
+
+
+def find_compensated(sweep: Sweep, twist: Float, period_s: float) -> Rings | None:
     """Return the rings of a raw sweep whose motion is compensated already; else None.
 
     Args:
         twist: (6,) of the lidar, per second.
+        period_s: Duration of a sweep without times of points.
     """
-    if sweep.offset_ns is None or np.linalg.norm(twist[3:]) < LEAST_SPEED_M_S:
+    if np.linalg.norm(twist[3:]) < LEAST_SPEED_M_S:
         return None
     for lidar in np.unique(sweep.lidar).tolist():
         mine = sweep.select(sweep.lidar == lidar)
         near, R = sample_rows(mine, COMPENSATED_M), mine.axes(lidar)
-        if mine.offset_ns is None or not len(near):
+        if not len(near):
             continue
-        offset_s = np.asarray(mine.offset_ns[near] * 1e-9, np.float64)
+        if mine.offset_ns is None:
+            offset_s = turning_s(mine.points[near], period_s)
+        else:
+            offset_s = np.asarray(mine.offset_ns[near] * 1e-9, np.float64)
         origins_m = [R @ mine.origin_m(lidar) + [0.0, 0.0, height_m] for height_m in _HEIGHTS_M]
         rings = rings_by_motion(mine.points[near], offset_s, twist, R, origins_m)
         if rings.are_compensated:

@@ -135,6 +135,11 @@ class RegisteredSweep:
         """The frame of the sweep."""
         return self.sweep.frame
 
+    @property
+    def twist(self) -> Float:
+        """(6,) rotation vector and translation per second at the reference time."""
+        return 0.5 * (self.twist_before + self.twist_after)
+
     @staticmethod
     def without_points(trajectory: Trajectory, frame: int) -> RegisteredSweep:
         """Return the pose and time of a sweep of the trajectory, without points."""
