@@ -116,3 +116,19 @@ def test_the_tables_of_confidence_are_found_again(monkeypatch) -> None:
         for group, rows in zip(scale.GROUPS, shares, strict=True)
     }
     np.testing.assert_allclose(scale.tables_of({"tables": written}), shares, rtol=2e-3, atol=1e-9)
+
+
+def test_the_weights_of_tracks_are_found_again(monkeypatch) -> None:
+    """Tracks are drawn from known odds; where a static one costs more, the price is higher."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    import fit_tracks as example
+
+    rng, num = np.random.default_rng(0), len(example.names())
+    known = np.linspace(-2.0, 2.0, num)
+    terms = rng.normal(1.0, 2.0, (40_000, num))
+    moves = rng.random(len(terms)) < 1 / (1 + np.exp(0.7 - terms @ known))
+    streets = [example.Tracks("", terms, moves, moves)]
+    monkeypatch.setattr(example, "PRICE", 1.0)
+    np.testing.assert_allclose(example.fit(streets), [*known, 0.7], atol=0.1)
+    monkeypatch.setattr(example, "PRICE", 10.0)
+    assert example.fit(streets)[-1] > 1.5

@@ -8,11 +8,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from densify.flow.tracking import proof
+from densify.flow.tracking import likelihood
 from densify.flow.tracking.candidates import Obstacles, find_candidates
 from densify.flow.tracking.following import find_starts
+from densify.flow.tracking.likelihood import (
+    Evidence,
+    Places,
+    Violations,
+    find_places_left,
+    judge,
+    own_table,
+)
 from densify.flow.tracking.objects import MovingObject, Observation, Shape, Track
-from densify.flow.tracking.proof import Places, PlacesLeft, find_places_left, violations_left
+from densify.flow.tracking.tracks import find_tracks
 from densify.free_space.ground import ground
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry.clock import Clock
@@ -54,56 +62,58 @@ def test_few_points_or_few_seeds_start_nothing(size, seed_share, starts_one):
     assert len(starts([clusters([size], seed_share)])) == starts_one
 
 
-# --- the proof, by its figures --------------------------------------------------------------------
+# --- the odds, by their figures -------------------------------------------------------------------
 
-EMPTY, FENCE, NOTHING = ((0, 100), (0, 100)), ((953, 34), (689, 0)), ((0, 0), (0, 0))
+SURE = Evidence(Violations(200, 0, 300), Places(0, 100), Places(0, 100), 30.0, 0.1, 1.0)
+
+
+def odds(**changed: object) -> float:
+    return SURE._replace(**changed).log_odds(own_table())
 
 
 @pytest.mark.parametrize(
-    ("step_m", "num_states", "gap_m", "counts", "places", "confirmed"),
+    "worse",
     [
-        (0.9, 8, 0.1, (200, 0, 300), EMPTY, True),
-        (0.9, 2, 0.1, (200, 0, 300), EMPTY, False),  # two states
-        (0.02, 8, 0.1, (200, 0, 300), EMPTY, False),  # a short way
-        (0.24, 3, 0.5, (100, 0, 300), EMPTY, True),
-        (0.24, 3, 1.8, (100, 0, 300), EMPTY, False),  # short, between rings far apart
-        (0.9, 8, 0.1, (10, 0, 600), EMPTY, False),  # few violations if static
-        (0.9, 8, 0.1, (200, 120, 700), EMPTY, False),  # the motion does not explain them
-        (0.2, 8, 0.05, (200, 80, 700), ((0, 30), (0, 30)), True),  # limbs
-        (0.2, 8, 0.05, (200, 80, 700), ((1, 30), (0, 30)), False),
-        (0.9, 8, 0.1, (200, 0, 300), FENCE, False),  # a fence goes on, on both sides
-        (0.9, 8, 0.1, (200, 0, 300), ((100, 0), (0, 100)), True),  # the rest of a long object
-        (0.9, 8, 0.1, (200, 0, 300), NOTHING, True),
-        (0.9, 3, 0.1, (100, 20, 300), EMPTY, False),  # three positions of a tree's crown
-        (0.9, 3, 0.1, (100, 2, 300), EMPTY, True),
-        (1.2, 8, 0.1, (280, 98, 700), ((0, 1639), (2, 11)), True),  # far, empty on one side
-        (1.2, 8, 0.1, (280, 98, 700), ((0, 80), (2, 11)), False),
-        (0.12, 10, 0.4, (108, 16, 1920), ((14, 15), (42, 0)), False),  # rings glide on a parked car
-        (0.12, 10, 0.4, (300, 16, 1920), ((14, 15), (42, 0)), True),
+        {"violations": Violations(10, 0, 300)},  # few violations if static
+        {"violations": Violations(200, 120, 300)},  # the motion does not explain them
+        {"before": Places(100, 0), "after": Places(100, 0)},  # a fence goes on, on both sides
+        {"after": Places(100, 0)},
+        {"travelled": 1.0},  # a short way
+        {"rough": 1.0},  # off the smooth path
+        {"slender": 5.0},  # a rail that moves along itself
     ],
 )
-def test_what_is_confirmed(step_m, num_states, gap_m, counts, places, confirmed, monkeypatch):
-    """counts: violations if static, violations left, tests. places: taken and empty, before and
-    after."""
-    track = Track(np.array([20.0, 0, 0]))
-    for n in range(num_states):
-        state = np.array([step_m * n, 0, 0, 0])
-        track.observations[n] = Observation(state, 0.1 * n, n * PERIOD_NS, (n,))
-        track.claimed[n] = np.arange(8)
-    space = SimpleNamespace(
-        gap_m=lambda *_: gap_m, clock=SimpleNamespace(time_s=0.1 * np.arange(11))
-    )
-    monkeypatch.setattr(proof, "count_violations", lambda *_: counts)
-    left = PlacesLeft(*(Places(*side) for side in places))
-    monkeypatch.setattr(proof, "find_places_left", lambda *_: left)
-    assert np.isfinite(violations_left(track, [], space, [])) == confirmed
+def test_each_term_speaks_against_a_track(worse):
+    assert odds(**worse) < odds() - 1
 
 
 @pytest.mark.parametrize(
-    ("along_deg", "static", "rail"),
-    [(0, 25, True), (34, 25, True), (90, 25, False), (0, 35, False)],
+    ("evidence", "moves"),
+    [
+        # limbs swing: violations are left
+        (((200, 80, 700), (0, 30), (0, 30), 7.0, 0.1, 1.0), True),
+        # the rest of a long object is there, on either side
+        (((200, 0, 300), (100, 0), (0, 100), 30.0, 0.1, 1.0), True),
+        (((200, 0, 300), (0, 0), (0, 0), 30.0, 0.1, 1.0), True),
+        # far, and empty on one side
+        (((280, 98, 700), (0, 1639), (2, 11), 40.0, 0.1, 1.0), True),
+        # rings glide on a parked car
+        (((108, 16, 1920), (14, 15), (42, 0), 5.4, 0.1, 1.0), False),
+        # a guard rail seen between rings
+        (((221, 0, 920), (111, 165), (349, 41), 92.0, 0.02, 6.7), False),
+        # a tree's crown, a hedge: the motion leaves as many violations as there were
+        (((56, 130, 400), (79, 30), (91, 10), 9.5, 0.3, 1.9), False),
+        (((369, 415, 3190), (0, 0), (0, 0), 0.3, 0.13, 1.5), False),
+    ],
 )
-def test_a_line_that_moves_along_itself_may_be_a_rail(along_deg, static, rail, monkeypatch):
+def test_what_is_confirmed(evidence, moves):
+    violations, before, after, *rest = evidence
+    found = Evidence(Violations(*violations), Places(*before), Places(*after), *rest)
+    assert (found.log_odds(own_table()) > 0) == moves
+
+
+@pytest.mark.parametrize(("along_deg", "slender"), [(0, 7.4), (90, 1.0)])
+def test_only_what_moves_along_itself_is_slender(along_deg, slender, monkeypatch):
     offset_m = np.linspace(-1.2, 1.2, 20)
     way = np.array([np.cos(np.deg2rad(along_deg)), np.sin(np.deg2rad(along_deg)), 0])
     track, obstacles = Track(np.zeros(3)), []
@@ -113,14 +123,52 @@ def test_a_line_that_moves_along_itself_may_be_a_rail(along_deg, static, rail, m
         track.claimed[n] = np.arange(20)
         line = np.stack([offset_m, 0 * offset_m, 0 * offset_m], 1) + state[:3]
         obstacles.append(SimpleNamespace(points=line, time_s=np.full(20, 0.1 * n)))
-    track.smooth()
-    monkeypatch.setattr(proof, "count_violations", lambda *_: (static, 0, 100))
-    left = PlacesLeft(Places(9, 30), Places(0, 30))
-    monkeypatch.setattr(proof, "find_places_left", lambda *_: left)
-    assert proof.is_rail(track, obstacles, SimpleNamespace(), []) == rail
+    monkeypatch.setattr(likelihood, "count_violations", lambda *_: Violations(25, 0, 100))
+    nowhere = Places(0, 0), Places(0, 0)
+    monkeypatch.setattr(likelihood, "find_places_left", lambda *_: nowhere)
+    found = []
+    space = SimpleNamespace(gap_m=lambda *_: 0.65)
+    judge(track, obstacles, space, [], lambda _, evidence: found.append(evidence))
+    assert found[0].slender == pytest.approx(slender, abs=0.05)
+    assert found[0].travelled == pytest.approx(10 / 0.325)
 
 
-# --- the proof, in scenes -------------------------------------------------------------------------
+def test_two_states_confirm_nothing():
+    track = Track(np.zeros(3))
+    for n in range(2):
+        track.observations[n] = Observation(np.zeros(4), 0.1 * n, n * PERIOD_NS, (n,))
+    assert not judge(track, [], SimpleNamespace(), []).moves
+
+
+def test_the_weights_separate_the_tracks_of_a_street_that_had_no_part_in_the_fit():
+    movers = car(6, 1.8, 9, 1), car(45, 1.8, 8, 2, yaw=np.pi), car(12, -1.6, 6, 3)
+    walker = car(16, 3.6, 1.5, 4, yaw=-np.pi / 2, size_m=(0.5, 0.5, 1.7))
+    leaves = [
+        Box((6, 1.5, 2.0), Arc(x, y), solid=0.5) for x, y in ((8, 5.5), (15, -6), (-6, 6), (20, 5))
+    ]
+    scanner = Scanner(32, 900, (-25.0, 5.0), 0.02)
+    scene = Scene(World((*street(), *leaves, *movers, walker)), EGO, scanner)
+    stretch = scene.stretch(KEY, 5)
+    space, heights = FreeSpace.of(stretch), ground(stretch)
+    found = find_candidates(stretch, space, heights)
+    obstacles = [Obstacles.of(stretch, i, c) for i, c in enumerate(found)]
+    shares, log_odds = [], []
+
+    def judged(track, evidence):
+        on = [
+            scene.scan(KEY - 5 + i).instance[obstacles[i].row[rows]] >= 0
+            for i, rows in track.claimed.items()
+        ]
+        shares.append(np.concatenate(on).mean())
+        log_odds.append(evidence.log_odds(own_table()))
+
+    find_tracks(obstacles, space, heights, judged=judged)
+    share, moves = np.array(shares), np.array(log_odds) > 0
+    assert (share > 0.9).sum() > 5 and (share < 0.1).sum() > 5
+    assert not moves[share < 0.1].any() and moves[share > 0.9].mean() > 0.8
+
+
+# --- the odds, in scenes --------------------------------------------------------------------------
 
 SPEED_M_S, KEY = 6.0, 6
 EGO = Arc(0.0, -1.5, 0.0, 9.0)
@@ -128,7 +176,7 @@ CARS = [car(x, -4.0, SPEED_M_S, n) for n, x in enumerate((8.7, 2.0, -4.7))]
 
 
 class Seen:
-    """A scene as the proof sees it, and what seems to go through it at `SPEED_M_S`."""
+    """A scene as the judge sees it, and what seems to go through it at `SPEED_M_S`."""
 
     def __init__(self, *boxes: Box) -> None:
         self.scene = Scene(World((*street(), *boxes)), EGO, Scanner(sigma_m=0.01))
@@ -154,17 +202,16 @@ class Seen:
     def places(self, track: Track, *known: Track) -> np.ndarray:
         """[before, after] × [taken, empty]"""
         objects = [MovingObject(t, Shape.of(t.points_in(self.obstacles, t.claimed))) for t in known]
-        return np.array(find_places_left(track, self.obstacles, self.space, objects))
+        return np.array(find_places_left(track, self.obstacles, self.space, objects, 0.2))
 
 
-def test_a_fence_does_not_move(monkeypatch):
+def test_a_fence_does_not_move():
     """It stops half of the rays, wherever a piece of it seems to be."""
     fence = Seen(Box((60.0, 0.06, 1.6), Arc(0.0, -4.0), solid=0.5))
     piece = fence.track([0], -7.0)
     places = fence.places(piece)
     assert (places[:, 0] > 10 * places[:, 1]).all()
-    monkeypatch.setattr(proof, "count_violations", lambda *_: (1000, 0, 3000))
-    assert np.isinf(violations_left(piece, fence.obstacles, fence.space, []))
+    assert not judge(piece, fence.obstacles, fence.space, []).moves
 
 
 def test_a_car_moves_though_others_go_close_before_and_behind():
@@ -173,4 +220,4 @@ def test_a_car_moves_though_others_go_close_before_and_behind():
     first, middle, last = (row.track([n], car.path.x - 2.1) for n, car in enumerate(CARS))
     taken = [row.places(middle, *known)[:, 0] for known in ((), (first,), (first, last))]
     assert (taken[0] > 20 * taken[2]).all() and taken[1].sum() > 20 * taken[2].sum()
-    assert np.isfinite(violations_left(middle, row.obstacles, row.space, []))
+    assert judge(middle, row.obstacles, row.space, []).moves

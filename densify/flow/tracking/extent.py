@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.flow.tracking.candidates import Obstacles, Strips, firing_times_s
-from densify.flow.tracking.objects import MovingObject, Shape, Track
+from densify.flow.tracking.candidates import LINK_M, Obstacles, Strips, firing_times_s
+from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track, near_m
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
@@ -23,19 +23,16 @@ from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 
 Instance = NDArray[np.int32]
 
-_ATTACH_M, _ATTACH_UNSEEN_M = 0.3, 0.15  # to the shape: of candidates, of other points;
-_GAPS_REACHED, _GAPS_REACHED_UNSEEN = 0.8, 0.5  # or so many gaps between rings
+_REACH = 1.5  # of candidates, in distances up to which other points count as neighbours
 _LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M, _AS_LOW_AS_ROAD_M = 0.08, 0.1, 0.15
-_WHEELS_M = 1.0
 _WALKS_M_S = 2.0
-_AROUND_M, _LEAST_SEEDS, _WALKER_M = 0.3, 0.1, 1.5
+_LEAST_SEEDS, _WALKER_M = 0.1, 1.5
 _WIDER_M, _MOSTLY = 0.5, 0.5  # so many of the points so close must move too
 _ALONE_GAPS, _NUM_BESIDE = 2.0, 2
-_LENGTH_M, _SIDE_M = 15.0, 0.1
-# Along a side that falls away from the scanner, so many columns of rays.
-_HOLE_M, _HOLE_COLUMNS, _LONGEST_HOLE_M = 0.6, 2.0, 2.0
+NUM_COLUMNS = 2.0
+"""Columns of rays in a gap along a side that falls away from the scanner."""
+_LONGEST_HOLE_M = 2.0
 _MAX_VIOLATIONS = 0.05
-_LEFT_M, _THERE_M = 0.6, 0.2
 _PREDICTED_S = 0.2  # before the first and after the last observation
 
 
@@ -45,7 +42,7 @@ class SweepPoints:
 
     row: (N,) in the sweep. points: (N,3) world. time_s: (N,) firing time. height_m: (N,) above the
     ground. gap_m: (N,) between neighbouring rings there. reach_m: (N,) greatest distance from an
-    object's shape. seed: (N,) True if another sweep saw through the point.
+    object's shape.
     """
 
     row: Int
@@ -54,7 +51,6 @@ class SweepPoints:
     height_m: Float32
     gap_m: Float
     reach_m: Float
-    seed: Bool
 
     @staticmethod
     def of(
@@ -65,16 +61,11 @@ class SweepPoints:
         height_m = ground.above(points)
         row = np.flatnonzero(height_m > _LEAST_HEIGHT_M)
         gap_m = sensors.gap_m(registered.sweep.points[row], registered.sweep.lidar[row])
-        candidate, seed = np.zeros((2, len(points)), bool)
+        candidate = np.zeros(len(points), bool)
         candidate[obstacles.row[obstacles.candidate]] = True
-        seed[obstacles.row[obstacles.seed]] = True
-        reach_m = np.where(
-            candidate[row],
-            np.maximum(_ATTACH_M, _GAPS_REACHED * gap_m),
-            np.maximum(_ATTACH_UNSEEN_M, _GAPS_REACHED_UNSEEN * gap_m),
-        )
+        reach_m = np.where(candidate[row], _REACH, 1.0) * near_m(gap_m)
         time_s = firing_times_s(stretch, i, row)
-        return SweepPoints(row, points[row], time_s, height_m[row], gap_m, reach_m, seed[row])
+        return SweepPoints(row, points[row], time_s, height_m[row], gap_m, reach_m)
 
     @staticmethod
     def together(parts: Sequence[SweepPoints]) -> SweepPoints:
@@ -99,19 +90,18 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
     points = np.concatenate(list(parts.values()))
     if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
         return Shape.of(points)
-    gap_m = space.gap_m(track.centre, sweeps[0])
+    within_m = near_m(space.gap_m(track.centre, sweeps[0]))
     of = np.repeat(np.arange(len(sweeps)), [len(part) for part in parts.values()])
     again = np.zeros(len(points), bool)
     for odd in (False, True):
         mine = of % 2 == odd
         if not mine.all():
             tree = tree_of(points[~mine])
-            again[mine] = is_near(tree, points[mine], max(_ATTACH_M, _GAPS_REACHED * gap_m))
-    reach_m = max(_THERE_M, _GAPS_REACHED_UNSEEN * gap_m)
-    moves = ~_is_static(track, obstacles, parts, of, reach_m)
+            again[mine] = is_near(tree, points[mine], _REACH * within_m)
+    moves = ~_is_static(track, obstacles, parts, of, within_m)
     again &= moves & close_to_seeds(points, moves, _WIDER_M, _MOSTLY)
     seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
-    own = again & close_to_seeds(points, seed, _AROUND_M, _LEAST_SEEDS)
+    own = again & close_to_seeds(points, seed, _REACH * within_m, _LEAST_SEEDS)
     if own.any() and np.linalg.norm(np.ptp(points[own, :2], axis=0)) < _WALKER_M:
         return Shape.of(points[own])
     return Shape.of(points[again] if again.any() else points)
@@ -153,9 +143,7 @@ def assign_points(
     parts = [SweepPoints.of(stretch, i, ground, obstacles[i], space.sensors) for i in batch]
     attached = []
     for i, points in zip(batch, parts, strict=True):
-        instance = attach(points, i, objects, space.clock)
-        detach(instance, points, i, objects, obstacles, space.clock)
-        attached.append(instance)
+        attached.append(attach(points, i, objects, space.clock))
     joined = np.concatenate(attached)
     lengthen(joined, SweepPoints.together(parts), batch[0], objects, space)
     attached = np.split(joined, np.cumsum([len(mine) for mine in attached])[:-1])
@@ -172,7 +160,7 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
     """Return (N,) the object of each point of sweep i, -1 for none.
 
     A point belongs to an object if it is close to the object's accumulated points, or lies within
-    their outline.
+    their outline. The ground below a walker does not.
     """
     instance = np.full(len(seen.points), -1, np.int32)
     least_m = np.full(len(seen.points), np.inf)
@@ -180,8 +168,8 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
         if not is_known_at(track, i, clock):
             continue
         rim = track.place(shape.rim, track.seen_at(clock.time_ns[i]))
-        low, high = rim.min(0) - 2 * _ATTACH_M, rim.max(0) + 2 * _ATTACH_M
-        low[2] -= _WHEELS_M
+        low, high = rim.min(0) - LINK_M, rim.max(0) + LINK_M
+        low[2] = -np.inf  # wheels
         rows = seen.strips.rows_inside(low, high)
         if not len(rows):
             continue
@@ -189,38 +177,12 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
         distance_m, _ = nearest(shape.tree, in_object)
         belongs = (distance_m < seen.reach_m[rows]) & (seen.height_m[rows] >= ABOVE_GROUND_M)
         belongs |= shape.within_outline(in_object)
+        if _speed_m_s(track, i, clock) <= _WALKS_M_S:
+            belongs &= seen.height_m[rows] >= _LEAST_HEIGHT_OF_WALKERS_M
         closer = belongs & (distance_m < least_m[rows])
         instance[rows[closer]] = k
         least_m[rows[closer]] = distance_m[closer]
     return instance
-
-
-def detach(
-    instance: Instance,
-    seen: SweepPoints,
-    i: int,
-    objects: Sequence[MovingObject],
-    obstacles: Sequence[Obstacles],
-    clock: Clock,
-) -> None:
-    """Take the ground and the static points beside them from walkers: points that no sweep saw
-    through, and that are still there when the walker is gone."""
-    for k, (track, shape) in enumerate(objects):
-        if _speed_m_s(track, i, clock) > _WALKS_M_S:
-            continue
-        instance[(instance == k) & (seen.height_m < _LEAST_HEIGHT_OF_WALKERS_M)] = -1
-        rows = np.flatnonzero((instance == k) & ~seen.seed)
-        for j in {min(track.claimed), max(track.claimed)} - {i}:
-            in_object = track.undo(seen.points[rows], clock.time_s[j])
-            away = rows[~is_near(shape.tree, in_object, _LEFT_M)]
-            if not len(away):
-                continue
-            places, c = seen.points[away], obstacles[j]
-            near = c.strips.rows_inside(places.min(0) - _THERE_M, places.max(0) + _THERE_M)
-            static = c.points[near[~c.candidate[near]]]
-            if len(static):
-                there = is_near(tree_of(static), places, _THERE_M)
-                instance[away[there]] = -1
 
 
 def leave_out_isolated(
@@ -257,22 +219,17 @@ def lengthen(
         if not len(mine) or _speed_m_s(track, i, space.clock) <= _WALKS_M_S:
             continue
         at_s = track.seen_at(space.clock.time_ns[i])
-        ahead = MovingObject(track, shape).heading(at_s)
-        axes = np.stack([ahead, [-ahead[1], ahead[0]]], axis=1)
-        rim = track.place(shape.rim, at_s)
-        aside = (rim[:, :2] @ axes)[:, 1]
+        lane = MovingObject(track, shape).lane(at_s)
         middle = track.place(shape.points.mean(0, keepdims=True), at_s)[0]
-        reach = np.array([1.5 * _LENGTH_M, 1.5 * _LENGTH_M, np.inf])
+        reach = np.array([1.5 * LANE_M, 1.5 * LANE_M, np.inf])
         rows = seen.strips.rows_inside(middle - reach, middle + reach)
         rows = rows[instance[rows] < 0]
         at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
-        along = at_once[:, :2] @ axes
-        fits = (along[:, 1] > aside.min() - _SIDE_M) & (along[:, 1] < aside.max() + _SIDE_M)
-        fits &= at_once[:, 2] < rim[:, 2].max() + _SIDE_M
-        own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ ahead
-        rows, along = rows[fits], along[fits, 0]
-        columns_m = columns_apart_m(middle, ahead, space.T_lidar_world[i], space.sensors)
-        hole_m = float(np.clip(_HOLE_COLUMNS * columns_m, _HOLE_M, _LONGEST_HOLE_M))
+        fits = lane.holds(at_once)
+        rows, along = rows[fits], at_once[fits, :2] @ lane.ahead
+        own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ lane.ahead
+        columns_m = columns_apart_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
+        hole_m = float(np.clip(NUM_COLUMNS * columns_m, LINK_M, _LONGEST_HOLE_M))
         linked = _is_linked(along, own, hole_m)
         if linked.any():
             rows, along = rows[linked], along[linked] - np.median(own)
@@ -308,7 +265,7 @@ def _is_free_of_violations(
 
     along: (N,) metres ahead of the middle.
     """
-    step = np.floor(np.abs(along) / _HOLE_M).astype(np.int64)
+    step = np.floor(np.abs(along) / LINK_M).astype(np.int64)
     num_steps = int(step.max(initial=0)) + 1
     step += num_steps * (along < 0)  # those ahead, then those behind
 

@@ -25,7 +25,8 @@ _MIN_SEED_SHARE = 0.4
 _AROUND_S = 0.5  # from both ends of the recording, any start is equally good
 _NEARER_END, _NEARER_END_S = 0.7, 0.1  # nearer to an end, it is worth 0.7 for each 0.1 s
 _BESIDE_M = 1.0  # from a towing vehicle to what it tows
-_FIT_M = 0.3
+FIT_M = 0.3
+"""From the object to its points."""
 _SHARE_UNSEEN = 0.5  # of the points that a batch usually has
 # m, m, rad: of a prediction over 0.25 s, and in proportion over longer times.
 _PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
@@ -136,7 +137,7 @@ class Follower:
         if state is None:
             return None
         state[2] = track.rise_m(self.ground, state)
-        fit = model.covers(undo(state, target, centre), _FIT_M)
+        fit = model.covers(undo(state, target, centre), FIT_M)
         if fit.sum() < enough:
             return None
         return state, seen_s, rows[fit], target[fit]

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
@@ -19,12 +19,26 @@ from densify.free_space.seen_through import FreeSpace
 from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
+_NEAR_M, _NEAR_GAPS = 0.2, 0.5
 _MANY_POINTS = 100  # more do not locate an object better
 _BESIDE_M = 1.0
 _OUTLINE_M = 0.05
-_LONG_M = 3.0
+LONG_M = 3.0
+"""Shorter objects may bend, and need not move where they point."""
+LANE_M = 15.0
+"""So far ahead of and behind an object its parts are looked for."""
+_SIDE_M = 0.1
 _QUARTERS_RAD = np.arange(4) * np.pi / 2
 _SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
+
+
+def near_m(gap_m: Float | float) -> Any:
+    """Return the distance (m) up to which two points may be of one place.
+
+    Args:
+        gap_m: Between neighbouring rings there.
+    """
+    return np.maximum(_NEAR_M, _NEAR_GAPS * gap_m)
 
 
 @dataclass(frozen=True)
@@ -204,9 +218,38 @@ class MovingObject(NamedTuple):
         ahead = self.track.path.rate(at_s)[:2]
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
         rim = self.track.place(self.shape.rim, at_s)[:, :2]
-        if np.linalg.norm(np.ptp(rim, axis=0)) < _LONG_M:
+        if np.linalg.norm(np.ptp(rim, axis=0)) < LONG_M:
             return ahead
         sides_rad = self.shape.side_rad + float(self.track.path(at_s)[3]) + _QUARTERS_RAD
         sides = np.stack([np.cos(sides_rad), np.sin(sides_rad)], axis=1)
         side: Float = sides[np.argmax(sides @ ahead)]
-        return side if np.ptp(rim @ side) >= _LONG_M else ahead
+        return side if np.ptp(rim @ side) >= LONG_M else ahead
+
+    def lane(self, at_s: float) -> Lane:
+        """Return the space ahead of and behind the object at a time, world."""
+        ahead = self.heading(at_s)
+        rim = self.track.place(self.shape.rim, at_s)
+        aside = rim[:, :2] @ [-ahead[1], ahead[0]]
+        return Lane(ahead, aside.min() - _SIDE_M, aside.max() + _SIDE_M, rim[:, 2].max() + _SIDE_M)
+
+
+class Lane(NamedTuple):
+    """The space ahead of and behind an object, as wide and as high as it is.
+
+    Attributes:
+        ahead: (2,) unit vector.
+        right_m: Its end to the right, m along the normal of ``ahead``.
+        left_m: Its end to the left.
+        top_m: Its upper end, world.
+    """
+
+    ahead: Float
+    right_m: float
+    left_m: float
+    top_m: float
+
+    def holds(self, points: Float) -> Bool:
+        """Return (N,) True for (N,3) points within."""
+        aside = points[:, :2] @ [-self.ahead[1], self.ahead[0]]
+        inside: Bool = (aside > self.right_m) & (aside < self.left_m) & (points[:, 2] < self.top_m)
+        return inside

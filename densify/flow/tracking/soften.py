@@ -18,6 +18,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
+from densify.flow.tracking.objects import LONG_M
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Float, Int
 
@@ -31,7 +32,6 @@ _STEADY = 1.0  # weight of equal velocities before and after
 _ANCHOR, _ANCHOR_M = 2.0, 0.02  # weight of the rigid position, and the distance that ends it
 _MAX_PRODUCTS, _RESIDUAL_DROP = 30, 0.02
 _NUM_LOOKED_UP = 3
-_LARGEST_M = 3.0
 _MIN_PARTS, _MIN_SEEN_S, _MIN_POINTS = 5, 0.35, 20
 _CAP_M = 0.3  # a stray point counts no more than this
 # On eight streets parts of vehicles gained up to 0.045 of the squared distance, walkers within
@@ -129,7 +129,7 @@ def _may_bend(parts: tuple[Part, ...]) -> bool:
     if np.median([len(p.points) for p in parts]) < _MIN_POINTS:
         return False
     lengths_m = [np.linalg.norm(np.ptp(p.points, axis=0)) for p in parts]
-    return bool(np.median(lengths_m) < _LARGEST_M)
+    return bool(np.median(lengths_m) < LONG_M)
 
 
 def _held_out(parts: tuple[Part, ...]) -> Float:

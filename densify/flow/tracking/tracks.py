@@ -8,24 +8,24 @@ confirmed only if the smooth motion explains the measurements.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain
 
 import numpy as np
 from scipy import ndimage
 
 from densify.flow.surface_matching import Model
 from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles
-from densify.flow.tracking.extent import columns_apart_m
+from densify.flow.tracking.extent import NUM_COLUMNS, columns_apart_m
 from densify.flow.tracking.following import (
+    FIT_M,
     MIN_POINTS,
     Follower,
     find_starts,
     velocities_beside,
 )
-from densify.flow.tracking.objects import MovingObject, Shape, Track
-from densify.flow.tracking.proof import is_rail, violations_left
+from densify.flow.tracking.likelihood import Judge, Verdict, judge
+from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track
 from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
@@ -35,14 +35,10 @@ from densify.geometry.clock import Clock
 from densify.geometry.linking import link
 from densify.geometry.types import Bool, Float, Int
 
-_FIT_M = 0.3
 _NEAR_S = 0.3
 _REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: of the smooth motion
-_CLEARLY = 0.5  # of the violations of another motion
-_DOUBTFUL = 0.0025  # share of violations from which on a track is followed from its ends too
 _AS_WHOLE = 0.9  # of its points
-_AHEAD_M, _SIDE_M = 15.0, 0.1
-_COLUMNS_IN_GAP, _GAPS_IN_LINE_M = 2.0, (1.5, 4.0)
+_GAPS_IN_LINE_M = (1.5, 4.0)
 _ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of one, in steps of rings and of columns
 
 
@@ -51,13 +47,14 @@ def find_tracks(
     space: FreeSpace,
     ground: HeightMap,
     velocities_m_s: Sequence[Float] | None = None,
+    judged: Judge | None = None,
 ) -> list[Track]:
     """Return the confirmed tracks of all moving objects in the stretch.
 
     velocities_m_s: per sweep (C,3) of its obstacles, with which clusters start; None lets the
-    neighbouring sweeps vote.
+    neighbouring sweeps vote. judged: called with each track that was tried, and its evidence.
     """
-    return _Search(obstacles, space, ground, velocities_m_s).tracks()
+    return _Search(obstacles, space, ground, velocities_m_s, judged).tracks()
 
 
 class _Search:
@@ -69,8 +66,10 @@ class _Search:
         space: FreeSpace,
         ground: HeightMap,
         velocities_m_s: Sequence[Float] | None,
+        judged: Judge | None,
     ) -> None:
         self._obstacles, self._space, self._ground = obstacles, space, ground
+        self._judged = judged
         self._velocities_m_s = velocities_m_s
         self.batches = [Batch.of(sweeps, obstacles, space.clock) for sweeps in space.batches]
         self.clock = Clock(np.array([batch.time_ns for batch in self.batches]))
@@ -102,14 +101,13 @@ class _Search:
                 members = cluster[untaken]
                 if len(members) < MIN_POINTS:
                     continue
-                track, left = self._track_of(members, n)
+                track, verdict = self._track_of(members, n)
                 for j, rows in batch.split(members).items():
                     not_started[j][rows] = False
                 for j, rows in track.claimed.items():
                     untried[j][rows] = False
-                if np.isinf(left) or (may_start is not_started and not self._leaves_itself(track)):
-                    continue
-                self._keep(track)
+                if verdict.moves and (may_start is untried or self._leaves_itself(track)):
+                    self._keep(track)
         return [track for track, _ in self._objects]
 
     def _leaves_itself(self, track: Track) -> bool:
@@ -121,13 +119,16 @@ class _Search:
         """Keep a confirmed track, unless it is a piece of a guard rail."""
         self._gather(track)
         # A piece of a guard rail is recognised by the rest of it.
-        if is_rail(track, self._obstacles, self._space, self._objects):
+        if not self._judge(track).moves:
             return
         _refine(track, self._obstacles, self._ground)
         self._claim_in_line(track)
         for j, rows in track.claimed.items():
             self._free[j][rows] = False
         self._objects.append(MovingObject(track, self._shape_of(track)))
+
+    def _judge(self, track: Track) -> Verdict:
+        return judge(track, self._obstacles, self._space, self._objects, self._judged)
 
     def _shape_of(self, track: Track) -> Shape:
         return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
@@ -142,43 +143,30 @@ class _Search:
             velocity = np.median(self.batches[n].gather(self._velocities_m_s)[members], axis=0)
         return velocity
 
-    def _track_of(self, members: Int, n: int) -> tuple[Track, float]:
-        """Return the best track of a cluster of batch n, see `_best_of`.
+    def _track_of(self, members: Int, n: int) -> tuple[Track, Verdict]:
+        """Return the most likely track of a cluster of batch n.
 
         It starts at the velocity that most sweeps agree on, and at those of the objects beside it,
         such as its towing vehicle's. If violations are left, it is followed from its ends too: more
         may be in view there than a side that slides along itself.
         """
-        beside = velocities_beside(self.batches[n], members, self._objects)
-        track, left = self._best_of(members, n, chain([self._velocity_of(members, n)], beside))
-        if not _DOUBTFUL < left < np.inf:
-            return track, left
-        for k in sorted({min(track.observations), max(track.observations)} - {n}):
-            rows = track.rows_in(self.batches[k])
-            if len(rows) >= MIN_POINTS:
-                tried, violations = self._best_of(rows, k, [self._velocity_of(rows, k)])
-                is_whole = tried.total_points() >= _AS_WHOLE * track.total_points()
-                if is_whole and violations < _CLEARLY * left:
-                    track, left = tried, violations
-        return track, left
+        best = self._follow(members, n, self._velocity_of(members, n))
+        for velocity in velocities_beside(self.batches[n], members, self._objects):
+            if best[1].is_clearly_below(best[1].at_most):
+                best = _better(best, self._follow(members, n, velocity))
+        track, verdict = best
+        if verdict.moves and verdict.is_clearly_below(verdict.at_most):
+            for k in sorted({min(track.observations), max(track.observations)} - {n}):
+                rows = track.rows_in(self.batches[k])
+                if len(rows) >= MIN_POINTS:
+                    found = self._follow(rows, k, self._velocity_of(rows, k))
+                    if found[0].total_points() >= _AS_WHOLE * track.total_points():
+                        best = _better(best, found)
+        return best
 
-    def _best_of(self, members: Int, n: int, velocities: Iterable[Float]) -> tuple[Track, float]:
-        """Follow a cluster from each velocity, up to a track without violations.
-
-        Returns the confirmed track with clearly the lowest share of violations, and the share; the
-        last track and inf if none is confirmed.
-        """
-        best, least = Track(np.zeros(3)), np.inf
-        for velocity in velocities:
-            track = self._follower.follow(members, n, velocity)
-            left = violations_left(track, self._obstacles, self._space, self._objects)
-            if left < _CLEARLY * least:
-                best, least = track, left
-            elif np.isinf(least):
-                best = track
-            if least == 0:
-                break
-        return best, least
+    def _follow(self, members: Int, n: int, velocity: Float) -> tuple[Track, Verdict]:
+        track = self._follower.follow(members, n, velocity)
+        return track, self._judge(track)
 
     def _gather(self, track: Track) -> None:
         """Claim the free candidates close to or within the object that its motion explains, before
@@ -187,9 +175,9 @@ class _Search:
         for j, own in track.claimed.items():
             c = self._obstacles[j]
             there = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
-            rows = c.strips.rows_inside(there.min(0) - 2 * _FIT_M, there.max(0) + 2 * _FIT_M)
+            rows = c.strips.rows_inside(there.min(0) - LINK_M, there.max(0) + LINK_M)
             rows = self._unclaimed(j, rows, own)
-            rows = rows[shape.near(track.undo(c.points[rows], c.time_s[rows]), _FIT_M)]
+            rows = rows[shape.near(track.undo(c.points[rows], c.time_s[rows]), FIT_M)]
             track.claimed[j] = np.concatenate([own, self._without_violations(track, j, rows)])
 
     def _claim_in_line(self, track: Track) -> None:
@@ -198,29 +186,24 @@ class _Search:
         On a roof, or a side that falls away from the scanner, they lie too far apart to be linked.
         Tracked alone, such a cluster would stay where the rays are.
         """
-        space = self._space
-        shape = self._shape_of(track)
-        ahead = MovingObject(track, shape).heading(next(iter(track.observations.values())).seen_s)
-        across = np.array([-ahead[1], ahead[0]])
-        aside = shape.rim[:, :2] @ across
-        found, parts = {}, [shape.points]
+        space, shape = self._space, self._shape_of(track)
+        at_s = next(iter(track.observations.values())).seen_s
+        lane = MovingObject(track, shape).lane(at_s)
+        found, parts = {}, [track.place(shape.points, at_s)]
         for j, own in track.claimed.items():
-            c, T_lidar_world = self._obstacles[j], space.T_lidar_world[j]
+            c = self._obstacles[j]
             there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
-            rows = c.strips.rows_inside(there.min(0) - _AHEAD_M, there.max(0) + _AHEAD_M)
+            rows = c.strips.rows_inside(there.min(0) - LANE_M, there.max(0) + LANE_M)
             rows = self._unclaimed(j, rows, own)
-            rows = rows[_few_rays(c, rows, T_lidar_world, space.sensors)]
-            points = track.undo(c.points[rows], c.time_s[rows])
-            side = points[:, :2] @ across
-            fits = (side > aside.min() - _SIDE_M) & (side < aside.max() + _SIDE_M)
-            fits &= points[:, 2] < shape.rim[:, 2].max() + _SIDE_M
-            found[j] = self._without_violations(track, j, rows[fits])
-            parts.append(track.undo(c.points[found[j]], c.time_s[found[j]]))
+            rows = rows[_few_rays(c, rows, space.T_lidar_world[j], space.sensors)]
+            rows = rows[lane.holds(track.carry(c.points[rows], c.time_s[rows], at_s))]
+            found[j] = rows = self._without_violations(track, j, rows)
+            parts.append(track.carry(c.points[rows], c.time_s[rows], at_s))
         j = next(iter(track.claimed))
-        columns_m = columns_apart_m(track.centre, ahead, space.T_lidar_world[j], space.sensors)
-        gap_m = float(np.clip(_COLUMNS_IN_GAP * columns_m, *_GAPS_IN_LINE_M))
+        columns_m = columns_apart_m(track.centre, lane.ahead, space.T_lidar_world[j], space.sensors)
+        gap_m = float(np.clip(NUM_COLUMNS * columns_m, *_GAPS_IN_LINE_M))
         points = np.concatenate(parts)
-        points[:, :2] -= (1 - LINK_M / gap_m) * (points[:, :2] @ ahead)[:, None] * ahead
+        points[:, :2] -= (1 - LINK_M / gap_m) * (points[:, :2] @ lane.ahead)[:, None] * lane.ahead
         _, group = link(points, LINK_M)
         linked = np.isin(group, group[: len(shape.points)])
         ends = np.cumsum([len(part) for part in parts])
@@ -240,6 +223,11 @@ class _Search:
                 in_object = track.undo(c.points[rows], c.time_s[rows])
                 rows = rows[~track.seen_through(in_object, i, self._space)]
         return rows
+
+
+def _better(known: tuple[Track, Verdict], found: tuple[Track, Verdict]) -> tuple[Track, Verdict]:
+    """Return the track that was found if it is clearly more likely, otherwise the known one."""
+    return found if known[1].is_clearly_below(found[1].log_odds) else known
 
 
 def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -> Bool:

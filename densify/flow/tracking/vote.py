@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from densify.flow.tracking.candidates import LINK_M
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import Kernel
 from densify.geometry.nearest import nearest, tree_of
@@ -19,7 +20,7 @@ Bytes = NDArray[np.uint8]
 
 _MAX_SPEED_M_S = 38.0
 _NEAR_S = 0.1  # to the nearer batches; the farther ones are twice as far
-_STEP_M, _REACH_M = 0.2, 0.6
+_STEP_M = 0.2  # of the grid
 _FEW_POINTS, _MANY_POINTS = 60, 600
 _TIMES_ASKED = 3  # the firing time depends on the position
 _FINE_S, _FINE_M_S = 0.5, 0.2  # of the last vote: its time span and step
@@ -43,13 +44,13 @@ class DistanceField:
         """points: (N,3) world."""
         if not len(points):
             return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3), None, time_s)
-        low = points.min(0) - 2 * _REACH_M
-        shape = tuple(np.ceil((points.max(0) + 2 * _REACH_M - low) / _STEP_M).astype(int) + 1)
+        low = points.min(0) - 2 * LINK_M
+        shape = tuple(np.ceil((points.max(0) + 2 * LINK_M - low) / _STEP_M).astype(int) + 1)
         nearness = np.zeros(shape, np.uint8)
-        n = int(np.ceil(_REACH_M / _STEP_M))
+        n = int(np.ceil(LINK_M / _STEP_M))
         span = np.arange(-n, n + 1)
         offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), -1).reshape(-1, 3)
-        far = np.linalg.norm(offsets, axis=1) * _STEP_M / _REACH_M
+        far = np.linalg.norm(offsets, axis=1) * _STEP_M / LINK_M
         values = (255 - np.round(255 * far[far < 1])).astype(np.uint8)
         _spread(points, low, _STEP_M, offsets[far < 1], values, nearness)
         return DistanceField(nearness, low, tree_of(points), time_s)

@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: MIT
+"""The log-likelihood ratio that decides whether a track moves, or is static.
+
+A static object that is seen differently from sweep to sweep, such as a fence or a tree's crown, can
+look as if it moved. Each term is the logarithm of something measured. Their weights, and the price
+of a track, were fitted to tracks of simulated streets whose truth is known::
+
+    log odds = w · terms - price
+
+``examples/fit_tracks.py`` makes the table, ``likelihood.json`` beside this file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from densify.config.file_content import read_json
+from densify.flow.tracking.candidates import LINK_M, Obstacles
+from densify.flow.tracking.objects import MovingObject, Track, near_m
+from densify.free_space.seen_through import REACH_S, FreeSpace
+from densify.geometry.nearest import is_near, nearest, tree_of
+from densify.geometry.types import Float
+
+_NUM_STATES = 3  # fewer lie on a line anyway
+_NUM_ASKED = 60  # points of a batch
+_GIVEN = 5.0  # answers that are taken to be for either side, since few answers tell little
+_CLEARLY = 1.0  # by so much the log odds of two motions must differ, to be told from noise
+_ROUGH = 0.1  # of the distance between neighbours: no state is known better
+
+_FILE = Path(__file__).with_name("likelihood.json")
+
+Judge = Callable[[Track, "Evidence"], None]
+
+
+class Places(NamedTuple):
+    """How often another return was at a position of the object, and how often it was empty."""
+
+    taken: int
+    empty: int
+
+    def log_taken(self) -> float:
+        """Return the logarithm of the odds that a position is taken, 0 where nothing is known."""
+        return float(np.log((self.taken + _GIVEN) / (self.empty + _GIVEN)))
+
+
+class Violations(NamedTuple):
+    """How often another sweep saw through the points of a track.
+
+    Attributes:
+        static: Number of tests that see through a point at its measured position.
+        moved: Number of those that see through it where the motion brings it.
+        tests: Number of tests of either kind.
+    """
+
+    static: int
+    moved: int
+    tests: int
+
+
+class Evidence(NamedTuple):
+    """What tells a track that moves from one that is static.
+
+    Lengths are in units of the distance up to which points count as neighbours there.
+
+    Attributes:
+        violations: Of its points, static and moved.
+        before: Positions of the object before it arrives there.
+        after: Positions of the object after it leaves.
+        travelled: Distance along the path.
+        rough: Residual of the states about the path.
+        slender: Extent along the motion over the height, at least 1.
+    """
+
+    violations: Violations
+    before: Places
+    after: Places
+    travelled: float
+    rough: float
+    slender: float
+
+    def terms(self) -> dict[str, float]:
+        """Return the terms of the log odds by name."""
+        static, moved, tests = self.violations
+        less, more = sorted([self.before.log_taken(), self.after.log_taken()])
+        return {
+            "removed": float(np.log((max(static - moved, 0) + 1) / (tests + 1))),
+            "left": float(np.log((moved + _GIVEN) / (static + _GIVEN))),
+            "travelled": float(np.log(self.travelled + _ROUGH)),
+            "rough": float(np.log(self.rough + _ROUGH)),
+            "taken": less,
+            "taken too": more,  # counts less: the rest of a long object may be there
+            "slender": float(np.log(self.slender) ** 2),
+        }
+
+    def log_odds(self, table: Mapping[str, float]) -> float:
+        """Return the log odds that the track moves.
+
+        Args:
+            table: Weights by term, and ``price``.
+        """
+        return sum(table[name] * value for name, value in self.terms().items()) - table["price"]
+
+
+class Verdict(NamedTuple):
+    """Log odds that a track moves.
+
+    Attributes:
+        log_odds: After the price of a track.
+        at_most: The same if the motion left no violations.
+    """
+
+    log_odds: float
+    at_most: float
+
+    @property
+    def moves(self) -> bool:
+        """Return True if the track more likely moves than not."""
+        return self.log_odds > 0
+
+    def is_clearly_below(self, log_odds: float) -> bool:
+        """Return True if a motion of these log odds explains the same points better."""
+        return log_odds > max(self.log_odds, 0.0) + _CLEARLY
+
+
+def judge(
+    track: Track,
+    obstacles: Sequence[Obstacles],
+    space: FreeSpace,
+    objects: Sequence[MovingObject],
+    judged: Judge | None = None,
+) -> Verdict:
+    """Fit the smooth motion of a track, and judge it. Tracks of fewer than 3 states do not move.
+
+    Args:
+        track: To judge; its path is fitted in place.
+        obstacles: Of all sweeps.
+        space: The free space that the sweeps observed.
+        objects: Other confirmed objects.
+        judged: Called with the track and its evidence.
+    """
+    if len(track.observations) < _NUM_STATES:
+        return Verdict(-np.inf, -np.inf)
+    track.smooth()
+    violations = count_violations(track, obstacles, space)
+    within_m = near_m(space.gap_m(track.centre, next(iter(track.claimed))))
+    best = Places(0, violations.tests)
+    found = Evidence(
+        violations,
+        best,
+        best,
+        track.path.travelled_m() / within_m,
+        track.path.residual_m / within_m,
+        _slenderness(track, obstacles, within_m),
+    )
+    # The places left cost most; where the rest tells enough, they are not looked at.
+    if judged is not None or found.log_odds(own_table()) > 0:
+        before, after = find_places_left(track, obstacles, space, objects, within_m)
+        found = found._replace(before=before, after=after)
+    if judged is not None:
+        judged(track, found)
+    none_left = found._replace(violations=violations._replace(moved=0))
+    return Verdict(found.log_odds(own_table()), none_left.log_odds(own_table()))
+
+
+def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Violations:
+    """Test some points of the track against all sweeps around them."""
+    tested = {}
+    for batch in space.batches:
+        num = _NUM_ASKED // len(batch)
+        for i in batch:
+            if i in track.claimed:
+                rows = track.claimed[i]
+                tested[i] = rows[:: len(rows) // num + 1]
+    others = {i: frozenset(space.others(i)) for i in tested}
+    points = {i: obstacles[i].points[rows] for i, rows in tested.items()}
+    body = {i: track.undo(points[i], obstacles[i].time_s[rows]) for i, rows in tested.items()}
+    static = moved = num_tests = 0
+    for j, *_ in space.batches:
+        sources = [i for i in tested if j in others[i]]
+        if sources:
+            in_object = np.concatenate([body[i] for i in sources])
+            moved += int(track.seen_through(in_object, j, space).sum())
+            in_world = np.concatenate([points[i] for i in sources])
+            static += int(space.seen_through(in_world, j).sum())
+            num_tests += len(in_object)
+    return Violations(static, moved, num_tests)
+
+
+def _slenderness(track: Track, obstacles: Sequence[Obstacles], within_m: float) -> float:
+    """Return the extent of the points along their motion over their height, at least 1.
+
+    Nothing of a guard rail tells its motion along itself, and between two rings sweeps see through
+    it.
+
+    Args:
+        track: To measure.
+        obstacles: Of all sweeps.
+        within_m: Accuracy of the height, m.
+    """
+    points = track.points_in(obstacles, track.claimed)
+    way = (track.path(track.path.end_s) - track.path(track.path.begin_s))[:2]
+    along_m = float(np.ptp(points[:, :2] @ way)) / max(float(np.hypot(*way)), 1e-9)
+    return max(1.0, along_m / (float(np.ptp(points[:, 2])) + within_m))
+
+
+def find_places_left(
+    track: Track,
+    obstacles: Sequence[Obstacles],
+    space: FreeSpace,
+    objects: Sequence[MovingObject],
+    within_m: float,
+) -> tuple[Places, Places]:
+    """Count what other sweeps observed at the positions of the track, before and after.
+
+    A wire fence is seen through from beside and not from ahead. The border between the two moves
+    along the fence with the scanner, but the fence stays where it is. Returns of other confirmed
+    objects do not count.
+
+    Args:
+        track: To test.
+        obstacles: Of all sweeps.
+        space: The free space that the sweeps observed.
+        objects: Other confirmed objects.
+        within_m: Greatest distance from a position to a return that takes it, m.
+    """
+    some = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
+    tree = tree_of(track.points_in(obstacles, track.claimed))
+    rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
+    room_m = LINK_M + REACH_S * float(np.linalg.norm(rate[:2]))
+
+    def count(batch: tuple[int, ...], sweeps: Sequence[int]) -> Places:
+        places = np.concatenate([np.zeros((0, 3)), *(obstacles[i].points[some[i]] for i in sweeps)])
+        in_object = track.undo(places, space.clock.time_s[batch[0]])
+        away_m, _ = nearest(tree, in_object, room_m)
+        places = places[(away_m > LINK_M) & np.isfinite(away_m)]
+        if not len(places):
+            return Places(0, 0)
+        returns = np.concatenate(
+            [_returns_near(places, within_m, obstacles[j], objects) for j in batch]
+        )
+        taken = np.zeros(len(places), bool)
+        if len(returns):
+            taken = is_near(tree_of(returns), places, within_m)
+        empty = space.seen_through(places, batch[0]) & ~taken
+        return Places(int(taken.sum()), int(empty.sum()))
+
+    def total(parts: Sequence[Places]) -> Places:
+        return Places(sum(p.taken for p in parts), sum(p.empty for p in parts))
+
+    return (
+        total([count(batch, [i for i in some if i > batch[-1]]) for batch in space.batches]),
+        total([count(batch, [i for i in some if i < batch[0]]) for batch in space.batches]),
+    )
+
+
+def _returns_near(
+    places: Float, reach_m: float, c: Obstacles, objects: Sequence[MovingObject]
+) -> Float:
+    """Return (N,3) the points of a sweep close to some positions, without those of the objects."""
+    rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
+    rows = rows[is_near(tree_of(places), c.points[rows], reach_m)]
+    for track, shape in objects:
+        if len(rows):
+            rows = rows[~shape.near(track.undo(c.points[rows], c.time_s[rows]), LINK_M)]
+    return c.points[rows]
+
+
+@cache
+def own_table() -> Mapping[str, float]:
+    """Return the package's own weights, as examples/fit_tracks.py wrote them."""
+    weights: Mapping[str, float] = read_json(_FILE)["weights"]
+    return weights
