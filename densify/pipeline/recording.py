@@ -114,6 +114,7 @@ class Recording:
         if keys is None:
             self.cut = Cut.whole(timeline, window)
         else:
+            Cut.around(timeline, window, keys)  # refuses bad ones before a sweep is read
             looks_around &= engine_row(settings.flow.engine)[0].shared
             around_s, step_s = self._look_around(keys) if looks_around else (0.0, 0.0)
             self.cut = Cut.around(timeline, window, keys, around_s)
