@@ -65,10 +65,12 @@ class Candidates:
 class Obstacles:
     """The C points of one sweep, or of a batch, that lie above the ground.
 
-    row: (C,) index into the sweep's points. points: (C,3) world, rigidly registered.
-    time_s: (C,) firing time since the first sweep's reference time.
-    seed: (C,) True if another sweep saw through the point.
-    cluster: (C,) label of the cluster of candidates, -1 for points that are no candidates.
+    Attributes:
+        row: (C,) index into the sweep's points.
+        points: (C,3) world, rigidly registered.
+        time_s: (C,) firing time since the first sweep's reference time.
+        seed: (C,) True if another sweep saw through the point.
+        cluster: (C,) label of the cluster of candidates, -1 for points that are no candidates.
     """
 
     row: Int
@@ -93,10 +95,12 @@ class Obstacles:
 
     @property
     def candidate(self) -> Bool:
+        """Return (C,) True for points of a cluster."""
         return self.cluster >= 0
 
     @cached_property
     def strips(self) -> Strips:
+        """Return the points, ready to be searched."""
         return Strips(self.points)
 
 
@@ -104,9 +108,12 @@ class Obstacles:
 class Batch:
     """The obstacles of the sweeps of one batch, see `Clock.batches`.
 
-    sweeps: indices. time_ns: middle of their reference times, since the first sweep. half_s: from
-    there to the first and the last. obstacles: of all sweeps, sweep by sweep. begins: first row of
-    each sweep.
+    Attributes:
+        sweeps: Indices.
+        time_ns: Middle of their reference times, since the first sweep.
+        half_s: From there to the first and the last.
+        obstacles: Of all sweeps, sweep by sweep.
+        begins: First row of each sweep.
     """
 
     sweeps: tuple[int, ...]
@@ -169,7 +176,8 @@ def find_candidates(
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
     since a moving object's points are not all seen through.
 
-    among: sweeps to work on; None for all.
+    Args:
+        among: Sweeps to work on; None for all.
     """
 
     def of_sweep(i: int) -> Candidates:
@@ -193,8 +201,9 @@ def find_candidates(
 def closer_rings(points: Float, gap_m: Float) -> Float:
     """Return the (N,3) points with heights compressed where rings lie too far apart to be linked.
 
-    points: relative to the scanner, z up, so that level surfaces stay level.
-    gap_m: (N,) between neighbouring rings.
+    Args:
+        points: Relative to the scanner, z up, so that level surfaces stay level.
+        gap_m: (N,) between neighbouring rings.
     """
     squeezed = points.copy()
     squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))

@@ -40,9 +40,13 @@ _PREDICTED_S = 0.2  # before the first and after the last observation
 class SweepPoints:
     """The N points of a sweep, or of a batch, that may belong to an object.
 
-    row: (N,) in the sweep. points: (N,3) world. time_s: (N,) firing time. height_m: (N,) above the
-    ground. gap_m: (N,) between neighbouring rings there. reach_m: (N,) greatest distance from an
-    object's shape.
+    Attributes:
+        row: (N,) in the sweep.
+        points: (N,3) world.
+        time_s: (N,) firing time.
+        height_m: (N,) above the ground.
+        gap_m: (N,) between neighbouring rings there.
+        reach_m: (N,) greatest distance from an object's shape.
     """
 
     row: Int
@@ -56,6 +60,7 @@ class SweepPoints:
     def of(
         stretch: Stretch, i: int, ground: HeightMap, obstacles: Obstacles, sensors: Sensors
     ) -> SweepPoints:
+        """Return the points of sweep i that are not too low."""
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
@@ -75,6 +80,7 @@ class SweepPoints:
 
     @cached_property
     def strips(self) -> Strips:
+        """Return the points, ready to be searched."""
         return Strips(self.points)
 
 
@@ -110,10 +116,17 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
 def _is_static(
     track: Track, obstacles: Sequence[Obstacles], parts: dict[int, Float], of: Int, reach_m: float
 ) -> Bool:
-    """Return (N,) True for the points whose positions are taken in more of the other sweeps than
-    the positions that they would have moved to.
+    """Return (N,) True for points whose measured positions are more often occupied than moved ones.
 
-    parts: by sweep, in the object's own frame, N in all. of: (N,) number of the point's sweep.
+    Other sweeps decide: at a static point they have more returns at its measured position than at
+    the position that it would have moved to.
+
+    Args:
+        track: The object.
+        obstacles: Of all sweeps.
+        parts: By sweep, in the object's own frame, N points in all.
+        of: (N,) number of the point's sweep.
+        reach_m: Greatest distance from a position to a return that occupies it.
     """
     in_object = np.concatenate(list(parts.values()))
     places = np.concatenate([obstacles[j].points[track.claimed[j]] for j in parts])
@@ -138,7 +151,8 @@ def assign_points(
 ) -> list[Instance]:
     """Return for each sweep of a batch (N,) the object of each of its points, -1 for none.
 
-    obstacles: of all sweeps of the stretch.
+    Args:
+        obstacles: Of all sweeps of the stretch.
     """
     parts = [SweepPoints.of(stretch, i, ground, obstacles[i], space.sensors) for i in batch]
     attached = []
@@ -188,8 +202,10 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
 def leave_out_isolated(
     instance: Instance, seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock
 ) -> None:
-    """Take isolated points from the objects, where they are low as the road or the object walks:
-    echoes merged with those of a wall or the road behind an edge."""
+    """Take isolated points from the objects, in place, where they are low or the object walks.
+
+    They are echoes merged with those of a wall, or the road behind an edge.
+    """
     low = seen.height_m < _AS_LOW_AS_ROAD_M
     for k in np.unique(instance[instance >= 0]):
         mine = np.flatnonzero(instance == k)
@@ -239,7 +255,10 @@ def lengthen(
 def columns_apart_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
     """Return the distance along a side between the columns of rays that hit it.
 
-    place: (3,) on the side, world. ahead: (2,) unit vector along it. T_lidar_world: (4,4).
+    Args:
+        place: (3,) on the side, world.
+        ahead: (2,) unit vector along it.
+        T_lidar_world: (4,4).
     """
     in_lidar = poses.transform(T_lidar_world, place[None])[0, :2]
     x, y = T_lidar_world[:2, :2] @ ahead
@@ -260,10 +279,17 @@ def _is_linked(along: Float, own: Float, hole_m: float) -> Bool:
 def _is_free_of_violations(
     track: Track, seen: SweepPoints, rows: Int, along: Float, i: int, space: FreeSpace
 ) -> Bool:
-    """Return (N,) True for the points from the middle outwards, ahead and behind, up to where
-    another sweep sees through too many of the moved points.
+    """Return (N,) True for the points that no other sweep contradicts, from the middle outwards.
 
-    along: (N,) metres ahead of the middle.
+    Ahead and behind, the points end where another sweep sees through too many of the moved points.
+
+    Args:
+        track: The object.
+        seen: Points of the batch.
+        rows: (N,) of ``seen``.
+        along: (N,) metres ahead of the middle.
+        i: Sweep of the points.
+        space: The free space that the sweeps observed.
     """
     step = np.floor(np.abs(along) / LINK_M).astype(np.int64)
     num_steps = int(step.max(initial=0)) + 1

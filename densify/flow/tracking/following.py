@@ -41,7 +41,11 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
     """Return the batch and the rows of each cluster that may start a track, the best first.
 
     Large clusters make good models, and far from the ends of the recording both sides tell how the
-    object moves. clock: of the batches.
+    object moves.
+
+    Args:
+        batches: Obstacles of each.
+        clock: Of the batches.
     """
     starts = []
 
@@ -61,8 +65,10 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
 def velocities_beside(
     batch: Batch, members: Int, objects: Sequence[MovingObject]
 ) -> Iterator[Float]:
-    """Yield the velocities (3,) at a cluster of the objects close to it, such as its towing
-    vehicle: little else tells how fast a long side slides along itself."""
+    """Yield the velocities (3,) at a cluster of the objects close to it, such as a towing vehicle.
+
+    Little else tells how fast a long side slides along itself.
+    """
     points = batch.obstacles.points[members]
     tree, middle = tree_of(points), points.mean(0, keepdims=True)
     for track, shape in objects:
@@ -75,7 +81,9 @@ def velocities_beside(
 class Follower:
     """Tracks clusters through the batches.
 
-    free: per sweep (C,) True for points that no track has claimed. clock: of the batches.
+    Attributes:
+        free: Per sweep (C,) True for points that no track has claimed.
+        clock: Of the batches.
     """
 
     batches: Sequence[Batch]
@@ -86,7 +94,9 @@ class Follower:
     def follow(self, members: Int, start: int, velocity: Float) -> Track:
         """Track a cluster forwards, then backwards, with all points so far as the model.
 
-        members: rows of batch ``start``. velocity: (3,) m/s at first.
+        Args:
+            members: Rows of batch ``start``.
+            velocity: (3,) m/s at first.
         """
         here, rate = self.batches[start].obstacles, np.append(velocity, 0.0)
         seen_s = float(here.time_s[members].mean())
@@ -113,8 +123,9 @@ class Follower:
     ) -> tuple[Float, float, Int, Float] | None:
         """Align the candidates of batch n with the model.
 
-        Returns the state, its time, the rows that fit and where those points were at that time;
-        None where too few fit.
+        Returns:
+            The state, its time, the rows that fit and where those points were at that time; None
+            where too few fit.
         """
         batch, recent = self.batches[n], self.clock.num_in(_RECENT_S)
         c, centre = batch.obstacles, track.centre
@@ -154,8 +165,14 @@ def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float,
     The velocity turns as the object does (Schubert, Richter, Wanielik, "Comparison and Evaluation
     of Advanced Motion Models for Vehicle Tracking", FUSION 2008).
 
-    rate: (4,) given at the start.
-    Returns the state (4,), its rate (4,), and the standard deviation (3,) of x, y and yaw.
+    Args:
+        track: The object so far.
+        rate: (4,) given at the start.
+        num: Number of states.
+        time_s: Time of the prediction.
+
+    Returns:
+        The state (4,), its rate (4,), and the standard deviation (3,) of x, y and yaw.
     """
     nearest_first = sorted(
         track.observations.items(), key=lambda s: (abs(s[1].seen_s - time_s), s[0])

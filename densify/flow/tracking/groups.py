@@ -28,8 +28,9 @@ _FINE_M = 0.3  # ring gap up to which a limb has returns of several rings
 class GroupMotion:
     """The motion of all objects in a stretch: a `Motion`.
 
-    instance: per sweep (N,) int32, index of the point's track, -1 for none. bendings: of the tracks
-    that are not rigid, by index.
+    Attributes:
+        instance: Per sweep (N,) int32, index of the point's track, -1 for none.
+        bendings: Of the tracks that are not rigid, by index.
     """
 
     stretch: Stretch
@@ -47,7 +48,8 @@ class GroupMotion:
         Points of an object that was last observed more than 0.2 s before the target, or first
         observed more than that after it, are lost.
 
-        frame, target: frame numbers.
+        Args:
+            frame, target: Frame numbers.
         """
         here, there = self.stretch.frames.index(frame), self.stretch.frames.index(target)
         registered, instance = self.stretch.sweeps[here], self.instance[here]
@@ -80,10 +82,16 @@ class Bending:
     softened: Softened
 
     def carry(self, here: int, there: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
-        """Return the points of sweep ``here`` in the object's own frame, at that sweep's reference
-        time and at that of sweep ``there``, or of the nearest sweep that observed the object.
+        """Return the points of sweep ``here`` in the object's own frame at two times.
 
-        seen_s: (N,) firing times.
+        These are the reference times of that sweep and of sweep ``there``, or of the nearest sweep
+        that observed the object.
+
+        Args:
+            here: Sweep of the points.
+            there: Sweep to whose time they are carried.
+            clock: Of the sweeps.
+            seen_s: (N,) firing times.
         """
         n, m = (self.sweeps.index(i) for i in (here, clock.nearest(there, self.sweeps)))
         points = self.softened.parts[n].points
@@ -108,7 +116,8 @@ def motion_of(
 ) -> GroupMotion:
     """Find the moving objects among given candidates.
 
-    velocities_m_s: per sweep (C,3) of its candidates, world; None lets the sweeps vote.
+    Args:
+        velocities_m_s: Per sweep (C,3) of its candidates, world; None lets the sweeps vote.
     """
     stretch, space = scene.stretch, scene.space
     obstacles = [Obstacles.of(stretch, i, found) for i, found in enumerate(candidates)]

@@ -45,8 +45,12 @@ def near_m(gap_m: Float | float) -> Any:
 class Observation:
     """The pose of an object in one batch of sweeps.
 
-    state: (4,) x y z displacement (m) and yaw (rad) since the first observation; z follows the
-    ground. seen_s: when that was. time_ns: the batch's own time. sweeps: those with its points.
+    Attributes:
+        state: (4,) x y z displacement (m) and yaw (rad) since the first observation; z follows
+            the ground.
+        seen_s: When that was.
+        time_ns: The batch's own time.
+        sweeps: Those with its points.
     """
 
     state: Float
@@ -59,8 +63,11 @@ class Observation:
 class Track:
     """One rigid object.
 
-    centre: (3,) about which it turns, world. observations: by batch, in the order of tracking.
-    claimed: by sweep, the rows of `Obstacles` that are its points. path: its smooth motion.
+    Attributes:
+        centre: (3,) about which it turns, world.
+        observations: By batch, in the order of tracking.
+        claimed: By sweep, the rows of `Obstacles` that are its points.
+        path: Its smooth motion.
     """
 
     centre: Float
@@ -127,6 +134,7 @@ class Track:
         return sum(len(self.claimed[j]) for j in self.observations[n].sweeps)
 
     def total_points(self) -> int:
+        """Return the number of points of all sweeps."""
         return sum(map(len, self.claimed.values()))
 
     def duration_s(self) -> float:
@@ -134,8 +142,11 @@ class Track:
         return float(np.ptp([seen.seen_s for seen in self.observations.values()]))
 
     def rise_m(self, ground: HeightMap, state: Float) -> float:
-        """Return how much higher the ground is in that state: the median of the object's place and
-        both sides of it, since the road below an object may never be observed."""
+        """Return how much higher the ground is in that state.
+
+        It is the median of the object's place and both sides of it, since the road below an object
+        may never be observed.
+        """
         way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
         start = self.centre[:2] + np.outer([-_BESIDE_M, 0.0, _BESIDE_M], [-way[1], way[0]])
         return float(np.median(ground.under(start + state[:2]) - ground.under(start)))
@@ -152,9 +163,12 @@ class Track:
 class Shape:
     """The accumulated points of one object, upright in its own frame.
 
-    points: (M,3). tree: of the points. rim: (K,3) those points that reach farthest in each
-    horizontal direction, up and down. edges: (E,3) normals and offsets of the convex outline seen
-    from above; (0,3) where the points span none.
+    Attributes:
+        points: (M,3).
+        tree: Of the points.
+        rim: (K,3) those points that reach farthest in each horizontal direction, up and down.
+        edges: (E,3) normals and offsets of the convex outline seen from above; (0,3) where the
+            points span none.
     """
 
     points: Float
@@ -186,8 +200,11 @@ class Shape:
 
     @cached_property
     def side_rad(self) -> float:
-        """Direction of one side seen from above, in [0, pi / 2); the others are parallel to it or
-        perpendicular. It maximises the sum of squares of the histograms along both axes."""
+        """Return the direction of one side seen from above, in [0, pi / 2).
+
+        The others are parallel to it or perpendicular. It maximises the sum of squares of the
+        histograms along both axes.
+        """
         points = self.points[:: len(self.points) // _SOME_POINTS + 1, :2]
         points = points - points.mean(axis=0)
         reach_m = float(np.linalg.norm(points, axis=1).max())

@@ -30,9 +30,11 @@ _DEGREE = 3
 class Path:
     """A cubic spline of time with d coordinates.
 
-    knots_s, coefficients: of its n B-splines, (n + 4,) and (n,d). begin_s, end_s: of the fit;
-    outside, the path goes on at constant velocity. residual_m: root mean square over the states,
-    first two coordinates, corrected for the degrees of freedom.
+    Attributes:
+        knots_s, coefficients: Of its n B-splines, (n + 4,) and (n,d).
+        begin_s, end_s: Of the fit; outside, the path goes on at constant velocity.
+        residual_m: Root mean square over the states, first two coordinates, corrected for the
+            degrees of freedom.
     """
 
     knots_s: Float

@@ -43,7 +43,9 @@ _MIN_GAIN, _MIN_SHARE_BETTER = 0.05, 0.75
 class Part:
     """The points of an object in one sweep.
 
-    points: (n,3) metres, n >= 1, in the object's own frame. time_s: when they were measured.
+    Attributes:
+        points: (n,3) metres, n >= 1, in the object's own frame.
+        time_s: When they were measured.
     """
 
     points: Float
@@ -54,11 +56,13 @@ class Part:
 class Softened:
     """How an object bends from part to part.
 
-    to_next, to_previous: for each part (n,3) metres by which its points leave the rigid motion
-        until the next and the previous part; 0 where there is none, and for a rigid object.
-    alpha: the stiffness that held-out parts confirmed, inf for rigid.
-    held_out_m: for each alpha tried, inf first, the root mean square distance of held-out parts
-        from their prediction; empty where nothing was tried.
+    Attributes:
+        to_next, to_previous: For each part (n,3) metres by which its points leave the rigid
+            motion until the next and the previous part; 0 where there is none, and for a rigid
+            object.
+        alpha: The stiffness that held-out parts confirmed, inf for rigid.
+        held_out_m: For each alpha tried, inf first, the root mean square distance of held-out
+            parts from their prediction; empty where nothing was tried.
     """
 
     parts: tuple[Part, ...]
@@ -201,8 +205,10 @@ class _Bending:
             )
 
     def bring_beyond(self) -> None:
-        """Add to each hop's target the part after it, moved there by the flow so far, which fills
-        the gaps and edges of the target."""
+        """Add to each hop's target the part after it, moved there by the flow so far.
+
+        It fills the gaps and edges of the target.
+        """
         flows = self._by_hop()
         targets = []
         for a, b in self._hops:
@@ -236,8 +242,10 @@ class _Bending:
         return np.concatenate([c + [k * self._apart_m, 0.0, 0.0] for k, c in enumerate(clouds)])
 
     def _steadiness(self) -> csr_array:
-        """Return the matrix of ``|f_next / dt_next + f_previous / dt_previous|²``, scaled to a
-        weight of 1 for equal intervals."""
+        """Return the matrix of ``|f_next / dt_next + f_previous / dt_previous|²``.
+
+        It is scaled to a weight of 1 for equal intervals.
+        """
         number = {hop: k for k, hop in enumerate(self._hops)}
         times_s = [p.time_s for p in self._parts]
         opposite = np.arange(len(self._source))
@@ -295,8 +303,12 @@ def _one_per_voxel(points: Float) -> Int:
 
 
 def _blurred(points: Float, near: Int, at: Float, blur_m: float) -> tuple[Float, Float]:
-    """Return (N,3) the Gaussian-weighted mean of ``points[near]`` around each position, and (N,)
-    the distance to the nearest of them."""
+    """Return the Gaussian-weighted means around positions, and the distances to the nearest points.
+
+    Returns:
+        (N,3) mean of ``points[near]`` around each position, and (N,) distance to the nearest of
+        them.
+    """
     around = points[near]
     away = around - at[:, None]
     squared = np.einsum("nki,nki->nk", away, away)
@@ -309,7 +321,9 @@ def _blurred(points: Float, near: Int, at: Float, blur_m: float) -> tuple[Float,
 def _look_up(at: Float, came: Float, points: Float, known_came: Float, values: Float) -> Float:
     """Interpolate the values of the points nearest in position and in the way they came.
 
-    at, came: (N,3). points, known_came, values: (M,3). Legs that cross differ in the way they came.
+    Args:
+        at, came: (N,3).
+        points, known_came, values: (M,3). Legs that cross differ in the way they came.
     """
     known, asked = np.hstack([points, known_came]), np.hstack([at, came])
     near = nearest_k(tree_of(known), asked, _NUM_LOOKED_UP)[1]

@@ -51,8 +51,10 @@ def find_tracks(
 ) -> list[Track]:
     """Return the confirmed tracks of all moving objects in the stretch.
 
-    velocities_m_s: per sweep (C,3) of its obstacles, with which clusters start; None lets the
-    neighbouring sweeps vote. judged: called with each track that was tried, and its evidence.
+    Args:
+        velocities_m_s: Per sweep (C,3) of its obstacles, with which clusters start; None lets
+            the neighbouring sweeps vote.
+        judged: Called with each track that was tried, and its evidence.
     """
     return _Search(obstacles, space, ground, velocities_m_s, judged).tracks()
 
@@ -169,8 +171,10 @@ class _Search:
         return track, self._judge(track)
 
     def _gather(self, track: Track) -> None:
-        """Claim the free candidates close to or within the object that its motion explains, before
-        a part of it starts a track of its own."""
+        """Claim the free candidates within or close to the object that its motion explains.
+
+        Otherwise a part of it would start a track of its own.
+        """
         shape = self._shape_of(track)
         for j, own in track.claimed.items():
             c = self._obstacles[j]

@@ -30,8 +30,12 @@ _FINE_S, _FINE_M_S = 0.5, 0.2  # of the last vote: its time span and step
 class DistanceField:
     """A voxel grid of the distance to the nearest candidate of a sweep.
 
-    nearness: (X,Y,Z) 255 at a candidate, 0 beyond the reach; mostly zeros, which take no memory.
-    low: (3,) corner of the grid. tree: of the candidates. time_s: (N,) their firing times.
+    Attributes:
+        nearness: (X,Y,Z) 255 at a candidate, 0 beyond the reach; mostly zeros, which take no
+            memory.
+        low: (3,) corner of the grid.
+        tree: Of the candidates.
+        time_s: (N,) their firing times.
     """
 
     nearness: Bytes
@@ -56,8 +60,10 @@ class DistanceField:
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_to(self, found: Bytes, group: Group, velocities: Float) -> None:
-        """Raise ``found`` (V,N), in place, to the nearness of the group's N points, moved with each
-        of (V,3) velocities to the time at which this sweep measures them."""
+        """Raise ``found`` (V,N), in place, to the nearness of the group's N points.
+
+        They are moved with each of (V,3) velocities to the time at which this sweep measures them.
+        """
         if self.tree is None:
             return
         elapsed_s = np.zeros(len(velocities))
@@ -81,8 +87,11 @@ class DistanceField:
 class Group:
     """The points of a cluster in one batch.
 
-    points: (N,3) world. late_s: (N,) firing times minus their mean. middle_s: that mean. middle:
-    (3,) mean of the points.
+    Attributes:
+        points: (N,3) world.
+        late_s: (N,) firing times minus their mean.
+        middle_s: That mean.
+        middle: (3,) mean of the points.
     """
 
     points: Float
@@ -92,6 +101,7 @@ class Group:
 
     @staticmethod
     def of(points: Float, time_s: Float) -> Group:
+        """Return the group of (N,3) points and their (N,) firing times."""
         middle_s = float(time_s.mean())
         return Group(points, time_s - middle_s, middle_s, points.mean(axis=0))
 
@@ -109,7 +119,10 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
     side only the ends tell how fast it moves, by less than a voxel in so short a time. Therefore
     batches up to 0.5 s away are asked in fine steps.
 
-    group: observed in batch n. fields: of the sweeps of each batch. clock: of the batches.
+    Args:
+        group: Observed in batch n.
+        fields: Of the sweeps of each batch.
+        clock: Of the batches.
     """
     near_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
     coarse = 2 * _STEP_M / near_s
@@ -152,7 +165,10 @@ def _spread(
 ) -> None:
     """Raise the cells of ``grid`` around each of (N,3) points to the (K,) values, in place.
 
-    low: (3,) corner of the grid. step: side of a cell. offsets: (K,3) cells from the point's own.
+    Args:
+        low: (3,) corner of the grid.
+        step: Side of a cell.
+        offsets: (K,3) cells from the point's own.
     """
     for i in range(len(points)):
         x, y, z = (
@@ -178,8 +194,10 @@ def _look_up(
     nearness: Bytes,
     found: Bytes,
 ) -> None:
-    """Raise ``found`` (V,N), in place, to the cells of (N,3) points, each moved with the velocity
-    (V,3) for ``elapsed_s`` (V,) minus ``late_s`` (N,); 0 outside the grid."""
+    """Raise ``found`` (V,N), in place, to the cells of (N,3) moved points; 0 outside the grid.
+
+    Each point is moved with the velocity (V,3) for ``elapsed_s`` (V,) minus ``late_s`` (N,).
+    """
     num_x, num_y, num_z = nearness.shape
     for v in range(first, last):
         for i in range(len(points)):
