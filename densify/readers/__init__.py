@@ -15,21 +15,21 @@ from densify.geometry.types import LidarSequence
 from densify.readers.checks import drive_around
 from densify.readers.file_sequence import FileSequence
 
-_MOST_PLACES = 200  # are looked at for a recording, where the one named is none itself
+_MOST_PLACES = 200  # files and folders searched inside a folder that is no recording
 
 
 class ReaderModule(Protocol):
-    """The members of a reader's module."""
+    """Interface of a reader's module."""
 
     def open_recording(self, path: Path, scene: str | None) -> LidarSequence:
-        """Return the recording at a path, opened lazily: only small files are read at once.
+        """Open the recording at a path; sweeps and images are read later, on demand.
 
         Args:
-            path: The text after ``READER:``, or a place that the reader recognises.
-            scene: The text after ``#``; None without it, and for readers without scenes.
+            path: File or folder of the recording.
+            scene: Scene name or reader's option after ``#`` in ``--data``; None without ``#``.
 
         Raises:
-            InputError: There is no such recording. The message names the place.
+            InputError: The path or scene holds no recording. The message names the path.
         """
         ...
 
@@ -38,10 +38,10 @@ class Spec(NamedTuple):
     """A recording as ``--data`` names it.
 
     Attributes:
-        reader: Name of a row of `READERS`; "street" for the built-in one; None if the files
-            tell.
-        place: A path. For the street, its preset and options.
-        scene: The text after ``#``, None without it.
+        reader: Name of the reader in `READERS`; "street" for the built-in simulated recording;
+            None if the reader is recognised by the files.
+        place: Path as typed by the user; for the street, the whole text with its options.
+        scene: Scene name or reader's option after ``#``; None without ``#``.
     """
 
     reader: str | None
@@ -50,10 +50,10 @@ class Spec(NamedTuple):
 
     @staticmethod
     def parse(text: str | Path) -> Spec:
-        """Return the spec of ``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``.
+        """Parse ``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``.
 
-        An existing path that contains ``#`` has no scene. Neither has a path without a reader if
-        the part before the ``#`` does not exist.
+        A ``#`` belongs to the path if the path with ``#`` exists. Without ``READER:``, the ``#``
+        also belongs to the path if no file or folder is named by the text before ``#``.
         """
         text = str(text)
         if text == "street" or text.startswith(("street:", "street?")):
@@ -68,11 +68,11 @@ class Spec(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """The place as a path; a leading ``~`` is expanded, as shells do not after a colon."""
+        """Path with a leading ``~`` expanded, which shells do not do after ``READER:``."""
         return Path(self.place).expanduser()
 
     def absolute(self) -> str:
-        """Return the spec of the same recording for a process with another working directory."""
+        """Return the text of the spec with an absolute path, valid in any working directory."""
         if self.reader == "street":
             return self.place
         reader = "" if self.reader is None else f"{self.reader}:"
@@ -85,15 +85,15 @@ def _exists(place: str) -> bool:
 
 
 def open_sequence(spec: str | Path = "street") -> LidarSequence:
-    """Return a recording, opened lazily.
+    """Open a recording; sweeps and images are read later, on demand.
 
     Args:
-        spec: A path, ``READER:PATH[#SCENE]``, or the built-in
-            ``street[:PRESET][?seed=N&sensor=NAME]``. Without ``READER:`` the files tell the reader.
+        spec: Path, ``READER:PATH[#SCENE]``, or ``street[:PRESET][?seed=N&sensor=NAME]`` for the
+            built-in simulated street. Without ``READER:`` the reader is recognised by the files.
 
     Raises:
-        InputError: There is nothing there, no reader knows it, or the first image of a camera is
-            not of the size of its calibration.
+        InputError: The path does not exist, no reader recognises the files, the reader has no
+            scenes but ``#SCENE`` is given, or a camera's first image contradicts its calibration.
     """
     parsed = Spec.parse(spec)
     if parsed.reader == "street":
@@ -113,7 +113,10 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
 
 
 def _reader_of(parsed: Spec, where: str) -> Plugin:
-    """Return the reader that is named, or the first that recognises the place."""
+    """Return the named reader, or the first reader that recognises the path.
+
+    Error messages begin with ``where``.
+    """
     if parsed.reader is not None:
         return READERS.row(parsed.reader, where)
     if not parsed.path.exists():
@@ -137,7 +140,7 @@ def _reader_of(parsed: Spec, where: str) -> Plugin:
 
 
 def _what_is_there(path: Path) -> str:
-    """Return what a place without a recording holds, for people."""
+    """Describe the contents of a path without a recording, as a clause for error messages."""
     if path.is_file():
         return f"it is a {path.suffix or 'file without a suffix'} file"
     found = Counter(entry.suffix.lower() or "other" for entry in path.iterdir() if entry.is_file())
@@ -150,9 +153,9 @@ def _what_is_there(path: Path) -> str:
 
 
 def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:
-    """Return the first recording in a folder or its subfolders.
+    """Return the path of the first recording in a folder, at most two levels down; else None.
 
-    A recording of a known form comes before a plain folder of sweeps.
+    Readers are tried in the given order, each on all paths.
     """
     places = [*path.glob("*"), *path.glob("*/*")][:_MOST_PLACES] if path.is_dir() else []
     places = [place for place in sorted(places) if place.exists()]  # links may lead nowhere

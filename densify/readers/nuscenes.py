@@ -7,15 +7,15 @@ Layout::
     ROOT/v1.0-trainval/sample_annotation.json    optional: tracked boxes
     ROOT/{samples,sweeps}/LIDAR_TOP/*.pcd.bin    ROOT/samples/CAM_FRONT/*.jpg ...
 
-A scene is named by ``#scene-0061``. Its sweeps, key frames or not, and each camera's images are
-numbered from 0 in the order of time; a missing file leaves a gap. Images are undistorted, stamped
-at their exposure. The path of the vehicle is made of all its poses in a scene, one for each record.
+A scene is named by ``#scene-0061``. All its sweeps, and each camera's images, are numbered from 0
+in the order of time. The number of a missing file is skipped. Images are undistorted; their stamp
+is the exposure. The vehicle's path joins the poses of all records of a scene.
 
-One HDL-32E at 20 Hz. Points are in the scanner's frame (x right, y forward, z up), compensated to
-the stamp, that of the *last* packet, without times. Rows are columns of 32 rings in the order of
-firing, 46.08 µs apart (HDL-32E manual, 9.3). Column c of n fired (c + 1 - n) · 46.08 µs after the
-stamp. The compensation is undone with these times. Rows without a return are then at the origin and
-are left out. The tables have millions of records; only the needed ones are parsed.
+The scanner is one HDL-32E at 20 Hz. Points are in the scanner's frame (x right, y forward, z up),
+ego-motion compensated to the sweep's stamp, the time of the *last* packet. They have no times. A
+file lists the firings in the order of time, 32 rings each, 46.08 µs apart (HDL-32E manual, 9.3).
+Firing c of n is (c + 1 - n) · 46.08 µs after the stamp. With these times the compensation is
+undone. Missing returns then lie at the origin and are left out.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from densify.readers import checks
 from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.recorded_poses import PoseTrack
 
-_COLUMN_NS = 46_080  # from column to column of an HDL-32E
+_COLUMN_NS = 46_080  # between two firings of an HDL-32E
 _NO_RETURN_M = 0.05
 _RECORD = re.compile(rb"\{[^{}]*\}")
 _LENGTH_WIDTH_HEIGHT = [1, 0, 2]  # of the table's width, length, height
@@ -57,30 +57,30 @@ Record = dict[str, Any]
 
 
 def stamp_ns(record: Record) -> int:
-    """Return the time of a record; the tables have microseconds."""
+    """Return the time of a record in nanoseconds since 1970; tables have microseconds."""
     return int(np.int64(int(record["timestamp"]) * 1000))
 
 
 def pose_of(record: Record, where: str) -> Float:
-    """Return the (4,4) of its rotation and translation."""
+    """Return the (4,4) pose of a record with a quaternion w x y z and a translation (m)."""
     return checks.quaternion_pose(record["rotation"], record["translation"], where)
 
 
 def read_table(path: Path) -> dict[str, Record]:
-    """Return all records by token.
+    """Return all records of a JSON table, by their tokens.
 
     Raises:
-        InputError: The file is missing or no such table.
+        InputError: The file is missing, or is no table of nuScenes.
     """
     with described_in(path, _EXPECTED):
         return {str(record["token"]): record for record in read_json(_existing(path))}
 
 
 def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Record]:
-    """Return the records, by token, whose ``key`` is one of ``wanted``; others are not parsed.
+    """Return the records of a JSON table whose field ``key`` is in ``wanted``, by their tokens.
 
     Raises:
-        InputError: The file is missing or cut off, or one of the records is malformed.
+        InputError: The file is missing or cut off, or a wanted record is malformed.
     """
     pattern = re.compile(rb'"%s"\s*:\s*"([^"]*)"' % key.encode())
     names = frozenset(name.encode() for name in wanted)
@@ -95,7 +95,7 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
             for match in _RECORD.finditer(data):
                 of = pattern.search(match[0])
                 if of and of[1] in names:
-                    found.append(parse_json(match[0], path))
+                    found.append(parse_json(match[0], path))  # tables have millions of records
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: not a whole JSON table: {reason(error)}; fetch it again"
@@ -111,10 +111,10 @@ def _existing(path: Path) -> Path:
 
 
 class KeyBox(NamedTuple):
-    """A box of a key frame.
+    """The annotated box of one object in one key frame.
 
     Attributes:
-        T_world_box: (4,4).
+        T_world_box: (4,4) pose of the box in the world: origin in its middle, x front, z up.
         size_m: (3,) length, width, height.
     """
 
@@ -124,14 +124,15 @@ class KeyBox(NamedTuple):
 
 @dataclass(frozen=True)
 class Annotations:
-    """The boxes of a scene's key frames (2 Hz), from ``sample_annotation.json``.
+    """The boxes of a scene's n key frames (2 Hz), from ``sample_annotation.json``.
 
-    Between two key frames an object moves straight and turns evenly, as in the devkit. An object
-    that only one of them has continues at its speed without a track, because its real position is
-    unknown.
+    Between key frames, boxes are interpolated at constant velocity and turn rate, as in the devkit.
+    An object in only one of two consecutive key frames is extrapolated from its nearest motion. Its
+    box then has no track name, because the real position is unknown.
 
     Attributes:
-        key_ns: (n,) ascending stamps of the key frames.
+        where: Path of the table, for messages.
+        key_ns: (n,) ascending times of the key frames.
         boxes: Boxes of each key frame, by the token of the object.
     """
 
@@ -141,13 +142,14 @@ class Annotations:
 
     @staticmethod
     def read(tables: Path, scene: str) -> Annotations | None:
-        """Return the boxes of a scene. None without the table, or without a box in the scene.
+        """Return the boxes of a scene; None if the table is missing or has no box in the scene.
 
         Args:
+            tables: Folder of the JSON tables.
             scene: Token of the scene.
 
         Raises:
-            InputError: A record is malformed, or an object is twice in a key frame.
+            InputError: A record is malformed, or an object has two boxes in a key frame.
         """
         path = tables / "sample_annotation.json"
         if not path.is_file():
@@ -170,7 +172,10 @@ class Annotations:
         return Annotations(str(path), key_ns, tuple(found[t] for t in order)) if found else None
 
     def at(self, stamp_ns: int, T_lidar_world: Float) -> Boxes | None:
-        """Return the boxes of that time in a lidar frame, None outside the key frames."""
+        """Return the boxes at a time in the lidar frame; None outside the time of the key frames.
+
+        ``T_lidar_world`` (4,4) maps world coordinates to the lidar frame at that time.
+        """
         if not self.key_ns[0] <= stamp_ns <= self.key_ns[-1]:
             return None
         after = int(np.searchsorted(self.key_ns, stamp_ns))
@@ -186,7 +191,7 @@ class Annotations:
         )
 
     def _box(self, instance: str, before: int, after: int, stamp_ns: int) -> KeyBox:
-        """Interpolate, or extrapolate from the two nearest key frames that have the object."""
+        """Inter- or extrapolate an object's box between key frames ``before`` and ``after``."""
         boxes = self.boxes
         for first, last in ((before, after), (after, after + 1), (before - 1, before)):
             inside = 0 <= first < last < len(boxes)
@@ -200,11 +205,11 @@ class Annotations:
 
 
 def open_recording(path: Path, scene: str | None) -> NuScenes:
-    """See `densify.readers.ReaderModule`.
+    """Open a scene of nuScenes, as `densify.readers.ReaderModule` specifies.
 
     Args:
-        path: The folder that holds the tables, or the one above it, which may hold several
-            versions.
+        path: Folder of the JSON tables, or its parent with the tables of one or more versions.
+        scene: Name such as ``scene-0061``; None if there is only one scene.
     """
     folders = [path] if (path / "sample_data.json").is_file() else []
     folders = folders or sorted(found.parent for found in path.glob("v*/sample_data.json"))
@@ -226,14 +231,14 @@ def open_recording(path: Path, scene: str | None) -> NuScenes:
 
 @dataclass(frozen=True)
 class Channel:
-    """One sensor of a scene.
+    """One sensor of a scene, with R records (sweeps or images).
 
     Attributes:
-        stamps_ns: Of its records, ascending.
-        files: Of its records.
-        T_ego_sensor: (4,4) for each record.
-        size_px: Of its images.
-        intrinsics: Of the first record.
+        stamps_ns: R times of the records, ascending.
+        files: R paths of the records' files; a file may be missing on the disk.
+        T_ego_sensor: R poses (4,4) of the sensor in the vehicle's frame.
+        size_px: Width and height of the images; zeros for a lidar.
+        intrinsics: Camera matrix (3 x 3) of the first record as parsed from JSON.
     """
 
     stamps_ns: Sequence[int]
@@ -243,7 +248,7 @@ class Channel:
     intrinsics: Any
 
     def on_disk(self) -> dict[int, Path]:
-        """Return the existing files, by number."""
+        """Return the existing files, by the index of their records."""
         return {i: file for i, file in enumerate(self.files) if isfile(file)}
 
 
@@ -252,11 +257,11 @@ class Scene:
     """A scene with its sensors.
 
     Attributes:
-        tables: Folder of the tables.
-        token: Of the scene.
-        lidars: By channel, sorted.
-        cameras: By channel, sorted.
-        track: Path of the vehicle.
+        tables: Folder of the JSON tables.
+        token: Token of the scene, its key in the tables.
+        lidars: Lidars by the name of their channel, sorted.
+        cameras: Cameras by the name of their channel, sorted.
+        track: Poses T_world_ego of the vehicle over time.
     """
 
     name: str
@@ -268,7 +273,7 @@ class Scene:
 
     @staticmethod
     def read(tables: Path, token: str, name: str) -> Scene:
-        """Return a scene.
+        """Read the sensors and the vehicle's path of a scene, without sweeps and images.
 
         Raises:
             InputError: A table is missing or malformed, or the scene has no sweeps.
@@ -299,7 +304,7 @@ class Scene:
 
 
 def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[str, Channel]:
-    """Return the sensors of one kind by name. records: of the sample data, in the order of time."""
+    """Return the sensors of a modality by channel, from sample data records in order of time."""
     path = tables / "calibrated_sensor.json"
     calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
     found: dict[str, list[Record]] = defaultdict(list)
@@ -322,13 +327,13 @@ def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[st
 
 
 class NuScenes(FileSequence):
-    """A scene of nuScenes as a `LidarSequence`; the lidar frame is the scanner's."""
+    """A nuScenes scene as a `LidarSequence`; the lidar frame is the scanner's own frame."""
 
     def __init__(self, scene: Scene) -> None:
-        """Open a scene.
+        """Prepare a scene for reading its sweeps and images on demand.
 
         Raises:
-            InputError: No sweep is on the disk, or a camera is malformed.
+            InputError: No sweep is on the disk, or a camera's calibration is malformed.
         """
         self._scene, self._lidar = scene, next(iter(scene.lidars.values()))
         self._T_ego_lidar, track = self._lidar.T_ego_sensor[0], scene.track
@@ -364,10 +369,10 @@ class NuScenes(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `LidarSequence`; the test split has none.
+        """Return a sweep's boxes in the lidar frame; None if not annotated, as in the test split.
 
         Raises:
-            InputError: The table is malformed.
+            InputError: The annotation table is malformed.
         """
         self.check_frame(frame)
         if self._annotations is None:
@@ -379,7 +384,7 @@ class NuScenes(FileSequence):
         return Annotations.read(self._scene.tables, self._scene.token)
 
     def T_world_cam(self, camera: str, number: int) -> Float:
-        """Return the (4,4) pose of an image."""
+        """Return the (4,4) pose T_world_cam at the exposure of image ``number`` of a camera."""
         T_world_ego = self._scene.track.at(self.image_stamps_ns(camera)[number])
         return T_world_ego @ self._scene.cameras[camera].T_ego_sensor[number]
 

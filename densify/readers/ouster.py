@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Read packets of an Ouster scanner, by the maker's ouster-sdk (extra ``ouster``).
 
-A recording is a ``.pcap`` file and the metadata ``.json`` of the sensor: the one whose name begins
-the name of the capture, the only one beside it, or the one named behind ``#``.
+A recording is a ``.pcap`` capture and the ``.json`` metadata of the sensor. The metadata file is
+named after ``#``, or its name begins the name of the capture, or no other ``.json`` is beside it.
 
-A sweep is a frame of the sensor, numbered from 0, read on demand. Its stamp is the computer's, of
-its first packet. The sensor's clock gives the times of the columns since then. Points are as
-measured, in the sensor's frame (x forward, y left, z up, origin on its base). Rays start on the
-spinning axis. Rows count over the image of returns. Of two returns the first is taken. There are
-neither cameras nor poses.
+A sweep is a frame of the sensor, numbered from 0, read on demand. Its stamp is the time at which
+the computer captured its first packet. The sensor's clock gives the firing times of the columns
+relative to the first column. Points are as measured, without compensation, in the sensor's frame (x
+forward, y left, z up, origin on the base). Rays start on the spinning axis. Point rows follow the
+range image, row by row. For a ray with two returns, the first is read. There are no cameras and no
+poses.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from densify.readers.file_sequence import FileSequence, Returns
 
 
 def open_recording(path: Path, scene: str | None) -> Ouster:
-    """See `densify.readers.ReaderModule`.
+    """Open an Ouster capture, as `densify.readers.ReaderModule` specifies.
 
     Args:
-        path: The capture.
-        scene: Its metadata's file name.
+        path: Capture, a ``.pcap`` file.
+        scene: Name of the metadata file in the folder of the capture; None to find the file.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an Ouster capture (.pcap)")
@@ -43,7 +44,11 @@ def open_recording(path: Path, scene: str | None) -> Ouster:
 
 
 def find_metadata(path: Path) -> Path | None:
-    """Return the metadata beside a capture, found by names; None if names do not tell."""
+    """Return the metadata file in the folder of a capture; None if the choice is not clear.
+
+    The file with the longest name that begins the name of the capture is chosen, or else the only
+    ``.json`` file.
+    """
     found = sorted(path.parent.glob("*.json"))
     named = [p for p in found if path.stem.startswith(p.stem)]
     if named:
@@ -52,24 +57,24 @@ def find_metadata(path: Path) -> Path | None:
 
 
 class Ouster(FileSequence):
-    """A capture as a `LidarSequence`. The stamp of a sweep is the capture of its first packet."""
+    """An Ouster capture as a `LidarSequence`, stamped at the first packet of each sweep."""
 
     def __init__(self, path: Path, metadata: Path) -> None:
         """Open a capture with its metadata.
 
         Raises:
-            InputError: The file is no capture, the metadata is not of an Ouster, or they do not
-                belong together.
+            InputError: The file is no capture, the metadata does not describe an Ouster, or the
+                capture is from another sensor than the metadata.
         """
         core = needed("ouster.sdk.core", "ouster", "Ouster captures")
         pcap = needed("ouster.sdk.pcap", "ouster", "Ouster captures")
         read_json(metadata)
-        open_file(path).close()  # says what is wrong with the file itself
+        open_file(path).close()  # raises a clear error for an unreadable file
         try:
             self._source = pcap.PcapFrameSetSource(str(path), meta=[str(metadata)], index=True)
             index = self._source.individual_index[0]
             self._table = core.XYZLut(self._source.sensor_info[0])
-        except Exception as error:  # of the library's many kinds
+        except Exception as error:  # the library raises many types
             raise InputError(
                 f"{path}: cannot be decoded with {metadata.name}: {reason(error)}; expected a "
                 f".pcap of an Ouster and the metadata of the same sensor"
@@ -81,7 +86,7 @@ class Ouster(FileSequence):
             )
         self._stamps_ns = index[:, 0].astype(np.int64) * 1000
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # deprecated names
+            warnings.simplefilter("ignore")  # the library warns of deprecated names
             T = np.asarray(self._source.sensor_info[0].lidar_to_sensor_transform, np.float64)
         self._origins_m = T[None, :3, 3] * 1e-3
         super().__init__(path.stem, path, range(len(index)))
@@ -90,7 +95,7 @@ class Ouster(FileSequence):
         try:
             scan = self._source[frame][0]
             points = np.asarray(self._table(scan), np.float64)
-        except Exception as error:  # of the library's many kinds
+        except Exception as error:  # the library raises many types
             raise InputError(
                 f"{self.where}: frame {frame} cannot be decoded: {reason(error)}; choose a key or "
                 f"window without it"

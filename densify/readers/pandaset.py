@@ -7,18 +7,18 @@ Its files::
     002/camera/front_camera/{00.jpg, ..., poses.json, timestamps.json, intrinsics.json}
     002/annotations/cuboids/{00.pkl.gz, ...}    optional: tracked boxes
 
-- A frame's number is that of its files; its stamp is the end of the sweep. The first scanner (``d``
-  0, Pandar64) turns once in a sweep, the second (``d`` 1, PandarGT, forward) runs free of it.
-- Points are in the world, each placed with the vehicle's pose at its own time. Poses are the
-  vehicle's, x right, y forward, z up, 10 Hz; their clock agrees with that of the points to 20 ms.
-- The positions of the scanners are not published. The Pandar64 is assumed where its rings are
-  sharpest, the PandarGT where the swings of its mirror are smoothest. The same vehicle drove all
+- A frame is numbered as its files; its stamp is the end of the sweep. The first scanner (``d`` 0,
+  Pandar64) turns once in a sweep. The second (``d`` 1, PandarGT, forward) is not synchronised.
+- Points are in the world, each transformed by the vehicle's pose at its firing time. The vehicle's
+  poses are at 10 Hz, x right, y forward, z up. The clocks of poses and points agree to 20 ms.
+- The positions of the scanners are not published. The assumed position of the Pandar64 makes its
+  rings sharpest, and of the PandarGT the swings of its mirror smoothest. The same vehicle drove all
   sequences. The lidar frame is the Pandar64's: x forward, y left, z along its axis.
-- Boxes are in the world. An object that both scanners observe has two, one for each scanner
-  (``cuboids.sensor_id``). ``dimensions`` are width, length, height; ``yaw`` turns the front from
-  the world's y (devkit; not tried on real boxes).
+- Boxes are in the world. An object that both scanners observe has two boxes, one for each scanner
+  (``cuboids.sensor_id``). ``dimensions`` are width, length, height. ``yaw`` is measured from the
+  world's y axis to the front of the box (as in the devkit; not tried on real boxes).
 - Cameras are pinholes without distortion, as large as their images. Each image has a pose and a
-  stamp. A camera's mounting is taken from the image at which the vehicle moved least.
+  stamp. A camera's mounting is computed from the image at which the vehicle moved least.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.pickled_frame import read_columns
 from densify.readers.recorded_poses import PoseTrack
 
-_AXIS = np.array([-0.0157, 0.00045, 1.0])  # of the Pandar64, forward left up
+_AXIS = np.array([-0.0157, 0.00045, 1.0])  # spinning axis of the Pandar64, forward left up
 _POSITION_M = np.array([0.777, 0.002, 1.8593])
 PANDAR_GT_M = np.array([0.580, 0.027, -0.294])
 """(3,) origin of the PandarGT's rays in the Pandar64's frame."""
 
-_LATEST_S = 4e9  # of stamps: the year 2096
+_LATEST_S = 4e9  # latest accepted stamp: the year 2096
 _CENTRE = tuple(f"position.{axis}" for axis in "xyz")
 _LENGTH_WIDTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "yxz")
 
@@ -59,28 +59,28 @@ def _T_pose_lidar() -> Float:
 
 
 T_POSE_LIDAR = _T_pose_lidar()
-"""(4,4) from the Pandar64's frame to that of the poses in the files."""
+"""(4,4) pose of the lidar frame (Pandar64) in the vehicle frame of the pose files."""
 
 
 def open_recording(path: Path, scene: str | None) -> PandaSet:
-    """See `densify.readers.ReaderModule`; a sequence has no scenes."""
+    """Open a PandaSet sequence by its folder; a sequence has no scenes."""
     return PandaSet(path)
 
 
 class PandaSet(FileSequence):
-    """A sequence as a `LidarSequence` with poses of its images.
+    """A PandaSet sequence as a `LidarSequence` with a recorded pose for each image.
 
     The stamp of a sweep is the end of the Pandar64's turn.
     """
 
     def __init__(self, path: Path) -> None:
-        """Read poses, stamps and intrinsics.
+        """Read poses, stamps and intrinsics; sweeps and images are read on demand.
 
         Args:
             path: Folder of the sequence.
 
         Raises:
-            InputError: There are no sweeps, or poses, stamps or intrinsics are missing or
+            InputError: The folder has no sweeps, or poses, stamps or intrinsics are missing or
                 malformed.
         """
         lidar = path / "lidar"
@@ -116,14 +116,14 @@ class PandaSet(FileSequence):
         )
 
     def T_world_cam(self, camera: str, number: int) -> Float:
-        """Return the data set's own (4,4) pose of an image."""
+        """Return the recorded (4,4) pose T_world_cam of image ``number`` of a camera."""
         self.check_image(camera, number)
         return self._T_world_cam[camera][number]
 
     def _step_m(self, stamp_ns: int) -> float:
-        """Return the distance between the poses around that time.
+        """Return the distance in metres between the recorded vehicle positions around a time.
 
-        The smaller it is, the better is an interpolated pose.
+        A short distance means a small error of pose interpolation. Outside the path return inf.
         """
         after = np.searchsorted(self._track.stamp_ns, stamp_ns)
         if not 0 < after < len(self._track.stamp_ns):
@@ -158,10 +158,10 @@ class PandaSet(FileSequence):
         return self._track.at(self.stamp_ns(frame))
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `LidarSequence`; None without the frame's file.
+        """Return the boxes of a sweep in the lidar frame; None without a file of boxes.
 
         Raises:
-            InputError: The file is malformed.
+            InputError: The file of boxes is malformed.
         """
         self.check_frame(frame)
         path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"
@@ -179,7 +179,10 @@ class PandaSet(FileSequence):
 
 
 def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
-    """Return (n,) stamps and (n,4,4) poses of the files up to number ``last`` at least."""
+    """Return (n,) stamps in ns and (n,4,4) world poses from a folder's JSON files.
+
+    Element i belongs to file number i. Raise InputError if ``last`` is not covered (n <= last).
+    """
     path = folder / "timestamps.json"
     with described_in(path, "a list of seconds"):
         stamps_s = np.array(read_json(path), np.float64).reshape(-1)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Read columns of a pickled pandas data frame without pandas and without running the pickle.
 
-A pickle is a program: it may name any function of any package and call it. Here each name stands
-for a record that only notes the arguments of its calls. Names that the file of a data frame does
-not need are refused. The columns are taken from the notes.
+A pickle is a program that may import and call any function. Here every imported name is replaced
+by a class that only stores the call's arguments. Names that a pickled data frame does not need are
+refused. The columns are then taken from the stored arguments.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _NUMBERS = re.compile(r"[fiu][1248]|b1")
 
 
 class _Record:
-    """Note how an object of the file is made, and the state set on it."""
+    """Store the constructor arguments and the state of a pickled object, without making it."""
 
     args: tuple[Any, ...]
     state: Any = None
@@ -57,7 +57,7 @@ _RECORDS: dict[str, type[_Record]] = {
 
 
 class _Unpickler(pickle._Unpickler):
-    """Unpickle in pure Python, where a damaged file cannot reach past its buffers."""
+    """Unpickle in pure Python, where a damaged file cannot read outside its buffers."""
 
     def find_class(self, module: str, name: str) -> type[_Record]:
         named = f"{module}.{name}"
@@ -67,19 +67,19 @@ class _Unpickler(pickle._Unpickler):
 
 
 def read_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the columns of a gzipped pickle of a data frame, (N,) each, by name.
+    """Return the columns of a gzipped, pickled data frame with N rows, by column name.
 
-    Columns of texts are arrays of objects, each of which the caller must check. Nothing in the file
-    is run.
+    Each column is an array (N,) of numbers, or of Python objects where the frame holds texts. The
+    caller must check the type of these objects. No code in the file is run.
 
     Raises:
         InputError: The file is missing, damaged, or no data frame of numbers and texts, or it
-            names a function that frames do not need.
+            names a function that data frames do not need.
     """
     data = read_bytes(path)
     try:
         return _columns(_Unpickler(io.BytesIO(gunzipped(data, path))).load())
-    except Exception as error:  # the file decides which
+    except Exception as error:  # a damaged file can raise any type
         raise InputError(
             f"{path}: not a gzipped pandas data frame of numbers and texts ({reason(error)}); "
             f"nothing in it was run; fetch the file again from where the data set is published"
@@ -87,7 +87,7 @@ def read_columns(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _columns(frame: Any) -> dict[str, NDArray[Any]]:
-    """Return the columns of a frame. pandas stores columns of one kind together, (C,N)."""
+    """Return the columns of a frame; pandas stores the C columns of a type together, (C,N)."""
     if not isinstance(frame, _RECORDS["pandas.core.frame.DataFrame"]):
         raise ValueError(f"it holds a {type(frame).__name__}")
     managed = frame.state["_data"].state[-1]["0.14.1"]
@@ -102,6 +102,7 @@ def _columns(frame: Any) -> dict[str, NDArray[Any]]:
 
 
 def _array(record: _Record) -> NDArray[Any]:
+    """Rebuild a NumPy array from the stored state of its pickle."""
     _, shape, dtype, by_columns, data = record.state
     kind, order = dtype.args[0], dtype.state[1]
     if kind == "O8" and isinstance(data, list):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Find the meaning of a point cloud's fields by their names, and of times also by their values.
 
-Velodyne's ``time`` are seconds since the stamp, Ouster's ``t`` nanoseconds, Hesai's and RoboSense's
-``timestamp`` seconds since 1970, Livox's ``offset_time`` nanoseconds. The span of the times of a
-sweep tells the unit, because units differ by a factor of 1000 and a sweep takes about one period.
-Points whose time cannot be of their sweep are left out and counted.
+Velodyne's ``time`` is in seconds since the stamp. Ouster's ``t`` and Livox's ``offset_time`` are in
+nanoseconds, Hesai's and RoboSense's ``timestamp`` in seconds since 1970. The unit is found from the
+span of a sweep's times: units differ by a factor of 1000, and a sweep takes about one period.
+Points with a time outside their sweep are left out and counted.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from densify.readers.file_sequence import Returns
 
 K = TypeVar("K")
 Columns = Mapping[str, NDArray[Any]]
-"""The fields of a sweep's points by name, (N,) each."""
+"""Fields of a sweep's N points by name, an array (N,) each."""
 
 UNIT_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 REFERENCES = ("start", "middle", "end")
@@ -40,7 +40,7 @@ _NAMES = {
     "ring": "ring line channel laser_id laser_number laserid beam scalar_ring",
     "lidar": "lidar lidar_id scanner sensor_id scanner_channel",
 }
-_SHORTEST_SHARE, _LONGEST_SHARE = 0.08, 4.0  # of a period that the times of a sweep span
+_SHORTEST_SHARE, _LONGEST_SHARE = 0.08, 4.0  # accepted span of a sweep's times, in periods
 _NUM_SAMPLED = 5
 _SAME_CLOCK_NS = 2_000_000_000
 _RELATIVE_NS = 3_000_000_000
@@ -49,7 +49,7 @@ _FULL_SCALES = (1.0, 255.0, 65535.0)
 
 @dataclass(frozen=True)
 class Fields:
-    """The name of the field for each part, "" for none."""
+    """Names of the point fields that hold each quantity, "" if no field does."""
 
     x: str = ""
     y: str = ""
@@ -61,7 +61,7 @@ class Fields:
 
 
 def find_fields(names: Collection[str]) -> Fields:
-    """Return the fields by their names, in any case. Of several for one part, the first counts."""
+    """Find the field of each quantity by name, in any case; the order of `_NAMES` decides."""
     lower = {name.lower(): name for name in reversed(list(names))}
     found = {
         part: next((lower[name] for name in known.split() if name in lower), "")
@@ -72,17 +72,18 @@ def find_fields(names: Collection[str]) -> Fields:
 
 @dataclass(frozen=True)
 class PointTimes:
-    """The meaning of a field of times.
+    """How to convert a field of point times to nanoseconds since the stamp of the sweep.
 
     Attributes:
-        unit: A key of `UNIT_NS`.
-        absolute: The times count from an epoch, not from the stamp of the sweep.
-        other_clock: Absolute times have another epoch than the stamps.
-        middle_ns: Usual middle of a sweep since its stamp; with another clock each sweep has its
-            own.
-        reach_ns: Largest distance of a right time from the middle.
-        reference: The moment of the sweep at its stamp, one of `REFERENCES`; "" if the times
-            say it.
+        field: Name of the field.
+        unit: Unit of the times, one of `UNIT_NS`.
+        absolute: True if times count from an epoch, False if from the stamp of the sweep.
+        other_clock: True if the epoch of absolute times is not the epoch of the stamps.
+        middle_ns: Typical middle of a sweep's times, since its stamp. It is not used with
+            ``other_clock``, where the middle is computed for each sweep.
+        reach_ns: Largest accepted distance of a time from the middle of its sweep.
+        reference: Part of the sweep measured at its stamp, one of `REFERENCES`; "" to use the
+            times as they are.
     """
 
     field: str
@@ -94,13 +95,14 @@ class PointTimes:
     reference: str
 
     def offset_ns(self, values: NDArray[Any], stamp_ns: int) -> tuple[Int, Bool]:
-        """Return the times of points since the stamp of their sweep.
+        """Convert the times of a sweep's N points to nanoseconds since its stamp.
 
         Args:
-            values: (N,) of the field.
+            values: (N,) values of the field, in its own unit.
+            stamp_ns: Stamp of the sweep.
 
         Returns:
-            (N,) int64, 0 for times that cannot be right, and a mask (N,) of those that can.
+            The times (N,) int64 in ns, 0 where invalid, and a mask (N,) of the valid times.
         """
         right = self._right(values, stamp_ns)
         offset_ns = np.zeros(len(values), np.int64)
@@ -113,9 +115,9 @@ class PointTimes:
         return offset_ns, right
 
     def own_stamp_ns(self, values: NDArray[Any]) -> int | None:
-        """Return the stamp of a sweep with these absolute times (N,), None if no time is finite.
+        """Return a stamp (ns) for a sweep whose (N,) point times are absolute.
 
-        It is that of the first point, or the moment of `reference`.
+        The stamp is the earliest time or the time of `reference`; None if no time is valid.
         """
         right = self._right(values, None)
         if not right.any():
@@ -124,10 +126,11 @@ class PointTimes:
         return self._zero(near)[1] if self.reference else self._in_ns(near.min())
 
     def _right(self, values: NDArray[Any], stamp_ns: int | None) -> Bool:
-        """Return a mask (N,) of the times within `reach_ns` of the middle of the sweep.
+        """Return a mask (N,) of the valid times, within `reach_ns` of the middle of the sweep.
 
         Args:
-            stamp_ns: None for a sweep without a stamp.
+            values: (N,) values of the field, in its own unit.
+            stamp_ns: Stamp of the sweep, None if unknown.
         """
         times_ns = values.astype(np.float64) * UNIT_NS[self.unit]
         middle_ns = self.middle_ns + ((stamp_ns or 0) if self.absolute else 0.0)
@@ -137,9 +140,9 @@ class PointTimes:
         return right
 
     def _zero(self, near: NDArray[Any]) -> tuple[Any, int]:
-        """Return the origin of the offsets of a sweep's right times (M,).
+        """Return the time to subtract from a sweep's M valid times ``near`` (M,).
 
-        It is given in the unit of the field, and in nanoseconds.
+        The first value is in the unit of the field, the second is the same time in nanoseconds.
         """
         low, high = near.min(), near.max()
         if self.reference or self.other_clock:
@@ -150,7 +153,7 @@ class PointTimes:
         return zero, self._in_ns(zero)
 
     def _in_ns(self, time: Any) -> int:
-        """Return a time in nanoseconds, through no float that holds an epoch's nanoseconds."""
+        """Return a time in nanoseconds; whole units are converted as int to keep every digit."""
         whole = int(time)
         return whole * UNIT_NS[self.unit] + round(float(time - whole) * UNIT_NS[self.unit])
 
@@ -162,15 +165,15 @@ class PointTimes:
 
 
 def widened(values: NDArray[Any]) -> NDArray[Any]:
-    """Return int64 or float64, whichever holds the values."""
+    """Return the values as float64 if they are floats, else as int64."""
     return values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
 
 
 def _extent(times: NDArray[Any]) -> tuple[float, float]:
-    """Return the middle of a sweep's times (N,), and their reach on each side of it.
+    """Return the middle of a sweep's times (N,) and half their span, without outlying times.
 
-    Times far from most do not count: farther from the middle of the closest half than twice the
-    width of that half.
+    Outlying times are farther from the middle of the shortest interval that contains half of the
+    times than twice the width of this interval.
     """
     times = np.sort(times[np.isfinite(times)].astype(np.float64))
     half = len(times) // 2
@@ -182,13 +185,17 @@ def _extent(times: NDArray[Any]) -> tuple[float, float]:
 
 
 def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K, Columns]:
-    """Return the columns of a few sweeps with points, from all over a recording.
+    """Read the columns of up to 5 sweeps with points, spread over a recording.
 
     Args:
-        read: Returns the columns of one sweep.
+        sweeps: Frame numbers, files or messages, as ``read`` takes them.
+        read: Function that returns the columns of one sweep.
+
+    Returns:
+        The columns by element of ``sweeps``; empty if all sampled sweeps are without points.
 
     Raises:
-        InputError: None of the sweeps can be read.
+        InputError: No sampled sweep has points, and at least one sweep is unreadable.
     """
     found, errors = dict[K, Columns](), list[InputError]()
     for sweep in sweeps[:: max(1, len(sweeps) // _NUM_SAMPLED)][:_NUM_SAMPLED]:
@@ -213,19 +220,21 @@ def find_times(
     absolute: bool | None = None,
     reference: str = "",
 ) -> tuple[PointTimes | None, str]:
-    """Return how a field tells the times of points, and the finding in words.
+    """Find the unit, epoch, middle and span of point times from several sweeps of a recording.
 
-    Without a meaning, return None and the reason. The recording decides, not one sweep: the unit is
-    that of most sweeps, the extent their median.
+    The unit is the most frequent unit. The middle and the span are medians over the sweeps.
 
     Args:
-        sweeps: (N,) of each of some sweeps.
+        sweeps: Values (N,) of the field for each sweep; N differs between sweeps.
         field: Name of the field.
-        period_ns: Time from sweep to sweep.
-        stamps_ns: Stamps of these sweeps, None without stamps.
-        unit: The unit, "" if unknown.
-        absolute: As in `PointTimes`, None if unknown.
+        period_ns: Time between consecutive sweeps.
+        stamps_ns: Stamps of the given sweeps, None without stamps.
+        unit: Unit of the times, "" to find the unit.
+        absolute: As in `PointTimes`, None to find the value.
         reference: As in `PointTimes`, "" if unknown.
+
+    Returns:
+        The meaning of the times and its description; or None and the reason of the failure.
     """
     told = [_unit_of(values, field, period_ns, unit) for values in sweeps]
     units = Counter(found for found, _ in told)
@@ -258,10 +267,10 @@ def find_times(
 
 
 def _unit_of(values: NDArray[Any], field: str, period_ns: int, unit: str) -> tuple[str, str]:
-    """Return the unit of a sweep's times (N,), or "" and the reason.
+    """Return the unit of a sweep's times (N,) and "", or else "" and the reason of the failure.
 
     Args:
-        unit: "" to find the one in which they take about a period.
+        unit: Known unit; "" to find the unit in which the times span about one period.
     """
     times = widened(values)
     times = times[np.isfinite(times)]
@@ -287,28 +296,28 @@ def _unit_of(values: NDArray[Any], field: str, period_ns: int, unit: str) -> tup
 
 
 def full_scale(intensity: NDArray[Any]) -> float:
-    """Return the divisor that scales intensities to 0 to 1.
+    """Return the divisor that scales intensities to the range 0 to 1.
 
-    It is 1, 255, 65535, or the largest finite intensity.
+    It is the smallest of 1, 255 and 65535 that suffices, or else the largest finite intensity.
     """
     greatest = float(np.max(intensity, initial=0.0, where=np.isfinite(intensity)))
     return next((scale for scale in _FULL_SCALES if greatest <= scale), greatest)
 
 
 def scaled(intensity: NDArray[Any], scale: float) -> Float32:
-    """Return intensities of 0 to 1, clipped; 0 where they are not finite."""
+    """Return intensities divided by ``scale`` and clipped to 0 to 1; NaN and infinity give 0."""
     share = np.nan_to_num(intensity.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0) / scale
     return np.clip(share, 0, 1).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class PointLayout:
-    """The meaning of the fields of a sensor's sweeps, found in some of them.
+    """The meaning of the fields in a sensor's sweeps.
 
     Attributes:
-        times: Meaning of the times, None if no field has them.
-        time_words: The finding about times, in words.
-        intensity_scale: Intensity of full brightness.
+        times: Meaning of the point times, None without usable times.
+        time_words: Description of the times, or the reason why there are none.
+        intensity_scale: Divisor that scales intensities to 0 to 1.
     """
 
     fields: Fields
@@ -326,16 +335,18 @@ class PointLayout:
         intensity_scale: float = 0.0,
         **times: Any,
     ) -> PointLayout:
-        """Return the layout of the columns (N,) of some sweeps.
+        """Find the layout from the columns of several sweeps.
 
         Args:
-            stamps_ns: Stamps of these sweeps, None without stamps.
-            named: Fields by their part.
-            intensity_scale: 0 to find it.
-            times: Known properties of the times, see `find_times`.
+            where: File or topic, which begins error messages.
+            period_ns: Time between consecutive sweeps.
+            stamps_ns: Stamps of the given sweeps, None without stamps.
+            named: Names of fields that the user gave, by the attributes of `Fields`.
+            intensity_scale: Known divisor of intensities, 0 to find the divisor.
+            times: Known ``unit``, ``absolute`` or ``reference`` of `find_times`.
 
         Raises:
-            InputError: There is no x, y or z.
+            InputError: No field holds x, y or z.
         """
         fields = Fields(**(vars(find_fields(sweeps[0])) | dict(named or {})))
         missing = [axis for axis in "xyz" if not getattr(fields, axis)]
@@ -355,12 +366,13 @@ class PointLayout:
         return PointLayout(fields, found, words, intensity_scale or 1.0)
 
     def returns(self, columns: Columns, where: Path | str, stamp_ns: int) -> tuple[Returns, Bool]:
-        """Return the rows of a sweep of that stamp, and a mask (N,) of the valid ones.
+        """Return all N rows of a sweep, and a mask (N,) of the valid rows.
 
-        A valid row has a finite position and a time that can be right. The others are at 0 0 0.
+        A valid row has a finite position other than 0 0 0 and a time inside the sweep. Invalid
+        rows get the position 0 0 0.
 
         Raises:
-            InputError: A field of the first sweep is missing.
+            InputError: The sweep lacks a field of the layout.
         """
         missing = [name for name in vars(self.fields).values() if name and name not in columns]
         if missing:

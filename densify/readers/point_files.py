@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Read the columns of point files of every format. Nothing in them is run as code."""
+"""Read the columns of point files (.bin, .npy, .npz, .csv, .txt, .pcd, .ply, .las, .laz).
+
+No content of a file is run as code.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,10 @@ from densify.readers.decoded_files import read_array, read_arrays, read_las
 
 Columns = dict[str, NDArray[Any]]
 
-_UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most others follow
-_ALIKE = 0.5  # steps from row to row, as a share of the sizes
-_FEWEST_ROWS = 20  # that tell
-_MOST_COLUMNS = 100  # more are rows
+_UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most data sets follow
+_ALIKE = 0.5  # largest median step between rows, as a share of the coordinates
+_FEWEST_ROWS = 20  # for this test
+_MOST_COLUMNS = 100  # a wider array is probably transposed
 _ROWS_LOOKED_AT = 4000
 
 
@@ -32,8 +35,9 @@ class PointTable:
     """The N points of a file.
 
     Attributes:
-        columns: (N,) numbers each, as stored, by name; `unnamed` names those without names.
-        beside: The other arrays of an .npz file.
+        columns: Values (N,) of each column as stored, by name. Columns that have no name in the
+            file get the names of `unnamed`.
+        beside: Further arrays of an .npz file, by name.
     """
 
     columns: Columns
@@ -44,7 +48,7 @@ class PointTable:
 
 
 def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
-    """Return every row of the file in its order.
+    """Read the points of a file, all rows in file order.
 
     ========================= ==================================================================
     .bin                      float32 columns
@@ -56,8 +60,12 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     .las, .laz                dimensions
     ========================= ==================================================================
 
-    names: of the columns, where the file has none; a .bin file without them has x y z intensity.
-    Raises InputError if the file is missing, damaged, of another form, or has no rows.
+    Args:
+        path: Point file.
+        names: Names of the columns if the file has none. By default they are those of `unnamed`.
+
+    Raises:
+        InputError: The file is missing, damaged, of another format, or has no rows.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -77,12 +85,12 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
 
 
 def unnamed(num_columns: int) -> tuple[str, ...]:
-    """Return the names given to columns without names: x y z intensity, then numbers."""
+    """Return default column names: x, y, z, intensity, column4, column5 and so on."""
     return tuple(_UNNAMED[i] if i < len(_UNNAMED) else f"column{i}" for i in range(num_columns))
 
 
 def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Columns:
-    """Return the columns of an (N,k) array, or the fields of a structured one."""
+    """Return the k columns of an (N,k) array, or the fields of a structured array, by name."""
     if array.dtype.names and array.ndim == 1:
         return {name: array[name] for name in array.dtype.names if array[name].ndim == 1}
     if array.size == 0:
@@ -118,12 +126,12 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _are_scanned(points: NDArray[Any]) -> bool:
-    """Return True if consecutive (N,3) points are close to each other.
+    """Return True if consecutive (N,3) points are close to each other, as in a scan.
 
-    The median of the steps is compared with the distances. A wrong number of columns mixes x with
-    y.
+    Rows read with a wrong number of columns mix x with y, and consecutive points lie far apart. The
+    test compares the median step with the coordinates.
     """
-    with np.errstate(invalid="ignore"):  # other bytes may be any sort of NaN
+    with np.errstate(invalid="ignore"):  # wrongly read bytes may be signalling NaN
         near = np.nan_to_num(points.astype(np.float64), posinf=0, neginf=0)
     step, size = np.abs(np.diff(near, axis=0)).sum(axis=1), np.abs(near).sum(axis=1)
     share = step / (size[1:] + size[:-1] + 1e-9)
@@ -167,7 +175,7 @@ def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[str], str | None]:
-    """Return the number of header lines, the column names and the delimiter (None for blanks).
+    """Return the number of header lines, the column names and the delimiter (None: whitespace).
 
     Comments before the names are skipped.
     """
@@ -196,10 +204,10 @@ def _are_numbers(words: Sequence[str]) -> bool:
 
 
 def _pcd_header(file: Any) -> list[str]:
-    """Return the lines up to DATA, without comments. The file is then at the first point.
+    """Read the header lines up to DATA, without comments; the file is left at the first point.
 
-    Padding fields with a COUNT of 0 and old headers without COUNT are put in the form that parsers
-    take.
+    The header is normalised for the parser: padding fields with a COUNT of 0 are removed, and
+    missing COUNT, VERSION, HEIGHT and POINTS are added.
     """
     lines: list[str] = []
     while len(lines) < 20:
@@ -292,4 +300,4 @@ _READERS: Mapping[str, Callable[[Path, Sequence[str] | None], PointTable]] = {
 }
 
 SUFFIXES = tuple(_READERS)
-"""Those that nothing but points has come first."""
+"""Suffixes of point files; suffixes that only point files have come first."""

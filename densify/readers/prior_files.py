@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Read depth images that the user brings, such as those of a monocular network.
+"""Read depth priors: depth images that the user provides, such as from a monocular network.
 
 A folder of them::
 
-    DIR/[CAMERA/[data/]]FRAME.npy, .exr or .png    without CAMERA of a single one; or a file alone
-    DIR/sky/[CAMERA/]FRAME.png    optional masks, not 0 for sky
+    DIR/[CAMERA/[data/]]FRAME.npy, .exr or .png    CAMERA may be omitted for a single camera
+    DIR/sky/[CAMERA/]FRAME.png    optional masks, nonzero for sky
 
-FRAME is the image's number: 120, 000120, 0000000120, 0000000120_depth or _disp. Arrays are (H,W) of
-any number type, with further axes of length 1; EXR files have one channel, or one called Z, Y or
-depth; PNG files are 16 bit gray. A number that is not finite or not above 0 is no value.
+A single file is accepted too. FRAME is the number of the image: 120, 000120, 0000000120,
+0000000120_depth or _disp. Arrays are (H,W) of any number type; axes of length 1 are dropped. EXR
+files have one channel, or a channel called Z, Y or depth. PNG files are 16 bit gray. A pixel that
+is not finite or not above 0 has no value.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from densify.geometry.types import Bool, Camera, Float32, Prior
 from densify.readers.decoded_files import check_pixels, read_array, read_image
 from densify.readers.timeline import format_frames
 
-_SUFFIXES = (".png", ".exr", ".npy")  # the finest last
+_SUFFIXES = (".png", ".exr", ".npy")  # ascending precision
 _STEM = re.compile(r"(\d+)(?:[_-](?:depth|disp|disparity|pred|prior))?", re.IGNORECASE)
 _CHANNELS = ("Z", "Y", "depth", "Depth")
 _SAME_ASPECT = 0.02
@@ -36,11 +37,12 @@ _SAME_ASPECT = 0.02
 
 @dataclass(frozen=True)
 class PriorFiles:
-    """The files of priors.
+    """The files of the user's depth priors.
 
     Attributes:
-        values: Camera -> number of the image -> file.
-        sky: The same of masks.
+        place: Folder or file that the user named.
+        values: Depth files, by camera name and image number.
+        sky: Files of sky masks, by camera name and image number.
     """
 
     place: Path
@@ -49,10 +51,10 @@ class PriorFiles:
 
     @staticmethod
     def open(place: Path, cameras: Sequence[str]) -> PriorFiles:
-        """Return the files of some cameras in a folder, or a single file.
+        """Find the priors of the given cameras in a folder, or take a single file.
 
         Raises:
-            InputError: There is nothing, or a file could be of several cameras.
+            InputError: No prior is found, or a file could belong to several cameras.
         """
         where, example = f"--prior {place}", "0000000120.npy, .exr or .png"
         if not place.exists():
@@ -77,16 +79,16 @@ class PriorFiles:
         return PriorFiles(place, values, sky)
 
     def said_of(self, camera: str) -> str:
-        """Return the numbers of a camera's images with a prior, as text for messages."""
+        """Return a clause for messages that lists the numbers of a camera's images with a prior."""
         return f"there are {format_frames(self.values[camera])}"
 
     def prior(self, camera: Camera, number: int) -> Prior | None:
-        """Return the prior of an image at the camera's size; None if there is none.
+        """Return the prior of an image at the camera's size (H,W); None if the image has no prior.
 
-        A prior of another size is resized if its aspect agrees.
+        A prior of another size is resized if its aspect ratio agrees to 2 %.
 
         Raises:
-            InputError: A file cannot be read or is something else.
+            InputError: A file is unreadable, has another aspect ratio, or holds no depth.
         """
         path = self.values[camera.name].get(number)
         if path is None:
@@ -98,11 +100,11 @@ class PriorFiles:
 
 
 def _in(folder: Path) -> dict[int, Path]:
-    """Return number -> file, in the folder or its ``data``. A single file is returned as it is."""
+    """Return the prior files of a folder or its ``data`` subfolder by image number."""
     groups = [sorted(f.iterdir()) for f in (folder, folder / "data") if f.is_dir()]
     for paths in [[folder]] if folder.is_file() else groups:
         found: dict[int, Path] = {}
-        # The finest last: a coarser file of the same number may be a picture of it.
+        # The most precise file of a number wins: a PNG may be only a preview of the .npy.
         for suffix in _SUFFIXES:
             for path in paths:
                 stem = _STEM.fullmatch(path.stem)
@@ -120,7 +122,7 @@ def _in(folder: Path) -> dict[int, Path]:
 
 
 def _value(path: Path) -> Float32:
-    """Return (H,W) values, 0 for none."""
+    """Read the (H,W) float32 values of a prior; 0 marks pixels without a value."""
     read = {".npy": read_array, ".exr": _read_exr, ".png": _read_png}[path.suffix.lower()]
     image = np.asarray(read(path))
     image = image.reshape([n for n in image.shape if n != 1]) if image.ndim > 2 else image
@@ -166,7 +168,7 @@ def _read_png(path: Path) -> NDArray[Any]:
 
 
 def _resized(value: Float32, camera: Camera, path: Path) -> Float32:
-    """Return the values at the camera's size, linear between two of them, none beside none."""
+    """Resize values (H,W) to the camera's size; a pixel beside an empty pixel becomes 0 (empty)."""
     if value.shape == (camera.height_px, camera.width_px):
         return value
     known = _at_size((value > 0).astype(np.float32), camera, path)
@@ -174,6 +176,7 @@ def _resized(value: Float32, camera: Camera, path: Path) -> Float32:
 
 
 def _sky(path: Path, camera: Camera) -> Bool:
+    """Read a sky mask at the camera's size (H,W), True for sky."""
     mask = read_image(path, as_stored=True)
     mask = mask if mask.ndim == 2 else mask[:, :, :3].max(axis=2)
     sky: Bool = _at_size((mask > 0).astype(np.float32), camera, path) >= 0.5
@@ -181,7 +184,7 @@ def _sky(path: Path, camera: Camera) -> Bool:
 
 
 def _at_size(image: Float32, camera: Camera, path: Path) -> Float32:
-    """Return an image (H,W) at the camera's size. Raises InputError if it has another aspect."""
+    """Resize an image linearly to the camera's size; raise InputError for another aspect ratio."""
     import cv2
 
     height, width = image.shape
