@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Write files and folders that appear when they are complete.
+"""Write files and folders that appear only when they are complete.
 
-They are written in a hidden folder, then renamed. Missing folders above them are made. A failure to
-write is an OutputError that names the place.
+The content is written into a hidden folder and then renamed. Missing parent folders are made. A
+failure to write raises OutputError with the path.
 """
 
 from __future__ import annotations
@@ -22,18 +22,21 @@ import numpy as np
 
 from densify.config.errors import OutputError
 
-LEFT_AFTER_S = 600.0  # no file takes as long to write
+LEFT_AFTER_S = 600.0  # longer than the writing of any file
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write or replace a file. On any failure the old file stays, and nothing else is left."""
+    """Write or replace a file. On any failure the old file stays, and no other file is left."""
     with file_aside(path) as aside:
         aside.write_bytes(data)
 
 
 @contextmanager
 def file_aside(path: Path) -> Iterator[Path]:
-    """Yield a temporary path, which becomes ``path`` if the block ends without an error."""
+    """Yield a temporary path. The file there is renamed to ``path`` when the block ends.
+
+    On an error within the block, the temporary file is removed and ``path`` stays as it was.
+    """
     with _hidden_folder(path) as hidden:
         yield hidden / path.name
         os.replace(hidden / path.name, path)
@@ -43,11 +46,11 @@ def file_aside(path: Path) -> Iterator[Path]:
 def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
     """Yield a folder to write into, which becomes ``folder`` if the block ends without an error.
 
-    On any exception ``folder`` and the folders above it are as they were before.
+    On any exception ``folder`` and its parent folders are as they were before.
 
     Args:
-        owned: Entries of the writer, which are replaced or removed if ``folder`` exists. Others
-            are kept.
+        owned: Names of the entries that the block writes. Existing entries of these names are
+            replaced or removed. All other entries of ``folder`` are kept.
     """
     folder = Path(os.path.realpath(folder))
     missing = [place for place in folder.parents if not place.exists()]
@@ -70,8 +73,8 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
                     os.rename(hidden / "old", folder)
                 raise
     except BaseException:
-        for place in missing:  # from the deepest up
-            with suppress(OSError):  # others wrote into it meanwhile
+        for place in missing:  # from the deepest folder up
+            with suppress(OSError):  # another process may have written into the folder
                 place.rmdir()
         raise
 
@@ -79,7 +82,7 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
 def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
     """Remove the hidden folders that killed processes left anywhere under ``root``.
 
-    A folder younger than ``age_s`` seconds stays, because another process may be writing there.
+    Folders younger than ``age_s`` seconds are kept, because another process may be writing there.
     """
     for folder, names, _ in os.walk(root):  # skips files that others remove meanwhile
         for name in names:
@@ -91,6 +94,7 @@ def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
 
 @contextmanager
 def _hidden_folder(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside ``path``. Raise OutputError if writing fails."""
     prefix = f".{path.name[:100]}."
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -103,14 +107,15 @@ def _hidden_folder(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write `plain` of a mapping, indented."""
+    """Write a mapping as indented JSON, after its conversion by `plain`."""
     write_file(path, (json.dumps(plain(value), indent=2, allow_nan=False) + "\n").encode())
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON and YAML can write it.
+    """Return a value with types that JSON and YAML can write.
 
-    Numpy's numbers become Python's, tuples lists, and numbers that are not finite None.
+    NumPy arrays and tuples become lists, NumPy scalars become Python numbers. NaN and infinity
+    become None.
     """
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}

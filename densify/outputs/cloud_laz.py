@@ -39,19 +39,20 @@ _STANDARD_DIMENSIONS = {"intensity", "gps_time", "red", "green", "blue"}
 
 @dataclass(frozen=True)
 class StoredCloud:
-    """M points as they are stored: key frame, metres, rounded to the millimetre.
+    """M points as stored in ``cloud.laz``, at the key sweep's reference time.
 
     Attributes:
-        frame: (M,) int32 source sweep.
-        instance: (M,) int32 object, -1 for none.
-        moving: (M,) bool.
-        far: (M,) bool.
-        confidence: (M,) float32.
-        displaced: (M,) float32 metres.
-        intensity: (M,) float32.
-        rgb: (M,3) uint8, 0 where no camera observed the point.
-        displacement: (M,3) float32 metres beyond the rigid alignment.
-        gps_time: (M,) seconds, see `write_cloud`.
+        points: (M,3) positions in metres, in the lidar frame of the key sweep, rounded to 1 mm.
+        frame: (M,) int32 frame number of the source sweep.
+        moving: (M,) bool, True for points confirmed to move.
+        instance: (M,) int32 number of the moving object, -1 for points without an object.
+        confidence: (M,) float32 from 0 to 1.
+        displaced: (M,) float32 length of ``displacement`` in metres.
+        intensity: (M,) float32 from 0 to 1.
+        rgb: (M,3) uint8 colour, 0 where no camera observed the point.
+        far: (M,) bool, True for points of sweeps beyond the window.
+        displacement: (M,3) float32 metres from the rigidly accumulated position to ``points``.
+        gps_time: (M,) reference time of the source sweep in seconds, see `write_cloud`.
     """
 
     points: Float
@@ -68,30 +69,30 @@ class StoredCloud:
 
     @staticmethod
     def joined(parts: Sequence[StoredCloud]) -> StoredCloud:
-        """Return the points of all parts, one after another."""
+        """Return one cloud with the points of all clouds, in the given order."""
         columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(StoredCloud)}
         return StoredCloud(**{name: np.concatenate(part) for name, part in columns.items()})
 
     @property
     def rigid_points(self) -> Float:
-        """The (M,3) positions of rigid accumulation."""
+        """The (M,3) positions of rigid accumulation in metres, key sweep's lidar frame."""
         return self.points - self.displacement
 
     @property
     def stamp_ns(self) -> Int:
-        """The (M,) reference times of the source sweeps, to the microsecond."""
+        """The (M,) reference times of the source sweeps in ns since 1970, exact to 1 µs."""
         return np.rint(self.gps_time * 1e6).astype(np.int64) * 1000 + _LAS_EPOCH_NS
 
     def select(self, keep: Bool | Int) -> StoredCloud:
-        """Return the points where ``keep`` (M,) is True, or those of these rows."""
+        """Return some of the points. ``keep`` is a mask (M,) or an array of point indices."""
         return StoredCloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return the columns (M,) by name.
+        """Return a mapping from column name to values (M,).
 
-        They are x y z displaced_x displaced_y displaced_z red green blue intensity confidence
-        displaced frame instance gps_time moving far. Booleans are uint8. Positions are float32,
-        which keeps the millimetre up to 8 km.
+        The names are x y z displaced_x displaced_y displaced_z red green blue intensity confidence
+        displaced frame instance gps_time moving far. Booleans become uint8. Positions become
+        float32, which keeps 1 mm up to 8 km.
         """
         names = ("intensity", "confidence", "displaced", "frame", "instance", "gps_time")
         return {
@@ -104,16 +105,17 @@ class StoredCloud:
 
 
 def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
-    """Write a cloud with the extra dimensions of `_EXTRA_DIMENSIONS`.
+    """Write a cloud as LAZ with the extra dimensions of `_EXTRA_DIMENSIONS`.
 
-    ``gps_time`` is that of the source sweep, as LAS 1.4 has it: seconds since 1980-01-06 less 10^9,
-    without leap seconds. Coordinates are rounded to 1 mm, intensity and colour widened to 16 bits.
-    The same cloud gives the same bytes.
+    ``gps_time`` is the reference time of the source sweep as LAS 1.4 defines it: seconds since
+    1980-01-06 minus 10^9, without leap seconds. Coordinates are rounded to 1 mm. Intensity and
+    colour are scaled to 16 bits. Equal clouds give equal bytes.
 
     Args:
-        path: The file.
-        cloud: The cloud.
-        stamp_ns: Reference time of the key. The date in the header is its day.
+        path: The file to write.
+        cloud: The accumulated cloud.
+        stamp_ns: Reference time of the key sweep in ns since 1970. Its day is the date in the
+            header.
 
     Raises:
         ValueError: A coordinate is not finite or beyond 2,147 km.
@@ -148,10 +150,10 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
 
 
 def read_cloud(path: Path) -> StoredCloud:
-    """Return a cloud that `write_cloud` wrote.
+    """Return the cloud in a file that `write_cloud` wrote.
 
     Raises:
-        InputError: It is another file.
+        InputError: The file cannot be read, or lacks a dimension.
     """
     las = read_las(path)
     known = {*_STANDARD_DIMENSIONS, *(name for name, _, _ in _EXTRA_DIMENSIONS)}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Read and write depth, confidence, age, optical flow and pictures as PNG and JPEG.
 
-Depth is in the format of KITTI's depth completion benchmark (Uhrig et al., "Sparsity Invariant
-CNNs", 3DV 2017): 16 bit, one channel, ``value / 256`` metres, 0 = none.
+Depth has the format of KITTI's depth completion benchmark (Uhrig et al., "Sparsity Invariant CNNs",
+3DV 2017): PNG of 16 bits and one channel. A pixel stores ``256 * metres``, 0 for no depth.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from densify.outputs.atomic import write_file
 from densify.readers.decoded_files import read_image
 
 Picture = NDArray[np.uint8]
-"""(H,W,3) RGB."""
+"""(H,W,3) uint8 RGB image."""
 
 _STEPS_PER_M = 256.0
 _STEPS_OF_CONFIDENCE = 254.0
@@ -30,35 +30,35 @@ _MAX_VALUE = np.iinfo(np.uint16).max
 
 
 def encode_png(image: NDArray[np.uint16] | NDArray[np.uint8]) -> bytes:
-    """Return the PNG of (H,W) gray or (H,W,3) blue, green, red; 8 or 16 bit."""
+    """Return the bytes of a PNG of (H,W) gray or (H,W,3) blue, green, red; 8 or 16 bits."""
     return cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes()
 
 
 def encode_jpeg(picture: Picture, quality: int = 92) -> bytes:
-    """Return the JPEG of an RGB picture.
+    """Return the bytes of a JPEG file of an (H,W,3) RGB picture.
 
     Args:
-        quality: 0 to 100. A lower one is smaller, with blocks.
+        quality: 0 to 100. Lower values give smaller files with visible blocks.
     """
     bgr = np.ascontiguousarray(picture[:, :, ::-1])
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def map_path(folder: Path, kind: str, name: str, suffix: str = ".png") -> Path:
-    """Return ``folder/kind/name.png``.
+    """Return the path ``folder/kind/name.png`` of a map.
 
-    With ``project.per=image`` the name of a map is ``CAMERA/NUMBER``.
+    The name is CAMERA, or CAMERA/NUMBER with ``project.per=image``.
     """
     return folder / kind / f"{name}{suffix}"
 
 
 def write_depth_png(path: Path, depth_m: Float32) -> None:
-    """Write ``rint(256 * depth_m)``.
+    """Write a depth map. A pixel stores ``rint(256 * depth_m)``.
 
-    Depths beyond 65535/256 = 256 m and below half a step, 2 mm, become 0, none.
+    Depths beyond 65535/256 = 256 m or below 2 mm (half a step) are stored as 0, no depth.
 
     Args:
-        depth_m: (H,W) metres, 0 none.
+        depth_m: (H,W) depth in metres, 0 for no depth.
 
     Raises:
         ValueError: A depth is negative or not finite.
@@ -67,11 +67,11 @@ def write_depth_png(path: Path, depth_m: Float32) -> None:
 
 
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
-    """Write `stored_confidence` as 8 bit, 0 where `write_depth_png` has no depth.
+    """Write `stored_confidence` with 8 bits, 0 where `write_depth_png` stores no depth.
 
     Args:
-        confidence: (H,W), 0 to 1.
-        depth_m: (H,W) metres, the depth it belongs to.
+        confidence: (H,W) confidence from 0 to 1.
+        depth_m: (H,W) depth in metres that the confidence describes.
     """
     levels = np.zeros(depth_m.shape, np.uint8)
     has_depth = _quantised(depth_m) > 0
@@ -80,11 +80,12 @@ def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> N
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
-    """Write `stored_age` as 16 bit, 0 where `write_depth_png` has no depth.
+    """Write `stored_age` with 16 bits, 0 where `write_depth_png` stores no depth.
 
     Args:
-        age_s: (H,W) seconds, 0 or more wherever there is depth.
-        depth_m: (H,W) metres.
+        age_s: (H,W) seconds between the image's exposure and the sweep that measured the pixel, 0
+            or more at every pixel with a depth.
+        depth_m: (H,W) depth in metres, 0 for no depth.
     """
     steps = np.zeros(depth_m.shape, np.uint16)
     has_depth = _quantised(depth_m) > 0
@@ -93,13 +94,13 @@ def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
 
 
 def stored_confidence(confidence: ArrayLike) -> NDArray[np.uint8]:
-    """Return ``1 + rint(254 * confidence)``. 255 is most certain; 0 is left for no depth."""
+    """Return ``1 + rint(254 * confidence)``: 1 to 255 for confidence 0 to 1. 0 means no depth."""
     levels = np.rint(_STEPS_OF_CONFIDENCE * np.asarray(confidence, np.float64))
     return (1 + levels).astype(np.uint8)
 
 
 def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
-    """Return ``1 + rint(1000 * age_s)``. 0 is left for no depth; 65535 is 65.5 s or more."""
+    """Return ``1 + rint(1000 * age_s)``. 65535 means 65.5 s or more, 0 means no depth."""
     steps = np.rint(_STEPS_PER_S * np.asarray(age_s, np.float64))
     return (1 + np.minimum(steps, _MAX_VALUE - 1)).astype(np.uint16)
 
@@ -107,12 +108,12 @@ def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
 def write_flow_png(path: Path, flow_px: Float32) -> None:
     """Write optical flow in the format of KITTI's flow benchmark (Menze and Geiger, CVPR 2015).
 
-    It has 16 bit: red and green are ``rint(64 * flow) + 2^15`` to the right and down, blue is 1
-    where known.
+    The PNG has 16 bits. Red stores ``rint(64 * flow) + 2^15`` to the right, green the flow down.
+    Blue is 1 where the flow is known.
 
     Args:
-        flow_px: (H,W,2) pixels, NaN where unknown. Flow beyond 512 pixels is written as
-            unknown.
+        flow_px: (H,W,2) flow in pixels, to the right and down, NaN where unknown. Flow beyond 512
+            px is written as unknown.
     """
     levels = np.rint(_STEPS_PER_PX * flow_px.astype(np.float64)) + 2**15
     known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)
@@ -122,27 +123,28 @@ def write_flow_png(path: Path, flow_px: Float32) -> None:
 
 
 def metres(stored: NDArray[np.uint16]) -> Float32:
-    """Return (H,W) float32 metres of a stored depth map, exact to the last bit."""
+    """Return the (H,W) float32 metres of a stored depth map, without rounding."""
     return stored.astype(np.float32) / np.float32(_STEPS_PER_M)
 
 
 def read_depth_png(path: Path) -> Float32:
-    """Return (H,W) metres, 0 none.
+    """Return the (H,W) depth in metres of a PNG, 0 for no depth.
 
     Raises:
-        InputError: It is no 16-bit gray PNG.
+        InputError: The file is no PNG of 16 bits and one channel.
     """
     return metres(read_stored(path, np.uint16, "a depth map"))
 
 
 def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -> NDArray[Any]:
-    """Return (H,W) of a map as it is stored.
+    """Return the (H,W) pixel values of a map without conversion to metres.
 
     Args:
-        what: Name of the map, for the message.
+        kind: Expected type of the pixels.
+        what: Name of the map, for the error message.
 
     Raises:
-        InputError: It is no whole gray PNG of this depth.
+        InputError: The file is damaged, or has other bits or channels than expected.
     """
     image = read_image(path, as_stored=True)
     if image.dtype != kind or image.ndim != 2:
@@ -153,10 +155,10 @@ def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -
 
 
 def read_mask_png(path: Path) -> Bool:
-    """Return (H,W), True where any colour is not 0. Transparency is ignored.
+    """Return an (H,W) mask, True where any colour channel is above 0. Transparency is ignored.
 
     Raises:
-        InputError: It is no image.
+        InputError: The file is no image.
     """
     image = read_image(path, as_stored=True)
     colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
@@ -165,6 +167,7 @@ def read_mask_png(path: Path) -> Bool:
 
 
 def _quantised(depth_m: Float32) -> NDArray[np.uint16]:
+    """Return depths in steps of 1/256 m, 0 for depths beyond 256 m."""
     if not (np.isfinite(depth_m) & (depth_m >= 0)).all():
         raise ValueError("depth_m: expected finite depths, 0 or more")
     steps = np.rint(_STEPS_PER_M * depth_m.astype(np.float64))

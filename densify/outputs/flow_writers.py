@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Write scene flow of a key, and of a whole recording in the forms of other programs.
+"""Write scene flow of one window, or of a whole recording in the formats of other programs.
 
-NAME is that of the recording::
+NAME is the name of the recording. "Ego-motion" is the motion of the vehicle::
 
     npz            OUT/000119_000120.npz: flow files, see `densify.readers.flow_files`
     av2            OUT/NAME/STAMP.feather, of the Argoverse 2 scene flow challenge of 2024: is_valid
-                   bool, flow_tx_m flow_ty_m flow_tz_m float16, to the next sweep without the
-                   ego-motion; a row for each of the sweep's file, in its frame
+                   bool, flow_tx_m flow_ty_m flow_tz_m float16, flow to the next sweep without
+                   ego-motion in the sweep's lidar frame; a table row for each row of the sweep file
     opensceneflow  OUT/NAME.h5 (https://github.com/KTH-RPL/OpenSceneFlow), a group for each sweep,
                    its stamp in ns: lidar (N,4) deskewed to the stamp, pose (4,4), lidar_id,
-                   ground_mask (all False), row (N,) in the sweep's file; with the ego-motion, where
-                   known: flow (N,3), flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
+                   ground_mask (all False), row (N,) in the sweep file; where flow is known, flow
+                   (N,3) with ego-motion, flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
     semantickitti  OUT/sequences/NAME/predictions/000120.label, as semantic-kitti-api scores them
                    (https://github.com/PRBonn/semantic-kitti-api, evaluate_mos.py): uint32 for each
-                   row of the sweep's file, below 251 moving or 9 static, above the object, 0 none
+                   row of the sweep file; low 16 bits 251 moving or 9 static, high 16 bits the
+                   object's number, 0 none
     doc-depth      OUT/NAME, the exchange format of DOC-Depth (de Moreau et al., "DOC-Depth", IV
                    2025; https://github.com/SimondeMoreau/DOC-Depth, Preprocessing/FORMAT.md)
 
-The challenge takes every fifth sweep, zipped as NAME/0000000000.feather, NAME/0000000005.feather….
+The Argoverse challenge takes every fifth sweep, zipped as NAME/0000000000.feather,
+NAME/0000000005.feather….
 """
 
 from __future__ import annotations
@@ -50,21 +52,26 @@ from densify.outputs.key_outputs import Context
 from densify.readers.recorded_poses import PoseTrack
 
 MOVING, STATIC = 251, 9
-_GROUND, _STANDING, _DYNAMIC = 0, 50, 100  # DOC-Depth's classes
+_GROUND, _STANDING, _DYNAMIC = 0, 50, 100  # DOC-Depth's classes: ground, static, moving
 
 FlowWriter = Callable[[int, StretchFlow], Path]
-"""Writes a sweep and its flow to the next, the only step it is given (the last sweep: to the one
-before), and returns the folder of its file."""
+"""A function that writes the flow of one sweep and returns the folder that holds its file.
+
+The arguments are the sweep's frame number, and its flow to the next sweep. The last sweep has the
+flow to the previous sweep instead."""
 
 
 def write_flow(result: Result, context: Context, folder: Path) -> None:
-    """Write ``flow/`` if ``output.flow`` asks for it."""
+    """Write the flow files ``flow/*.npz`` if ``output.flow`` asks for flow."""
     if result.flow is not None:
         write_flow_npz(folder / "flow", result.flow)
 
 
 def write_flow_npz(folder: Path, flow: StretchFlow) -> list[Path]:
-    """Write ``folder/000119_000120.npz`` and so on, one for each step, and return the paths."""
+    """Write ``folder/000119_000120.npz`` for the flow from sweep 119 to 120, and all other steps.
+
+    Return the paths of the files.
+    """
     paths = []
     for (frame, target), field in flow.steps.items():
         sweep = flow.stretch[frame].sweep
@@ -76,9 +83,10 @@ def write_flow_npz(folder: Path, flow: StretchFlow) -> list[Path]:
 
 
 def _total_flow(flow: StretchFlow, frame: int, target: int) -> np.ndarray:
-    """Return (N,3) metres from each point to its position at the target's time, with ego-motion.
+    """Return the (N,3) flow in metres from sweep ``frame`` to sweep ``target``, with ego-motion.
 
-    The position is in the frame of the target.
+    The flow is the point's position in the lidar frame of ``target`` at its reference time, minus
+    the measured position in the lidar frame of ``frame``.
     """
     points, field = flow.stretch[frame].sweep.points, flow.steps[frame, target]
     T = flow.stretch.T_target_source(target, frame)
@@ -86,10 +94,14 @@ def _total_flow(flow: StretchFlow, frame: int, target: int) -> np.ndarray:
 
 
 def flow_npz(field: FlowField, **beside: Any) -> bytes:
-    """Return a file of a flow field.
+    """Return the bytes of a .npz file with a flow field of N points.
 
-    It has ``residual_flow`` float32, ``moving``, ``instance`` (-1 none), ``lost``, ``to_reference``
-    float32 if it is known, and the arrays in ``beside``.
+    The arrays are ``residual_flow`` (N,3) float32 in metres without ego-motion, ``moving``,
+    ``instance`` (-1 none), ``lost``, and ``to_reference`` float32 if known.
+
+    Args:
+        field: The flow field, in the lidar frame of its sweep.
+        beside: Further arrays by name. Float64 arrays are stored as float32.
     """
     arrays: dict[str, Any] = {"residual_flow": field.displacement}
     arrays |= {name: getattr(field, name) for name in ("moving", "instance", "lost")} | beside
@@ -103,7 +115,7 @@ def flow_npz(field: FlowField, **beside: Any) -> bytes:
 
 
 def _followed(known: dict[int, Float], frame: int, stretch: Stretch) -> Float:
-    """Return the pose of a sweep in one world, from that of the last sweep before it."""
+    """Return the (4,4) pose of a sweep, chained to the last earlier pose in ``known``, by frame."""
     before = next((f for f in reversed(known) if f in stretch.frames), None)
     if before is None:
         return stretch[frame].T_world_lidar
@@ -111,7 +123,7 @@ def _followed(known: dict[int, Float], frame: int, stretch: Stretch) -> Float:
 
 
 def _add_sweep(file: Any, frame: int, flow: StretchFlow, T_world_lidar: Float) -> None:
-    """Add a sweep to an open file, with its flow to the next one if known."""
+    """Add a sweep to an open HDF5 file, with the flow to the next sweep if known."""
     registered = flow.stretch[frame]
     sweep = registered.sweep
     arrays = {
@@ -138,14 +150,16 @@ def _add_sweep(file: Any, frame: int, flow: StretchFlow, T_world_lidar: Float) -
 def flow_writer(
     form: str, sequence: LidarSequence, out: Path, frames: Sequence[int], overwrite: bool
 ) -> Iterator[FlowWriter]:
-    """Yield a writer for these sweeps. Each file appears when it is complete.
+    """Yield a function that writes the flow of one sweep. Each file appears when it is complete.
 
     Args:
-        form: One of those above. The file of opensceneflow has all sweeps.
+        form: Name of a format in the module's docstring.
+        out: Folder of ``--out``.
+        frames: Frame numbers of the sweeps to write. The file of opensceneflow holds all of them.
 
     Raises:
         InputError: A package is missing, or a file exists and must not be overwritten.
-        OutputError: Nothing can be written.
+        OutputError: A file cannot be written.
     """
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)
     following = dict(zip(sequence.frames[:-1], sequence.frames[1:], strict=True))
@@ -195,16 +209,17 @@ def flow_writer(
 
 
 def _place(form: str, out: Path, name: str) -> Path:
+    """Return the folder that the user is told for a format."""
     return out / name if form in ("av2", "doc-depth") else out
 
 
 def _num_rows(sequence: LidarSequence, frame: int) -> int:
-    """Return how many rows the sweep's file has."""
+    """Return the number of rows in the sweep's file, valid or not."""
     return sequence.num_rows(frame) if hasattr(sequence, "num_rows") else len(sequence[frame])
 
 
 def _write_labels(path: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> None:
-    """Write a label for each row. Rows without a valid return, or too near, are static."""
+    """Write a label for each row of the sweep file. Rows without a usable return are static."""
     label = np.full(_num_rows(sequence, frame), STATIC, np.uint32)
     for field in flow.steps.values():
         own = np.where(field.moving, MOVING | (field.instance.astype(np.int64) + 1) << 16, STATIC)
@@ -213,7 +228,7 @@ def _write_labels(path: Path, sequence: LidarSequence, frame: int, flow: Stretch
 
 
 def _write_classes(path: Path, frame: int, flow: StretchFlow) -> None:
-    """Write a sweep, deskewed to its stamp, with the class of each point."""
+    """Write the deskewed points of a sweep, each with its DOC-Depth class."""
     registered = flow.stretch[frame]
     points = registered.sweep.points
     on_world = poses.transform(registered.T_world_lidar, points)
@@ -226,11 +241,11 @@ def _write_classes(path: Path, frame: int, flow: StretchFlow) -> None:
 
 
 def _write_paths(folder: Path, sequence: LidarSequence, T_world_lidar: dict[int, Float]) -> None:
-    """Write the poses of the lidar, and the calibration and poses of the first camera.
+    """Write the lidar poses, and calibration and poses of the first camera, for DOC-Depth.
 
-    traj_camera.ply has the lidar's poses at the camera's images, with their places among all of
-    them. The format's document names the quaternion qx qy qz qw, its reader q_x q_y q_z q_w: both
-    are there.
+    traj_camera.ply has the lidar pose at the exposure of each image, and the index of the image in
+    the recording. DOC-Depth's document names the quaternion qx qy qz qw, its reader q_x q_y q_z
+    q_w. The file has both.
     """
     stamp_ns = np.array([sequence.stamp_ns(f) for f in T_world_lidar], np.int64)
     track = PoseTrack(sequence.name, stamp_ns, np.stack([*T_world_lidar.values()]))
@@ -245,6 +260,7 @@ def _write_paths(folder: Path, sequence: LidarSequence, T_world_lidar: dict[int,
 
 
 def _save_path(path: Path, track: PoseTrack, stamps_ns: Int, numbers: Sequence[int]) -> None:
+    """Write the poses of a track at (n,) times as a PLY file, with an index for each pose."""
     T = np.stack([track.at(int(ns)) for ns in stamps_ns]) if len(stamps_ns) else np.zeros((0, 4, 4))
     turns = Rotation.from_matrix(T[:, :3, :3]).as_quat().T if len(T) else np.zeros((4, 0))
     columns = dict(zip("xyz", T[:, :3, 3].T, strict=True))
@@ -257,7 +273,7 @@ def _save_path(path: Path, track: PoseTrack, stamps_ns: Int, numbers: Sequence[i
 
 
 def _write_feather(path: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> None:
-    """Write the flow of one sweep. Rows without a valid return are static."""
+    """Write the flow of one sweep. Rows of the sweep file without a valid return have flow 0."""
     arrow, feather = (needed(m, "argoverse", "") for m in ("pyarrow", "pyarrow.feather"))
     num_rows = _num_rows(sequence, frame)
     residual = np.zeros((num_rows, 3), np.float16)

@@ -1,37 +1,39 @@
 # SPDX-License-Identifier: MIT
-"""The outputs of a key: depth maps, moving objects, metrics.json, movers.json, run.yaml, scene/.
+"""Write the files of one densified sweep: depth maps, cloud, metrics.json, movers.json, scene/.
 
-metrics.json; compare.json has the fields from ``frames`` on, by method, under ``methods``. A score
-is null where nothing is known::
+"Key" is the frame number of that sweep. metrics.json has these fields. compare.json has the fields
+from ``frames`` on for each method, under ``methods``. A score is null where it is unknown::
 
     schema_version, key, method
-    frames      of the window, absolute numbers
-    num_points  of the cloud; num_moving of those
+    frames      frame numbers of the window
+    num_points  number of points in the cloud; num_moving: number of moving points
     density     camera -> measured, filled: share of the pixels with a depth; with --prior also
-                full, and prior, the share that came from it
+                full (completed map), and prior, the share of pixels that came from the prior
     ghosts      `densify.scores.cloud_scores.ghost_scores`
-    depth       with truth: camera -> measured, filled (full, prior) -> all, moving, static ->
-                `densify.scores.depth_metrics.DepthErrors`
+    depth       with ground truth: camera -> measured, filled (full, prior) -> all, moving, static
+                -> `densify.scores.depth_metrics.DepthErrors`
     measure     map -> z, depth along the camera's axis, or range, distance from the lens
-    held_out    camera -> as depth: the key densified from its neighbours alone against its own
-                returns; curve, `precision_density`; reliability, `densify.depth.confidence`;
+    held_out    camera -> as depth: map made without the key sweep, against its returns; curve,
+                `precision_density`; reliability, `densify.depth.confidence`;
                 unjudged, share of the filled pixels near which the key sweep has no return
-    reliability with truth: map -> the same list against it
-    expected_outliers  map -> measured, filled: the share of outliers that confidence expects
-    baselines   as from ``frames`` on for each simpler method on the same registration
+    reliability with ground truth: map -> the same list against ground truth
+    expected_outliers  map -> measured, filled: the share of outliers that confidence predicts
+    baselines   simpler method on the same registration -> the fields from ``frames`` on
 
-movers.json, by `ObjectTrack`: schema_version, key, objects (instance as in cloud.laz; size_m:
-length, width, height; poses: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,) in
-key coordinates without the ego-motion, at each sweep that observed it and at the key).
+movers.json, by `ObjectTrack`: schema_version, key, objects. An object has instance (as in
+cloud.laz), size_m (length, width, height) and poses. Poses are at each sweep that observed the
+object and at the key sweep: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,)
+without ego-motion, in the key sweep's lidar frame.
 
 scene/, for pages, viewers and other tools::
 
     image/CAMERA.jpg   the image that the map shows
-    none/CAMERA.png, icp/…, truth/…   depth of the simpler methods and the true one, as in ``depth``
-    sweep/CAMERA.png   uint16, measured pixels: 1 + row of the source sweep in ``sweeps``; 0 none
+    none/CAMERA.png, icp/…, truth/…   depth of the simpler methods, and true depth, as in ``depth``
+    sweep/CAMERA.png   uint16, measured pixels: 1 + index of the source sweep in ``sweeps``; 0 none
     reason/CAMERA.png  uint8 `Reason` that the nearest point of a pixel was rejected
     scene.json         schema_version, key; sweeps: frame, since_key_s, far, T_key_lidar (4,4);
-                       views: map -> camera, T_cam_key (4,4), late_s after the key, image number
+                       views: map -> camera, T_cam_key (4,4), late_s after the key sweep's
+                       reference time, image number
 """
 
 from __future__ import annotations
@@ -62,7 +64,7 @@ from densify.outputs.depth_png import (
 )
 
 SCHEMA_VERSION = 1
-"""Version of each JSON file; grows when a field changes its meaning or goes."""
+"""Version of each JSON file. It grows when a field changes its meaning or is removed."""
 _PACKAGES = (
     *("numpy", "scipy", "torch", "embreex", "kiss-icp", "small-gicp", "opencv-python-headless"),
     *("laspy", "lazrs", "PyYAML"),
@@ -71,11 +73,11 @@ _PACKAGES = (
 
 @dataclass(frozen=True)
 class Context:
-    """What an output gets beside the result.
+    """Describe how a result was asked for. Each output function gets it beside the result.
 
     Attributes:
         config: The merged configuration as plain mappings, by section.
-        data: The recording, as the user named it.
+        data: Specification of the recording, as the user gave it.
     """
 
     config: Mapping[str, Any]
@@ -83,10 +85,10 @@ class Context:
 
 
 def write_depth(result: Result, context: Context, folder: Path) -> None:
-    """Write ``depth``, ``depth_filled``, ``confidence`` and ``age``.
+    """Write the maps ``depth``, ``depth_filled``, ``confidence`` and ``age`` of each camera.
 
-    Age is the time between the exposure and the sweep that measured the pixel. A filled pixel has
-    the age of the nearest measured pixel.
+    Age is the time between the image's exposure and the sweep that measured the pixel. A filled
+    pixel has the age of the nearest measured pixel.
 
     Raises:
         ValueError: The maps have no ages.
@@ -104,7 +106,7 @@ def write_depth(result: Result, context: Context, folder: Path) -> None:
 def write_full(result: Result, context: Context, folder: Path) -> None:
     """Write ``depth_full``, depth completed with the user's prior, and ``confidence_full``.
 
-    The confidence is at most 0.2 where the depth is that of the prior.
+    Confidence is at most 0.2 at pixels whose depth comes from the prior.
     """
     for camera, full in result.full.items():
         write_depth_png(map_path(folder, "depth_full", camera), full.depth_m)
@@ -113,22 +115,22 @@ def write_full(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_optical_flow(result: Result, context: Context, folder: Path) -> None:
-    """Write ``optical_flow/previous`` and ``optical_flow/next``, if they were asked for."""
+    """Write ``optical_flow/previous`` and ``optical_flow/next`` of maps with optical flow."""
     for camera, flows in result.optical_flow.items():
         for other, flow_px in flows.items():
             write_flow_png(map_path(folder / "optical_flow", other, camera), flow_px)
 
 
 def write_cloud_laz(result: Result, context: Context, folder: Path) -> None:
-    """Write ``cloud.laz``."""
+    """Write the accumulated cloud as ``cloud.laz``."""
     write_cloud(folder / "cloud.laz", result.cloud, result.stamp_ns)
 
 
 def write_movers(result: Result, context: Context, folder: Path) -> None:
-    """Write cloud and depth of each object, if objects are separated.
+    """Write cloud and depth maps of each moving object, if ``output.movers`` separates objects.
 
-    They are in ``movers/0007/`` for instance 7, and in ``movers/others/`` for moving points of no
-    object.
+    Object number 7 is in ``movers/0007/``. Moving points without an object are in
+    ``movers/others/``.
     """
     for instance, mover in result.movers.items():
         place = folder / "movers" / (f"{instance:04d}" if instance >= 0 else "others")
@@ -138,7 +140,7 @@ def write_movers(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_metrics(result: Result, context: Context, folder: Path) -> None:
-    """Write ``metrics.json``."""
+    """Write ``metrics.json``, the scores of the result and of its baselines."""
     table = {
         "schema_version": SCHEMA_VERSION,
         "key": result.key,
@@ -151,7 +153,7 @@ def write_metrics(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_tracks(result: Result, context: Context, folder: Path) -> None:
-    """Write ``movers.json``, if the result has poses."""
+    """Write ``movers.json``, the poses of moving objects, if the sweeps are registered."""
     if not result.T_key_lidar:
         return
     names = ("stamp_ns", "num_points", "T_key_object", "velocity_m_s")
@@ -167,15 +169,15 @@ def write_tracks(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
-    """Write ``run.yaml``, `record`."""
+    """Write ``run.yaml``, the content of `record`."""
     text = yaml.safe_dump(plain(record(result, context)), sort_keys=False, allow_unicode=True)
     write_file(folder / "run.yaml", text.encode())
 
 
 def record(result: Result, context: Context) -> dict[str, Any]:
-    """Return how a result was made.
+    """Return a mapping that says how a result was made.
 
-    The record has data, key, frames, cameras, warnings, configuration, cost of each stage, and
+    The mapping has data, key, frames, cameras, warnings, configuration, cost of each stage, and
     versions. A package of unknown version, as in system builds, has None.
     """
     versions: dict[str, str | None] = {"densify": __version__, "python": platform.python_version()}
@@ -216,7 +218,7 @@ def record(result: Result, context: Context) -> dict[str, Any]:
 
 
 def write_scene(result: Result, context: Context, folder: Path) -> None:
-    """Write ``scene/``, if the result has poses."""
+    """Write the folder ``scene/`` if the sweeps are registered."""
     if not result.T_key_lidar:
         return
     place = folder / "scene"
@@ -248,7 +250,7 @@ def write_scene(result: Result, context: Context, folder: Path) -> None:
 
 
 def _sweeps(result: Result) -> list[dict[str, Any]]:
-    """Return the sweeps of the window and all other sources of the cloud, by frame."""
+    """Return entries of scene.json for all source sweeps and the window, by frame number."""
     frames, rows = np.unique(result.cloud.frame, return_index=True)
     since_s = dict(zip(frames.tolist(), 1e-9 * result.cloud.since_key_ns[rows], strict=True))
     far = {*result.far_frames} - {*result.T_key_lidar}

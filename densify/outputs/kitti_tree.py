@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Write keys as files of a KITTI depth tree (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017).
+"""Write depth maps as a KITTI depth tree (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017).
 
-Loaders for KITTI depth completion read it unchanged::
+Loaders for KITTI depth completion read the tree unchanged::
 
     val/2011_09_26_drive_0013_sync/proj_depth/velodyne_raw/image_02/0000000120.png
                                               groundtruth/
@@ -32,7 +32,7 @@ README = "README.txt"
 
 @dataclass(frozen=True)
 class FileRecord:
-    """The expected content of a file, with its hexadecimal ``sha256``."""
+    """The expected size of a file in bytes and its hexadecimal SHA-256."""
 
     num_bytes: int
     sha256: str
@@ -56,18 +56,18 @@ _FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 def split_of(drive: str) -> Split:
     """Return the split of a recording by its name, such as ``2011_09_26_drive_0013_sync``.
 
-    It is "val" for the 13 validation drives of KITTI's depth benchmark, "train" for any other.
+    The split is "val" for the 13 validation drives of KITTI's depth benchmark, else "train".
     """
     match = _KITTI_DRIVE.fullmatch(drive)
     return "val" if match and match[1] in _VALIDATION else "train"
 
 
 def drive_folder(name: str) -> str:
-    """Return the name of a recording as the name of a folder.
+    """Return a valid, unique folder name for a recording.
 
-    A valid name, as those of KITTI, is kept. ``street:street?seed=0&sensor=hdl64`` becomes
-    ``street-street_seed-0_sensor-hdl64``. Another name loses all but ASCII letters and digits, and
-    ends in a digest, which keeps it unique.
+    A valid name, such as KITTI's names, is kept. ``street:street?seed=0&sensor=hdl64`` becomes
+    ``street-street_seed-0_sensor-hdl64``. Any other name is reduced to ASCII letters and digits. A
+    hash at its end keeps the name unique.
     """
     folder = name.translate(_PUNCTUATION)
     if _FOLDER_NAME.fullmatch(folder):
@@ -83,19 +83,17 @@ def write_key(
     sparse: Mapping[str, DepthMap],
     dense: Mapping[str, DepthMap],
 ) -> dict[str, FileRecord]:
-    """Write the maps of one key, each file whole or absent.
-
-    The same maps give the same bytes.
+    """Write the depth maps of one key sweep. Equal maps give equal bytes.
 
     Args:
-        root: Root of the tree.
+        root: Root folder of the tree.
         folder: Folder of the drive, relative to the root: ``val/2011_09_26_drive_0013_sync``.
-        frame: The key.
-        sparse: Camera -> map of the single sweep.
+        frame: Frame number of the key sweep.
+        sparse: Camera -> map of the key sweep alone.
         dense: Camera -> map of all sweeps.
 
     Returns:
-        The record of each file, by its path relative to the root.
+        Path relative to the root -> size and hash of the file.
 
     Raises:
         OutputError: A file cannot be written.
@@ -117,14 +115,15 @@ def write_key(
 def write_readme(root: Path, *, method: str, window: int, settings: Mapping[str, Any]) -> None:
     """Write ``README.txt``, which describes the files beside it and how they were made.
 
-    The text depends on the arguments and the version of densify alone.
+    The text depends only on the arguments and the version of densify.
 
     Args:
-        window: Number of sweeps before and after the key.
+        method: Method that made the dense maps, such as ``flow``.
+        window: Number of sweeps before and after the key sweep.
         settings: All other settings, as plain mappings.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     text = _README.format(
         version=__version__,

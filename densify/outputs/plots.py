@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Draw pictures by matplotlib: figure.png, compare.png, curve.png, and the loss of a training.
+"""Draw pictures with matplotlib: figure.png, compare.png, curve.png, and the loss of a training.
 
-The first two have depth over the camera's image, curve.png has outliers over density.
+figure.png and compare.png show depth over the camera's image. curve.png shows outliers over
+density.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Curve = Sequence[Mapping[str, Any]]
-"""`densify.scores.depth_metrics.precision_density`."""
+"""Points of outliers over density, see `densify.scores.depth_metrics.precision_density`."""
 
 _DPI = 100
-# Fixed, to compare the pictures of different keys.
+# The colour scale is fixed, so that pictures of different key sweeps can be compared.
 _NEAR_M, _FAR_M = 3.0, 80.0
 _TICKS_M = (3, 5, 10, 20, 40, 80)
 _NO_DEPTH_M = np.float32(1e6)
@@ -35,26 +36,30 @@ _MIN_WIDTH_PX = 480
 _POINT_SIZE_PX = 3
 _TITLE_PX, _SCALE_PX = 36, 60
 _FONT_PT, _LETTER_PX = 13.0, 0.85  # width of a letter, per point of the font
-_FEWEST_OUTLIERS = 1e-4  # below, the scale is linear down to 0
-_MEDIAN_SHARE = 20  # the running median covers this part of all steps
+_FEWEST_OUTLIERS = 1e-4  # the axis is linear below this share and logarithmic above
+_MEDIAN_SHARE = 20  # the running median covers one twentieth of all steps
 
 
 def write_plot(path: Path, figure: Figure) -> None:
-    """Write a figure of matplotlib as PNG. The same figure gives the same bytes."""
+    """Write a matplotlib figure as PNG. Equal figures give equal bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     write_file(path, buffer.getvalue())
 
 
 def write_key_figure(result: Result, context: Context, folder: Path) -> None:
-    """Write ``figure.png``: the baselines from top to bottom, then the result."""
+    """Write ``figure.png``: the maps of the baselines from top to bottom, then the result's."""
     write_figure(folder / "figure.png", {**result.baselines, result.method: result})
 
 
 def write_figure(path: Path, results: Mapping[str, Result]) -> None:
-    """Write the measured depth of each method in the first camera.
+    """Write a figure with the measured depth of each method in the first camera.
 
-    A prior adds the completed depth of the last method. Without a camera nothing is written.
+    With a prior, the figure also shows the completed depth of the last method. Without a camera no
+    file is written.
+
+    Args:
+        results: Method -> result for the same key sweep.
     """
     method, last = list(results.items())[-1]
     if not last.depth:
@@ -72,13 +77,17 @@ def write_figure(path: Path, results: Mapping[str, Result]) -> None:
 
 
 def _image(result: Result, camera: str) -> Picture:
-    """Return (H,W,3) the image of the camera, black without one."""
+    """Return the (H,W,3) RGB image of a camera, black if the recording has no image."""
     shape = (*result.depth[camera].depth_m.shape, 3)
     return result.images.get(camera, np.zeros(shape, np.uint8))
 
 
 def _error(result: Result, camera: str, product: str) -> str:
-    """Return the share of outliers, against the truth if there is one, else of the held-out key."""
+    """Return text with the share of outliers, "" if it is unknown.
+
+    The share is against ground truth if available, else against the returns of the held-out key
+    sweep.
+    """
     for source, against in (("depth", "truth"), ("held_out", "key held out")):
         scores = (result.metrics.get(source) or {}).get(camera, {}).get(product)
         if scores and scores["all"]["outliers"] is not None:
@@ -89,12 +98,12 @@ def _error(result: Result, camera: str, product: str) -> str:
 def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Figure:
     """Draw depth maps over an image, from top to bottom in the order of the mapping.
 
-    A depth covers 3 x 3 pixels, and the nearest wins. Near is red, far is blue, logarithmic from 3
-    to 80 m.
+    Each depth covers 3 x 3 pixels. Where they overlap, the nearest depth is drawn. Colours run from
+    red at 3 m to blue at 80 m on a logarithmic scale.
 
     Args:
-        image: (H,W,3) uint8 RGB, drawn in gray.
-        panels: Title -> (H,W) depth in metres, 0 none.
+        image: (H,W,3) uint8 RGB image, drawn in gray.
+        panels: Title -> (H,W) depth in metres, 0 for no depth.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
@@ -125,7 +134,7 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Figure:
 
 
 def write_curve(result: Result, context: Context, folder: Path) -> None:
-    """Write ``curve.png`` of all cameras, if any method was scored with the key held out."""
+    """Write ``curve.png`` of all cameras, if a method has scores with the key sweep held out."""
     curves: dict[str, dict[str, Curve]] = {}
     for method, of_method in {**result.baselines, result.method: result}.items():
         for camera, scores in (of_method.metrics.get("held_out") or {}).items():
@@ -135,13 +144,13 @@ def write_curve(result: Result, context: Context, folder: Path) -> None:
 
 
 def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
-    """Draw the share of outliers over the density, for each least confidence.
+    """Draw the share of outliers over the density, one point for each confidence threshold.
 
-    Each camera has its own axes, two in a row. A thin line is of measured pixels, a thick line of
-    measured and filled ones.
+    Each camera has its own axes, two in a row. Thin lines show measured pixels, thick lines the
+    filled map.
 
     Args:
-        curves: Camera -> method -> curve.
+        curves: Camera -> method -> points of `densify.scores.depth_metrics.precision_density`.
     """
     from matplotlib.figure import Figure
 

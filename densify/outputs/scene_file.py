@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read and check a key's scene.json and movers.json (`densify.outputs.key_outputs`)."""
+"""Read and check the files scene.json and movers.json (`densify.outputs.key_outputs`)."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ class SceneFile:
     """The content of scene.json.
 
     Attributes:
-        table: The whole file.
-        views: Map -> its camera and pose.
-        T_key_lidar: Frame -> (4,4) of sweeps of the window.
+        table: The parsed JSON of the whole file.
+        views: Name of the depth map -> its camera and pose.
+        T_key_lidar: Frame number of a sweep of the window -> (4,4) pose in the key sweep's lidar
+            frame.
     """
 
     table: Mapping[str, Any]
@@ -36,7 +37,7 @@ def read_scene(path: Path) -> SceneFile:
     """Read scene.json.
 
     Raises:
-        InputError: It is missing or damaged.
+        InputError: The file is missing or damaged.
     """
     with damage_named(path):
         table = read_json(path)
@@ -49,10 +50,10 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def read_tracks(path: Path) -> list[ObjectTrack]:
-    """Return the tracks of movers.json.
+    """Return the tracks of moving objects in movers.json.
 
     Raises:
-        InputError: It is missing or damaged, or an object has no pose at the key.
+        InputError: The file is missing or damaged, or an object has no pose at the key sweep.
     """
     with damage_named(path):
         table = read_json(path)
@@ -64,7 +65,7 @@ def read_tracks(path: Path) -> list[ObjectTrack]:
 
 @contextmanager
 def damage_named(path: Path) -> Iterator[None]:
-    """Raise InputError, which names the file, for unexpected content within the block."""
+    """Turn errors from unexpected content within the block into InputError with the path."""
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
@@ -77,6 +78,7 @@ def damage_named(path: Path) -> Iterator[None]:
 
 
 def _view(view: Mapping[str, Any]) -> CameraView:
+    """Return the camera and pose in an entry of scene.json. Raise an error for bad values."""
     own = {f.name: view[f.name] for f in fields(Camera)}
     own |= {
         "K": _array(view["K"], 3, 3),

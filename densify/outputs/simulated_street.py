@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write frames of the built-in street, with exact truth, as a KITTI raw drive or a plain folder.
+"""Write frames of the simulated street as KITTI raw drive or plain folder, with ground truth.
 
 The files::
 
@@ -9,12 +9,12 @@ The files::
         image_02/{data/0000000120.png, timestamps.txt}  image_03/...
         oxts/{data/0000000120.txt, timestamps.txt}  truth/
 
-    OUT/street/densify.yaml timestamps.txt (s since 1970) poses.txt (TUM, the lidar's) truth/
+    OUT/street/densify.yaml timestamps.txt (s since 1970) poses.txt (lidar poses, TUM format) truth/
     OUT/street/sweeps/000000.bin, ...  float32 x y z intensity time lidar, s since the stamp
-    OUT/street/images/CAMERA/1781258406000000000.png, ...  named by their times in ns
+    OUT/street/images/CAMERA/1781258406000000000.png, ...  named by exposure times in ns
 
-A timestamps file of KITTI's has a line per frame of the street. The truth of the folder is numbered
-from 0. ``truth/`` is described in `densify.readers.truth_files`.
+A timestamps file of the KITTI drive has a line for each frame of the whole street. In the plain
+folder, ground truth is numbered from 0. ``truth/`` is described in `densify.readers.truth_files`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_v
 _FOLDER = (NAME, "sweeps", "timestamps.txt", "poses.txt", "images", "truth")
 _POSE_STEP_NS = 5_000_000
 _MARGIN_NS = 150_000_000  # poses start this long before the first sweep and end after the last
-T_LEVEL_IMU = np.eye(4)  # the inertial unit is behind and below the scanner, slightly turned
+T_LEVEL_IMU = np.eye(4)  # the inertial unit is behind and below the scanner, slightly rotated
 T_LEVEL_IMU[:3, :3] = Rotation.from_rotvec([0.012, -0.003, -0.001]).as_matrix()
 T_LEVEL_IMU[:3, 3] = [-0.81, 0.32, -0.80]
 _LATITUDE_DEG, _LONGITUDE_DEG, _ALTITUDE_M = 49.0, 8.4, 115.0
@@ -65,15 +65,20 @@ def write_street(
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write frames of a street and return the path that ``--data`` opens, complete or absent.
+    """Write frames of a simulated street and return the path to give to ``--data``.
+
+    On an error no file of the recording is left.
 
     Args:
-        format: A form of `FORMATS`.
-        cameras: None for all cameras of the street.
+        format: Name of a format in `FORMATS`.
+        out: Folder above the recording.
+        frames: Frame numbers to write.
+        cameras: Names of the cameras to write, None for all.
         overwrite: Replace an existing recording.
 
     Raises:
-        InputError: The format, a frame or a camera does not exist or fit, or the place exists.
+        InputError: The format, a frame or a camera is unknown or does not fit, or the recording
+            exists.
     """
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
@@ -98,11 +103,11 @@ def write_street(
 
 @dataclass(frozen=True)
 class Excerpt:
-    """Frames of a street.
+    """Chosen frames and cameras of a simulated street.
 
     Attributes:
-        frames: Ascending.
-        cameras: Names.
+        frames: Frame numbers, ascending.
+        cameras: Names of the cameras.
     """
 
     street: Street
@@ -113,10 +118,10 @@ class Excerpt:
     def of(
         cls, street: Street, frames: Sequence[int], cameras: Sequence[str] | None = None
     ) -> Excerpt:
-        """Return an excerpt.
+        """Return an excerpt with checked frames and cameras.
 
         Args:
-            cameras: None for all of the street.
+            cameras: Names of the cameras, None for all of the street.
 
         Raises:
             InputError: A frame or a camera does not exist.
@@ -133,10 +138,10 @@ class Excerpt:
         return cls(street, tuple(sorted(frames)), names)
 
     def image_numbers(self, camera: str) -> list[int]:
-        """Return the numbers of images around these frames.
+        """Return the numbers of the images exposed during the excerpt.
 
-        They are exposed from half a period before the first stamp to half a period after the last
-        one.
+        The excerpt lasts from half a sweep period before the first stamp to half a sweep period
+        after the last stamp.
         """
         half_ns = self.street.simulator.period_ns // 2
         begin_ns = self.street.stamp_ns(self.frames[0]) - half_ns
@@ -145,28 +150,34 @@ class Excerpt:
         return [n for n, ns in exposed_ns.items() if begin_ns <= ns < end_ns]
 
     def png_image(self, camera: str, number: int) -> bytes:
-        """Return the bytes of a PNG file."""
+        """Return the bytes of an image as PNG file."""
         return encode_png(self.street.image(camera, number)[:, :, ::-1])
 
     def T_world_ego(self, stamp_ns: Int, T_lidar_ego: Float | None = None) -> Float:
-        """Return (n,4,4) true poses of the scanner, or of a frame fixed to it, at (n,) times."""
+        """Return the (n,4,4) true poses of an ego frame at (n,) times in ns since 1970.
+
+        Args:
+            T_lidar_ego: (4,4) pose of the ego frame in the lidar frame, None for the lidar frame
+                itself.
+        """
         T_world_lidar = [self.street.simulator.T_world_lidar_at(int(t)) for t in stamp_ns]
         return np.stack(T_world_lidar) @ (np.eye(4) if T_lidar_ego is None else T_lidar_ego)
 
     def poses(self, T_lidar_ego: Float | None = None) -> PoseTrack:
-        """Return the true path of the scanner, or of a frame fixed to it, every 5 ms."""
+        """Return the true poses of an ego frame every 5 ms. ``T_lidar_ego`` as in `T_world_ego`."""
         first_ns, last_ns = (self.street.stamp_ns(f) for f in (self.frames[0], self.frames[-1]))
         stamp_ns = np.arange(first_ns - _MARGIN_NS, last_ns + _MARGIN_NS + 1, _POSE_STEP_NS)
         return PoseTrack(self.street.name, stamp_ns, self.T_world_ego(stamp_ns, T_lidar_ego))
 
 
 def put(path: Path, data: bytes | str) -> None:
-    """Write a file and make the folders above it."""
+    """Write a file and make its parent folders."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
 def _numbered(frames: Sequence[int], progress: Progress) -> Iterator[tuple[int, int]]:
+    """Yield the index and frame number of each frame, and report progress."""
     for number, frame in enumerate(frames):
         progress("simulate", number, len(frames))
         yield number, frame
@@ -174,9 +185,9 @@ def _numbered(frames: Sequence[int], progress: Progress) -> Iterator[tuple[int, 
 
 
 def _write_truth(folder: Path, excerpt: Excerpt, bodies: Bodies, renumbered: bool) -> None:
-    """Write the truth folder.
+    """Write the ground truth folder, numbered from 0 if ``renumbered``, else by frame number.
 
-    bodies: poses at the stamp of each sweep. renumbered: files are numbered from 0.
+    ``bodies`` has the poses of all rigid bodies at the stamp of each sweep.
     """
     street = excerpt.street
     write_bodies(folder, bodies)
@@ -225,7 +236,7 @@ def _seconds(time_ns: int) -> str:
 
 
 def config_text(excerpt: Excerpt) -> str:
-    """Return the densify.yaml of the excerpt."""
+    """Return the text of densify.yaml for the excerpt."""
     sensor = excerpt.street.simulator.sensor
     columns = ["x", "y", "z", "intensity", "time", "lidar"]
     cameras = {}
@@ -287,14 +298,14 @@ def _write_kitti(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
 
 
 def numbers(values: Float) -> str:
-    """Return a line of KITTI's text files, with every digit."""
+    """Return values as a line of KITTI's text files, with every digit."""
     return " ".join(repr(float(v)) for v in np.ravel(values))
 
 
 def projections(key: str) -> str:
-    """Return the lines of the keys of cameras 0 to 3, such as ``P{}``.
+    """Return the calibration lines of cameras 0 to 3 with label ``key``, such as ``P_rect_0{}``.
 
-    A line is K [I | t], with t from the rectified camera 0.
+    A line is K [I | t], with t in metres from the rectified camera 0.
     """
     lines = ""
     for number in range(4):  # 0 and 1 are the gray cameras beside them
@@ -305,16 +316,16 @@ def projections(key: str) -> str:
 
 
 def stamp_lines(stamps_ns: Int) -> str:
-    """Return a timestamps file."""
+    """Return the text of a KITTI timestamps file for (n,) times in ns since 1970."""
     texts = stamps_ns.astype("datetime64[ns]").astype(str)
     return "".join(text.replace("T", " ") + "\n" for text in texts)
 
 
 def sweep_data(street: Street, frame: int, points: Float | Float32 | None = None) -> bytes:
-    """Return the file of a sweep.
+    """Return the bytes of a KITTI sweep file: float32 x y z intensity for each return.
 
     Args:
-        points: (N,3), None for the points as fired.
+        points: (N,3) positions in metres, None for each point at its own firing time.
     """
     returns = street.returns(frame)
     columns = [returns.points if points is None else points, returns.intensity]
@@ -322,7 +333,7 @@ def sweep_data(street: Street, frame: int, points: Float | Float32 | None = None
 
 
 def T_lidar_imu(tilt_deg: float) -> Float:
-    """Return (4,4) the inertial unit in the frame of the scanner, whose mount is tilted."""
+    """Return the (4,4) pose of the inertial unit in the frame of the tilted scanner."""
     return poses.inverse(T_level_lidar(tilt_deg)) @ T_LEVEL_IMU
 
 
@@ -330,8 +341,9 @@ def oxts_line(street: Street, frame: int, first: int) -> str:
     """Return an oxts record of the true pose. Velocities, accelerations and turn rates are 0.
 
     Args:
-        first: The first frame written, at the fixed latitude. Readers take the scale of the
-            Mercator projection from the first record.
+        frame: Frame number of the record.
+        first: First frame number written, which lies at the fixed latitude. Readers take the scale
+            of the Mercator projection from the first record.
     """
     T_lidar = T_lidar_imu(street.simulator.tilt_deg)
     here, start = (

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Write the files of one key, ``OUT/000120/...``, whole or not at all.
+"""Write the files of one key sweep to ``OUT/000120/...``, all of them or none.
 
-They are results of ``run`` and tables of ``compare``.
+The files are results of ``run`` and tables of ``compare``.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ _OUTPUTS: Mapping[tuple[str, ...], Callable[[Result, Context, Path], None]] = {
     ("figure.png",): plots.write_key_figure,
     ("curve.png",): plots.write_curve,
     ("run.yaml",): key_outputs.write_run_yaml,
-    ("report.html",): write_report,  # last, because it reads the files of the others
+    ("report.html",): write_report,  # last, because it reads the files written above
 }
-"""The entries of a key's folder, and what writes them where the result has something for them. The
-same result and context give the same bytes."""
+"""Names of the entries in the folder of a key sweep, and the function that writes them.
+
+A function writes no entry if the result lacks its content. Equal results give equal bytes."""
 
 _RUN = tuple(name for names in _OUTPUTS for name in names)
 _COMPARISON = ("compare.json", "compare.png", "compare", "compare.html")
@@ -47,13 +48,13 @@ def check_writable(
     overwrite: bool = False,
     verb: Literal["run", "compare"] = "run",
 ) -> None:
-    """Raise InputError if a result cannot be written. Nothing is changed.
+    """Raise InputError if a result cannot be written. No file is changed.
 
-    The reasons are existing files of ``verb`` that must not be overwritten, and missing
-    permissions.
+    Reasons are missing permissions, and existing files of ``verb`` that must not be overwritten.
 
     Args:
-        out: The folder of ``--out``, which need not exist.
+        out: Folder of ``--out``, which need not exist.
+        key: Frame number of the key sweep.
     """
     owned = _RUN if verb == "run" else _COMPARISON
     _check_place(_key_folder(out, key), owned, out, overwrite)
@@ -64,8 +65,8 @@ def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) ->
     """Yield a folder to write into, which becomes ``folder`` if the block ends without an error.
 
     Args:
-        owned: Entries that are written, see `staged_folder`.
-        out: The text of ``--out``, for messages.
+        owned: Names of the entries that the block writes, see `staged_folder`.
+        out: Folder of ``--out``, for error messages.
 
     Raises:
         InputError: As in `check_writable`.
@@ -76,12 +77,13 @@ def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) ->
 
 
 def _check_place(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> None:
+    """Raise InputError unless ``folder`` can be made or updated, as in `writing`."""
     place = folder
     while not os.path.lexists(place):
         place = place.parent
     if not place.is_dir():
         raise InputError(f"--out {out}: {place} is not a folder; choose another one with --out DIR")
-    # An existing folder is emptied, and replaced from beside it.
+    # An existing folder is renamed, and a new folder beside it takes its place.
     beside = [Path(os.path.realpath(place)).parent] if place == folder else []
     for touched in (place, *beside):
         if not os.access(touched, os.W_OK | os.X_OK):
@@ -104,19 +106,19 @@ def write_result(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write one densified key as ``out/KEY/``, and return the files written.
+    """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
 
     Other files in the folder are kept.
 
     Args:
-        result: The key.
-        out: The folder above.
+        result: Result for one key sweep.
+        out: Parent folder.
         config: The merged configuration, as plain mappings.
-        data: The recording, as the user named it.
+        data: Specification of the recording, as the user gave it.
         overwrite: Replace an earlier result.
 
     Raises:
-        InputError: The place cannot be written to, or holds a result.
+        InputError: The folder cannot be written to, or holds a result.
     """
     context = Context(config, data)
     with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:
@@ -133,13 +135,13 @@ def write_comparison(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write methods side by side, and return the files written.
+    """Write the results of several methods and return the paths of the files.
 
-    They are ``out/KEY/compare.json`` and ``compare.png``, and in ``compare/`` the maps, cloud and
-    scene of the last method.
+    The files are ``out/KEY/compare.json`` and ``compare.png``. The folder ``compare/`` has the
+    maps, cloud and scene of the last method.
 
     Args:
-        results: Method -> result, of one key. The rest as in `write_result`.
+        results: Method -> result for the same key sweep. Other arguments as in `write_result`.
     """
     last = list(results.values())[-1]
     key, context = last.key, Context(config, data)

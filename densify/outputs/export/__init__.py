@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Write a finished run in the formats of other tools.
 
-`config.plugins.EXPORTS` has the forms. The record export.yaml is beside the files: run, to,
-min_confidence, max_age_ms (null for any age), density (camera -> measured, filled -> before, after:
-shares of the pixels), num_points (before, after), version.
+`config.plugins.EXPORTS` lists the formats. The file export.yaml beside the exported files records
+run, to (format), min_confidence, max_age_ms (null for any age), density (camera -> measured, filled
+-> before, after the thresholds: shares of the pixels), num_points (before, after), version.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ _RECORD = "export.yaml"
 
 @dataclass(frozen=True)
 class Export:
-    """The written files, and what the thresholds left.
+    """The written files, and the pixels and points within the thresholds.
 
     Attributes:
-        density: Camera -> ``measured`` and ``filled``, shares of the pixels, for forms with
-            maps.
-        num_points: For forms with the cloud.
+        paths: Paths of the files.
+        density: Camera -> ``measured`` and ``filled`` -> share of the pixels with a depth, for
+            formats with maps.
+        num_points: Number of points, for formats with a cloud.
     """
 
     paths: list[Path]
@@ -52,21 +53,22 @@ def export_run(
     cameras: Sequence[str] | None = None,
     overwrite: bool = False,
 ) -> Export:
-    """Write a finished run in another form. Nothing is computed again.
+    """Write a finished run in another format, from its files alone.
 
     Args:
-        run: Folder of one key, or of several for forms of drives.
-        to: A form of `densify.config.plugins.EXPORTS`.
-        out: Folder to write into; None for ``RUN/export/FORM``.
-        min_confidence: 0 to 1. Pixels and points below are left out.
-        max_age_ms: Greatest time between the exposure, or the key, and the sweep that measured
-            a pixel or point; None for any. A filled pixel has the age of the nearest measured one.
-        cameras: Names; None for all.
+        run: Folder of one key sweep, or of several for formats of whole drives.
+        to: Name of a format in `densify.config.plugins.EXPORTS`.
+        out: Folder to write into, None for ``RUN/export/FORMAT``.
+        min_confidence: Least confidence of an exported pixel or point, 0 to 1.
+        max_age_ms: Greatest age in ms of an exported pixel or point, None for any. Age is the time
+            from the image's exposure (pixels) or the key sweep (points) to the sweep that measured
+            it. A filled pixel has the age of the nearest measured pixel.
+        cameras: Names of the cameras, None for all.
         overwrite: Replace an earlier export.
 
     Raises:
         InputError: A threshold is out of range, a file is missing, damaged or inconsistent, the
-            form cannot hold the run, or ``out`` holds an export or a run.
+            format cannot hold the run, or ``out`` holds an export or a run.
     """
     if not 0 <= min_confidence <= 1:
         raise InputError(f"--min-confidence {min_confidence}: expected a number from 0 to 1")
@@ -94,7 +96,7 @@ def export_run(
 
 
 def facts(export: Export) -> dict[str, Any]:
-    """Return density and num_points as plain mappings, without unknown ones."""
+    """Return the known ones of density and num_points as plain mappings."""
     density = {
         camera: {product: kept._asdict() for product, kept in products.items()}
         for camera, products in export.density.items()
@@ -105,5 +107,6 @@ def facts(export: Export) -> dict[str, Any]:
 
 
 def _total(runs: Sequence[FinishedRun]) -> Kept | None:
+    """Return the number of points of all runs, None if no cloud was read."""
     known = [run.num_points for run in runs if run.num_points is not None]
     return Kept(sum(k.before for k in known), sum(k.after for k in known)) if known else None

@@ -4,9 +4,10 @@
 COLMAP's text model: https://colmap.github.io/format.html. nerfstudio's folder: ``ns-train
 depth-nerfacto --data DIR``.
 
-The world is the first key frame. The centre of the upper left pixel is (0.5, 0.5). Lenses are
-OpenCV's. COLMAP's poses are world to camera. nerfstudio's are camera to world with OpenGL's axes: x
-right, y up, the camera looks along -z. Its depth is in millimetres.
+The world is the lidar frame of the first key sweep. The centre of the upper left pixel is (0.5,
+0.5). Lenses are OpenCV's. COLMAP's poses are world to camera. nerfstudio's poses are camera to
+world with OpenGL's axes: x right, y up, the camera looks along -z. nerfstudio's depth is in
+millimetres.
 """
 
 from __future__ import annotations
@@ -38,13 +39,15 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class Picture(NamedTuple):
-    """An image of a finished run.
+    """An image of a finished run, with its camera and pose.
 
     Attributes:
-        name: Of its files.
-        run, map: The finished run, and the name of its map.
-        T_cam_world: (4,4).
-        jpeg: The image as it is stored.
+        name: Name of the image's files.
+        run: The finished run.
+        map: Name of the depth map in the run that shows this image.
+        camera: The camera.
+        T_cam_world: (4,4) pose from the world, the first key sweep's lidar frame.
+        jpeg: Bytes of the image file.
     """
 
     name: str
@@ -58,7 +61,7 @@ class Picture(NamedTuple):
 def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``images/`` and ``sparse/0/`` with cameras.txt, images.txt and points3D.txt.
 
-    The points are those that a camera observed.
+    The model has the points that a camera observed.
 
     Raises:
         InputError: COLMAP has no model of the lens.
@@ -70,17 +73,17 @@ def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:
 def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write the input of 3-D Gaussian splatting (Kerbl et al., SIGGRAPH 2023).
 
-    It is a COLMAP model of the static world, also as points3D.ply, with depth maps, and each moving
-    object in its own frame.
+    The input is a COLMAP model of the static world, also as points3D.ply, with depth maps. Each
+    moving object is a file of its own, in its own frame.
 
-    ``depths/NAME.png`` and ``sparse/0/depth_params.json`` are read with ``-d depths``. Inverse
-    depth is ``value / 65536 * scale + offset``. That training takes an empty pixel as infinitely
-    far. Images are therefore transparent where there is no depth, neither filled nor of a prior,
-    and these pixels are not trained.
+    The training reads ``depths/NAME.png`` and ``sparse/0/depth_params.json`` with ``-d depths``.
+    Inverse depth is ``value / 65536 * scale + offset``. The training takes an empty pixel as
+    infinitely far. Images are therefore transparent, and not trained, where no depth is measured,
+    filled or from a prior.
 
-    ``movers/0003.ply`` has all points of object 3, ``movers/others.ply`` moving points without a
-    track, in the key frame. ``tracks.json`` is the movers.json of the run. Several keys have
-    ``movers/000120/`` with ``tracks.json`` each.
+    ``movers/0003.ply`` has all points of object 3. ``movers/others.ply`` has moving points without
+    a track, in the key sweep's lidar frame. ``tracks.json`` is the movers.json of the run. With
+    several runs, each has its folder ``movers/000120/`` with ``tracks.json``.
 
     Raises:
         InputError: The maps hold ranges, or COLMAP has no model of the lens.
@@ -100,6 +103,7 @@ def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def _write_depths(pictures: Sequence[Picture], folder: Path) -> None:
+    """Write inverse depth of each picture, its scale, and the image transparent without depth."""
     depths_m = {picture.name: picture.run.full_m(picture.map) for picture in pictures}
     nearest_m = min(float(d[d > 0].min(initial=np.inf)) for d in depths_m.values())
     scale = 1 / nearest_m if np.isfinite(nearest_m) else 1.0
@@ -117,6 +121,7 @@ def _write_depths(pictures: Sequence[Picture], folder: Path) -> None:
 
 
 def _write_movers(run: FinishedRun, folder: Path) -> None:
+    """Write the points of each moving object in its own frame, and those without a track."""
     whole = run.cloud()
     moving = [whole.select(whole.moving), *run.mover_clouds()]
     points, rgb, instance = (
@@ -138,12 +143,12 @@ def _write_movers(run: FinishedRun, folder: Path) -> None:
 def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``transforms.json``, ``images/``, ``depth/CAMERA.npy`` and ``cloud.ply``.
 
-    Depth is the measured one, float32 millimetres, 0 none. The cloud has the points that a camera
-    observed.
+    Depth is measured depth in float32 millimetres, 0 for no depth. The cloud has the points that a
+    camera observed.
 
     Raises:
-        InputError: The maps hold ranges, a lens is not OpenCV's with k1 k2 k3 p1 p2, or
-            fisheyes are together with other cameras.
+        InputError: The maps hold ranges, a lens needs more than OpenCV's k1 k2 k3 p1 p2, or
+            fisheyes are mixed with other cameras.
     """
     pictures = write_images(runs, folder)
     fisheyes = {picture.camera.model == "fisheye" for picture in pictures}
@@ -189,14 +194,15 @@ def _frame(picture: Picture) -> dict[str, Any]:
 
 
 def pictures_of(runs: Sequence[FinishedRun], flat: bool = False) -> list[Picture]:
-    """Return the images of the runs' maps in one world.
+    """Return the images of the runs with poses in one world, the first key sweep's lidar frame.
 
     Args:
-        runs: Ascending by key.
-        flat: Names without folders, since the reader of Gaussian splatting leaves folders out.
+        runs: Finished runs, ascending by frame number.
+        flat: Use file names without folders, because the reader of Gaussian splatting drops
+            folders.
 
     Raises:
-        InputError: There is no image.
+        InputError: The runs have no image.
     """
     pictures = []
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
@@ -217,7 +223,7 @@ def pictures_of(runs: Sequence[FinishedRun], flat: bool = False) -> list[Picture
 
 
 def write_images(runs: Sequence[FinishedRun], folder: Path, flat: bool = False) -> list[Picture]:
-    """Write the images as ``images/NAME.jpg`` and return them."""
+    """Write the images as ``images/NAME.jpg`` and return them. Arguments as in `pictures_of`."""
     pictures = pictures_of(runs, flat)
     for picture in pictures:
         write_file(map_path(folder, "images", picture.name, ".jpg"), picture.jpeg)
@@ -225,7 +231,7 @@ def write_images(runs: Sequence[FinishedRun], folder: Path, flat: bool = False) 
 
 
 def _world_cloud(runs: Sequence[FinishedRun]) -> StoredCloud:
-    """Return the cloud of a key, or the points of each key's own sweep in the world of several."""
+    """Return the whole cloud of one run, or the key sweeps' points of several runs in one world."""
     if len(runs) == 1:
         return runs[0].cloud()
     parts = []
@@ -237,10 +243,13 @@ def _world_cloud(runs: Sequence[FinishedRun]) -> StoredCloud:
 
 
 def intrinsics(camera: Camera) -> dict[str, float]:
-    """Return fx, fy, cx, cy in pixels and the coefficients of the lens.
+    """Return fx, fy, cx, cy in pixels and the lens coefficients, by OpenCV's names.
 
-    They are k1 k2 p1 p2 and the existing ones of k3 k4 k5 k6, or k1 to k4 of a fisheye. Raises
-    InputError for a lens that OpenCV's eight coefficients cannot describe.
+    A pinhole has k1 k2 p1 p2 and, if present, k3 k4 k5 k6. A fisheye has k1 to k4. A pinhole
+    without distortion has no coefficients.
+
+    Raises:
+        InputError: OpenCV's eight coefficients cannot describe the lens.
     """
     names = _FISHEYE_LENS if camera.model == "fisheye" else _LENS
     lens, K = list(camera.distortion), camera.K
@@ -256,14 +265,14 @@ def intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def _observed(cloud: StoredCloud) -> StoredCloud:
-    """Return the points that a camera observed. Others have no colour."""
+    """Return the points that a camera observed. All other points have no colour."""
     return cloud.select(np.any(cloud.rgb, axis=1))
 
 
 def _write_model(
     pictures: Sequence[Picture], cloud: StoredCloud, folder: Path, suffix: str = ".jpg"
 ) -> None:
-    """Write COLMAP's text model with these points, which no image refers to."""
+    """Write COLMAP's text model of the pictures and points. No image refers to a point."""
     cameras, images, number_of = "", "", dict[str, int]()
     for number, picture in enumerate(pictures, 1):
         camera, T_cam_world = picture.camera, picture.T_cam_world
@@ -284,6 +293,7 @@ def _write_model(
 
 
 def _model(camera: Camera) -> tuple[str, list[float]]:
+    """Return COLMAP's name of the camera model and its parameters."""
     params = list(intrinsics(camera).values())
     if camera.model == "fisheye":
         return "OPENCV_FISHEYE", params
@@ -297,7 +307,7 @@ def _text(numbers: Sequence[float]) -> str:
 
 
 def _save_splats(path: Path, points: Float, rgb: NDArray[np.uint8]) -> None:
-    """Write points with normals of 0, as the method's own code reads them."""
+    """Write points with normals of 0, as the code of Gaussian splatting reads them."""
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", points.T.astype(np.float32), strict=True))
     columns |= {name: np.zeros(len(points), np.float32) for name in ("nx", "ny", "nz")}
     save_ply(path, columns | dict(zip(("red", "green", "blue"), rgb.T, strict=True)))

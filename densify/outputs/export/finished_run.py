@@ -36,21 +36,21 @@ _UNOBSERVED = np.array([140, 140, 140], np.uint8)
 
 
 class Kept(NamedTuple):
-    """A share of the pixels with a depth, or a number of points, before and after thresholds."""
+    """A share of pixels with a depth, or a number of points, before and after the thresholds."""
 
     before: float
     after: float
 
 
 class FinishedRun:
-    """The folder of one key. Its files are read on demand; each may raise InputError.
+    """The folder of one densified key sweep. Files are read on demand and may raise InputError.
 
     Attributes:
-        key: Frame number.
-        stamp_ns: Reference time of the key.
-        data: The recording.
-        density: Camera -> ``measured``, ``filled``, of the maps that were read.
-        num_points: Of the clouds that were read, None before the first.
+        key: Frame number of the key sweep.
+        stamp_ns: Reference time of the key sweep in ns since 1970.
+        data: Specification of the recording.
+        density: Camera -> ``measured``, ``filled`` -> share of pixels, for the maps read so far.
+        num_points: Number of points in the clouds read so far, None before the first cloud.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class FinishedRun:
         max_age_ms: float | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
-        """Open a folder; arguments as `densify.outputs.export.export_run`.
+        """Open a folder. Arguments as in `densify.outputs.export.export_run`.
 
         Raises:
             InputError: The folder holds no run.
@@ -83,7 +83,7 @@ class FinishedRun:
 
     @cached_property
     def cameras(self) -> list[str]:
-        """The chosen maps: CAMERA, or CAMERA/NUMBER of one of its images."""
+        """The names of the chosen maps: CAMERA, or CAMERA/NUMBER of one image."""
         names = map_names(self.folder / "depth")
         if not names:
             raise InputError(f"{self.folder}: no depth maps in it; run densify with a camera first")
@@ -94,27 +94,27 @@ class FinishedRun:
 
     @cached_property
     def scene(self) -> SceneFile:
-        """The scene of the run."""
+        """The content of scene.json."""
         return read_scene(self.folder / "scene" / "scene.json")
 
     @cached_property
     def views(self) -> dict[str, CameraView]:
-        """Camera and pose of each chosen map."""
+        """The camera and pose of each chosen map, by name."""
         return {name: view for name, view in self.scene.views.items() if name in self.cameras}
 
     @cached_property
     def tracks(self) -> list[ObjectTrack]:
-        """Tracks of moving objects, each with a pose at the key."""
+        """The tracks of moving objects, each with a pose at the key sweep."""
         return read_tracks(self.folder / "movers.json")
 
     def measure(self, camera: str) -> str:
-        """Return the measure of a map's depth, ``z`` or ``range``."""
+        """Return ``z`` (depth along the camera's axis) or ``range`` (distance from the lens)."""
         path = self.folder / "metrics.json"
         with damage_named(path):
             return str(read_json(path)["measure"][camera])
 
     def jpeg(self, camera: str) -> bytes | None:
-        """Return the image of a map as it is stored, None if there is none."""
+        """Return the bytes of a map's image file, None if the run has no image."""
         path = map_path(self.folder / "scene", "image", camera, ".jpg")
         if camera not in self.scene.views or not path.is_file():
             return None
@@ -128,9 +128,9 @@ class FinishedRun:
         return data
 
     def maps(self, camera: str) -> dict[str, NDArray[Any]]:
-        """Return kind -> (H,W) as stored (`densify.outputs.depth_png`).
+        """Return kind -> (H,W) stored values (`densify.outputs.depth_png`) within the thresholds.
 
-        The kinds are depth, depth_filled, confidence and age. A pixel that is left out is 0.
+        The kinds are depth, depth_filled, confidence and age. Pixels beyond a threshold are 0.
         """
         maps: dict[str, NDArray[Any]] = {}
         for kind, dtype in _KINDS.items():
@@ -149,10 +149,10 @@ class FinishedRun:
         return {kind: stored * keep for kind, stored in maps.items()}
 
     def full_m(self, camera: str) -> Float32:
-        """Return (H,W) metres, 0 none: measured and filled pixels, and those of a prior if given.
+        """Return (H,W) filled depth in metres, completed with a prior if given, 0 for no depth.
 
         Raises:
-            InputError: Depth is not camera z.
+            InputError: The map holds ranges instead of camera z.
         """
         if self.measure(camera) != "z":
             raise InputError(
@@ -174,11 +174,12 @@ class FinishedRun:
         return self._select(read_cloud(self.folder / "cloud.laz"))
 
     def mover_clouds(self) -> list[StoredCloud]:
-        """Return the points within the thresholds of separated objects (``movers=separate``)."""
+        """Return a cloud for each separated object (``movers=separate``), within the thresholds."""
         paths = sorted(self.folder.glob("movers/*/cloud.laz"))
         return [self._select(read_cloud(path)) for path in paths]
 
     def _select(self, cloud: StoredCloud) -> StoredCloud:
+        """Return the points within the thresholds and add their number to ``num_points``."""
         age = stored_age(1e-9 * np.abs(cloud.stamp_ns - self.stamp_ns))
         keep = (stored_confidence(cloud.confidence) >= self._min_confidence) & (
             age <= self._max_age
@@ -189,7 +190,7 @@ class FinishedRun:
 
 
 def map_names(*folders: Path) -> list[str]:
-    """Return the maps in folders: CAMERA, or CAMERA/NUMBER of one of its images."""
+    """Return the names of the maps in folders: CAMERA, or CAMERA/NUMBER of one image."""
     paths = {path.relative_to(folder) for folder in folders for path in folder.rglob("*.png")}
     return sorted(path.with_suffix("").as_posix() for path in paths)
 
@@ -200,7 +201,10 @@ def finished_runs(
     max_age_ms: float | None = None,
     cameras: Sequence[str] | None = None,
 ) -> list[FinishedRun]:
-    """Return the run in a folder, or those of several keys below it, ascending by recording."""
+    """Return the run in a folder, or the runs below it, ordered by parent folder and frame number.
+
+    Arguments as in `densify.outputs.export.export_run`.
+    """
     places = sorted(
         path.parent for level in ("*", "*/*") for path in folder.glob(f"{level}/run.yaml")
     )
@@ -211,9 +215,13 @@ def finished_runs(
 
 
 class ShownSweep(NamedTuple):
-    """A sweep as it was measured, at the poses of registration (``rigid_points``).
+    """A sweep as measured, with its registered pose.
 
-    stamp_ns is its reference time.
+    Attributes:
+        frame: Frame number.
+        stamp_ns: Reference time in ns since 1970.
+        T_key_lidar: (4,4) pose in the key sweep's lidar frame.
+        points: Points of the sweep. ``points.rigid_points`` are the measured positions.
     """
 
     frame: int
@@ -223,12 +231,15 @@ class ShownSweep(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """An image of a camera.
+    """An image of a camera, with its depth maps.
 
     Attributes:
-        stamp_ns: Its exposure.
-        maps_m: "depth" and "depth_filled", (H,W) float32, 0 none.
-        is_pinhole: The camera has no distortion, and depth is along its axis.
+        name: Name of the map.
+        view: Camera and pose.
+        stamp_ns: Time of the exposure in ns since 1970.
+        jpeg: Bytes of the image file, None without an image.
+        maps_m: "depth" and "depth_filled" -> (H,W) float32 metres, 0 for no depth.
+        is_pinhole: True if the camera has no distortion and depth is along its axis.
     """
 
     name: str
@@ -240,12 +251,14 @@ class Shot(NamedTuple):
 
 
 class Timeline(NamedTuple):
-    """A key with its sweeps.
+    """A densified key sweep with its sweeps and images.
 
     Attributes:
-        T_world_key: (4,4). The world is the frame of the first key.
-        cloud: At the key's time.
-        sweeps: One or more, by time.
+        run: The finished run.
+        T_world_key: (4,4) pose of the key sweep. The world is the first key sweep's lidar frame.
+        cloud: Accumulated points at the key sweep's time, key sweep's lidar frame.
+        sweeps: One or more sweeps, by time.
+        shots: Images of the chosen maps.
     """
 
     run: FinishedRun
@@ -256,14 +269,14 @@ class Timeline(NamedTuple):
 
 
 def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
-    """Yield one key with all sweeps of its window, or several keys with their own sweeps.
+    """Yield one run with all sweeps of its window, or several runs with their key sweeps.
 
     Args:
-        runs: Ascending by key.
+        runs: Finished runs, ascending by frame number.
 
     Raises:
-        InputError: Neither of two consecutive keys is in the window of the other. Their
-            relative pose is then unknown.
+        InputError: Neither of two consecutive key sweeps is in the window of the other, so their
+            relative pose is unknown.
     """
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
         cloud, sweeps = run.cloud(), []
@@ -278,10 +291,10 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
 
 
 def key_poses(runs: Sequence[FinishedRun]) -> Iterator[Float]:
-    """Yield ``T_world_key`` (4,4) of each run; the world is the first key frame.
+    """Yield ``T_world_key`` (4,4) of each run. The world is the first key sweep's lidar frame.
 
     Raises:
-        InputError: As `timelines`.
+        InputError: A relative pose is unknown as in `timelines`.
     """
     T_world_key = np.eye(4)
     for before, run in zip([None, *runs], runs, strict=False):
@@ -291,12 +304,12 @@ def key_poses(runs: Sequence[FinishedRun]) -> Iterator[Float]:
 
 
 def colours(cloud: StoredCloud) -> NDArray[np.uint8]:
-    """Return (N,3) colours, gray for points that no camera observed."""
+    """Return (N,3) uint8 RGB colours, gray for points that no camera observed."""
     return np.where(cloud.rgb.any(axis=1, keepdims=True), cloud.rgb, _UNOBSERVED)
 
 
 def _relative_pose(run: FinishedRun, other: FinishedRun) -> Float:
-    """Return (4,4), the other's key frame in the run's."""
+    """Return the (4,4) pose of the other run's key sweep in the run's key sweep."""
     if other.key in run.scene.T_key_lidar:
         return run.scene.T_key_lidar[other.key]
     if run.key in other.scene.T_key_lidar:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write forms of maps (npy, exr, kitti) and of the cloud (ply, pcd)."""
+"""Write depth maps (npy, exr, kitti) and the cloud (ply, pcd) of a finished run."""
 
 from __future__ import annotations
 
@@ -25,15 +25,16 @@ _PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar", "u2": "
 
 
 def write_npy(run: FinishedRun, folder: Path) -> None:
-    """Write (H,W) float32 arrays, one file for each camera.
+    """Write (H,W) float32 arrays, one .npy file for each kind of map and camera.
 
-    They are ``depth`` and ``depth_filled`` in metres, 0 none, and ``confidence``, 0 to 1.
+    The kinds are ``depth`` and ``depth_filled`` in metres, 0 for no depth, and ``confidence``, 0 to
+    1.
     """
     _write_maps(run, folder, ".npy", lambda path, _, values: np.save(path, values))
 
 
 def write_exr(run: FinishedRun, folder: Path) -> None:
-    """Write the same maps as OpenEXR files of one 32-bit channel, without loss.
+    """Write the maps of `write_npy` as OpenEXR files with one 32-bit channel, without loss.
 
     The channel is ``Z`` for depth and ``Y`` for confidence.
 
@@ -53,6 +54,7 @@ def write_exr(run: FinishedRun, folder: Path) -> None:
 def _write_maps(
     run: FinishedRun, folder: Path, suffix: str, save: Callable[[Path, str, Float32], None]
 ) -> None:
+    """Write each map by ``save``, a function of path, kind and (H,W) float32 values."""
     for camera in run.cameras:
         maps = run.maps(camera)
         levels = np.maximum(maps["confidence"].astype(np.float32) - 1, 0)
@@ -64,15 +66,15 @@ def _write_maps(
 
 
 def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write the tree of KITTI depth completion (`densify.outputs.kitti_tree`).
+    """Write a KITTI depth completion tree (`densify.outputs.kitti_tree`).
 
     Maps are ``SPLIT/DRIVE/proj_depth/KIND/CAMERA/0000000120.png``. Beside proj_depth are the image
     ``CAMERA/data/0000000120.png`` and K, row by row, in ``intrinsics/CAMERA/0000000120.txt``.
 
-    KIND is groundtruth (measured), groundtruth_filled, confidence, and velodyne_raw, the single
-    sweep, if the run has it. Recordings that the benchmark lacks are in train.
-    files.txt has image, measured and filled depth of each map that has an image, a line each.
-    annotations.json has the same with ``cam_in`` (fx fy cx cy) and ``depth_scale``, for Metric3D.
+    KIND is groundtruth (measured), groundtruth_filled, confidence, and velodyne_raw (single sweep)
+    if the run has it. Recordings unknown to the benchmark are in train. files.txt has a line for
+    each map with an image: paths of image, measured and filled depth. annotations.json has the same
+    paths with ``cam_in`` (fx fy cx cy) and ``depth_scale``, for Metric3D.
     """
     files: list[dict[str, Any]] = []
     for run in runs:
@@ -88,7 +90,7 @@ def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def _write_view(run: FinishedRun, view: str, drive: Path, root: Path) -> list[dict[str, Any]]:
-    """Write the files of a map and return its entry of annotations.json, if it has an image."""
+    """Write the files of a map and return its annotations.json entries, none without an image."""
     camera, _, number = view.partition("/")
     file, maps = number or f"{run.key:010d}", run.maps(view)
     for kind, product in _TREE.items():
@@ -121,7 +123,7 @@ def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write vertices as PLY (Turk, 1994), binary, little-endian.
 
     Args:
-        columns: (N,) float32, float64, int32, uint8 or uint16 each.
+        columns: Property name -> (N,) float32, float64, int32, uint8 or uint16 values.
     """
     rows = table(columns)
     rows = rows.astype(rows.dtype.newbyteorder("<"), copy=False)
@@ -138,7 +140,7 @@ def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 
 def write_pcd(run: FinishedRun, folder: Path) -> None:
-    """Write ``cloud.pcd``, PCD 0.7 of the Point Cloud Library, binary, with the same columns.
+    """Write ``cloud.pcd``, binary PCD 0.7 of the Point Cloud Library, with the same columns.
 
     The colour is the column ``rgb``, three bytes packed into a float.
     """

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Write one key or a drive as MCAP in Foxglove's schemas (extra ``mcap``).
+"""Write one key sweep or a drive as MCAP in Foxglove's schemas (extra ``mcap``).
 
-Foxglove and Lichtblick show it. Topics::
+Foxglove and Lichtblick show the file. Topics, with "key" for the key sweep's lidar frame::
 
     /tf                FrameTransform: world -> key, key -> vehicle and each camera
-    /cloud, /sweep     PointCloud: the accumulated cloud at the key's time; each sweep as measured
+    /cloud, /sweep     PointCloud: accumulated cloud at the key sweep's time; sweeps as measured
     /movers            SceneUpdate: boxes of moving objects, by time
     /CAMERA/image, /CAMERA/calibration, /CAMERA/depth, /CAMERA/depth_filled
                        CompressedImage, CameraCalibration, RawImage (32FC1, metres)
@@ -31,10 +31,10 @@ _NS = 10**9
 
 
 def write_mcap(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``recording.mcap``. The same runs give the same bytes.
+    """Write ``recording.mcap``. Equal runs give equal bytes.
 
     Raises:
-        InputError: foxglove-sdk is not installed, or as in `timelines`.
+        InputError: foxglove-sdk is not installed, or a relative pose is unknown as in `timelines`.
     """
     foxglove = needed("foxglove", "mcap", "MCAP files")
     context, channels = foxglove.Context(), {}
@@ -49,7 +49,7 @@ def write_mcap(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def _messages(m: Any, timeline: Timeline) -> Iterator[tuple[str, int, Any]]:
-    """Yield topic, time and message. m: `foxglove.messages`."""
+    """Yield topic, time in ns and message. ``m`` is the module `foxglove.messages`."""
     start_ns, cloud = timeline.sweeps[0].stamp_ns, timeline.cloud
     yield "/tf", start_ns, _transform(m, start_ns, "world", "key", timeline.T_world_key)
     beside = {name: getattr(cloud, name) for name in ("confidence", "instance", "frame")}
@@ -68,6 +68,7 @@ def _messages(m: Any, timeline: Timeline) -> Iterator[tuple[str, int, Any]]:
 
 
 def _of_shot(m: Any, shot: Shot) -> Iterator[tuple[str, Any]]:
+    """Yield the kind and the message of an image, its calibration and its depth maps."""
     about = {"timestamp": _stamp(m, shot.stamp_ns), "frame_id": shot.name}
     if shot.jpeg is not None:
         yield "image", m.CompressedImage(**about, data=shot.jpeg, format="jpeg")
@@ -84,7 +85,7 @@ def _of_shot(m: Any, shot: Shot) -> Iterator[tuple[str, Any]]:
 
 
 def _lens(camera: Camera) -> tuple[str, list[float]] | None:
-    """Return ROS's name of the lens and its coefficients, None for a pinhole."""
+    """Return ROS's name of the lens model and its coefficients, None if ROS has no such model."""
     lens = [*camera.distortion]
     if camera.model == "fisheye":
         return "kannala_brandt", lens
@@ -96,6 +97,7 @@ def _lens(camera: Camera) -> tuple[str, list[float]] | None:
 
 
 def _cloud(m: Any, stamp_ns: int, points: Any, rgb: Any, beside: dict[str, NDArray[Any]]) -> Any:
+    """Return a PointCloud message of points (N,3) in the key sweep's lidar frame."""
     values = [*points.T.astype(np.float32), *rgb.T]
     columns = dict(zip(("x", "y", "z", "red", "green", "blue"), values, strict=True))
     rows = table(columns | {"alpha": np.full(len(points), 255, np.uint8), **beside})
@@ -111,7 +113,7 @@ def _cloud(m: Any, stamp_ns: int, points: Any, rgb: Any, beside: dict[str, NDArr
 
 
 def _boxes(m: Any, stamp_ns: int, tracks: Sequence[ObjectTrack], frame: int) -> Any:
-    """Return the boxes at that sweep, which replace all earlier ones."""
+    """Return the boxes of objects at sweep ``frame``. The message replaces all earlier boxes."""
     stamp, entities = _stamp(m, stamp_ns), []
     for track, i in [(t, t.frames.index(frame)) for t in tracks if frame in t.frames]:
         pose, size = _pose(m, track.T_key_object[i]), _vector(m, track.size_m)

@@ -11,12 +11,12 @@ from densify.outputs.export.finished_run import FinishedRun, colours, timelines
 
 
 def show(runs: Sequence[FinishedRun]) -> None:
-    """Show static and moving points and the boxes of objects, with a time line over several keys.
+    """Show static and moving points and the boxes of objects, with a time line over several runs.
 
-    It returns when the window is closed.
+    The call returns when the user closes the window.
 
     Raises:
-        InputError: There is no open3d or no screen.
+        InputError: open3d is not installed, or there is no screen.
     """
     o3d, shown = needed("open3d", "open3d", "Windows with the cloud"), []
     for at, line in enumerate(timelines(runs)):

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Write one key or a drive for rerun's viewer (https://rerun.io, extra ``rerun``).
+"""Write one key sweep or a drive for rerun's viewer (https://rerun.io, extra ``rerun``).
 
-By ``time`` (the recording's clock as UNIX time) and ``frame`` there are in ``world/key``::
+Time lines are ``time`` (the recording's clock as UNIX time) and ``frame``. Entities in
+``world/key``, the key sweep's lidar frame::
 
-    cloud/static, cloud/moving, sweep, vehicle    the cloud, each sweep as measured, the sensor
-    movers/box, movers/path     moving objects; labels give object and speed
+    cloud/static, cloud/moving, sweep, vehicle    the cloud, each sweep as measured, lidar poses
+    movers/box, movers/path     moving objects; labels give object number and speed
     CAMERA/{image,depth,depth_filled}    image and metres; with a pinhole for rectified cameras
 """
 
@@ -28,10 +29,10 @@ _POINT, _SWEEP_POINT = -1.5, -2.5  # radii in points of the screen, as rerun wri
 
 
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``recording.rrd``. rerun numbers its chunks by the clock, so bytes differ.
+    """Write ``recording.rrd``. Bytes differ between calls, because rerun numbers chunks by the clock.
 
     Raises:
-        InputError: rerun is not installed, or as in `timelines`.
+        InputError: rerun is not installed, or a relative pose is unknown as in `timelines`.
     """
     with _stream(runs) as stream:
         stream.save(folder / "recording.rrd")
@@ -39,7 +40,7 @@ def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def show(runs: Sequence[FinishedRun]) -> None:
-    """Show the same in rerun's viewer, which stays open. Raise InputError as `write_rrd`."""
+    """Show the runs in rerun's viewer, which stays open. Raise InputError as `write_rrd`."""
     with _stream(runs) as stream:
         stream.spawn()
         _log(stream, runs)
@@ -67,7 +68,7 @@ def _log(stream: Any, runs: Sequence[FinishedRun]) -> None:
 
 
 def _entities(timeline: Timeline) -> Iterator[tuple[int, int, str, Any]]:
-    """Yield frame, stamp, name and content."""
+    """Yield frame number, stamp in ns, entity path below ``world/key``, and rerun object."""
     import rerun as rr
 
     def points(xyz: Any, cloud: StoredCloud, radius: float = _POINT) -> Any:
@@ -92,6 +93,7 @@ def _entities(timeline: Timeline) -> Iterator[tuple[int, int, str, Any]]:
 
 
 def _of_shot(shot: Shot) -> Iterator[tuple[str, Any]]:
+    """Yield entity path below the camera and rerun object, for pose, lens, image and depth."""
     import rerun as rr
 
     yield "", _transform(poses.inverse(shot.view.T_cam_key))
@@ -106,6 +108,7 @@ def _of_shot(shot: Shot) -> Iterator[tuple[str, Any]]:
 
 
 def _boxes(tracks: Sequence[ObjectTrack], frame: int) -> Any:
+    """Return the boxes of the objects that have a pose at sweep ``frame``."""
     import rerun as rr
 
     seen = [(t, t.frames.index(frame)) for t in tracks if frame in t.frames]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write training sets of depth networks: a scene of map-anything, a set of MoGe."""
+"""Write training sets of depth networks: a scene for map-anything, a data set for MoGe."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _LOG_STEPS = 65533  # of 16 bits, as MoGe divides them
 
 
 def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write a scene as map-anything reads it (its data_processing/README.md).
+    """Write a scene that map-anything reads (format: its data_processing/README.md).
 
-    scene_meta.json has poses with OpenCV's axes. Beside it are ``images/`` and ``depth/NAME.exr``,
-    measured metres, 0 none.
+    scene_meta.json has camera-to-world poses with OpenCV's axes. Images are in ``images/``.
+    Measured depth is in ``depth/NAME.exr`` in metres, 0 for no depth.
 
     Raises:
         InputError: The maps hold ranges, a lens has distortion, or OpenEXR is missing.
@@ -70,11 +70,11 @@ def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write a training set as MoGe reads it (its docs/train.md and moge/utils/io.py).
+    """Write a training set that MoGe reads (format: its docs/train.md and moge/utils/io.py).
 
-    .index.txt lists the folders of the images. Each has image.jpg, meta.json (K of an image of
-    width and height 1) and depth.png: 16 bit, measured, 0 none, else logarithmic from ``near`` to
-    ``far``.
+    .index.txt lists the folders of the images. A folder has image.jpg, depth.png and meta.json (K
+    scaled to an image of width and height 1). depth.png has 16 bits: measured depth on a
+    logarithmic scale from ``near`` to ``far``, 0 for no depth.
 
     Raises:
         InputError: The maps hold ranges, or a lens has distortion.
@@ -99,6 +99,7 @@ def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def _logarithmic_png(depth_m: Float32) -> bytes:
+    """Return the bytes of depth.png for (H,W) metres, see `write_moge`."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Make the page of one key: data, script and style in a single file that opens from disk."""
+"""Make the HTML page of one key sweep: a single file with data, script and style."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make the page of one key from those files of a run or a comparison that are whole."""
+"""Make the HTML page of one key sweep from the readable files of a run or a comparison."""
 
 from __future__ import annotations
 
@@ -41,12 +41,13 @@ _MAPS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
 
 @dataclass
 class KeyFiles:
-    """The files of one key. ``missing`` names each file that cannot be read, a sentence each.
+    """The files of one key sweep.
 
     Attributes:
         maps: Folder of depth maps, cloud and scene.
-        about: Content of run.yaml, or the same facts of compare.json.
-        methods: Method -> its scores. The last one is that of the maps.
+        about: Content of run.yaml, or the same fields of compare.json.
+        methods: Method -> its scores. The last method made the maps.
+        missing: A sentence for each file that cannot be read.
     """
 
     maps: Path
@@ -59,7 +60,7 @@ class KeyFiles:
         """Return the files of a run.
 
         Raises:
-            InputError: Run.yaml is missing or damaged.
+            InputError: The file run.yaml is missing or damaged.
         """
         files = KeyFiles(folder, _mapping(read_yaml(folder / "run.yaml")[0]), {})
         metrics = _mapping(files.read(read_json, "metrics.json"))
@@ -69,7 +70,7 @@ class KeyFiles:
 
     @staticmethod
     def of_comparison(folder: Path) -> KeyFiles:
-        """Return the files of a comparison. Raise InputError for a bad compare.json."""
+        """Return the files of a comparison. Raise InputError unless compare.json is whole."""
         about = _mapping(read_json(folder / "compare.json"))
         methods = {str(m): _mapping(s) for m, s in _mapping(about.get("methods")).items()}
         if not methods:
@@ -77,10 +78,12 @@ class KeyFiles:
         return KeyFiles(folder / "compare", about, methods)
 
     def read(self, read: Callable[[Path], T], name: str, optional: bool = False) -> T | None:
-        """Return the content of a file, None if it is damaged or missing.
+        """Return the content of a file, None if the file is damaged or missing.
 
         Args:
-            optional: The file may be missing without a note.
+            read: Function that reads a path.
+            name: Path of the file relative to ``maps``.
+            optional: Add no sentence to ``missing`` if there is no such file.
         """
         path = self.maps / name
         if optional and not path.is_file():
@@ -92,10 +95,10 @@ class KeyFiles:
             return None
 
     def camera(self, name: str) -> dict[str, NDArray[Any]]:
-        """Return kind -> (H,W) as stored.
+        """Return kind -> (H,W) stored values, for the map called CAMERA or CAMERA/NUMBER.
 
-        The kinds are maps of the run and of its scene, and the measured depth of each baseline, by
-        method.
+        The kinds are the maps of the run and of its scene. The measured depth of a baseline has the
+        name of its method as kind.
         """
         maps: dict[str, NDArray[Any]] = {}
         of_methods = {f"scene/{method}": np.uint16 for method in self.methods}
@@ -110,7 +113,7 @@ class KeyFiles:
         return maps
 
     def image(self, name: str) -> bytes | None:
-        """Return the JPEG of a map's image, None without one."""
+        """Return the JPEG bytes of the image of a map, None if the run has no image."""
 
         def jpeg(path: Path) -> bytes:
             decode_image(data := read_bytes(path), path)
@@ -120,7 +123,7 @@ class KeyFiles:
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:
-    """Return a mapping from a file, an empty one for other content."""
+    """Return the value if it is a mapping, else an empty mapping."""
     return value if isinstance(value, dict) else {}
 
 
@@ -132,16 +135,16 @@ def write_report(result: Result, context: Context, folder: Path) -> None:
 
 
 def key_page(files: KeyFiles, folder: str) -> bytes:
-    """Return the page.
+    """Return the bytes of the HTML page.
 
-    Too many points are thinned out, and the page says it.
+    A cloud with too many points is thinned out, and the page says so.
 
     Args:
-        files: Files of the key.
-        folder: Folder of a run, as the user names it; "" of a comparison.
+        files: Files of the key sweep.
+        folder: Folder of the run, as the user names it. "" for a comparison.
 
     Raises:
-        InputError: There is neither a depth map nor a cloud.
+        InputError: Neither a depth map nor a cloud can be read.
     """
     scene = files.read(read_scene, "scene/scene.json", optional=True)
     views, sweeps = (scene.table["views"], scene.table["sweeps"]) if scene else ({}, [])
@@ -183,6 +186,7 @@ def key_page(files: KeyFiles, folder: str) -> bytes:
 
 
 def _mover(track: ObjectTrack, key: Any) -> dict[str, Any]:
+    """Return the page's entry of a moving object, with metres in the key sweep's lidar frame."""
     at = track.frames.index(key)
     places_m = track.T_key_object[:, :3, 3]
     path = zip(track.frames, places_m, strict=True)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Write one HTML file with data, script and style that opens from disk and loads nothing else.
+"""Write one HTML file with data, script and style. It opens from disk and loads no other file.
 
-The page uses WebGL2 and the browser's own inflate, because a copy of three.js would be 700 kB for
-points and lines. Content of other files is JSON, which the script sets as text. The page's policy
-(CSP) allows its one script, by its hash, and no request.
+The page uses WebGL2 and the browser's own inflate, because a copy of three.js would add 700 kB.
+Content of other files is JSON, which the script inserts as text. The page's content security policy
+allows no request and only its one script, by hash.
 """
 
 from __future__ import annotations
@@ -46,23 +46,26 @@ _NEAR_M, _MOVING_WEIGHT = 4.0, 100.0
 
 
 class Blobs:
-    """Packed arrays of a page: bytes by significance, deflate, base64.
+    """Collect the packed arrays of a page: bytes sorted by significance, deflated, in base64.
 
-    ``page/unpack.js`` unpacks them. 16-bit PNG would lose depth, because browsers decode it to 8
+    ``page/unpack.js`` unpacks them. 16-bit PNG would lose depth, because browsers decode PNG to 8
     bits.
 
     Attributes:
-        texts: Name -> base64.
+        texts: Name of the blob -> base64 text.
     """
 
     def __init__(self) -> None:
         self.texts: dict[str, str] = {}
 
     def add(self, array: NDArray[Any]) -> dict[str, Any]:
-        """Pack whole numbers (N,) or (H,W) and return the description that the page needs.
+        """Pack an array and return the description that the page needs to unpack it.
 
-        Numbers are 0 or more and below 2^32. They are packed in 8, 16 or 32 bits, as they are or as
-        differences along the last axis, whichever is smaller.
+        The values are packed in 8, 16 or 32 bits. They are stored directly or as differences along
+        the last axis, whichever is smaller.
+
+        Args:
+            array: (N,) or (H,W) integers of 0 or more, below 2^32.
         """
         array = array.astype(np.min_scalar_type(int(array.max(initial=0))))
         steps = np.diff(array, axis=-1, prepend=array.dtype.type(0))
@@ -76,7 +79,7 @@ class Blobs:
         }
 
     def add_file(self, data: bytes, mime: str) -> dict[str, Any]:
-        """Add an image file as it is."""
+        """Add an image file unchanged and return its description."""
         return {"blob": self._keep(data), "mime": mime}
 
     def _keep(self, data: bytes) -> str:
@@ -97,14 +100,14 @@ def packed_camera(
     jpeg: bytes | None,
     focal_px: float | None,
 ) -> dict[str, Any]:
-    """Return the entry of a camera.
+    """Pack the maps of a camera into ``blobs`` and return the camera's entry in the page.
 
-    Measured, source sweep and age are one map. Its pixels are numbers of rows of ``sources``, which
-    are [row of the sweep + 1, age in ms + 1, measured 0 or 1], 0 where unknown.
+    Source sweep, age and the flag "measured" share one map of indices into ``sources``. A row of
+    ``sources`` is [index of the sweep + 1, age in ms + 1, measured 0 or 1], 0 where unknown.
 
     Args:
-        maps: Kind -> (H,W) as stored, see `outputs.report.key_page.KeyFiles.camera`.
-        jpeg: The image.
+        maps: Kind -> (H,W) values, see `outputs.report.key_page.KeyFiles.camera`.
+        jpeg: Bytes of the image, None without an image.
     """
     nothing = np.zeros_like(next(iter(maps.values())), np.uint16)
     depth, filled, sweep, age = (
@@ -130,15 +133,16 @@ def packed_camera(
 def packed_cloud(
     blobs: Blobs, cloud: StoredCloud, frames: Sequence[int], instances: Sequence[int]
 ) -> dict[str, Any]:
-    """Return the entry of the cloud: the points of `thinned`, moving ones first.
+    """Pack a thinned cloud into ``blobs`` and return its entry in the page, moving points first.
 
-    Positions are 16-bit numbers in a box. ``mover`` is 0 for static points, 1 for moving points
-    without a track, 2 and up for tracked objects. ``displaced``, metres beyond the rigid alignment,
-    is of moving points alone, in ``displaced_step_m`` plus 32768.
+    Positions are 16-bit integers: ``low_m`` + ``step_m`` times the integer. ``mover`` is 0 for
+    static points, 1 for moving points without a track, 2 and up for tracked objects. ``displaced``
+    is 32768 plus the displacement beyond rigid alignment in steps of ``displaced_step_m``, for
+    moving points only.
 
     Args:
-        frames: The sweeps that ``sweep`` numbers.
-        instances: The tracked objects.
+        frames: Frame numbers of the page's sweeps. ``sweep`` holds indices into this list.
+        instances: Instance numbers of the tracked objects, in the order of ``mover``.
     """
     rows = thinned(cloud.points, cloud.moving, _MOST_POINTS)
     chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])
@@ -167,14 +171,14 @@ def packed_cloud(
 
 
 def thinned(points: Float, moving: Bool, most: int) -> Int:
-    """Return (K,) rows of at most ``most`` points, ascending, chosen at random with a fixed seed.
+    """Return (K,) ascending indices of at most ``most`` points, drawn with a fixed random seed.
 
-    A point counts by its squared distance, and moving points count more. The result is about
-    equally dense in angle everywhere.
+    The probability grows with squared distance, so the result is about equally dense in angle.
+    Moving points get a larger weight.
 
     Args:
-        points: (N,3) key frame.
-        moving: (N,) bool.
+        points: (N,3) positions in metres, key sweep's lidar frame.
+        moving: (N,) bool, True for moving points.
     """
     if len(points) <= most:
         return np.arange(len(points))
@@ -185,7 +189,7 @@ def thinned(points: Float, moving: Bool, most: int) -> Int:
 
 
 def _colours(cloud: StoredCloud) -> NDArray[np.uint8]:
-    """Return (N,3) in 64 levels, gray by reflectance where no camera observed the point."""
+    """Return (N,3) colours of 64 levels, gray by reflectance where no camera observed the point."""
     dark, bright = _GRAY
     gray = dark + (bright - dark) * np.sqrt(np.clip(cloud.intensity, 0, 1))
     observed = cloud.rgb.any(axis=1, keepdims=True)
@@ -193,17 +197,17 @@ def _colours(cloud: StoredCloud) -> NDArray[np.uint8]:
 
 
 def _numbers(values: NDArray[np.int32], known: Sequence[int]) -> Int:
-    """Return the position of each value (N,) in a list, 0 for others."""
+    """Return the index of each value (N,) in the list ``known``, 0 for unknown values."""
     number_of = {value: number for number, value in enumerate(known)}
     return np.array([number_of.get(value, 0) for value in values.tolist()], np.int64)
 
 
 def page_file(title: str, data: Mapping[str, Any], blobs: Blobs) -> bytes:
-    """Return a whole page.
+    """Return the bytes of a whole HTML page.
 
     Args:
-        title: Any text.
-        data: Plain numbers, texts, lists and mappings, ``page`` in the script.
+        title: Title as plain text.
+        data: Numbers, texts, lists and mappings, which the script reads as ``page``.
         blobs: The packed arrays.
     """
     script, style = "\n".join(map(_source, _SCRIPTS)), _source("page.css")
@@ -231,18 +235,18 @@ def _source(name: str) -> str:
 
 
 def _hash(text: str) -> str:
-    """Return the name of an inline script in a policy."""
+    """Return the hash that names an inline script in the content security policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def _json(value: Mapping[str, Any]) -> str:
-    """Return JSON that cannot end its script element."""
+    """Return JSON text that cannot close its HTML script element."""
     text = json.dumps(plain(value), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return re.sub("[<>&\u2028]", lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def _palettes() -> dict[str, str]:
-    """Return 256 x RGB of each colour map, base64."""
+    """Return the name of each colour map -> 256 RGB colours in base64."""
     levels = np.arange(256, dtype=np.uint8)
     maps = {name: cv2.applyColorMap(levels, number) for name, number in _COLOUR_MAPS.items()}
     return {
