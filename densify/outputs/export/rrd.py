@@ -29,7 +29,7 @@ _POINT, _SWEEP_POINT = -1.5, -2.5  # radii in points of the screen, as rerun wri
 
 
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``recording.rrd``. Bytes differ between calls, because rerun numbers chunks by the clock.
+    """Write ``recording.rrd``. Bytes differ each time: rerun numbers its chunks by the clock.
 
     Raises:
         InputError: rerun is not installed, or a relative pose is unknown as in `timelines`.
