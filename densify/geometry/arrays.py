@@ -16,7 +16,11 @@ Bool = NDArray[np.bool_]
 
 
 def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return an (M,) structured array with a field for each of the (M,) columns, without gaps."""
+    """Return an (M,) structured array whose fields are the given columns.
+
+    Args:
+        columns: Field name -> its (M,) values. The fields are packed without padding.
+    """
     rows = np.empty(
         len(next(iter(columns.values()))), [(name, c.dtype) for name, c in columns.items()]
     )

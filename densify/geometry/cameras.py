@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Project camera-frame points into images, and find the ray of each place of an image.
+"""Project camera-frame points into images, and find the viewing ray of image coordinates.
 
-Every model takes a direction to a plane, bends that plane with one radial and tangential
-distortion, then scales it to pixels by ``K``:
+Every model maps a direction to a plane, distorts the plane radially and tangentially, and scales
+it to pixels by ``K``:
 
 pinhole
     plane (x/z, y/z); OpenCV's 0, 4, 5 or 8 (rational) coefficients (docs.opencv.org, calib3d).
-    Thin prism and tilted sensor terms have to be 0.
+    Thin prism and tilted sensor terms must be 0.
 fisheye
     plane θ (x, y) / hypot(x, y), θ the angle off the axis; OpenCV's four coefficients k1 to k4
     (docs.opencv.org, fisheye; Kannala and Brandt, "A generic camera model and calibration method
@@ -14,7 +14,7 @@ fisheye
 mei
     plane (x, y) / (z + ξ r), r the range; ξ k1 k2 p1 p2 (Mei and Rives, "Single view point
     omnidirectional camera calibration from planar grids", ICRA 2007), as KITTI-360's fisheyes;
-    gamma1, gamma2, u0, v0 stand in ``K``.
+    ``K`` holds gamma1, gamma2, u0, v0.
 """
 
 from __future__ import annotations
@@ -33,28 +33,27 @@ _RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # all others are 0
 _NUM_ANGLES = 4096
 _NUM_STEPS = 10  # of Newton's method
 _STEP_RAD = np.cbrt(np.finfo(float).eps)  # step of differences with the least rounding error
-_CONVERGED = np.sqrt(np.finfo(float).eps)  # the next step of Newton's method is exact
+_CONVERGED = np.sqrt(np.finfo(float).eps)  # from here one more step of Newton's method is exact
 
 
 def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
     """Return the projection of points into the image of a camera.
 
-    A distortion polynomial is fitted inside the image only. Beyond the angle at which the distorted
-    radius stops growing it folds points back into the image. These points count as invisible, and
-    so do points more than the camera's ``max_angle_deg`` off its axis.
+    A distortion polynomial is valid only inside the image. Beyond the angle at which the distorted
+    radius stops growing, it would fold points back into the image. Such points, and points more
+    than the camera's ``max_angle_deg`` off its axis, are invisible.
 
     Args:
-        camera: The camera.
         points_cam: (N,3) metres, camera frame (x right, y down, z forward).
 
     Returns:
-        uv: (N,2) image coordinates in pixels. An integer is the centre of a pixel. NaN for a
-            point without one.
-        visible: (N,) bool: not too near (z, or range for more than a half space, over 0.1 m),
-            in the valid field of view of the lens, and on a pixel of the image after ``rint``.
+        uv: (N,2) image coordinates in pixels, integers at pixel centres. NaN for a point that is
+            too near or outside the view of the lens.
+        visible: (N,) bool, True for a point in the view of the lens that falls on a pixel after
+            ``rint`` and is farther than 0.1 m: in z for a pinhole, in range for other lenses.
 
     Raises:
-        InputError: The model is unknown, or has other coefficients.
+        InputError: The camera model is unknown, or its number of coefficients is invalid.
     """
     lens = _lens(camera)
     uv, seen = np.full((len(points_cam), 2), np.nan), np.zeros(len(points_cam), bool)
@@ -71,10 +70,12 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
 
 
 def rays(camera: Camera, uv: Float) -> Float:
-    """Return (N,3) unit vectors in the camera frame of (N,2) image coordinates.
+    """Return (N,3) unit vectors in the camera frame along the viewing rays of image coordinates.
 
-    This is the inverse of `image_points`, with its errors. The result is NaN outside the view of
-    the lens.
+    This inverts `image_points` and raises the same errors.
+
+    Args:
+        uv: (N,2) pixels, integers at pixel centres. Outside the view of the lens the ray is NaN.
     """
     lens = _lens(camera)
     on_plane = (np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T)[:, :2]
@@ -88,9 +89,13 @@ def rays(camera: Camera, uv: Float) -> Float:
 
 
 def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
-    """Return (N,2,3) the Jacobian of the projection of visible points (N,3).
+    """Return the (N,2,3) Jacobian of the projection, in pixels per metre.
 
-    It is the change of u and v as a point moves by a metre along x, y and z of the camera frame.
+    Element [n, i, j] is the change of u (i = 0) or v (i = 1) per metre that point n moves along
+    axis j (x, y, z) of the camera frame.
+
+    Args:
+        points_cam: (N,3) metres, camera frame; visible points only.
     """
     lens = _lens(camera)
     range_m = np.linalg.norm(points_cam, axis=1, keepdims=True)
@@ -105,12 +110,25 @@ def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
 
 
 def depth_along(points_cam: Float, measure: str) -> Float:
-    """Return (N,) metres of points (N,3): camera z, or the range from the lens."""
+    """Return the (N,) depth in metres of points in the camera frame.
+
+    Args:
+        points_cam: (N,3) metres, camera frame.
+        measure: ``z`` for depth along the optical axis, ``range`` for distance from the lens.
+    """
     return points_cam[:, 2] if measure == "z" else np.linalg.norm(points_cam, axis=1)
 
 
 def converted(camera: Camera, depth_m: Float32, given: str, wanted: str) -> Float32:
-    """Return (H,W) depth in the other measure (``z`` or ``range``), 0 without a z > 0."""
+    """Convert an (H,W) depth map between depth along the optical axis and range.
+
+    Args:
+        camera: The camera of the map.
+        depth_m: (H,W) metres, 0 for pixels without depth.
+        given: Measure of ``depth_m``, ``z`` or ``range``.
+        wanted: Measure of the result. Pixels whose ray has z <= 0 become 0, unless the measures
+            are the same and the map is returned unchanged.
+    """
     if given == wanted:
         return depth_m
     v, u = np.divmod(np.arange(depth_m.size, dtype=np.float64), camera.width_px)
@@ -123,8 +141,12 @@ def converted(camera: Camera, depth_m: Float32, given: str, wanted: str) -> Floa
 class _Lens(NamedTuple):
     """The distortion of a lens on the plane.
 
-    numerator and denominator: of the radial factor, polynomials in the squared radius. limit:
-    squared radius up to which the distorted radius grows.
+    Attributes:
+        numerator: Polynomial in the squared radius, over ``denominator`` the radial factor.
+        denominator: Polynomial in the squared radius.
+        p1: Tangential coefficient.
+        p2: Tangential coefficient.
+        limit: Squared radius up to which the distorted radius grows.
     """
 
     numerator: Polynomial
@@ -135,6 +157,7 @@ class _Lens(NamedTuple):
 
 
 def _lens(camera: Camera) -> _Lens:
+    """Return the lens of a camera; raise InputError for an unknown model or bad coefficients."""
     given = camera.distortion
     if camera.model not in _COEFFICIENTS:
         raise InputError(
@@ -179,7 +202,7 @@ def _stops_growing(n: Polynomial, d: Polynomial) -> float:
 
 
 def _in_view(camera: Camera, lens: _Lens, points_cam: Float) -> Bool:
-    """Return (N,) True for directions in the view of the lens, in the image or not."""
+    """Return (N,) True for directions in the view of the lens, inside or outside the image."""
     x, y, z = points_cam.T
     range_m = np.sqrt(x * x + y * y + z * z)  # norm takes three times as long
     seen: Bool = z >= range_m * np.cos(np.radians(camera.max_angle_deg))
@@ -197,7 +220,7 @@ def _in_view(camera: Camera, lens: _Lens, points_cam: Float) -> Bool:
 
 
 def _plane(camera: Camera, points_cam: Float) -> tuple[Float, Float]:
-    """Return coordinates on the plane, before any distortion."""
+    """Return (N,) x and y on the plane, before distortion, of points (N,3) in the camera frame."""
     x, y, z = points_cam.T
     if camera.model == "pinhole":
         return x / z, y / z
@@ -206,13 +229,13 @@ def _plane(camera: Camera, points_cam: Float) -> tuple[Float, Float]:
         return x / depth, y / depth
     aside = np.hypot(x, y)
     with np.errstate(invalid="ignore", divide="ignore"):
-        on_axis = np.where(z > 0, 1.0, np.nan)  # straight behind the lens there is no direction
+        on_axis = np.where(z > 0, 1.0, np.nan)  # straight behind the lens the angle is undefined
         stretch = np.where(aside > 0, np.arctan2(aside, z) / aside, on_axis)
     return stretch * x, stretch * y
 
 
 def _direction(camera: Camera, x: Float, y: Float) -> Float:
-    """Return the (N,3) inverse of `_plane`, of any length."""
+    """Return (N,3) directions, of any length, from (N,) x and y on the plane; inverts `_plane`."""
     if camera.model == "pinhole":
         return np.column_stack([x, y, np.ones(len(x))])
     squared = x**2 + y**2
@@ -227,7 +250,7 @@ def _direction(camera: Camera, x: Float, y: Float) -> Float:
 
 
 def _bent(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float]:
-    """Return distorted coordinates on the plane."""
+    """Return (N,) distorted x and y on the plane."""
     s = x**2 + y**2
     factor = lens.numerator(s) / lens.denominator(s)
     bent_x = factor * x + 2 * lens.p1 * x * y + lens.p2 * (s + 2 * x**2)
@@ -244,9 +267,9 @@ def _pixels(camera: Camera, lens: _Lens, points_cam: Float) -> Float:
 
 
 def _unbent(lens: _Lens, wanted: Float) -> Float:
-    """Return the (N,2) inverse of `_bent`, NaN where there is none.
+    """Return the (N,2) inverse of `_bent`, NaN where the inverse does not exist.
 
-    The radial part is looked up. Newton's method adds the rest.
+    A table gives the radial part. Newton's method then refines the result.
     """
     # Evenly in angle, because the plane of a lens with a half-space view is infinite.
     radius = np.tan(np.linspace(0, np.arctan(np.sqrt(lens.limit)), _NUM_ANGLES))
@@ -268,7 +291,12 @@ def _unbent(lens: _Lens, wanted: Float) -> Float:
 
 
 def _slopes(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float, Float]:
-    """Return (N,) derivatives of the distorted x by x, of either by the other, and of y by y."""
+    """Return three (N,) partial derivatives of the distortion on the plane.
+
+    Returns:
+        Derivative of the distorted x by x; of the distorted x by y, which equals that of the
+        distorted y by x; and of the distorted y by y.
+    """
     s, n, d = x**2 + y**2, lens.numerator, lens.denominator
     factor = n(s) / d(s)
     growth = 2 * (n.deriv()(s) - factor * d.deriv()(s)) / d(s)

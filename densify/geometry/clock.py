@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answer which sweeps are near each other in time."""
+"""Find sweeps that are near each other in time."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _BATCH_S = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """Reference times of W sweeps, at any rate and with gaps.
+    """Reference times of W sweeps, at any rate and with missing sweeps.
 
-    Sweeps are addressed by their index.
+    Its methods take and return sweep indices, 0 to W - 1.
 
     Attributes:
         time_ns: (W,) int64, ascending.
@@ -28,33 +28,34 @@ class Clock:
 
     @staticmethod
     def of(stretch: Stretch) -> Clock:
-        """Return the clock of a stretch; times count from its first sweep."""
+        """Return the clock of a stretch. Time 0 is the reference time of its first sweep."""
         stamp_ns = np.array([s.sweep.stamp_ns for s in stretch.sweeps], np.int64)
         return Clock(stamp_ns - stamp_ns[:1])
 
     @cached_property
     def time_s(self) -> Float:
-        """The (W,) `time_ns` in seconds."""
+        """The (W,) reference times in seconds."""
         return np.asarray(self.time_ns * 1e-9, np.float64)
 
     @cached_property
     def period_ns(self) -> float:
-        """The median time between two sweeps, infinite for fewer than two."""
+        """The median time between consecutive sweeps, infinite for fewer than two sweeps."""
         return float(np.median(np.diff(self.time_ns))) if len(self.time_ns) > 1 else np.inf
 
     def near(self, i: int, j: int, reach_s: float) -> bool:
-        """Return True if two sweeps are at most ``reach_s`` and half a period apart."""
+        """Return True if sweeps i and j are at most ``reach_s`` plus half a period apart."""
         return bool(abs(self.time_ns[i] - self.time_ns[j]) <= self._slack_ns(reach_s))
 
     def num_in(self, duration_s: float) -> int:
-        """Return the number of periods in the duration, at least 1."""
+        """Return the number of sweep periods in a duration, rounded, at least 1."""
         return max(1, round(duration_s * 1e9 / self.period_ns))
 
     def batches(self) -> tuple[tuple[int, ...], ...]:
-        """Return groups of consecutive sweeps within less than 0.1 s, to the nearest sweep.
+        """Return groups of consecutive sweep indices, each group covering about 0.1 s.
 
-        A faster scanner has fewer points in a sweep, and objects move less between sweeps. A batch
-        holds as much evidence as one sweep at 10 Hz, where each batch is one sweep.
+        A faster scanner measures fewer points per sweep, and objects move less between its sweeps.
+        A batch therefore has about as many points as one sweep at 10 Hz. At 10 Hz or slower each
+        batch is one sweep.
         """
         groups: list[list[int]] = []
         for j, time_ns in enumerate(self.time_ns.tolist()):
@@ -66,10 +67,12 @@ class Clock:
         return tuple(map(tuple, groups))
 
     def around(self, i: int, reach_s: float, most: int) -> list[int]:
-        """Return the other sweeps within ``reach_s`` and half a period of sweep i, ascending.
+        """Return the sweeps within ``reach_s`` plus half a period of sweep i, without i, ascending.
 
         Args:
-            most: Number of sweeps on each side. A larger number is thinned out evenly.
+            i: Index of a sweep.
+            reach_s: Greatest time before and after sweep i.
+            most: Greatest number of sweeps on each side. A larger number is thinned out evenly.
         """
         within_ns = self._slack_ns(reach_s)
         first = int(np.searchsorted(self.time_ns, self.time_ns[i] - within_ns))
@@ -78,20 +81,31 @@ class Clock:
         return sorted(_thinned(before, most) + _thinned(after, most))
 
     def at(self, i: int, later_s: float) -> int | None:
-        """Return the sweep nearest to ``later_s`` after sweep i, or before it if negative.
+        """Return the sweep whose time is nearest to ``later_s`` after sweep i.
 
-        Only sweeps on that side count. Without any, return None.
+        Args:
+            i: Index of a sweep.
+            later_s: Time in seconds. If positive, only sweeps after i are candidates, else only
+                sweeps before i.
+
+        Returns:
+            The index, or None if no sweep is on that side.
         """
         side = range(i + 1, len(self.time_ns)) if later_s > 0 else range(i - 1, -1, -1)
         wanted_ns = self.time_ns[i] + later_s * 1e9
         return min(side, key=lambda j: abs(self.time_ns[j] - wanted_ns), default=None)
 
     def nearest(self, j: int, among: Iterable[int]) -> int:
-        """Return the one of these sweeps that is nearest to sweep j, the earlier of two."""
+        """Return the candidate nearest in time to sweep j, the earlier candidate of two.
+
+        Args:
+            j: Index of a sweep.
+            among: Indices of the candidate sweeps.
+        """
         return min(among, key=lambda k: (abs(self.time_ns[k] - self.time_ns[j]), k))
 
     def from_end_s(self, i: int) -> float:
-        """Return the time to the nearer end."""
+        """Return the seconds from sweep i to the first or the last sweep, whichever is nearer."""
         from_end_ns = min(self.time_ns[i] - self.time_ns[0], self.time_ns[-1] - self.time_ns[i])
         return float(from_end_ns) / 1e9
 
@@ -100,7 +114,7 @@ class Clock:
 
 
 def num_in_batch(period_s: float) -> int:
-    """Return the number of sweeps in a batch, see `Clock.batches`."""
+    """Return the number of sweeps in one batch of `Clock.batches` at this sweep period."""
     return max(1, int(np.ceil(_BATCH_S / period_s + 0.5)) - 1)
 
 

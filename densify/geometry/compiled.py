@@ -68,9 +68,9 @@ def inlined(function: _Function) -> _Function:
 
 
 def _imported_code(function: Callable[..., Any]) -> str:
-    """Return a digest of the imported files of inlined functions.
+    """Return a digest of the source files of the inlined functions, "" if all are in the same file.
 
-    Numba's cache notices changes of the function's own file only.
+    Numba's cache detects changes of the function's own file only.
     """
     files = {
         f.__code__.co_filename for f in function.__globals__.values() if isinstance(f, Dispatcher)
@@ -82,7 +82,7 @@ def _imported_code(function: Callable[..., Any]) -> str:
 
 @cache
 def _is_open(folder: Path) -> bool:
-    """Return True, with a warning, if others can write to the folder or to its parent."""
+    """Return True, and warn, if other users can write to the folder or to its parent."""
     found = next((f for f in (folder, folder.parent) if others_can_write(f)), None)
     if found is not None:
         _log.warning(
@@ -94,12 +94,12 @@ def _is_open(folder: Path) -> bool:
 
 
 class Kernel:
-    """A function that is compiled at the first call with new types, and cached for later runs.
+    """A function compiled by numba at the first call with new types, and cached for later runs.
 
-    The cache is beside the source file, else in the user's cache directory, or where the
-    environment variable NUMBA_CACHE_DIR says. A cache is not used if it cannot be written, is
-    damaged, or if other users than those who can change the source could have written it, because
-    it is loaded as code. The function is then compiled in every run.
+    The cache is beside the source file, else in the user's cache directory, or in the folder that
+    the environment variable NUMBA_CACHE_DIR names. The cache is loaded as code. It is therefore
+    ignored if users who cannot change the source could have written it, and also if it is damaged
+    or not writable. The function is then compiled in every run.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -124,29 +124,34 @@ class Kernel:
             return self._compiled(*arguments)
 
     def over_rows(self, num_rows: int, *arguments: Any) -> None:
-        """Call with (begin, end, *arguments) for parts of the rows, on all cores.
+        """Call the kernel as ``kernel(begin, end, *arguments)`` for row ranges, on all cores.
 
-        The parts do not change the result of a kernel that treats each row alone. NUMBA_NUM_THREADS
-        limits the threads.
+        Args:
+            num_rows: Number of rows; the ranges cover 0 to ``num_rows``.
+            arguments: Arrays that the kernel reads and writes. Its result for a row must depend on
+                that row alone.
         """
         over_rows(self, num_rows, *arguments)
 
     def _do_without_cache(self, error: Exception | str) -> None:
+        """Compile the function anew, without a cache, and log the reason."""
         _log.debug("%s is compiled without a cache: %s", self._function.__name__, error)
         self._compiled = numba.njit(self._function, **_OPTIONS)
 
 
 def num_threads() -> int:
-    """Return the number of cores this process may use, or NUMBA_NUM_THREADS if that is fewer."""
+    """Return the number of cores this process may use, or NUMBA_NUM_THREADS if that is smaller."""
     return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
 def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> None:
-    """Call ``function(begin, end, *arguments)`` for ranges that cover 0 to ``num_rows``.
+    """Call ``function(begin, end, *arguments)`` on all cores, for ranges that cover all rows.
 
     Args:
-        function: Its result for a row must depend on that row alone. It must not call this
-            function.
+        function: Writes its result into the argument arrays. Its result for a row must depend on
+            that row alone. It must not call `over_rows`.
+        num_rows: Number of rows; the ranges cover 0 to ``num_rows``.
+        arguments: Passed on to each call.
     """
     num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
     if num_parts <= 1:

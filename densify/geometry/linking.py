@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Group points by distance (single linkage), and find the points close to seeds; exact."""
+"""Group points by single linkage, and find the points close to dense seeds; both exact."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from densify.geometry.types import Bool, Float, Int
 def link(points: Float, distance_m: float) -> tuple[int, Int]:
     """Return groups of points by single linkage: points closer than ``distance_m`` share a group.
 
-    All points of a grid cell whose diagonal is the distance are linked. Only cells are paired.
-    Therefore the cost does not grow with the square of the density.
+    The points are sorted into a grid whose cell diagonal equals the distance, hence all points of a
+    cell are linked. Only neighbouring cells are compared, and the cost does not grow with the
+    square of the point density.
 
     Args:
         points: (N,3) metres.
         distance_m: Greatest distance of linked points.
 
     Returns:
-        The number of groups and (N,) labels, numbered by the first point of each group.
+        The number of groups G, and (N,) int64 group labels 0 to G - 1, numbered by the first point
+        of each group.
     """
     if not len(points):
         return 0, np.zeros(0, np.int64)
@@ -47,11 +49,13 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
 def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
     """Return (N,) True for the points closer than ``within_m`` to a dense seed.
 
-    A seed is dense if at least ``least_share`` of the points within that distance of it are seeds.
+    A seed is dense if at least ``least_share`` of the points within ``within_m`` of it are seeds.
 
     Args:
         points: (N,3) metres.
-        seed: (N,) bool.
+        seed: (N,) bool, True for the seeds among the points.
+        within_m: Distance in metres, for both tests.
+        least_share: Share of 0 to 1.
     """
     seeds = points[seed]
     if not len(seeds):
@@ -68,10 +72,14 @@ def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: floa
 
 @Kernel
 def _join(points: Float, start: Int, pairs: Int, squared: float, parent: Int) -> None:
-    """Give cells with linked points one root in ``parent`` (C,), which starts as 0 to C - 1.
+    """Link cells that have two points closer than the distance, by union-find in place.
 
-    points: (N,3) by cell, those of cell c from ``start[c]`` to ``start[c + 1]``. pairs: (P,2) of
-    cells that may be linked. squared: of the distance.
+    Args:
+        points: (N,3) metres, sorted by cell.
+        start: (C+1,) cell c owns the points ``start[c]`` to ``start[c + 1] - 1``.
+        pairs: (P,2) cells that may be linked.
+        squared: Square of the distance in m².
+        parent: (C,) starts as 0 to C - 1; changed to the root cell of each cell.
     """
     for k in range(len(pairs)):
         a, b = _root(parent, pairs[k, 0]), _root(parent, pairs[k, 1])
@@ -83,6 +91,7 @@ def _join(points: Float, start: Int, pairs: Int, squared: float, parent: Int) ->
 
 @inlined
 def _root(parent: Int, cell: int) -> int:
+    """Return the root of a cell, and shorten the path to it in ``parent``."""
     while parent[cell] != cell:
         parent[cell] = parent[parent[cell]]
         cell = parent[cell]
@@ -91,7 +100,7 @@ def _root(parent: Int, cell: int) -> int:
 
 @inlined
 def _touch(points: Float, start: Int, one: int, other: int, squared: float) -> bool:
-    """Return True if two points of the cells are closer than the distance."""
+    """Return True if a point of one cell is closer than the distance to a point of the other."""
     for i in range(start[one], start[one + 1]):
         for j in range(start[other], start[other + 1]):
             dx, dy = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find nearest neighbours by SciPy's tree, and thin clouds by a grid."""
+"""Find nearest neighbours by SciPy's k-d tree, and thin point clouds by a grid."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from densify.geometry.types import Bool, Float, Float32, Int
 
 
 def tree_of(points: Float) -> cKDTree:
-    """Return the tree of (M,d) points, built fast for few searches."""
+    """Return the k-d tree of (M,d) points, optimised for fast construction and few queries."""
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Float, Int]:
-    """Return (N,) distances to the nearest point and (N,) its row.
-
-    Beyond ``within_m`` they are inf and -1.
+    """Return the distance to the nearest point of the tree, and the row of that point.
 
     Args:
-        queries: (N,d).
+        queries: (N,d) positions.
+        within_m: Greatest distance.
+
+    Returns:
+        (N,) distances and (N,) int64 rows of the tree's points; inf and -1 for a query without a
+        point closer than ``within_m``.
     """
     distance_m, row = tree.query(queries, distance_upper_bound=within_m)
     distance_m = np.asarray(distance_m)
@@ -28,29 +31,32 @@ def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Fl
 
 
 def nearest_k(tree: cKDTree, queries: Float, k: int) -> tuple[Float, Int]:
-    """Return (N,k) distances to the nearest points, nearest first, and (N,k) their rows.
+    """Return the distances to the k nearest points of the tree, and the rows of these points.
 
     Args:
-        queries: (N,d).
-        k: Is cut to the number of points.
+        queries: (N,d) positions.
+        k: Number of neighbours, reduced to M if larger.
+
+    Returns:
+        (N,k) distances, ascending, and (N,k) int64 rows of the tree's points.
     """
     distance_m, row = tree.query(queries, np.arange(1, min(k, tree.n) + 1))
     return np.asarray(distance_m), np.asarray(row, np.int64)
 
 
 def is_near(tree: cKDTree, queries: Float, within_m: float) -> Bool:
-    """Return (N,) True for the (N,d) queries closer to a point than ``within_m``."""
+    """Return (N,) True for (N,d) queries with a point of the tree closer than ``within_m``."""
     return np.isfinite(tree.query(queries, distance_upper_bound=within_m)[0])
 
 
 def thinned(points: Float | Float32, order: Int, step: float, most: int) -> Int:
-    """Return the rows, ascending, of (N,3) points after thinning by a grid.
-
-    Each cell keeps the first ``most`` of its points.
+    """Thin points by a grid, and return the rows of the points that are kept, ascending.
 
     Args:
-        order: Rows in the order of preference. Other rows are dropped.
-        step: Side of a cell.
+        points: (N,3).
+        order: (K,) rows of the candidates, the preferred ones first. All other rows are dropped.
+        step: Side of a grid cell, in the unit of the points.
+        most: Number of candidates kept in each cell.
     """
     low = points.min(axis=0, initial=np.inf).astype(np.float64)
     cell = ((points.take(order, axis=0) - low) / step).astype(np.int64)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Compute with rigid motions: (4,4) float64 matrices named ``T_target_source``.
 
-Some functions take (...,4,4).
+Twists are (6,) vectors: rotation vector (rad), then translation (m), or both per second.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.arrays import Float, Int
 
-_ROWS = 8192  # at once; for more rows OpenBLAS wakes threads that spin longer than the work takes
-_HOLD = 1e-9  # keeps points on a line from turning about it
+_ROWS = 8192  # per product; for more, OpenBLAS wakes threads that spin longer than they work
+_HOLD = 1e-9  # relative weight of no rotation, which decides where points leave it open
 
 
 def inverse(T_a_b: Float) -> Float:
-    """Return ``T_b_a`` of poses (...,4,4)."""
+    """Return the inverse ``T_b_a`` (...,4,4) of poses ``T_a_b`` (...,4,4)."""
     R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
     T_b_a = np.zeros(T_a_b.shape)
     T_b_a[..., :3, :3], T_b_a[..., 3, 3] = R_b_a, 1
@@ -25,14 +25,14 @@ def inverse(T_a_b: Float) -> Float:
 
 
 def transform(T_a_b: Float, points_b: Float) -> Float:
-    """Return points (N,3) of frame b in frame a."""
+    """Return (N,3) points, given in frame b, in frame a."""
     points_a = rotate(T_a_b, points_b)
     points_a += T_a_b[:3, 3]
     return points_a
 
 
 def rotate(T_a_b: Float, vectors_b: Float) -> Float:
-    """Return vectors (N,3) of frame b in frame a."""
+    """Return (N,3) vectors, given in frame b, in the axes of frame a."""
     R, vectors_a = T_a_b[:3, :3].T, np.empty(vectors_b.shape)
     for i in range(0, len(vectors_b), _ROWS):
         np.matmul(vectors_b[i : i + _ROWS], R, out=vectors_a[i : i + _ROWS])
@@ -40,17 +40,17 @@ def rotate(T_a_b: Float, vectors_b: Float) -> Float:
 
 
 def log(T_a_b: Float) -> Float:
-    """Return the (...,6) rotation vector (rad) and translation (m) of poses (...,4,4).
+    """Return the (...,6) twists of poses (...,4,4): rotation vector (rad), then translation (m).
 
-    The translation is the plain one, not that of the screw. At the turn of a vehicle within a sweep
-    (≤ 0.1 rad) the two paths differ by millimetres, and rotation and translation stay separate.
+    The translation is the pose's own, not the one of a screw motion. For a vehicle that turns by at
+    most 0.1 rad within a sweep the two paths differ by millimetres.
     """
     turn = Rotation.from_matrix(T_a_b[..., :3, :3]).as_rotvec()
     return np.concatenate([turn, T_a_b[..., :3, 3]], axis=-1)
 
 
 def exp(twist: Float) -> Float:
-    """Return the poses (...,4,4) of (...,6), the inverse of `log`."""
+    """Return the poses (...,4,4) of twists (...,6) in rad and m; inverts `log`."""
     T_a_b = np.zeros((*twist.shape[:-1], 4, 4))
     T_a_b[..., :3, :3] = Rotation.from_rotvec(twist[..., :3]).as_matrix()
     T_a_b[..., :3, 3], T_a_b[..., 3, 3] = twist[..., 3:], 1
@@ -58,18 +58,37 @@ def exp(twist: Float) -> Float:
 
 
 def twist_between(T_world_a: Float, T_world_b: Float, seconds: float) -> Float:
-    """Return the (6,) twist per second (rad/s, m/s) from a to b, in the frame of a."""
+    """Return the (6,) velocity (rad/s, m/s) of the motion from pose a to pose b, in frame a.
+
+    Args:
+        T_world_a: (4,4) first pose.
+        T_world_b: (4,4) second pose.
+        seconds: Time from a to b.
+    """
     return log(inverse(T_world_a) @ T_world_b) / seconds
 
 
 def twist_to(T_world_lidar: Float, stamp_ns: Int, i: int) -> Float:
-    """Return the (6,) twist per second from pose i - 1 to pose i, of (n,4,4) at (n,) times."""
+    """Return the (6,) velocity (rad/s, m/s) from pose i - 1 to pose i, in the frame of pose i - 1.
+
+    Args:
+        T_world_lidar: (n,4,4) poses.
+        stamp_ns: (n,) times of the poses.
+        i: Index of 1 to n - 1.
+    """
     seconds = (stamp_ns[i] - stamp_ns[i - 1]) * 1e-9
     return twist_between(T_world_lidar[i - 1], T_world_lidar[i], seconds)
 
 
 def carried(T_a_b: Float, twist_b: Float) -> Float:
-    """Return (...,6) twists of frames b as those of frames a fixed to them (the adjoint)."""
+    """Return twists (...,6) of frame b expressed in frame a, by the adjoint of ``T_a_b``.
+
+    Frames a and b are fixed to the same rigid body.
+
+    Args:
+        T_a_b: (...,4,4) poses of b in a.
+        twist_b: (...,6) twists in frame b; rotation first.
+    """
     R_a_b = T_a_b[..., :3, :3]
     turn = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., :3])
     along = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., 3:])
@@ -77,21 +96,30 @@ def carried(T_a_b: Float, twist_b: Float) -> Float:
 
 
 def transform_each(twist: Float, points: Float) -> Float:
-    """Return points (N,3), each moved by its own ``exp(twist)``, (N,6)."""
+    """Return the (N,3) points after moving each point by ``exp`` of its own twist.
+
+    Args:
+        twist: (N,6) rotation vector (rad) and translation (m) of each point.
+        points: (N,3) metres.
+    """
     moved: Float = Rotation.from_rotvec(twist[:, :3]).apply(points)
     moved += twist[:, 3:]
     return moved
 
 
 def interpolate(T_world_a: Float, T_world_b: Float, fraction: float) -> Float:
-    """Return the pose ``fraction`` of the way from a (0) to b (1), extrapolated outside."""
+    """Return the (4,4) pose between a (fraction 0) and b (fraction 1), or beyond."""
     return T_world_a @ exp(fraction * log(inverse(T_world_a) @ T_world_b))
 
 
 def fit_rigid(source: Float, target: Float) -> Float:
-    """Return the (4,4) pose that moves (N,3) points nearest to others (Kabsch 1976).
+    """Return the (4,4) rigid motion that maps source points to target points in least squares.
 
-    Points on a line do not turn about it, and a single point does not turn.
+    A rotation that the points do not determine, as about a line of points, is zero (Kabsch 1976).
+
+    Args:
+        source: (N,3) metres.
+        target: (N,3) metres, the corresponding points row by row.
     """
     from_m, to_m = source.mean(axis=0), target.mean(axis=0)
     # einsum and not BLAS: its sums do not depend on the number of threads.

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The pipeline: the steps in order (`densify.pipeline.run.run`), and what is kept between them."""
+"""Run the pipeline stages in order (`densify.pipeline.run.run`), and cache their results."""

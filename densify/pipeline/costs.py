@@ -16,16 +16,17 @@ _PER_MB = 1024 * 1024 if sys.platform == "darwin" else 1024  # of getrusage(2)
 
 
 class Watch:
-    """Measure stages, which may run in several threads. Their seconds are added up.
+    """Measure the wall time and memory of stages, which may run in several threads.
 
-    A stage that calls another one waits: those seconds count for the inner one only.
+    Times of all threads are added up. While a stage calls an inner stage, only the inner stage's
+    time counts.
     """
 
     def __init__(self, progress: Progress | None = None) -> None:
         """Begin to measure.
 
         Args:
-            progress: Is called with (stage, done, total), by one thread at a time.
+            progress: Callback (stage, done, total), called by one thread at a time.
         """
         self._progress = progress
         self._seconds: dict[str, float] = {}
@@ -35,7 +36,7 @@ class Watch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Measure the work inside the block as the stage of this name."""
+        """Measure the work inside the ``with`` block as the stage of this name."""
         self._report(name, 0)
         begin_s, inner_s = time.perf_counter(), getattr(self._thread, "inner_s", 0.0)
         self._thread.inner_s = 0.0
@@ -51,7 +52,7 @@ class Watch:
         self._report(name, 1)
 
     def costs(self) -> tuple[StageCost, ...]:
-        """Return the costs so far. Several runs of a stage are added up."""
+        """Return the cost of each stage measured until now, repeated runs of a stage added up."""
         return tuple(StageCost(n, self._seconds[n], peak) for n, peak in self._peak_mb.items())
 
     def _report(self, name: str, done: int) -> None:

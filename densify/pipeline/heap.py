@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Set how the C library keeps memory for arrays."""
+"""Set how the C library reuses the memory of freed arrays."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _MOST_OF_OLDER_BYTES = 2**25  # older releases refuse a larger threshold of mmap
 
 
 def keep_freed_memory() -> None:
-    """Let all threads of this process share one heap, which keeps freed memory of large arrays.
+    """Let all threads of this process share one heap that keeps the freed memory of large arrays.
 
-    Otherwise each thread has a heap of its own, and the system takes and clears the pages of every
-    large array again. Call this before threads are started. It does nothing if the C library is not
+    By default each thread has its own heap, and the system takes back and clears the pages of every
+    large array. Call this before threads are started. It does nothing if the C library is not
     glibc.
     """
     with suppress(OSError, AttributeError, TypeError):  # another library, or none by that name

@@ -23,14 +23,13 @@ from densify.scores.cloud_scores import ghost_scores
 
 
 class Method(NamedTuple):
-    """One method.
+    """The stages that a method uses.
 
     Attributes:
         all_sweeps: Use all sweeps of the window, else the key sweep alone.
-        engine: Engine of scene flow (``flow.engine``), "" for the configured one, None for
-            rigid accumulation.
-        visible: Reject occluded and unsupported points. Else each pixel shows its nearest
-            point.
+        engine: Name of the scene-flow engine (``flow.engine``), "" for the configured engine, None
+            for rigid accumulation.
+        visible: Reject occluded and unsupported points, else each pixel shows its nearest point.
         far: Add static surfaces beyond the window (``accumulate.far_m``).
     """
 
@@ -49,20 +48,20 @@ METHODS = {
     "paper": Method(True, "paper", True, True),
     "flow": Method(True, "", True, True),
 }
-"""Single sweep; rigid accumulation of the window, with the road beyond it, with visibility; our
-scene flow without visibility; the published scene flow; ours."""
+"""Methods, in order: single sweep; rigid accumulation of the window; with the far range added; with
+visibility too; scene flow without visibility; the published scene flow; our scene flow."""
 
 RUN = ("none", "icp", "flow")
-"""The methods of `run`; where scores are wanted, each with those before it as its baselines."""
+"""The methods of `run`; if scored, a method has the methods before it as its baselines."""
 COMPARED = ("none", "icp", "icp-far", "paper", "flow")
 """The methods that `compare` shows by default."""
 
 
 def methods_of_run(method: str, settings: Config) -> tuple[str, ...]:
-    """Return a method of `RUN`, after the simpler ones if it is scored.
+    """Return the method of `RUN`, preceded by its simpler baselines if results are scored.
 
     Raises:
-        InputError: It is another one.
+        InputError: The method is not in `RUN`.
     """
     if method not in RUN:
         raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
@@ -70,7 +69,7 @@ def methods_of_run(method: str, settings: Config) -> tuple[str, ...]:
 
 
 def looks_around(methods: Sequence[str]) -> bool:
-    """Return True if one of the methods finds moving objects."""
+    """Return True if a method of the list estimates scene flow."""
     return any(METHODS[name].engine is not None for name in methods if name in METHODS)
 
 
@@ -78,13 +77,16 @@ class KeyScene(NamedTuple):
     """The inputs that all methods of a key share.
 
     Attributes:
-        stretch: Window of the key.
-        beyond: Static surfaces beyond the window; None if unknown or unwanted.
+        settings: All settings.
+        key: Frame number of the key sweep.
+        stretch: Registered sweeps of the key's window.
+        beyond: Static surfaces beyond the window; None if unknown or not requested.
         key_image: Range image of the key sweep.
-        views: Views of the maps.
-        images: (H,W,3) RGB of the coloured maps.
-        truth: True depth and moving pixels, by map.
-        held_out: The key sweep as the truth of a map made without it; None without scores.
+        views: Viewpoints of the depth maps.
+        images: Map name -> (H,W,3) RGB image that colours the cloud.
+        truth: Map name -> ground-truth depth (H,W) in metres and mask (H,W) of moving pixels.
+        held_out: The key sweep as ground truth for maps made without it; None without scores.
+        watch: Measures the stages.
     """
 
     settings: Config
@@ -103,8 +105,9 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment, filled: bool) -
     """Return the result of one method, without its baselines.
 
     Args:
-        moment: The points at the key's time, as the method accumulates them.
-        filled: Fill the maps.
+        name: Name of the method, of `METHODS`.
+        moment: Points at the key's time, as this method accumulates them.
+        filled: Fill holes of the maps by interpolation.
     """
     method, output = METHODS[name], scene.settings.output
     views, watch, stretch = scene.views, scene.watch, scene.stretch
@@ -158,7 +161,7 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment, filled: bool) -
 
 
 def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
-    """Return the static surfaces beyond the window in the views of the cameras."""
+    """Return the static surfaces beyond the window as the cameras see them; None if not used."""
     if not method.far or scene.beyond is None:
         return None
     with scene.watch.stage("far"):
@@ -168,7 +171,7 @@ def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
 def _add_ages(
     scene: KeyScene, method: Method, depth: Mapping[str, DepthMap]
 ) -> dict[str, DepthMap]:
-    """Return the maps with the time between exposure and source sweep of each pixel."""
+    """Return the maps with the time between the exposure and the source sweep of each pixel."""
     stamps_ns = {s.frame: s.sweep.stamp_ns for s in scene.stretch.sweeps}
     if method.far and scene.beyond is not None:
         far = scene.beyond.standing
@@ -181,9 +184,9 @@ def _add_ages(
 
 
 def _without_times(scene: KeyScene, depth: dict[str, DepthMap]) -> dict[str, DepthMap]:
-    """Return maps that are less confident where sweeps have no times of points.
+    """Return the maps with a lower confidence if sweeps have no point times for deskewing.
 
-    Sweeps that are compensated already need none.
+    Sweeps already compensated for motion need no point times and keep their confidence.
     """
     sweeps, at = [s.sweep for s in scene.stretch.sweeps], scene.stretch[scene.key]
     untimed = np.mean([sweep.offset_ns is None for sweep in sweeps])
@@ -207,7 +210,7 @@ def _without_times(scene: KeyScene, depth: dict[str, DepthMap]) -> dict[str, Dep
 def _metrics(
     scene: KeyScene, cloud: Cloud, depth: Mapping[str, DepthMap], visible: bool
 ) -> dict[str, Any]:
-    """Return the scores without truth, and those against the truth if there is one."""
+    """Return the scores that need no ground truth, and depth scores if ground truth is given."""
     metrics: dict[str, Any] = {
         "num_points": len(cloud),
         "num_moving": int(cloud.moving.sum()),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Complete a result with depth images that the user brings."""
+"""Complete the depth maps of a result with depth images that the user supplies (priors)."""
 
 from __future__ import annotations
 
@@ -27,15 +27,20 @@ def complete_with_prior(
     truth: Mapping[str, tuple[Float32, Bool]],
     kind: str,
 ) -> Result:
-    """Return the result with ``full`` and its scores. A prior that does not fit gets a warning.
+    """Return the result with completed maps (``full``) and their scores.
+
+    A prior that does not fit the measured depth is not used, and a warning is logged.
 
     Args:
-        shots: Of the maps, by name.
-        truth: True depth and moving pixels, (H,W) each, if known.
-        kind: The setting ``prior.kind``.
+        result: Result of one method; not changed.
+        files: The user's depth images.
+        shots: Map name -> camera, image number and time of the map.
+        truth: Map name -> ground-truth depth (H,W) in metres and mask (H,W) of moving pixels.
+            Maps without ground truth are missing.
+        kind: Setting ``prior.kind``.
 
     Raises:
-        InputError: There is no prior of any map.
+        InputError: No map has a prior.
     """
     full, metrics = {}, copy.deepcopy(dict(result.metrics))
     for name, prior in _read(files, shots, result.key).items():
@@ -61,7 +66,7 @@ def complete_with_prior(
 
 
 def _read(files: PriorFiles, shots: Mapping[str, Shot], key: int) -> dict[str, Prior]:
-    """Return the priors by the names of the maps: of their images, or else of the key."""
+    """Return map name -> prior, read by image number, or by key if the map shows no image."""
     found, lacking = {}, []
     for name, shot in shots.items():
         number = key if shot.number is None else shot.number

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A recording, and the steps that its keys share, each made once for a block of sweeps::
+"""A recording, and the pipeline steps computed once for a block of neighbouring keys::
 
-    registration   poses of the block's sweeps, piece by piece
+    registration   poses of the block's sweeps, one world per piece
     deskewed       sweeps in the world of their piece
     ground         height map
-    motion         motion of everything, by free-space violations
-    far            static surfaces along the road, measured beyond the windows
+    motion         scene flow of all points, from free-space violations
+    far            static surfaces along the road beyond the windows
 
-Sweeps that cannot be read or registered, and holes in time, split a block into pieces, each with a
-world of its own. `run` and `compare` cut blocks around a few keys, which look at nothing else;
-`dataset` and `flow_steps` cut the whole recording (`densify.pipeline.sweeps`). Registration, motion
-and far are kept in the cache.
+A block is split into pieces at sweeps that cannot be read or registered, and at holes in time.
+`run` and `compare` cut blocks around a few keys and read no other sweeps; `dataset` and
+`flow_steps` cut the whole recording (`densify.pipeline.sweeps`). Registration, motion and far are
+cached.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ _TELL_SPEED = 2  # sweeps
 
 
 class Piece(NamedTuple):
-    """Registered sweeps of one block and one world.
+    """Registered sweeps of one block that share a world.
 
-    number: of the block. row: of the piece in it. poses: of its sweeps, and of one before them
-    to tell how the lidar moved; the world is the lidar of the first of ``frames``, upright.
-    frames: of its sweeps.
+    number: index of the block. row: index of the piece in the block. poses: poses of the piece's
+    sweeps and of one sweep before them, in the levelled lidar frame of the first of ``frames``.
+    frames: frame numbers of the piece's sweeps.
     """
 
     number: int
@@ -70,7 +70,7 @@ class Piece(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """All points around a key at the key's time. flow: if asked for. tracks: of moving objects."""
+    """Accumulated points at a key's time, the sweeps' flow (or None), and the objects' tracks."""
 
     cloud: Cloud
     flow: StretchFlow | None
@@ -78,14 +78,14 @@ class Moment(NamedTuple):
 
 
 class Beyond(NamedTuple):
-    """Static surfaces along the road beyond a key's window, in a world of their own."""
+    """Static surfaces beyond a key's window, and the (4,4) pose of their world in the key frame."""
 
     standing: StandingWorld
     T_key_standing: Float
 
 
 class Recording:
-    """A sequence with settings, and what the steps find in it. The last results stay in memory."""
+    """A sequence with its settings; computes pipeline steps and keeps recent results in memory."""
 
     def __init__(
         self,
@@ -98,12 +98,13 @@ class Recording:
         watch: Watch | None = None,
         looks_around: bool = False,
     ) -> None:
-        """Read the stamps, nothing else.
+        """Read the time stamps, and choose the blocks of sweeps.
 
-        window: sweeps on each side of a key. keys: work on their windows alone; None for the whole
-        recording. cache: keeps the results of steps on disk. run: the same text for all processes
-        between which no sweep changes; None for this object alone. watch: measures the steps.
-        looks_around: find motion ``flow.look_around_s`` beyond the windows of the keys too.
+        window: number of sweeps on each side of a key. keys: frame numbers; only sweeps around
+        these keys are read; None for all sweeps. cache: keeps results on disk. run: text shared by
+        all processes of a run, during which no sweep changes; None for this object alone. watch:
+        measures the steps. looks_around: also search motion ``flow.look_around_s`` beyond the
+        windows.
 
         Raises InputError if a key does not exist.
         """
@@ -119,7 +120,7 @@ class Recording:
             around_s, step_s = self._look_around(keys) if looks_around else (0.0, 0.0)
             self.cut = Cut.around(timeline, window, keys, around_s)
             self._step_around = max(1, timeline.num_in(step_s))
-            # The sweeps around a window lead in, too.
+            # The sweeps around a window count as lead-in, too.
             self._num_lead_in = max(_TELL_SPEED, timeline.num_in(LEAD_IN_S - around_s))
         self._is_whole = keys is None
         most = max((len(block) for block in self.cut.blocks), default=0)
@@ -129,7 +130,7 @@ class Recording:
         )
         self.registration = lru_cache(maxsize=2)(self._registration)
         self._pieces = lru_cache(maxsize=2)(self._find_pieces)
-        # By the number of a block and the row of a piece, because a piece cannot be hashed.
+        # Keyed by the index of the block and of the piece, because a Piece cannot be hashed.
         self._deskewed = lru_cache(maxsize=most)(self._deskew)
         self._stretch = lru_cache(maxsize=1)(self._make_stretch)
         self._searched = lru_cache(maxsize=2)(self._find_searched)
@@ -138,7 +139,7 @@ class Recording:
         self._far = lru_cache(maxsize=1)(self._find_far)
 
     def _look_around(self, keys: Collection[int]) -> tuple[float, float]:
-        """Return `FlowSettings.around`, by the number of points of the first key."""
+        """Return `FlowSettings.around` for the point rate of the first key."""
         if not keys or self.settings.flow.look_around_s == 0:
             return 0.0, 0.0
         try:
@@ -150,10 +151,10 @@ class Recording:
     # A key
 
     def window_frames(self, key: int) -> WindowFrames:
-        """Return the frames of a key's window, and where it is cut and why.
+        """Return the frames of a key's window, and the reasons if it is smaller than requested.
 
-        Raises InputError if the key does not exist or cannot be used, UnplacedSweepError if it
-        cannot be registered; SweepError if none of its neighbours can.
+        Raises InputError if the key does not exist or is unusable, UnplacedSweepError if it cannot
+        be registered, SweepError if none of its neighbours can be registered.
         """
         whole = self.timeline.window(key, self._num_around)
         number = self.cut.number_of[key]
@@ -171,27 +172,27 @@ class Recording:
         return window
 
     def window(self, key: int) -> Stretch:
-        """Return the registered, deskewed sweeps of a key's window. Errors as `window_frames`."""
+        """Return the registered, deskewed sweeps of a key's window. Raises as `window_frames`."""
         return self._stretch(self.cut.number_of[key], self.window_frames(key).frames)
 
     def raw(self, frame: int) -> Sweep:
-        """Return a sweep as it was fired, without the own vehicle's returns."""
+        """Return a raw sweep (not deskewed), without returns of the own vehicle."""
         return self._sweeps.read(frame)
 
     def around(self, key: int) -> Stretch:
-        """Return the sweeps in which the motion in a key's window is found."""
+        """Return the registered sweeps in which motion for a key's window is searched."""
         piece = self._piece(key)
         return self._stretch(piece.number, self._searched(piece.number, piece.row))
 
     def is_pair(self, key: int) -> bool:
-        """Return True if there are two sweeps around a key: a track needs three."""
+        """Return True if motion of a key is searched in only two sweeps; a track needs three."""
         piece = self._piece(key)
         return len(self._searched(piece.number, piece.row)) == 2
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
-        """Return the motion of everything in a key's window.
+        """Return the scene flow of all points in a key's window.
 
-        engine: None for that of ``flow.engine``; for two sweeps ``pairs`` replaces ``groups``.
+        engine: name, None for ``flow.engine``. With two sweeps ``pairs`` replaces ``groups``.
         """
         engine, window, piece = (
             engine or self.settings.flow.engine,
@@ -203,7 +204,7 @@ class Recording:
         if not engine_row(engine)[0].shared:
             scene = Scene(window, self._ground(piece.number, piece.row))
             return estimate_motion(scene, self.settings, engine)
-        # All poses, but the points of the window only.
+        # All poses, but points only for the sweeps of the window.
         at_hand = {s.frame: s for s in window.sweeps}
         sweeps = [
             at_hand.get(f) or RegisteredSweep.without_points(piece.poses, f)
@@ -213,10 +214,9 @@ class Recording:
         return motion.with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
-        """Return the flow of a sweep to the next; to the one before it where none follows; no step
-        where it is alone.
+        """Return the flow of a sweep to the next sweep, or else to the previous sweep.
 
-        Errors as `window_frames`, but a sweep may be alone.
+        A sweep without neighbours has no step. Raises as `window_frames`, but not for such a sweep.
         """
         window = self.window(frame)
         beside = [f for f in window.frames if f > frame] or [f for f in window.frames if f < frame]
@@ -228,11 +228,11 @@ class Recording:
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
     ) -> Moment:
-        """Accumulate the sweeps around a key at the key's moment.
+        """Accumulate the sweeps of a key's window at the key's reference time.
 
-        all_sweeps: of the window; else the key sweep alone. engine: of the flow that moves the
-        points, "" for the configured one; None for rigid accumulation. with_flow: return the flow
-        of every sweep to the next one on the way to the key too.
+        all_sweeps: use the whole window, else the key sweep alone. engine: name of the scene-flow
+        engine, "" for the configured engine, None for rigid accumulation. with_flow: also return
+        the flow of every sweep to the next sweep towards the key.
         """
         stretch, flow = self.window(key), None
         tracks: tuple[ObjectTrack, ...] = ()
@@ -250,9 +250,9 @@ class Recording:
             return Moment(accumulate(used, fields, key, drop_lost), flow, tracks)
 
     def standing(self, key: int) -> Beyond | None:
-        """Return the static surfaces before and behind the key's window.
+        """Return the static surfaces along the road before and after the key's window.
 
-        None where nothing is known there, or wanted (``accumulate.far_m``).
+        The result is None if none are known, or not requested (``accumulate.far_m``).
         """
         if not self.settings.accumulate.far_m:
             return None
@@ -271,7 +271,7 @@ class Recording:
     # The steps of a block
 
     def _registration(self, number: int) -> Registration:
-        """Register each run of neighbouring sweeps, split again at a sweep that fails."""
+        """Register each run of consecutive sweeps, split at sweeps that cannot be registered."""
         settings, frames = self.settings.register, self._registered_together(number)
 
         def make() -> Registration:
@@ -302,12 +302,12 @@ class Recording:
         return self._kept("registration", frames, make)
 
     def _registered_together(self, number: int) -> list[int]:
-        """Return the frames of a block, behind those of its lead-in."""
+        """Return the frames of a block's lead-in, then of the block."""
         block = self.cut.blocks[number]
         return [*self.timeline.before(block[0], self._num_lead_in), *block]
 
     def _find_pieces(self, number: int) -> list[Piece]:
-        """Return the pieces of a block."""
+        """Return the pieces of a block, with their poses."""
         block = frozenset(self.cut.blocks[number])
         wanted = block.union(self.timeline.before(self.cut.blocks[number][0], 1))
         pieces = list[Piece]()
@@ -325,12 +325,11 @@ class Recording:
             return deskew([sweep], piece.poses).sweeps[0]
 
     def _make_stretch(self, number: int, frames: tuple[int, ...]) -> Stretch:
-        """Return these sweeps of one piece, deskewed, in its world."""
+        """Return sweeps of one piece, deskewed, in the world of the piece."""
         return Stretch(tuple(self._deskewed(number, f) for f in frames))
 
     def _find_searched(self, number: int, row: int) -> tuple[int, ...]:
-        """Return the frames of a piece in which motion is searched: those of the windows, and from
-        there every so many."""
+        """Return the frames of a piece where motion is searched: windows, and every n-th around."""
         frames, inside = self._pieces(number)[row].frames, self._in_windows(number)
         at = np.flatnonzero([frame in inside for frame in frames])
         if self._step_around == 1 or not len(at):
@@ -339,13 +338,13 @@ class Recording:
         return tuple(f for f, n in zip(frames, away, strict=True) if n % self._step_around == 0)
 
     def _find_ground(self, number: int, row: int) -> HeightMap:
-        """Return the ground under a piece."""
+        """Return the height map of the ground of a piece."""
         stretch = self._stretch(number, self._searched(number, row))
         with self._watch.stage("ground"):
             return ground(stretch)
 
     def _find_motion(self, number: int, row: int, engine: str) -> SharedMotion:
-        """Return the motion in a piece, without its points."""
+        """Return the motion in a piece, its sweeps removed for the cache."""
         asked, frames = self._in_windows(number), self._searched(number, row)
 
         def make() -> SharedMotion:
@@ -360,11 +359,11 @@ class Recording:
         return self._kept("motion", together, make, settings)
 
     def _find_far(self, number: int, row: int) -> StandingWorld:
-        """Return the static surfaces along the road of a piece, in its world."""
+        """Return the static surfaces along the road of a piece, in the piece's world."""
         cameras = list(self.sequence.cameras.values())
         far_m, settings = self.settings.accumulate.far_m, self.settings.register
         road = Road(self.timeline, self._sweeps, cameras, settings, far_m)
-        # Sweeps of the block beyond the windows are as far as the rest of the road.
+        # Sweeps of the block outside the windows belong to the far range.
         inside, frames = self._in_windows(number), self._pieces(number)[row].frames
         near = tuple(f for f in frames if f in inside) or frames
 
@@ -374,7 +373,7 @@ class Recording:
             with self._watch.stage("far"):
                 return road.find_standing(stretch, keys, with_near=len(keys) > 1)
 
-        if not self._is_whole:  # to make it costs less than to read the road for a digest
+        if not self._is_whole:  # computing is cheaper than reading the road's sweeps for a digest
             return make()
         return self._kept("far", road.frames(near), make, [far_m, cameras, near])
 
@@ -391,7 +390,7 @@ class Recording:
         make: Callable[[], T],
         settings: Sequence[Any] = (),
     ) -> T:
-        """Return what ``make`` returns, or the cache has of the same sweeps and settings."""
+        """Return the result of ``make``, or the cached result for the same sweeps and settings."""
 
         def inputs() -> Any:
             content = [(f, self._sweeps.content(f)) for f in frames]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find static surfaces that sweeps beyond the window measured, along the road."""
+"""Find static surfaces along the road, measured by sweeps beyond the window."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ _SAME_VIEW_M = 3.0
 _SLACK_M = 4.0  # motion of a lidar within a sweep, and of a camera until its exposure
 
 _View = tuple[Camera, Float]
-"""A camera and its ``T_cam_world``."""
+"""A camera and its pose ``T_cam_world`` (4,4)."""
 
 
 class _Passed(NamedTuple):
     """A sweep along the road.
 
-    registered: its points in view of a camera, raw unless the sweep is known. sample: (N,3) some of
-    its points, deskewed. travel_m: since the first sweep of the window. known: it is part of the
-    window.
+    registered: returns in view of a camera, deskewed if ``known``, else raw. sample: (N,3) deskewed
+    subset of all returns. travel_m: distance along the road from the window's first sweep. known:
+    the sweep is in the window.
     """
 
     registered: RegisteredSweep
@@ -59,11 +59,14 @@ class _Passed(NamedTuple):
 
 @dataclass(frozen=True)
 class Road:
-    """The road around a window.
+    """The road before and after a window.
 
     Attributes:
-        far_m: Travel before and after the window.
-        cameras: Points out of view of all cameras are dropped.
+        timeline: Times of the recording's sweeps.
+        sweeps: Reader of the raw sweeps.
+        cameras: Cameras that must see a point for it to be kept.
+        settings: Settings of registration.
+        far_m: Distance along the road on each side of the window.
     """
 
     timeline: Timeline
@@ -73,7 +76,7 @@ class Road:
     far_m: float
 
     def frames(self, near: Sequence[int]) -> list[int]:
-        """Return the sweeps that may be read for these frames of a window."""
+        """Return the frames that may be read, ascending: the window (``near``) and around it."""
         num = int(_MOST_S * 1e9 / self.timeline.period_ns)
         return [*self.timeline.before(near[0], num), *near, *self.timeline.after(near[-1], num)]
 
@@ -81,8 +84,9 @@ class Road:
         """Return the static surfaces along the road, in the world of ``near``.
 
         Args:
-            near: Registered, deskewed sweeps, those of the keys among them.
-            with_near: Use their points too.
+            near: Registered, deskewed sweeps of the window, including the keys.
+            keys: Frame numbers of the keys.
+            with_near: Include the points of ``near``.
         """
         sensors, views = Sensors.of(near.sweeps), self._views(near, keys)
         with ThreadPoolExecutor(2) as pool:
@@ -102,7 +106,7 @@ class Road:
         return replace(far.joined(parts), left_out=tuple(sorted(left_out)))
 
     def _beyond(self, near: Stretch, views: Sequence[_View], side: int) -> list[_Passed]:
-        """Return sweeps before (-1) or after (1) those of the window, the nearest first."""
+        """Return the sweeps before (side -1) or after (side 1) the window, nearest first."""
         last = near.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
         begin_m = 0.0 if side < 0 else _travel_m(near)[-1]
         found, last_m, travel_m = list[_Passed](), 0.0, 0.0
@@ -119,7 +123,7 @@ class Road:
         return found
 
     def _views(self, near: Stretch, keys: Sequence[int]) -> list[_View]:
-        """Return the views of the cameras at the keys. Keys close to each other share one."""
+        """Return the views of all cameras at the keys. Keys less than 3 m apart share a view."""
         chosen: list[Float] = []
         for key in keys:
             T_world_lidar = near[key].T_world_lidar
@@ -133,7 +137,7 @@ class Road:
         ]
 
     def _sweeps_beyond(self, near: Stretch, side: int) -> Iterator[tuple[Sweep, Float, Float]]:
-        """Yield raw sweeps, the nearest first, their poses, and twists per second."""
+        """Yield (raw sweep, ``T_world_lidar``, (6,) velocity in rad/s, m/s), nearest first."""
         known = near.sweeps[::side]
         beside = self.timeline.before if side < 0 else self.timeline.after
         frames = beside(known[-1].frame, self._most_sweeps(near))[::side]
@@ -144,7 +148,7 @@ class Road:
         return follow_road(known, frames, stamp_ns, read, prepare, self.far_m, _STEP_M)
 
     def _most_sweeps(self, near: Stretch) -> int:
-        """Return the greatest number of sweeps on each side, at half the speed of the window."""
+        """Return the number of sweeps that cover ``far_m`` at half the speed of the window."""
         first, last = near.sweeps[0], near.sweeps[-1]
         most_s, step_ns = _MOST_S, last.sweep.stamp_ns - first.sweep.stamp_ns
         if step_ns > 0:
@@ -156,7 +160,7 @@ class Road:
     def _recorded(
         self, known: RegisteredSweep, frames: Sequence[int]
     ) -> Iterator[tuple[Sweep, Float, Float]]:
-        """Yield the same as `_sweeps_beyond`, by the recording's own poses."""
+        """Yield the values of `_sweeps_beyond` from the recording's own poses."""
         travel_m, last_m, last, last_ns = 0.0, 0.0, known.T_world_lidar, known.sweep.stamp_ns
         try:
             T_world_recorded = last @ poses.inverse(self._pose(known.frame))
@@ -186,13 +190,13 @@ def _deskewed(p: _Passed) -> RegisteredSweep:
 
 
 def _travel_m(near: Stretch) -> Float:
-    """Return (n,) metres of travel since the first of these sweeps."""
+    """Return (n,) metres travelled since the first sweep of the stretch."""
     positions = np.stack([s.T_world_lidar[:3, 3] for s in near.sweeps])
     return np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
 
 
 def _within(near: Stretch, views: Sequence[_View]) -> list[_Passed]:
-    """Return registered sweeps of the window at some distance from each other."""
+    """Return the window's sweeps, thinned to at least 1 m between sweeps."""
     found, last_m = list[_Passed](), -np.inf
     for s, at_m in zip(near.sweeps, _travel_m(near).tolist(), strict=True):
         if at_m - last_m >= _LEAST_STEP_M:
@@ -203,7 +207,7 @@ def _within(near: Stretch, views: Sequence[_View]) -> list[_Passed]:
 
 
 def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], frozenset[int]]:
-    """Return the sweeps with consistent poses, and the frames that cannot be used."""
+    """Return the sweeps with consistent poses, and the frames whose poses are unreliable."""
     frames = tuple(p.registered.frame for p in passed)
     found = relax_poses(
         [p.sample for p in passed],
@@ -222,7 +226,7 @@ def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], f
 
 
 def _in_view(sweep: Sweep, T_world_lidar: Float, views: Sequence[_View]) -> Bool:
-    """Return (N,) True for returns of a raw sweep that a view may show."""
+    """Return (N,) True for returns of a raw sweep that a camera may see."""
     keep = np.zeros(len(sweep), bool)
     rows = np.flatnonzero(far.in_reach(sweep))
     points = sweep.points[rows].astype(np.float32)

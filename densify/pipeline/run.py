@@ -65,20 +65,19 @@ def run(
     """Densify one key.
 
     Args:
-        sequence: The recording.
-        key: Absolute frame number.
+        key: Frame number of the key sweep.
         window: Number of sweeps on each side of the key. The window is cut, with a warning, at the
             ends of the recording, at a hole in time of more than three usual periods, and at a
             sweep that cannot be used.
         method: ``flow`` (scene flow), ``icp`` (rigid accumulation) or ``none`` (single sweep).
-        cameras: Names; None for all.
+        cameras: Names of cameras; None for all.
         config: Settings, see `densify.config.resolve`.
-        progress: Is called with (stage, done, total).
-        prior: A folder of depth images that complete the maps where nothing is measured or filled.
+        progress: Callback (stage, done, total).
+        prior: Folder of depth images that complete the pixels without measured or filled depth.
 
     Returns:
-        The result; with ``output.score`` it has the simpler methods as its ``baselines``, and the
-        scores of the key held out.
+        The result. With ``output.score`` it also has the simpler methods as ``baselines``, and
+        scores of maps made without the key sweep.
 
     Raises:
         InputError: The recording or the settings cannot be used.
@@ -102,16 +101,18 @@ def run_keys(
     cache: Cache | None = None,
     prior: str | Path | None = None,
 ) -> Iterator[tuple[int, Result | ComputationError | InputError]]:
-    """Densify several keys, ascending, and yield each with its result or its error.
+    """Densify several keys, and yield (key, result or error) by ascending key.
 
-    Keys whose windows overlap share registration, ground and motion. Objects are then followed over
-    all their sweeps, which can make a key slightly better than alone.
+    Keys whose windows overlap share registration, ground and motion. Objects are tracked over all
+    sweeps of these windows, which can improve a key slightly over `run`.
 
     Args:
-        cache: Keeps shared results on disk. The other arguments as in `run`.
+        keys: Frame numbers, in any order.
+        window: Number of sweeps on each side of a key. The other arguments are as in `run`.
+        cache: Keeps shared results on disk.
 
     Raises:
-        InputError: At once, if no key can be made.
+        InputError: The arguments are invalid; raised at the call, before the first key.
     """
     methods, watch = methods_of_run(method, resolve(config)), Watch(progress)
     recording = _open(sequence, keys, window, methods, cameras, config, cache, watch)
@@ -137,19 +138,18 @@ def compare(
     """Densify one key with several methods on the same registration, and score them.
 
     Args:
-        sequence: The recording.
-        key: Absolute frame number.
+        key: Frame number of the key sweep.
         window: Number of sweeps on each side of the key.
-        cameras: Names; None for all.
+        cameras: Names of cameras; None for all.
         config: Settings, see `densify.config.resolve`.
-        progress: Is called with (stage, done, total).
+        progress: Callback (stage, done, total).
         methods: Some of ``none``, ``icp``, ``icp-visible``, ``icp-far``, ``flow-plain``, ``paper``
             and ``flow``.
-        cache: Keeps the results of steps.
-        prior: A folder of depth images that complete the maps of the last method.
+        cache: Keeps the results of steps on disk.
+        prior: Folder of depth images that complete the maps of the last method.
 
     Returns:
-        The result of each method. Those before it are its ``baselines``.
+        Method -> result. Each result has the results before it as ``baselines``.
 
     Raises:
         InputError: The recording or the settings cannot be used.
@@ -168,16 +168,19 @@ def flow_steps(
     progress: Progress | None = None,
     cache: Cache | None = None,
 ) -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
-    """Yield sweeps of a whole recording with their flow to the next sweep, or with their error.
+    """Yield (frame, scene flow to the next sweep, or error) for sweeps of a whole recording.
 
-    The last sweep, and one before a hole in time, have a step to the sweep before.
+    If no next sweep exists, as at the end or before a hole in time, the flow is to the previous
+    sweep.
 
     Args:
-        frames: Ascending.
-        cache: Keeps the results of steps.
+        frames: Frame numbers, ascending.
+        config: Settings, see `densify.config.resolve`.
+        progress: Callback (stage, done, total).
+        cache: Keeps the results of steps on disk.
 
     Raises:
-        InputError: At once, if nothing can be made.
+        InputError: The arguments are invalid; raised at the call, before the first frame.
     """
     recording = _open(sequence, None, 1, ["flow"], None, config, cache, None)
 
@@ -199,15 +202,18 @@ def densify(
     with_images: bool = True,
     priors: PriorFiles | None = None,
 ) -> dict[str, Result]:
-    """Return the results of one key by method, each with those before as its baselines.
+    """Return method -> result for one key. Each result has the results before it as baselines.
 
-    Without scores, only the maps of the last method are filled.
+    Unless results are scored, only the maps of the last method are filled.
 
     Args:
-        methods: Of `METHODS`.
-        with_images: Colour the cloud, and compare depth with the truth if there is one. The
-            maps are the same either way.
-        priors: Complete the maps of the last method.
+        recording: The recording, whose blocks include the key.
+        key: Frame number of the key sweep.
+        methods: Names of `METHODS`.
+        cameras: Names of cameras; None for all.
+        with_images: Colour the cloud, and score depth if there is ground truth. The maps are the
+            same either way.
+        priors: Depth images that complete the maps of the last method.
 
     Raises:
         InputError: As in `run`.
@@ -256,6 +262,7 @@ def densify(
 
 
 def _or_error(make: Callable[[int], T], frame: int) -> T | ComputationError | InputError:
+    """Return the result for a frame, or the error that ``make`` raises."""
     try:
         return make(frame)
     except (ComputationError, InputError) as error:
@@ -282,7 +289,7 @@ def _open(
     cache: Cache | None,
     watch: Watch | None,
 ) -> Recording:
-    """Return the recording; raise InputError before any sweep is read."""
+    """Return the recording with checked arguments; raise InputError before any sweep is read."""
     settings = resolve(config)
     if not hasattr(sequence, "frames"):
         raise InputError(

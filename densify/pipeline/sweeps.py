@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read the raw sweeps of a recording on demand, and cut them into blocks.
+"""Read the raw sweeps of a recording on demand, and cut the recording into blocks.
 
 The keys of a block share registration and motion.
 """
@@ -24,7 +24,7 @@ AROUND_S = 1.0  # least time around a block in which moving objects are searched
 
 
 class Sweeps:
-    """Read sweeps, without returns of the own vehicle."""
+    """Reader of raw sweeps that drops the returns of the own vehicle."""
 
     def __init__(
         self,
@@ -39,10 +39,12 @@ class Sweeps:
         """Prepare to read.
 
         Args:
-            num_kept: Number of sweeps that stay in memory.
-            cache: On disk, None for none.
-            run: A text that is the same for all processes of a run, in which no sweep changes;
-                None for this object alone.
+            timeline: Times of its sweeps.
+            num_kept: Number of sweeps kept in memory.
+            cache: Cache on disk, None for no cache.
+            run: Text shared by all processes of a run, during which no sweep changes; None for this
+                object alone.
+            watch: Measures the stage ``read``.
         """
         self._sequence, self._timeline, self._settings = sequence, timeline, settings
         self._cache, self._run, self._watch = cache, run or uuid4().hex, watch
@@ -50,16 +52,16 @@ class Sweeps:
         self.content = lru_cache(maxsize=None)(self._content)
 
     def prepare(self, frames: Sequence[int]) -> None:
-        """Let a recording that renders its sweeps render these in parallel."""
+        """Let a recording that simulates its sweeps render these frames in parallel."""
         if hasattr(self._sequence, "prepare"):
             with self._watch.stage("read"):
                 self._sequence.prepare(frames)
 
     def recorded_pose(self, frame: int) -> Float | None:
-        """Return the recording's own ``T_world_lidar`` (4,4), None if it is not used.
+        """Return the recording's own ``T_world_lidar`` (4,4), None if the settings ignore it.
 
         Raises:
-            InputError: There is none.
+            InputError: The recording has no pose for the frame.
         """
         if self._settings.source != "dataset":
             return None
@@ -73,9 +75,9 @@ class Sweeps:
             return read_sweep(self._sequence, frame, self._settings)
 
     def _content(self, frame: int) -> str:
-        """Return a digest of a sweep and its recorded pose, or the reason of a failure.
+        """Return a digest of a sweep and its recorded pose, or the message of its error.
 
-        All processes of a run find it in the cache. Only the first one has to read the sweep.
+        Processes of a run share the digest through the cache, so only one process reads the sweep.
         """
 
         def find() -> str:
@@ -90,19 +92,19 @@ class Sweeps:
 
 @dataclass(frozen=True)
 class Cut:
-    """Blocks, ascending in time, which may overlap.
+    """Blocks of sweeps, ascending in time, which may overlap.
 
     Attributes:
-        blocks: The frames of each: the windows of its keys, and the sweeps between and around
-            them.
-        number_of: Key -> its block.
+        blocks: Frame numbers of each block: the windows of its keys, and the sweeps between and
+            around them.
+        number_of: Key -> index of its block.
     """
 
     blocks: tuple[tuple[int, ...], ...]
     number_of: Mapping[int, int]
 
     def number_near(self, frame: int) -> int:
-        """Return the block of a frame, or that of the last key before it."""
+        """Return the index of the block of the last key up to this frame, or of the first key."""
         keys = sorted(self.number_of)
         return self.number_of[keys[max(0, bisect_right(keys, frame) - 1)]]
 
@@ -112,9 +114,10 @@ class Cut:
 
     @staticmethod
     def whole(timeline: Timeline, window: int) -> Cut:
-        """Cut all sweeps, as keys, into blocks of `BLOCK_S`, counted from time 0.
+        """Cut the whole recording into blocks of `BLOCK_S` seconds, with every sweep as a key.
 
-        The same sweeps give the same maps, for any choice of keys.
+        Blocks are counted from time 0. Maps of a sweep are therefore the same for any choice of
+        keys.
         """
         check_window(window)
         groups: dict[int, list[int]] = {}
@@ -127,9 +130,9 @@ class Cut:
     def around(
         timeline: Timeline, window: int, keys: Collection[int], beyond_s: float = 0.0
     ) -> Cut:
-        """Take the windows of a few keys, and ``beyond_s`` around them, and nothing else.
+        """Cut blocks around the windows of some keys, ``beyond_s`` seconds longer on each side.
 
-        Overlapping windows are one block, unless its keys are more than `BLOCK_S` apart.
+        Keys with overlapping windows share a block, unless they are more than `BLOCK_S` apart.
 
         Raises:
             InputError: A key does not exist.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Warn about a result: assumptions and suspicions, a sentence each."""
+"""Warn about assumptions behind a result and suspected errors, in one sentence each."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from densify.registration.compensation import find_compensated
 from densify.scores.depth_metrics import image_density
 
 _LEAST_DENSITY = 0.001  # sixteen rings alone measure 0.5 % of an image
-_SLOW_S = 0.15  # from sweep to sweep; at 5 Hz trucks slide along their own sides
+_SLOW_S = 0.15  # period; at 5 Hz the motion of a truck along its own side is ambiguous
 _OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image
-_LIFTED_M = 0.04  # right poses lay real sweeps up to 0.03 m apart, half a second from each other
-_MUCH_NEAR = 0.2  # of the points; a car's own returns were 0 to 14 %
-_MUCH_MOVES = 1 / 3  # of the points: ground and buildings are most of what a scanner sees
+_LIFTED_M = 0.04  # correct poses leave surfaces up to 0.03 m apart after half a second
+_MUCH_NEAR = 0.2  # share of the points; a car's own returns were 0 to 14 %
+_MUCH_MOVES = 1 / 3  # share of the points; most returns are of ground and buildings
 
 
 def add_warnings(
@@ -32,10 +32,13 @@ def add_warnings(
     key: int,
     shots: Mapping[str, Shot],
 ) -> dict[str, Result]:
-    """Return the results of a key's methods, by name, with `Result.warnings`.
+    """Return method -> result of a key, each with its ``warnings``.
 
     Args:
-        shots: Of the maps, by name.
+        results: Method -> result.
+        recording: The recording of the results.
+        key: Frame number of the key sweep.
+        shots: Map name -> camera, image number and time of the map.
     """
     sequence, stretch = recording.sequence, recording.window(key)
     cameras = {shot.camera.name for shot in shots.values()}
@@ -91,7 +94,7 @@ def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
 
 
 def _of_motion(recording: Recording, key: int) -> Iterator[str]:
-    """Check the motion within the key sweep, and given poses against the sweeps themselves."""
+    """Yield warnings if sweeps seem compensated already, or if given poses do not align them."""
     settings, stretch = recording.settings.register, recording.window(key)
     at = stretch[key]
     rings = None
@@ -135,7 +138,7 @@ def _of_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[s
 
 
 def of_result(result: Result, stretch: Stretch) -> Iterator[str]:
-    """Yield the warnings about the result of one method, made of these sweeps."""
+    """Yield the warnings about the result of one method."""
     stamps_ns = [s.sweep.stamp_ns for s in stretch.sweeps]
     if METHODS[result.method].engine is not None and len(stamps_ns) > 1:
         period_s = float(np.median(np.diff(stamps_ns))) * 1e-9

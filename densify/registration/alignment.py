@@ -19,12 +19,12 @@ _MANY_POINTS = 30_000  # number of points before thinning to voxels
 _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are even for any order of the rings
 _VOXEL_M, _LEAF_M, _NUM_NEIGHBORS = 0.5, 1.0, 10
 _HELD_AT_M = 10.0
-_MISFIT_M = 1.0  # farther off, poses are found by their overlap
-_NORMAL_M = 0.0447  # two surfaces' spread along the normal, as small_gicp weighs: sqrt(2 · 1e-3)
+_MISFIT_M = 1.0  # poses with larger errors are detected by `check_overlap`
+_NORMAL_M = 0.0447  # standard deviation of two surfaces along the normal in small_gicp
 
 
 def subsample(sweep: Sweep, most: int = _MANY_POINTS) -> Sweep:
-    """Return about ``most`` points of a larger sweep, from all of its rings alike."""
+    """Return about ``most`` points of a larger sweep, spread evenly over its rings."""
     num = len(sweep)
     if num <= most:
         return sweep
@@ -34,7 +34,12 @@ def subsample(sweep: Sweep, most: int = _MANY_POINTS) -> Sweep:
 
 
 class Surface(NamedTuple):
-    """Points thinned to voxels, each with the covariance of its neighbours; of small_gicp."""
+    """Points thinned to voxels, with the covariance of each point's neighbours (small_gicp).
+
+    Attributes:
+        points: Point cloud of small_gicp.
+        tree: Its k-d tree.
+    """
 
     points: Any
     tree: Any
@@ -43,10 +48,12 @@ class Surface(NamedTuple):
     def of(
         points: Float, voxel_m: float = _VOXEL_M, num_neighbors: int = _NUM_NEIGHBORS
     ) -> Surface:
-        """Return a surface of points (N,3).
+        """Return the surface of a point cloud.
 
         Args:
-            num_neighbors: Number of points for a covariance.
+            points: (N,3) metres.
+            voxel_m: Side of a voxel.
+            num_neighbors: Number of neighbours for the covariance of a point.
         """
         import small_gicp
 
@@ -54,13 +61,14 @@ class Surface(NamedTuple):
 
 
 class Alignment(NamedTuple):
-    """The alignment of a source surface with a target.
+    """The alignment of a source surface with a target surface.
 
     Attributes:
+        T_target_source: (4,4) pose of the source in the target's frame.
         overlap: Share of the source's points with a match in the target.
-        information: (6,6) of rotation and translation of the source, in its frame. ``x @
-            information @ x`` is the mean square in m² by which a small motion x (rad, m) moves the
-            source off the target.
+        information: (6,6) matrix for a small motion x (rad, m) of the source in its own frame.
+            ``x @ information @ x`` is the mean square distance in m² by which x moves the source
+            off the target's surface.
     """
 
     T_target_source: Float
@@ -69,7 +77,7 @@ class Alignment(NamedTuple):
 
     @staticmethod
     def of(found: Any, source: Surface) -> Alignment:
-        """Return the alignment that small_gicp found."""
+        """Return the alignment from a result of small_gicp."""
         num = int(found.num_inliers)
         return Alignment(
             T_target_source=np.asarray(found.T_target_source),
@@ -79,7 +87,7 @@ class Alignment(NamedTuple):
 
 
 class SurfaceMap:
-    """Several surfaces in one frame."""
+    """A voxel map of several surfaces in one frame."""
 
     def __init__(self) -> None:
         import small_gicp
@@ -87,13 +95,14 @@ class SurfaceMap:
         self._voxels = small_gicp.GaussianVoxelMap(_LEAF_M)
 
     def insert(self, surface: Surface, T_map_surface: Float) -> None:
-        """Add a surface at its pose."""
+        """Add a surface at its pose (4,4) in the map."""
         self._voxels.insert(surface.points, T_map_surface)
 
     def align(self, source: Surface, T_map_source: Float, match_m: float) -> Alignment:
-        """Align a surface with the map, starting from ``T_map_source``.
+        """Align a surface with the map.
 
         Args:
+            T_map_source: (4,4) initial pose.
             match_m: Greatest distance between corresponding points.
         """
         import small_gicp
@@ -110,7 +119,7 @@ class SurfaceMap:
 
 
 def align(target: Surface, source: Surface, T_target_source: Float, match_m: float) -> Alignment:
-    """Align a surface with another one, as `SurfaceMap.align`."""
+    """Align a source surface with a target surface; arguments as in `SurfaceMap.align`."""
     import small_gicp
 
     found = small_gicp.align(
@@ -125,12 +134,12 @@ def align(target: Surface, source: Surface, T_target_source: Float, match_m: flo
 
 
 class Misfit(NamedTuple):
-    """The distance of a sweep from the pose at which it fits on another.
+    """The difference between a sweep's given pose and the pose that aligns it with another sweep.
 
     Attributes:
-        off_m: Metres.
-        off_deg: Degrees.
-        lift_m: Root mean square distance by which it lifts surfaces off those of the other.
+        off_m: Translation in metres.
+        off_deg: Rotation in degrees.
+        lift_m: Root mean square distance between the two sweeps' surfaces at the given pose.
     """
 
     off_m: float
@@ -139,7 +148,7 @@ class Misfit(NamedTuple):
 
 
 def find_misfit(target: RegisteredSweep, source: RegisteredSweep) -> Misfit:
-    """Return the distance of two deskewed sweeps from the poses at which their surfaces fit."""
+    """Return the error of the given relative pose of two deskewed sweeps, found by alignment."""
     onto, moved = (Surface.of(subsample(s.sweep).points) for s in (target, source))
     T = poses.inverse(target.T_world_lidar) @ source.T_world_lidar
     found = align(onto, moved, T, _MISFIT_M)
@@ -152,14 +161,15 @@ def find_misfit(target: RegisteredSweep, source: RegisteredSweep) -> Misfit:
 def align_with_planes(
     target: Surface, points: Float, voxel_m: float, match_m: float, hold: float
 ) -> Float:
-    """Return ``T_target_source``, near the identity, of points (N,3) on the target's planes.
+    """Return the (4,4) motion of points that aligns them with the target, by point-to-plane ICP.
 
     Args:
-        points: (N,3) metres.
+        points: (N,3) metres, approximately aligned with the target already.
+        voxel_m: Side of the voxels to which the points are thinned.
         match_m: Greatest distance between corresponding points.
-        hold: Share of the matches that is held in place by points 10 m away. Where few planes
-            constrain the motion, as along a straight road, the source then hardly moves. 0 lets it
-            slide.
+        hold: Weight, as a share of the matches, of points 10 m away that stay where they are. It
+            limits the motion in directions that few planes constrain, as along a straight road.
+            0 applies the full ICP motion.
     """
     import small_gicp
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Sweeps whose motion is compensated already.
+"""Detect sweeps that are compensated for motion already.
 
-The rings of a spinning scanner are cones about its own axis only if the points are seen from where
-it stood, as they were fired.
+The rings of a spinning scanner are cones about its spin axis. They appear as cones only if each
+point is given relative to the scanner's position at its firing.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from densify.geometry import poses
 from densify.geometry.types import Float, Int, Sweep
 
 LEAST_SHARPNESS = 4.0  # of a scanner with distinct rings
-CLEARLY = 1.25  # sharper by that factor
-LEAST_SPEED_M_S = 1.5  # that smears rings
-COMPENSATED_M = 25.0  # nearer returns show a motion within the sweep
-# KITTI's HDL-64E, whose two blocks of lasers stand apart, is sharpest from 0.2 m higher.
+CLEARLY = 1.25  # least ratio of two sharpnesses that counts as a difference
+LEAST_SPEED_M_S = 1.5  # slower motion does not smear the rings
+COMPENSATED_M = 25.0  # range within which motion during the sweep is visible
+# The HDL-64E of KITTI has two separate blocks of lasers; its rings are sharpest from 0.2 m above.
 _HEIGHTS_M = np.linspace(-0.3, 0.3, 13)
 _NEAR_M = 3.0
 _NUM_POINTS = 20_000
@@ -28,13 +28,13 @@ _BIN_RAD = np.deg2rad(0.02)
 
 
 class Rings(NamedTuple):
-    """The sharpness of the rings of a sweep.
+    """The sharpness of a sweep's rings under three assumptions, see `sharpness`.
 
     Attributes:
-        as_stored: Of the points as they are.
-        undone: With a compensation of the motion to ``moment`` undone.
-        done: With the motion compensated.
-        moment: Of the sweep, in words.
+        as_stored: Sharpness of the points as they are.
+        undone: Sharpness after undoing a motion compensation to ``moment``.
+        done: Sharpness after compensating the motion.
+        moment: Time within the sweep, in words.
     """
 
     as_stored: float
@@ -44,21 +44,26 @@ class Rings(NamedTuple):
 
     @property
     def are_distinct(self) -> bool:
-        """Return True if the scanner has rings that tell."""
+        """True if the rings are sharp enough for a conclusion."""
         return max(self.as_stored, self.undone) >= LEAST_SHARPNESS
 
     @property
     def are_compensated(self) -> bool:
-        """Return True if the motion within the sweep is compensated already."""
+        """True if the motion within the sweep is compensated already."""
         return self.are_distinct and self.undone > CLEARLY * self.as_stored
 
 
 def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
-    """Return how much the elevations at an origin are concentrated in rings, 1 for an even spread.
+    """Return how sharply points are concentrated in rings, as seen from an origin; 1 if not at all.
 
-    In each window of elevation it is the chance that two returns share a cell of ``bins`` times
-    0.02 degrees, relative to an even spread. The result is the mean over the windows, each counted
-    alike, because from a place on the ground all of a flat ground is in one of them.
+    Elevation angles are counted in cells. For each window of elevation, it is the chance that two
+    returns share a cell, relative to an even spread. The median over the windows keeps flat ground,
+    which all falls into one window, from dominating.
+
+    Args:
+        points: (N,3) metres, in axes with z along the spin axis.
+        origin_m: (3,) assumed position of the scanner, same axes.
+        bins: Width of a cell as a multiple of 0.02 degrees.
     """
     x, y, z = (points - origin_m).T
     elevation = np.arctan2(z, np.hypot(x, y))
@@ -76,14 +81,16 @@ def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
 def rings_by_motion(
     points: Float, offset_s: Float, twist: Float, R: Float, origins_m: Sequence[Float]
 ) -> Rings:
-    """Return the sharpness of the rings of a sweep, seen from the best of the origins.
+    """Return the sharpness of a sweep's rings, as stored and with the motion undone or compensated.
+
+    Each sharpness is the greatest over the given scanner positions.
 
     Args:
-        points: (N,3) raw, metres, lidar frame.
+        points: (N,3) metres, lidar frame, as stored.
         offset_s: (N,) firing times since the stamp.
-        twist: (6,) of the lidar, per second.
-        R: (3,3) into the axes of the scanner.
-        origins_m: Possible positions of the scanner, (3,) in its axes.
+        twist: (6,) velocity of the lidar (rad/s, m/s), lidar frame.
+        R: (3,3) rotation from the lidar axes to the scanner's axes.
+        origins_m: Candidate positions (3,) of the scanner, in its axes.
     """
 
     def sharpest(moved: Float) -> float:
@@ -92,7 +99,7 @@ def rings_by_motion(
     def carried(since_s: Float) -> Float:
         return poses.transform_each(since_s[:, None] * twist, points)
 
-    # The moment they were compensated to may be any of the sweep's.
+    # The time to which the points were compensated is unknown.
     moments_s = {
         "its stamp": 0.0,
         "its first point": float(offset_s.min()),
@@ -104,24 +111,32 @@ def rings_by_motion(
 
 
 def sample_rows(sweep: Sweep, far_m: float) -> Int:
-    """Return the rows of at most 20,000 returns of a sweep from 3 m to ``far_m`` away."""
+    """Return the rows of at most 20,000 returns of a sweep between 3 m and ``far_m`` away."""
     range_m = np.linalg.norm(sweep.points, axis=1)
     rows = np.flatnonzero((range_m > _NEAR_M) & (range_m < far_m))
     return rows[:: len(rows) // _NUM_POINTS + 1]
 
 
 def turning_s(points: Float, period_s: float) -> Float:
-    """Return (N,) firing times of a scanner that turns clockwise and faces forward at the stamp."""
+    """Return (N,) firing times since the stamp, estimated from azimuth.
+
+    The scanner is assumed to turn clockwise and to face forward at the stamp.
+
+    Args:
+        points: (N,3) lidar frame.
+        period_s: Time of one revolution.
+    """
     turn: Float = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     return turn * period_s
 
 
 def find_compensated(sweep: Sweep, twist: Float, period_s: float) -> Rings | None:
-    """Return the rings of a raw sweep whose motion is compensated already; else None.
+    """Return the rings of a sweep that is compensated for motion already, else None.
 
     Args:
-        twist: (6,) of the lidar, per second.
-        period_s: Duration of a sweep without times of points.
+        sweep: Sweep as stored in the recording.
+        twist: (6,) velocity of the lidar (rad/s, m/s), lidar frame.
+        period_s: Time of one revolution, used for sweeps without point times.
     """
     if np.linalg.norm(twist[3:]) < LEAST_SPEED_M_S:
         return None

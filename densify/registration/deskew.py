@@ -13,13 +13,13 @@ from densify.geometry.types import Float, RegisteredSweep, Stretch, Sweep, Traje
 
 
 def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
-    """Return the sweeps in the world, with the lidar's own motion within each removed.
+    """Return the sweeps at their poses, with the lidar's motion within each sweep removed.
 
-    Points before the reference time move with the twist from the previous sweep, points after it
-    with the twist to the next one. A sweep without point times keeps its points.
+    Points before the reference time move with the velocity from the previous sweep, points after it
+    with the velocity to the next sweep. A sweep without point times keeps its points.
 
     Args:
-        sweeps: Raw, a subset of the frames of the trajectory.
+        sweeps: Raw sweeps whose frames are in the trajectory.
     """
     registered = []
     for sweep in sweeps:
@@ -31,7 +31,14 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
 def deskew_sweep(
     sweep: Sweep, T_world_lidar: Float, twist_before: Float, twist_after: Float
 ) -> RegisteredSweep:
-    """Return a raw sweep deskewed by the (6,) twists per second before and after its stamp."""
+    """Return the deskewed sweep with its pose.
+
+    Args:
+        sweep: Raw sweep; not changed.
+        T_world_lidar: (4,4) pose at the reference time.
+        twist_before: (6,) velocity of the lidar (rad/s, m/s, lidar frame) before that time.
+        twist_after: (6,) velocity of the lidar after that time.
+    """
     points: Float = sweep.points
     if sweep.offset_ns is not None:
         offset_s = sweep.offset_ns[:, None] * 1e-9
@@ -42,7 +49,10 @@ def deskew_sweep(
 
 
 def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
-    """Return the (6,) twists per second before and after sweep i, equal at an end."""
+    """Return the (6,) velocities (rad/s, m/s) before and after sweep i, in its lidar frame.
+
+    At the first and last sweep both are equal.
+    """
     last = len(trajectory.frames) - 1
     if last == 0:
         return np.zeros(6), np.zeros(6)

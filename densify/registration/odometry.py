@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Estimate odometry of dense sweeps by KISS-ICP, in two passes, from a searched start speed.
+"""Estimate odometry of dense sweeps by KISS-ICP, in two passes, from a searched initial speed.
 
 Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
 """
@@ -19,7 +19,7 @@ from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
 from densify.registration.deskew import deskew
 
-_NUM_CATCHING_UP = 3  # sweeps that are registered at any distance in time
+_NUM_CATCHING_UP = 3  # first sweeps, whose poses in the first pass are less exact
 # Change of a sweep's pose (rad and m) below which KISS-ICP stops. The first pass only has to find
 # the motion within a sweep: 3 mm over 0.1 s bend its ends by 1.5 mm. The second pass is the start
 # of `densify.registration.surfaces`: with 3 mm there too, a highway of 32 rings slides by 0.1 m.
@@ -38,12 +38,15 @@ def find_odometry(
 ) -> tuple[Trajectory, list[Sweep]]:
     """Return the trajectory of raw, dense sweeps, and the sweeps deskewed by the first pass.
 
-    Sweeps of a fast scanner are grouped in time (`densify.geometry.clock.Clock.batches`), because
-    sparse sweeps cannot be registered against each other. One by one, the sweeps of a highway at 20
-    Hz look as if the vehicle stood: 19 m off after 0.75 s.
+    Sweeps of a fast scanner are registered in batches (`densify.geometry.clock.Clock.batches`),
+    because a few points of one sweep are not enough. Sweep by sweep, a highway at 20 Hz looks as if
+    the vehicle were at rest: 19 m off after 0.75 s.
 
     Args:
-        sweeps: Ascending in time, one or more.
+        sweeps: Raw sweeps, ascending in time, one or more.
+
+    Returns:
+        The (S,4,4) trajectory in the frame of the first sweep, and S deskewed sweeps.
     """
     stamp_ns, frames = np.array([s.stamp_ns for s in sweeps], np.int64), [s.frame for s in sweeps]
     groups = [list(rows) for rows in Clock(stamp_ns).batches()]
@@ -78,15 +81,16 @@ def register(
     settings: RegisterSettings,
     rough: Trajectory | None = None,
 ) -> Float:
-    """Return ``T_first_lidar`` (S,4,4) of S sweeps, registered one after another.
+    """Return ``T_first_lidar`` (S,4,4) of S sweeps, registered one after another by KISS-ICP.
 
-    The first pass starts each sweep at constant velocity, and the first sweep at `search_twist`,
-    because KISS-ICP assumes a start at rest. Its voxels are twice as large.
+    The first pass predicts each sweep at constant velocity, starting from `search_twist`, because
+    KISS-ICP assumes a start at rest. Its voxels are twice as large.
 
     Args:
         stamp_ns: (S,) ascending.
-        points: (N,3) of each sweep; raw in the first pass, then deskewed.
-        rough: Trajectory of the first pass, around which the second pass searches.
+        points: (N,3) of each sweep; raw in the first pass, deskewed in the second.
+        rough: Trajectory of the first pass, from which the second pass predicts each sweep; None
+            for the first pass.
     """
     from kiss_icp.kiss_icp import KissICP
 
@@ -111,7 +115,7 @@ def register(
 
 
 def _between(known: Trajectory, stamp_ns: Int) -> Float:
-    """Return poses (n,4,4) at other times, at constant velocity between known ones and beyond."""
+    """Return poses (n,4,4) at n other times, interpolated or extrapolated at constant velocity."""
     T_world_lidar = []
     for time_ns in stamp_ns:
         later = int(np.searchsorted(known.stamp_ns, time_ns, side="right"))
@@ -125,10 +129,10 @@ def _between(known: Trajectory, stamp_ns: Int) -> Float:
 def _kiss_icp_config(  # type: ignore[no-untyped-def]
     settings: RegisterSettings, voxel_size_m: float, second_pass: bool
 ):
-    """Return the settings of KISS-ICP, every field set.
+    """Return the configuration of KISS-ICP, with every field set.
 
-    A field that is not set is read from ``kiss_icp_*`` environment variables. In the second pass
-    the kernel is as wide as a voxel, because the first pass is a good start.
+    A field left unset would be read from ``kiss_icp_*`` environment variables. In the second pass
+    the matching threshold is one voxel, because the prediction is good.
     """
     from kiss_icp.config import KISSConfig
     from kiss_icp.config.config import (
@@ -159,16 +163,17 @@ def _kiss_icp_config(  # type: ignore[no-untyped-def]
 
 
 def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
-    """Return the (6,) twist per second at the start, without rotation, by a grid search.
+    """Return the (6,) initial velocity (rad/s, m/s), without rotation, by a grid search.
 
     The velocity is the one that best aligns the points above the ground in the first three sweeps.
-    Distances below the gap between rays count as none, because a guard rail looks the same from a
-    vehicle at rest and from one that moves along it. The grid moves the second sweep by steps of 1
-    m, then of 0.5 m around the best position, or less for sweeps less than 0.1 s apart.
+    Distances below the spacing of neighbouring rays count as 0, because a guard rail looks the same
+    from a vehicle at rest and from one that moves along it. The grid moves the second sweep by
+    steps of 1 m, then by 0.5 m around the best position. Steps are smaller for sweeps less than 0.1
+    s apart.
 
     Args:
         stamp_ns: (S,) ascending.
-        points: (N,3) of each sweep.
+        points: (N,3) metres of each of the S sweeps, in its lidar frame.
     """
     step_s = np.diff(stamp_ns[:3]) * 1e-9
     step_m = _STEP_M * min(1.0, step_s[0] / _STEP_S)
@@ -197,14 +202,18 @@ def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
 
 
 def _grid(center: Float, reach_m: float, step_m: float) -> Float:
-    """Return (n,3) horizontal motions around a center (2,)."""
+    """Return (n,3) horizontal motions on a square grid around a centre (2,)."""
     span = np.arange(-np.ceil(reach_m / step_m), np.ceil(reach_m / step_m) + 1) * step_m
     x, y = np.meshgrid(center[0] + span, center[1] + span, indexing="ij")
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
 
 
 def above_ground(points: Float) -> Float:
-    """Return the points above the lowest of their 1 m cell. Rings on the ground hide the motion."""
+    """Return the points more than 0.4 m above the lowest point of their 1 m grid cell.
+
+    Rings on flat ground move with the vehicle and would hide its motion. If no point is above, all
+    points are returned.
+    """
     if not len(points):
         return points
     x, y, z = points.T

@@ -2,9 +2,9 @@
 """Estimate poses of the sweeps along the road, before and after a window.
 
 A chain registers one sweep after another on a map of Gaussian voxels. A pose graph then aligns
-submaps with several before them: Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE
-Intelligent Transportation Systems Magazine 2010. With a Cauchy weight a bad pair does not bend the
-others.
+submaps with several submaps before them: Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE
+Intelligent Transportation Systems Magazine 2010. Cauchy weights keep an outlier among the submap
+alignments from bending the road.
 """
 
 from __future__ import annotations
@@ -48,21 +48,23 @@ def follow_road(
     reach_m: float,
     step_m: float,
 ) -> Iterator[tuple[Sweep, Float, Float]]:
-    """Yield raw sweeps along the road, ``T_world_lidar`` (4,4), and the (6,) twist per second.
+    """Register raw sweeps along the road one after another, and yield each with its pose.
 
     Each sweep is aligned with a map of the sweeps before it, starting at constant velocity. The
-    chain ends at a sweep that cannot be read, is too sparse, does not fit the map, or moves as no
-    vehicle does.
+    chain ends at a sweep that cannot be read, is too sparse, does not fit the map, or would need an
+    implausible vehicle motion.
 
     Args:
-        known: Registered sweeps, the nearest to the others last.
-        frames: The other frames, ascending or descending in time, beginning beside the last
-            known one.
-        stamp_ns: Their stamps.
-        read: Returns a raw sweep.
-        prepare: Is called with the frames that are read next.
-        reach_m: Travel to cover.
-        step_m: Approximate travel between sweeps. The sweeps between are not read.
+        known: Registered sweeps of the window, the sweep next to ``frames`` last.
+        frames: Frame numbers along the road, ascending or descending in time, nearest first.
+        stamp_ns: (n,) reference times of ``frames``.
+        read: Returns the raw sweep of a frame.
+        prepare: Called with the frames that are read next.
+        reach_m: Distance along the road to cover.
+        step_m: Approximate distance between sweeps. Sweeps in between are not read.
+
+    Yields:
+        The raw sweep, its ``T_world_lidar`` (4,4), and the (6,) velocity (rad/s, m/s) of the lidar.
     """
     backwards = len(frames) > 0 and int(stamp_ns[0]) < known[-1].sweep.stamp_ns
     end, travel_m, row = _ChainEnd(known, backwards), 0.0, 0
@@ -85,7 +87,7 @@ def follow_road(
 
 
 class _ChainEnd:
-    """The map of all sweeps of the chain, and pose, time and twist of the last sweep."""
+    """The map of all sweeps of the chain, and the pose, time and velocity of the last sweep."""
 
     def __init__(self, known: Sequence[RegisteredSweep], backwards: bool) -> None:
         self._map, last = SurfaceMap(), known[-1]
@@ -100,7 +102,7 @@ class _ChainEnd:
         return float(np.linalg.norm(self.twist[3:]))
 
     def move_to(self, sweep: Sweep) -> bool:
-        """Align the next sweep with the map, and return False if that fails."""
+        """Align the next sweep with the map and add it; return False if that fails."""
         if len(sweep) < MIN_NUM_POINTS:
             return False
         step_s = (sweep.stamp_ns - self.stamp_ns) * 1e-9
@@ -118,7 +120,7 @@ class _ChainEnd:
 
 
 def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: float) -> list[int]:
-    """Return the next few sweeps, about ``step_m`` apart at this speed."""
+    """Return the rows of the next few sweeps, about ``step_m`` apart at this speed."""
     gap_ns = 1e9 * min(_LONGEST_GAP_S, step_m / max(speed_m_s, 1e-3))
     rows: list[int] = []
     for r in range(row, len(stamp_ns)):
@@ -136,8 +138,8 @@ class Relaxed(NamedTuple):
     """Consistent poses of n sweeps.
 
     Attributes:
-        T_world_lidar: (n,4,4).
-        holds: (n,) False for sweeps that only bad pairs connect to the known ones.
+        T_world_lidar: (n,4,4) poses.
+        holds: (n,) True if reliable alignments connect the sweep to the sweeps with known poses.
     """
 
     T_world_lidar: Float
@@ -145,7 +147,7 @@ class Relaxed(NamedTuple):
 
 
 def num_in_submap(num_points: float) -> int:
-    """Return the number of sweeps of that many points in a submap."""
+    """Return the number of sweeps in a submap for sweeps with this number of points."""
     return int(np.clip(np.ceil(_LEAST_POINTS / max(num_points, 1)), 1, _MOST_SWEEPS))
 
 
@@ -154,15 +156,16 @@ def relax_poses(
 ) -> Relaxed:
     """Return poses of n consecutive sweeps, corrected until their surfaces agree.
 
-    Submaps are connected to the known ones up to the first bad place. There neighbours overlap by
-    less than half, or more than a quarter of the pairs across are off by more than 0.1 m. Good
-    poses are off by up to 0.03 m. A slide along a road without landmarks cannot be detected.
+    A pose is reliable if no unreliable place separates its submap from the known ones. At such a
+    place neighbouring submaps overlap by less than half, or more than a quarter of the alignments
+    across it are off by more than 0.1 m. Good alignments are off by at most 0.03 m. A slide along a
+    road without landmarks cannot be detected.
 
     Args:
         points: (N,3) of each sweep, deskewed, lidar frame; a sample suffices.
         T_world_lidar: (n,4,4) approximate poses.
-        known: (n,) poses that stay, one or more consecutive ones.
-        num_sweeps: Number of sweeps in a submap, within which poses keep their distances.
+        known: (n,) True for poses that stay fixed; at least one, and consecutive.
+        num_sweeps: Number of sweeps in a submap. Relative poses within a submap stay fixed.
     """
     member, middle = _submaps(known, num_sweeps)
     T, fixed = T_world_lidar[middle], known[middle]
@@ -197,8 +200,8 @@ def relax_poses(
 def _submaps(known: Bool, num_sweeps: int) -> tuple[Int, Int]:
     """Return (n,) the submap of each sweep, ascending, and (m,) the middle sweep of each submap.
 
-    No submap holds known sweeps and others. Incomplete submaps are the farthest from the known
-    ones.
+    A submap has either known sweeps or others. Incomplete submaps are the farthest from the known
+    sweeps.
     """
     begin, end = np.flatnonzero(known)[[0, -1]] + (0, 1)
     row = np.arange(len(known))
@@ -216,9 +219,9 @@ def _submaps(known: Bool, num_sweeps: int) -> tuple[Int, Int]:
 
 
 class _Graph:
-    """Submaps and their aligned pairs.
+    """A pose graph of m submaps and p alignments between two submaps each.
 
-    ends: (p,2) target and source of each pair. fixed: (m,) submaps that stay.
+    ends: (p,2) target and source submap of each alignment. fixed: (m,) True for submaps that stay.
     """
 
     def __init__(self, ends: Int, fixed: Bool, pairs: Sequence[Alignment]) -> None:
@@ -229,7 +232,7 @@ class _Graph:
         self._overlap = np.array([a.overlap for a in pairs])
 
     def relaxed(self, T_world_submap: Float) -> Float:
-        """Return the poses (m,4,4) that fit the pairs best, by Gauss-Newton."""
+        """Return the submap poses (m,4,4) that fit the alignments best, by Gauss-Newton."""
         T, free = T_world_submap.copy(), ~self._fixed
         if not free.any():
             return T
@@ -241,7 +244,7 @@ class _Graph:
         return T
 
     def holds(self, T: Float) -> Bool:
-        """Return (m,) True for submaps that good pairs connect to fixed ones, at poses (m,4,4)."""
+        """Return (m,) True for submaps that reliable alignments connect to fixed submaps."""
         target, source = self._ends.T
         wrong = self.off_m(self._apart(T)) > _MOST_LEFT_M
         across = np.zeros((2, len(self._fixed)))
@@ -258,20 +261,20 @@ class _Graph:
         return found
 
     def _between(self, T: Float) -> Float:
-        """Return (p,4,4) from each source to its target, by poses (m,4,4)."""
+        """Return (p,4,4) poses of sources in their target's frame, from submap poses (m,4,4)."""
         return poses.inverse(T[self._ends[:, 0]]) @ T[self._ends[:, 1]]
 
     def _apart(self, T: Float) -> Float:
-        """Return (p,6) the motion of each source away from its aligned pose."""
+        """Return (p,6) the motion (rad, m) of each source away from its aligned pose."""
         return poses.log(self._T_source_target @ self._between(T))
 
     def off_m(self, apart: Float) -> Float:
-        """Return (p,) root mean square distance of the surfaces at these motions."""
+        """Return (p,) root mean square distance of the surfaces after motions (p,6)."""
         square = np.einsum("pi,pij,pj->p", apart, self._information, apart)
         return np.sqrt(np.maximum(square, 0))
 
     def _step(self, T: Float) -> Float:
-        """Return (free,6) the next Gauss-Newton step of every free submap, in its own frame."""
+        """Return (free,6) the next Gauss-Newton step of each free submap, in its own frame."""
         apart = self._apart(T)
         weight = 1 / (1 + (self.off_m(apart) / _USUAL_M) ** 2)
         adjoint = poses.carried(poses.inverse(self._between(T))[:, None], np.eye(6))

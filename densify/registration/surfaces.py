@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Register sweeps point to plane on the surfaces of the last second.
 
-Point to point (`densify.registration.odometry`), a sweep is matched with the scan pattern of
-earlier sweeps, which moves with the vehicle. That pulls the poses by 1 cm with 64 rings and 1.3 cm
-with 32. A rosette that turns 7 degrees a sweep takes the poses with it. A second of sweeps together
-has surfaces whose normals do not depend on the pattern (Chen, Medioni, "Object modelling by
-registration of multiple range images", IVC 1992).
+Point-to-point registration (`densify.registration.odometry`) matches a sweep with the scan pattern
+of earlier sweeps, which moves with the vehicle. This biases the poses by 1 cm with 64 rings and by
+1.3 cm with 32. A rosette pattern that turns 7 degrees a sweep turns the poses with it. The sweeps
+of one second together give surface normals that do not depend on the pattern (Chen, Medioni,
+"Object modelling by registration of multiple range images", IVC 1992).
 """
 
 from __future__ import annotations
@@ -22,26 +22,30 @@ from densify.registration.deskew import deskew_sweep
 from densify.registration.odometry import search_twist
 
 _REACH_NS = 1_050_000_000
-_NUM_IN_REACH = 10  # sweeps; of a larger number every second, third, ... one
+_NUM_IN_REACH = 10  # sweeps of the last second; a larger number is thinned evenly
 _START_NS = 850_000_000  # time in which the start speed is found
 _NUM_START = 3  # sweeps of the first surfaces, at their expected poses
 _NUM_POINTS = 15_000  # number of points of a sweep
 _VOXEL_M = 0.25
-# The normal of points of one ring is that of their noise. It leans towards the scanner and tips
-# the vehicle by 0.03 degrees a sweep. Neighbours must include the next rings.
+# Neighbours must include the next rings. Points of one ring give normals of noise, which lean
+# towards the scanner and tilt the vehicle by 0.03 degrees a sweep.
 _NUM_NEIGHBORS, _NUM_NEIGHBORS_OF_FEW = 20, 50
-# For each round. Narrow at the end, because a point beyond all others has no partner.
+# One distance per round. The last is narrow, because points outside the target have no match.
 _MATCH_M = (0.5, 0.2)
 _MATCH_GUESSED_M = (0.9, *_MATCH_M)  # constant velocity is up to 0.3 m off after 0.1 s
-_MOST_M = 0.3  # from the odometry; at larger distances wrong partners are as near as right ones
+_MOST_M = 0.3  # from the odometry; at larger distances false matches are as near as correct ones
 _HOLD = 0.01  # along highways one plane in fifty constrains the motion
 
 
 def refine(sweeps: Sequence[Sweep], rough: Trajectory) -> Trajectory:
-    """Return the trajectory with each raw sweep aligned with those before it.
+    """Return the trajectory with each raw sweep aligned with the sweeps of the second before it.
 
-    The first sweeps are aligned with those after them. A sweep that would move by more than 0.3 m
-    from ``rough`` keeps its pose. The first pose does not change.
+    The first sweeps are aligned with the sweeps after them. A sweep that would move by more than
+    0.3 m from ``rough`` keeps its pose. The first pose does not change.
+
+    Args:
+        sweeps: Raw sweeps, ascending in time.
+        rough: Trajectory of these sweeps, by odometry.
     """
 
     def expected(i: int, _: Float) -> Float:
@@ -57,8 +61,9 @@ def refine(sweeps: Sequence[Sweep], rough: Trajectory) -> Trajectory:
 def register_on_surfaces(sweeps: Sequence[Sweep]) -> Trajectory:
     """Return the trajectory of sparse raw sweeps, ascending in time, without other odometry.
 
-    Each sweep starts at constant velocity. The first second is registered twice: from
-    `search_twist`, which is some metres per second off, then from the twist of that result.
+    Each sweep starts at constant velocity. The first second is registered twice. The first time
+    starts from `search_twist`, which is some metres per second off, the second time from the
+    velocity found.
     """
 
     def expected(_: int, before: Float) -> Float:
@@ -88,9 +93,9 @@ class _SweepRow:
     ) -> None:
         """Prepare the sweeps.
 
-        num_neighbors: used for a normal. match_m: greatest distance between corresponding points,
-        for each round. most_m: A sweep that is found farther from its expected position is put
-        there.
+        num_neighbors: number of points for a normal. match_m: greatest distance between
+        corresponding points, for each round. most_m: greatest correction of a predicted position; a
+        sweep with a larger correction keeps its prediction.
         """
         self._sweeps = [subsample(sweep, _NUM_POINTS) for sweep in sweeps]
         self.stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
@@ -99,10 +104,10 @@ class _SweepRow:
         self._points: list[Float] = []  # of the sweeps aligned so far, in the world
 
     def register(self, twist: Float, expected: Callable[[int, Float], Float]) -> Float:
-        """Return ``T_first_lidar`` (S,4,4).
+        """Return ``T_first_lidar`` (S,4,4) of the S sweeps.
 
-        twist: (6,) per second at the start. expected: returns the twist from sweep i - 1 to i,
-        given the previous one.
+        twist: (6,) initial velocity (rad/s, m/s). expected: function that predicts the velocity
+        from sweep i - 1 to i, given i and the previous velocity.
         """
         num, stamp_ns = len(self._sweeps), self.stamp_ns
         num_start = min(_NUM_START, num // 2)
@@ -123,9 +128,10 @@ class _SweepRow:
         return np.stack([np.eye(4), *(poses.inverse(self._T[0]) @ T for T in self._T[1:])])
 
     def _place(self, i: int, step: int, T_guess: Float, twist: Float, on: Iterable[int]) -> Float:
-        """Align sweep i with others, and return the twist from sweep ``step`` - 1 to ``step``.
+        """Align sweep i with others, and return the velocity from sweep ``step`` - 1 to ``step``.
 
-        on: the others, nearest first; none to keep the guess.
+        T_guess: predicted pose. twist: predicted (6,) velocity. on: indices of the other sweeps,
+        nearest first; if empty the sweep keeps its prediction.
         """
         self._T[i], near = T_guess, list(on)
         if near:
@@ -147,10 +153,10 @@ class _SweepRow:
         return twist
 
     def _seconds(self, i: int) -> float:
-        """Return the time from the previous sweep to sweep i."""
+        """Return the time from sweep i - 1 to sweep i in seconds."""
         return float(self.stamp_ns[i] - self.stamp_ns[i - 1]) * 1e-9
 
 
 def _deskewed(sweep: Sweep, twist: Float) -> Float:
-    """Return the sweep's points (N,3), deskewed."""
+    """Return the (N,3) points deskewed by a (6,) velocity (rad/s, m/s), lidar frame."""
     return deskew_sweep(sweep, np.eye(4), twist, twist).sweep.points

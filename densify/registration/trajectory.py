@@ -23,8 +23,8 @@ from densify.registration.odometry import MAX_SPEED_M_S, above_ground, find_odom
 from densify.registration.surfaces import refine, register_on_surfaces
 
 MIN_OVERLAP = 0.55
-"""Share of the points above the ground that must lie on the sweeps of a third of a second before.
-Right poses gave 0.73 (16 beams, 25 m/s) to 0.98, wrong ones of a rosette 0.42."""
+"""Least share of a sweep's points above the ground that overlap the sweeps of the third of a second
+before. Correct poses gave 0.73 (16 beams, 25 m/s) to 0.98, false poses of a rosette 0.42."""
 MIN_NUM_POINTS = 1000  # a sweep with fewer cannot be registered
 _MAX_ACCELERATION_M_S2 = 30.0  # three times the grip of tyres, for noise of the stamps
 _POSE_NOISE_M = 0.5
@@ -36,11 +36,12 @@ _OVERLAP_NS = 350_000_000  # time in which a pattern that does not repeat fills 
 
 
 class LeftOut(NamedTuple):
-    """The reason for which a sweep is not used.
+    """The reason why a sweep is not used.
 
     Attributes:
-        unreadable: It could not be read; else it was not registered.
-        unfit: Its content is the reason.
+        reason: Sentence for the user.
+        unreadable: True if the sweep could not be read, False if it could not be registered.
+        unfit: True if the sweep's own content prevents registration, as with too few points.
     """
 
     reason: str
@@ -48,7 +49,7 @@ class LeftOut(NamedTuple):
     unfit: bool = False
 
     def error(self, frame: int) -> InputError | SweepError:
-        """Return the error to raise if nothing can be made without the sweep."""
+        """Return the error to raise if the sweep is indispensable."""
         if self.unreadable:
             return InputError(self.reason)
         return (UnfitSweepError if self.unfit else UnplacedSweepError)(self.reason, frame)
@@ -59,9 +60,9 @@ class Registration:
     """The poses of a block of sweeps.
 
     Attributes:
-        pieces: Consecutive sweeps, each piece in a world of its own. The lead-in sweeps before
-            the block are among them.
-        bad: Frame -> reason for which it is left out.
+        pieces: Trajectories of consecutive sweeps, each in a world of its own, including the
+            lead-in sweeps before the block.
+        bad: Frame number -> reason why the sweep is not used.
     """
 
     pieces: tuple[Trajectory, ...]
@@ -71,16 +72,17 @@ class Registration:
 def find_trajectory(
     sweeps: Sequence[Sweep], settings: RegisterSettings, recorded: Trajectory | None = None
 ) -> Trajectory:
-    """Return the poses of raw sweeps, ascending in time.
+    """Return the poses of raw sweeps.
 
-    Dense sweeps are registered point to point and then aligned with the surfaces of earlier sweeps.
-    Sparse sweeps are registered on surfaces alone.
+    Dense sweeps are registered point to point, then aligned with the surfaces of earlier sweeps.
+    Sparse sweeps are registered on surfaces only.
 
     Args:
-        recorded: The recording's own poses, which are checked and used; None to register.
+        sweeps: Raw sweeps, ascending in time.
+        recorded: Poses of the recording, to be checked and used; None to register the sweeps.
 
     Raises:
-        SweepError: The poses cannot be right. The message names the frame.
+        SweepError: The poses are implausible. The message names the frame.
     """
     _check_stamps([s.frame for s in sweeps], np.array([s.stamp_ns for s in sweeps], np.int64))
     if recorded is not None:
@@ -126,7 +128,7 @@ def _check_stamps(frames: Sequence[int], stamp_ns: Int) -> None:
 
 
 def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
-    """Raise UnplacedSweepError if the trajectory jumps as no vehicle does."""
+    """Raise UnplacedSweepError if the trajectory has a motion that no vehicle can make."""
     T, before = trajectory.T_world_lidar, None
     if not np.isfinite(T).all():
         bad = trajectory.frames[int(np.argmin(np.isfinite(T).all((1, 2))))]
@@ -143,10 +145,12 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
 
 
 def find_jump(twist: Float, before: Float | None, step_s: float) -> str:
-    """Return why no vehicle moves by a (6,) twist per second for ``step_s``, "" if one may.
+    """Return why a vehicle cannot move at this velocity for ``step_s``; "" if it can.
 
     Args:
-        before: The twist of the previous step.
+        twist: (6,) velocity (rad/s, m/s).
+        before: (6,) velocity of the previous step; None if unknown.
+        step_s: Duration of the step in seconds.
     """
     slack_m_s = _POSE_NOISE_M / step_s
     speed_m_s, turn_deg_s = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))
@@ -166,11 +170,15 @@ def find_jump(twist: Float, before: Float | None, step_s: float) -> str:
 def check_overlap(
     sweeps: Sequence[Sweep], trajectory: Trajectory, settings: RegisterSettings
 ) -> None:
-    """Raise UnplacedSweepError if a sweep does not overlap those of the last third of a second.
+    """Raise UnplacedSweepError if a sweep overlaps too little with the sweeps just before it.
 
-    Odometry may continue at constant velocity over sweeps of another place. One earlier sweep is
-    not enough for a scan pattern that does not repeat. Near the start, the next third of a second
-    must agree too. Very sparse sweeps pass.
+    These are the sweeps of the last third of a second. Odometry can continue at constant velocity
+    over sweeps of another place. One earlier sweep is not enough for a scan pattern that does not
+    repeat. Near the start, the following third of a second is tested too. Very sparse sweeps pass.
+
+    Args:
+        sweeps: Deskewed sweeps.
+        trajectory: Poses of these sweeps.
     """
     frames, stamp_ns = trajectory.frames, trajectory.stamp_ns
 
@@ -203,7 +211,7 @@ def check_overlap(
 
 
 def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
-    """Return the share of (N,3) points close to one of the sweeps, 1 for very few points."""
+    """Return the share of (N,3) points within 0.5 m of any tree's points; 1 for few points."""
     if min(len(points), sum(tree.n for tree in trees)) < _OVERLAP_POINTS // 10:
         return 1.0
     left = points[:: len(points) // _OVERLAP_POINTS + 1]

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Define the types that stages hand to each other.
 
-All are frozen; columns stay aligned row by row. Poses are named ``T_target_source``: ``p_target =
-T_target_source @ p_source``. Frames of reference: ``world`` (the first sweep's lidar), ``lidar``
-(at the sweep's reference time), ``key`` (the key sweep's lidar), ``cam``.
+All are frozen. Per-point arrays of an object are aligned row by row. Poses are named
+``T_target_source``: ``p_target = T_target_source @ p_source``. Frames of reference: ``world`` (the
+first sweep's lidar), ``lidar`` (at the sweep's reference time), ``key`` (the key sweep's lidar at
+its reference time), ``cam`` (x right, y down, z forward).
 """
 
 from densify.geometry.arrays import Bool, Float, Float32, Int

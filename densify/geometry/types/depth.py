@@ -18,22 +18,22 @@ from densify.geometry.poses import inverse
 
 @dataclass(frozen=True)
 class Cloud:
-    """M accumulated points at the key's time.
+    """M accumulated points at the reference time of the key sweep.
 
     Attributes:
-        points: (M,3) metres, key frame.
-        rigid_points: (M,3) positions of rigid accumulation.
-        frame: (M,) int32 frame of the source sweep.
-        since_key_ns: (M,) int64 from the key's reference time to that of the source sweep.
-        row: (M,) int64 row in the file of the source sweep.
-        lidar: (M,) uint8 number of the scanner that measured the point.
-        moving: (M,) bool.
-        instance: (M,) int32 number of the moving object, -1 none.
-        velocity_m_s: (M,3) float32 at the key's time, ego-motion removed, 0 for static points.
-        confidence: (M,) float32, 0 to 1.
-        intensity: (M,) float32.
-        rgb: (M,3) uint8, black where no camera observed the point.
-        far: (M,) bool, from a sweep beyond the window (``accumulate.far_m``).
+        points: (M,3) metres, key frame, displaced by scene flow.
+        rigid_points: (M,3) metres, key frame, by registration only, as in rigid accumulation.
+        frame: (M,) int32 frame number of the source sweep.
+        since_key_ns: (M,) int64 reference time of the source sweep minus that of the key sweep.
+        row: (M,) int64 row of the point in the file of the source sweep.
+        lidar: (M,) uint8 index of the scanner that measured the point.
+        moving: (M,) bool, True if the point belongs to a moving object.
+        instance: (M,) int32 number of the moving object, -1 for none.
+        velocity_m_s: (M,3) float32 at the key's time, key frame, ego-motion removed; 0 if static.
+        confidence: (M,) float32 relative score of 0 to 1.
+        intensity: (M,) float32 of 0 to 1.
+        rgb: (M,3) uint8, black for points that no camera observed.
+        far: (M,) bool, True if the source sweep is beyond the window (``accumulate.far_m``).
     """
 
     points: Float
@@ -52,24 +52,24 @@ class Cloud:
 
     @property
     def displaced(self) -> Float32:
-        """Return (M,) metres moved beyond the rigid alignment."""
+        """(M,) metres between the positions by scene flow and by rigid accumulation."""
         x, y, z = (self.points - self.rigid_points).T
         return np.sqrt(x * x + y * y + z * z).astype(np.float32)
 
     def joined(self, other: Cloud) -> Cloud:
-        """Return the cloud with the points of another one appended."""
+        """Return a cloud of the points of this cloud, then those of the other cloud."""
         return Cloud(**{n: np.concatenate([c, vars(other)[n]]) for n, c in vars(self).items()})
 
     def select(self, keep: Bool) -> Cloud:
-        """Return the points where ``keep`` (M,) is True."""
+        """Return a cloud of the points where the (M,) mask is True."""
         rows = np.flatnonzero(keep)  # once for all columns
         return Cloud(**{name: column.take(rows, axis=0) for name, column in vars(self).items()})
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return all columns (M,) by name, vectors by axis.
+        """Return the attributes as (M,) columns by name, vectors split into one column per axis.
 
-        These are x y z, rigid_x rigid_y rigid_z, velocity_x velocity_y velocity_z (m/s), red green
-        blue, and the other attributes.
+        The vector columns are x y z, rigid_x rigid_y rigid_z, velocity_x velocity_y velocity_z
+        (m/s), and red green blue.
         """
         by_axis = {
             "points": "x y z",
@@ -84,7 +84,7 @@ class Cloud:
         return columns
 
     def to_numpy(self) -> NDArray[Any]:
-        """Return an (M,) structured array with a field for each of `columns`."""
+        """Return an (M,) structured array with the fields of `columns`."""
         return table(self.columns())
 
     def __len__(self) -> int:
@@ -93,16 +93,17 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Patches:
-    """The surface patches of M points of a cloud; see `densify.depth.patches`.
+    """The surface patches of the M points of a cloud, in the same order (`densify.depth.patches`).
 
     Attributes:
         normal: (M,3) float32 normal of the tangent plane, of any length, key frame.
-        spacing_m: (M,2) float32 distance to the neighbouring rays of the same sweep, across and
-            along elevation.
-        free: (M,) bool, the key sweep saw through the point.
-        sweep: (M,) int32 number of the source sweep by frame, those beyond the window last.
-        place: (M,) int32 number of the piece of road from which a sweep beyond the window
-            measured the point; -1 within the window.
+        spacing_m: (M,2) float32 distance to the neighbouring rays of the same sweep: in azimuth,
+            then in elevation.
+        free: (M,) bool, True if the key sweep saw through the point.
+        sweep: (M,) int32 index of the source sweep, ascending by frame; sweeps beyond the window
+            come last.
+        place: (M,) int32 index of the stretch of road from which a sweep beyond the window measured
+            the point; -1 for sweeps of the window.
     """
 
     normal: Float32
@@ -112,13 +113,13 @@ class Patches:
     place: NDArray[np.int32]
 
     def joined(self, other: Patches) -> Patches:
-        """Return the patches with those of another cloud appended. No sweep may be in both."""
+        """Return these patches, then the other cloud's. The two clouds must not share a sweep."""
         num_sweeps = np.int32(self.sweep.max(initial=-1) + 1)
         behind = vars(other) | {"sweep": num_sweeps + other.sweep}
         return Patches(**{n: np.concatenate([c, behind[n]]) for n, c in vars(self).items()})
 
     def select(self, keep: Bool) -> Patches:
-        """Return the patches of ``cloud.select(keep)``."""
+        """Return the patches of ``cloud.select(keep)``, with the sweeps renumbered from 0."""
         rows = np.flatnonzero(keep)
         kept = {name: column.take(rows, axis=0) for name, column in vars(self).items()}
         number = np.cumsum(np.bincount(kept["sweep"]) > 0) - 1
@@ -127,18 +128,21 @@ class Patches:
 
 @dataclass(frozen=True)
 class StandingWorld:
-    """K points of static surfaces, measured along the road.
+    """K points on static surfaces along the road, from n sweeps.
 
     Attributes:
-        points: (K,3) float32 metres.
-        normal: (K,3) float32 normal of the tangent plane, of any length.
-        spacing_m: (K,2) float32 distance to the neighbouring rays of the same sweep.
+        points: (K,3) float32 metres, in the world of the registered window.
+        normal: (K,3) float32 normal of the tangent plane, of any length, same frame.
+        spacing_m: (K,2) float32 distance to the neighbouring rays of the same sweep, as in
+            `Patches`.
         source: (K,) int32 index of the source sweep in ``frames``.
-        row: As in `Cloud`; lidar and intensity too.
-        frames: Frames of n sweeps.
-        stamp_ns: (n,) int64.
-        travel_m: (n,) float64 along the road: 0 at the key's window, negative before it.
-        left_out: Sweeps that could not be registered well.
+        row: (K,) int64 row of the point in the file of the source sweep.
+        lidar: (K,) uint8 index of the scanner.
+        intensity: (K,) float32 of 0 to 1.
+        frames: Frame numbers of the n sweeps.
+        stamp_ns: (n,) int64 reference times.
+        travel_m: (n,) float64 distance along the road from the window, negative before it.
+        left_out: Frame numbers of sweeps without a reliable registration.
     """
 
     points: Float32
@@ -154,7 +158,7 @@ class StandingWorld:
     left_out: tuple[int, ...] = ()
 
     def select(self, keep: Bool | Int) -> StandingWorld:
-        """Return some of the points."""
+        """Return the points where a (K,) mask is True, or at the given rows."""
         rows = np.flatnonzero(keep) if keep.dtype == bool else keep
         kept = {name: getattr(self, name).take(rows, axis=0) for name in _COLUMNS_OF_STANDING}
         return replace(self, **kept)
@@ -167,36 +171,36 @@ _COLUMNS_OF_STANDING = ("points", "normal", "spacing_m", "source", "row", "lidar
 
 
 class Reason(IntEnum):
-    """Why a point is not in a depth map; the first reason that applies."""
+    """Reason why a point is missing from a depth map; the first reason that applies."""
 
-    KEPT = 0  # it gives its pixel the depth
+    KEPT = 0  # not missing: the pixel has the depth of this point
     VETOED = 1  # the key sweep saw through its position
     OUTSIDE = 2  # not in the image
-    HIDDEN = 3  # behind another point's patch
-    NOT_CHOSEN = 4  # a point nearer in time to the key, or nearer, gives its pixel the depth
-    UNSUPPORTED = 5  # too few sweeps agree with it, or not the one nearest to the key
-    EDGE = 6  # so close to a depth discontinuity that its pixel may be beyond it
+    HIDDEN = 3  # occluded by the patch of another point
+    NOT_CHOSEN = 4  # another point of the pixel is nearer, or nearer in time to the key
+    UNSUPPORTED = 5  # too few sweeps agree with it, or the sweep nearest to the key does not
+    EDGE = 6  # boundary pixel: the pixel may show the other side of a depth discontinuity
     GLASS = 7  # inside a vehicle, measured through a car window
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera, rectified or with its lens.
+    """Intrinsics, lens and mounting pose of a camera.
 
     Attributes:
-        name: As in the recording.
+        name: Name of the camera in the recording.
         width_px: Width of the image.
         height_px: Height of the image.
         K: (3,3) intrinsics in pixels; an integer coordinate is the centre of a pixel.
-        T_cam_lidar: (4,4) pose.
-        distortion: Coefficients of the lens. Of a pinhole OpenCV's (k1 k2 p1 p2 k3 ...), empty
-            if rectified; of a fisheye k1 k2 k3 k4; of mei xi k1 k2 p1 p2.
+        T_cam_lidar: (4,4) pose of the lidar frame in the camera frame.
+        distortion: Coefficients of the lens: pinhole k1 k2 p1 p2 k3 ... as OpenCV, empty if
+            rectified; fisheye k1 k2 k3 k4; mei xi k1 k2 p1 p2.
         model: ``pinhole``, ``fisheye`` (Kannala-Brandt) or ``mei``.
-        max_angle_deg: Greatest angle off the axis in the view of the lens.
-        row_time_s: Time from the exposure of a row to that of the row below, negative if the
-            image is read from the bottom, 0 for all at once. Stamps are those of the image's
-            middle.
-        column_time_s: The same from a column to the one on its right.
+        max_angle_deg: Greatest angle off the optical axis that the lens sees.
+        row_time_s: Rolling shutter: time from the exposure of a row to the exposure of the row
+            below. It is negative if the image is read from the bottom, and 0 for a global shutter.
+            The stamp of an image is the exposure of its middle.
+        column_time_s: Time from the exposure of a column to the exposure of the next one right.
     """
 
     name: str
@@ -217,7 +221,7 @@ class Camera:
 
     @property
     def readout_s(self) -> float:
-        """Approximate seconds from the exposure of the first row or column to the last."""
+        """Approximate seconds from the first exposure of a row or column to the last."""
         along = abs(self.row_time_s) * self.height_px
         return along + abs(self.column_time_s) * self.width_px
 
@@ -228,27 +232,27 @@ class Camera:
 
     @property
     def measure(self) -> str:
-        """The default measure of depth, camera ``z`` or ``range``.
+        """The default measure of depth: ``z`` along the optical axis, or ``range`` from the lens.
 
-        A lens that may see behind its image plane, where z is negative, has ranges.
+        Only a pinhole uses ``z``, because other lenses may see points with a negative z.
         """
         return "z" if self.model == "pinhole" else "range"
 
     @property
     def focal_px(self) -> float:
-        """Pixels to the right per radian, in the middle of the image."""
+        """Pixels to the right per radian, at the principal point."""
         xi = self.distortion[0] if self.model == "mei" else 0.0
         return float(self.K[0, 0] / (1 + xi))
 
 
 class Ranked(NamedTuple):
-    """The inputs of the confidence of a map's pixels (`densify.depth.confidence`).
+    """The inputs of the calibrated confidence of a map (`densify.depth.confidence`).
 
     Attributes:
-        rank: (H,W) float32 0 to 1, larger is more certain, 0 where ``filled_m`` has none.
-        group: (H,W) uint8 kind of the pixel.
-        contradicted: (H,W) float32 0 to 1, share of the measurements around that contradict
-            each other.
+        rank: (H,W) float32 of 0 to 1, larger is more certain; 0 where ``filled_m`` has no depth.
+        group: (H,W) uint8 kind of the pixel, each kind with a calibration of its own.
+        contradicted: (H,W) float32, share (0 to 1) of the measurements near the pixel that
+            contradict each other.
     """
 
     rank: Float32
@@ -261,9 +265,10 @@ class CameraView:
     """The viewpoint of a depth map.
 
     Attributes:
-        T_cam_key: (4,4) at the moment the map shows.
-        late_s: Seconds from the key's reference time to that moment.
-        number: Number of the image, None without one.
+        camera: The camera.
+        T_cam_key: (4,4) pose of the key frame in the camera frame at the time the map shows.
+        late_s: Time the map shows minus the key's reference time, seconds.
+        number: Number of the image; None if the map shows no image.
     """
 
     camera: Camera
@@ -274,21 +279,21 @@ class CameraView:
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Dense depth of one camera; (H,W) each.
+    """Dense depth of one camera.
 
     Attributes:
         camera: Name of the camera.
-        depth_m: float32 metres of measured pixels, 0 none.
-        filled_m: The same, and pixels interpolated between measured ones.
-        confidence: float32 0 to 1, of every pixel in ``filled_m``.
-        frame: int32 frame of the sweep that measured the pixel, -1 elsewhere.
-        reason: (M,) uint8 `Reason` of each point of the cloud; empty without the cloud.
-        age_s: float32 time between the moment of the map and the sweep that measured the pixel,
-            of every pixel in ``filled_m``, nan elsewhere; None before
-            `densify.depth.views.with_ages`.
-        measure: ``z`` along the camera's axis, or ``range`` from the lens.
-        warnings: What could not be done as asked.
-        ranked: Inputs of the calibrated confidence; None for another one.
+        depth_m: (H,W) float32 metres of measured pixels, 0 elsewhere.
+        filled_m: (H,W) float32 metres of measured and interpolated pixels, 0 elsewhere.
+        confidence: (H,W) float32 of 0 to 1, for every pixel with a depth in ``filled_m``.
+        frame: (H,W) int32 frame number of the sweep that measured the pixel, -1 elsewhere.
+        reason: (M,) uint8 `Reason` of each point of the cloud; empty if the cloud is not kept.
+        age_s: (H,W) float32 seconds between the exposure of the image and the sweep that measured
+            the pixel, nan where ``filled_m`` has no depth. None until
+            `densify.depth.views.with_ages` computes it.
+        measure: ``z`` for depth along the optical axis, ``range`` for distance from the lens.
+        warnings: Sentences about requested steps that could not be done.
+        ranked: Inputs of the calibrated confidence; None if the confidence is not calibrated.
     """
 
     camera: str
@@ -305,11 +310,11 @@ class DepthMap:
     def to_points(self, view: CameraView, filled: bool = True) -> Float:
         """Return the map's pixels as points (K,3) in the key frame, metres, row by row.
 
-        Moving objects are where they were at the exposure.
+        Moving objects are at their position at the exposure of the image.
 
         Args:
-            view: ``Result.views`` of the same name.
-            filled: Take the interpolated pixels too.
+            view: Viewpoint of the map, from ``Result.views``.
+            filled: Include interpolated pixels.
 
         Raises:
             InputError: The camera is not rectified, or the map holds ranges.
@@ -329,14 +334,14 @@ class DepthMap:
         return np.asarray(points_cam @ T_key_cam[:3, :3].T + T_key_cam[:3, 3])
 
     def counts(self) -> dict[str, int]:
-        """Return the number of points for each `Reason`."""
+        """Return the number of points per `Reason`, by its name in lower case."""
         counts = np.bincount(self.reason, minlength=len(Reason))
         return {which.name.lower(): int(counts[which]) for which in Reason}
 
 
 @dataclass(frozen=True)
 class Mover:
-    """One moving object alone: its points, and its depth map in each camera."""
+    """The points of one moving object, and its depth map in each camera, by map name."""
 
     cloud: Cloud
     depth: Mapping[str, DepthMap]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Define the interface of readers, boxes around objects, and exact truth of simulations."""
+"""Define the interface of readers, boxes around objects, and the ground truth of simulations."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ from densify.geometry.types.sweeps import Sweep
 class LidarSequence(Protocol):
     """A recording, opened lazily. A reader is one class with these members.
 
-    Frames are absolute numbers. Methods raise InputError with a full sentence for anything missing
-    or malformed. A reader may also have these methods, which are found by name:
+    Frames are the data set's own sweep numbers. Methods raise InputError with a full sentence for
+    anything missing or malformed. A reader may also have these methods, which are looked up by
+    name:
 
-    - findings() -> Sequence[tuple[str, str]]: findings and assumptions, short labels and texts.
-    - gaps() -> Sequence[str]: missing parts and what is assumed instead, a sentence each.
-    - prepare(frames, images=()): make these sweeps and images (camera, number), read next.
-    - T_world_cam(camera, number) -> (4,4): pose of an image's exposure in the lidar's world.
-    - boxes(frame) -> Boxes | None: around objects in a sweep; None where nobody drew any.
-    - sweep_bytes() -> Mapping[int, int]: size of each sweep's file; empty for shared files.
-    - num_rows(frame) -> int: number of rows of the sweep's file, valid or not.
+    - findings() -> Sequence[tuple[str, str]]: short labels and texts of findings and assumptions.
+    - gaps() -> Sequence[str]: a sentence for each missing part and its replacement.
+    - prepare(frames, images=()): render these sweeps and images (camera, number) in parallel.
+    - T_world_cam(camera, number) -> (4,4): camera pose at an image's exposure in the lidar's world.
+    - boxes(frame) -> Boxes | None: annotated boxes of a sweep; None if it is not annotated.
+    - sweep_bytes() -> Mapping[int, int]: file size of each sweep by frame; empty for shared files.
+    - num_rows(frame) -> int: number of rows of the sweep's file, valid and invalid.
     """
 
     @property
     def name(self) -> str:
-        """Name for people and outputs."""
+        """Name of the recording in messages and outputs."""
 
     @property
     def frames(self) -> Sequence[int]:
-        """Numbers of the existing sweeps, ascending."""
+        """Frame numbers of the existing sweeps, ascending."""
         ...
 
     @property
@@ -45,7 +46,7 @@ class LidarSequence(Protocol):
 
     @property
     def truth(self) -> Truth | None:
-        """Exact truth, None if there is none."""
+        """Ground truth of a simulation, None for a real recording."""
 
     def __getitem__(self, frame: int) -> Sweep: ...
 
@@ -54,27 +55,28 @@ class LidarSequence(Protocol):
         ...
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """Return the exposure time of each of the camera's images (its middle row), by number.
+        """Return image number -> exposure time of the middle row, for all images of a camera.
 
-        Both ascend. Numbers need not be those of the sweeps.
+        Numbers and times both ascend. Image numbers may differ from frame numbers.
         """
         ...
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
-        """Return an image, (H,W,3) RGB."""
+        """Return the (H,W,3) RGB image of this number."""
         ...
 
     def T_world_lidar(self, frame: int) -> Float:
-        """Return the data set's own pose (4,4) at the sweep's reference time."""
+        """Return the data set's own (4,4) lidar pose at the sweep's reference time."""
         ...
 
 
 @dataclass(frozen=True)
 class BoxView:
-    """The image of the one camera in which boxes were drawn.
+    """The camera image in which an annotator drew the boxes.
 
     Attributes:
-        left_out_px: (R,4) left, top, right, bottom of rectangles without boxes.
+        camera: The camera.
+        left_out_px: (R,4) left, top, right, bottom of R image rectangles that are not annotated.
     """
 
     camera: Camera
@@ -83,19 +85,19 @@ class BoxView:
 
 @dataclass(frozen=True)
 class Boxes:
-    """The K boxes of one sweep.
+    """The K annotated boxes of one sweep.
 
     Attributes:
-        track: (K,) text, the same for an object in every sweep; empty for one that is not
-            tracked.
-        T_lidar_box: (K,4,4) lidar frame at the reference time; the points are assumed to be
-            ego-motion compensated. The origin of a box is in its middle, x to the front, z up.
+        track: (K,) text identifying the object in all sweeps; empty for an untracked object.
+        T_lidar_box: (K,4,4) pose of each box in the lidar frame at the reference time, for points
+            compensated for ego-motion. The box frame is in the middle of the box, x to the front,
+            z up.
         size_m: (K,3) length, width, height.
-        offset_ns: (K,) int64 since the reference time, where boxes are in the lidar frame of
-            another time; None for 0.
-        lidar: (K,) number of the scanner whose points a box is drawn around, -1 for all; None
-            for all.
-        view: None for boxes all round.
+        offset_ns: (K,) int64 time since the reference time at which the lidar frame of
+            ``T_lidar_box`` is taken; None for 0.
+        lidar: (K,) index of the scanner whose points a box encloses, -1 for all scanners; None if
+            every box encloses the points of all scanners.
+        view: Image in which the boxes were drawn; None for boxes all around the vehicle.
     """
 
     track: NDArray[Any]
@@ -108,13 +110,13 @@ class Boxes:
 
 @dataclass(frozen=True)
 class SweepTruth:
-    """The truth of the N points of a raw sweep, row by row.
+    """The ground truth of the N points of a raw sweep, in the same order.
 
     Attributes:
-        T_world_lidar: (4,4) at the reference time.
-        points: (N,3) lidar frame at the reference time.
-        instance: (N,) int32, -1 static.
-        moving: (N,) bool, moves at that time.
+        T_world_lidar: (4,4) lidar pose at the reference time.
+        points: (N,3) metres, positions at the reference time, lidar frame at that time.
+        instance: (N,) int32 number of the object, -1 for the static scene.
+        moving: (N,) bool, True if the object moves at the reference time.
     """
 
     T_world_lidar: Float
@@ -124,23 +126,27 @@ class SweepTruth:
 
 
 class Truth(Protocol):
-    """Exact truth of a simulated sequence."""
+    """Exact ground truth of a simulated sequence."""
 
     def sweep(self, frame: int) -> SweepTruth:
-        """Return the truth of a sweep."""
+        """Return the ground truth of a sweep."""
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return the (N,3) scene flow from the reference time of ``frame`` to that of ``target``.
+        """Return the (N,3) true scene flow in metres between two reference times.
 
         It is in the lidar frame of ``frame``, with ego-motion removed.
+
+        Args:
+            frame: Frame number of the sweep whose N points move.
+            target: Frame number of the sweep to whose reference time they move.
         """
         ...
 
     def depth_m(self, camera: str, number: int) -> Float32:
-        """Return (H,W) the true depth of an image, 0 none.
+        """Return the (H,W) true depth of an image in metres, 0 where the ray meets no surface.
 
-        It is the nearest solid surface at the exposure of each row, in the camera's own measure
-        (`Camera.measure`).
+        It is the depth of the nearest solid surface at the exposure of each row, in the camera's
+        own measure (`Camera.measure`).
         """
         ...
 

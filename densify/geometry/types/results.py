@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Define the result of a key: its maps, tracks and costs, and its maps completed with a prior."""
+"""Define the result of a key: depth maps, tracks, costs, and maps completed with a prior."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ METHOD_NAMES = {"none": "single sweep", "icp": "rigid accumulation", "flow": "sc
 
 @dataclass(frozen=True)
 class ObjectTrack:
-    """One moving object at n times: the reference times of its sweeps, and that of the key.
+    """Poses of one moving object at n reference times: those of its sweeps and of the key.
 
-    The frame of the object has its origin in the middle of the box, x along the motion at the key's
-    time, z along the key's.
+    The object frame has its origin in the middle of the box, x along the direction of motion at the
+    key's time, and the z axis of the key frame.
 
     Attributes:
-        instance: Number as in `Cloud`.
+        instance: Number of the object, as in `Cloud`.
         size_m: (3,) length, width and height of the box around its points.
-        frames: n sweeps, ascending.
-        stamp_ns: (n,) int64.
-        T_key_object: (n,4,4), ego-motion removed.
-        velocity_m_s: (n,3) of the middle of the box, key frame.
-        num_points: (n,) returns in the sweep.
+        frames: Frame numbers of the n sweeps, ascending.
+        stamp_ns: (n,) int64 reference times.
+        T_key_object: (n,4,4) poses in the key frame, ego-motion removed.
+        velocity_m_s: (n,3) velocity of the middle of the box, key frame, ego-motion removed.
+        num_points: (n,) number of points of the object in each sweep.
     """
 
     instance: int
@@ -46,12 +46,12 @@ class ObjectTrack:
 
 @dataclass(frozen=True)
 class Prior:
-    """A depth image that the user brings, as large as its map.
+    """A depth image supplied by the user, of the size of its depth map.
 
     Attributes:
-        value: (H,W) float32, 0 none: depth or inverse depth, relative or metric.
-        sky: (H,W) bool, to be left empty.
-        source: Origin, for messages.
+        value: (H,W) float32 depth or inverse depth, relative or metric; 0 for no value.
+        sky: (H,W) bool, True for pixels that stay without depth.
+        source: File of the image, for messages.
     """
 
     value: Float32
@@ -61,17 +61,19 @@ class Prior:
 
 @dataclass(frozen=True)
 class PriorFit:
-    """The fit of a prior's values p to depth z in metres over the image, before local correction.
+    """The fit of a prior's values p to the measured depth z (metres) of a map.
 
-    Kind ``depth``: z = scale p + shift_m. ``inverse``: 1/z = scale p + shift_per_m. ``log``: ln z =
-    scale ln p + shift.
+    It is one fit for the whole image, before local correction. Kind ``depth``: z = scale p + shift
+    (m). ``inverse``: 1/z = scale p + shift (1/m). ``log``: ln z = scale ln p + shift.
 
     Attributes:
-        residual: Mean of |ln z - ln measured| over the measured pixels, at most ln 1.25 each.
-            Each octave of depth counts alike.
-        wrong: Share of the measured pixels, weighted in the same way, that are off by more than
-            25 %.
-        used: The prior fits well enough to be used.
+        kind: ``depth``, ``inverse`` or ``log``.
+        scale: Factor of the fit.
+        shift: Offset of the fit, in the unit above.
+        residual: Mean of |ln z - ln measured| over the measured pixels, each limited to ln 1.25.
+            Pixels are weighted for each octave of depth to count alike.
+        wrong: Share of the measured pixels off by more than 25 %, with the same weights.
+        used: True if the prior fits well enough to be used.
     """
 
     kind: str
@@ -87,10 +89,12 @@ class FullDepth:
     """A depth map completed with a prior.
 
     Attributes:
-        depth_m: (H,W) float32 metres, 0 none: ``DepthMap.filled_m`` where that has a depth.
-        confidence: (H,W) float32 0 to 1, lower for pixels of the prior than for all others.
-        from_prior: (H,W) bool.
-        source: Origin of the prior.
+        depth_m: (H,W) float32 metres, 0 for none. Pixels with a depth in ``DepthMap.filled_m``
+            keep it.
+        confidence: (H,W) float32 of 0 to 1; pixels of the prior are below all others.
+        from_prior: (H,W) bool, True for pixels whose depth is from the prior.
+        fit: Fit of the prior to the map.
+        source: File of the prior.
     """
 
     depth_m: Float32
@@ -101,12 +105,12 @@ class FullDepth:
 
 
 Progress = Callable[[str, int, int], None]
-"""Called as ``(stage, done, total)`` while something takes its time."""
+"""Callback ``(stage, done, total)``: name of the stage, finished and total number of steps."""
 
 
 @dataclass(frozen=True)
 class StageCost:
-    """The wall seconds of a stage and the peak memory of the process at its end."""
+    """The wall time of a pipeline stage and the peak memory of the process at its end."""
 
     name: str
     seconds: float
@@ -115,32 +119,35 @@ class StageCost:
 
 @dataclass(frozen=True)
 class Result:
-    """One densified key. A map's name is its camera's, or CAMERA/NUMBER with ``project.per=image``.
+    """The result of one method for one key.
+
+    A map's name is its camera's name, or CAMERA/NUMBER with ``project.per=image``.
 
     Attributes:
-        method: ``flow``, ``icp``, ``none`` or another one of `densify.compare`.
-        key: Absolute frame number.
-        frames: Sweeps of the window.
-        cloud: All points at the key's time.
-        depth: Depth map by name.
-        metrics: Scores, plain numbers, ready for JSON.
-        costs: Seconds and memory of each stage.
-        baselines: Results of the simpler methods on the same registration, by method.
-        flow: Flow of every sweep to the next one towards the key (``output.flow``).
-        movers: Each moving object alone, by instance (``output.movers``).
-        optical_flow: By name (H,W,2) pixels to the "previous" and the "next" image
+        method: ``flow``, ``icp``, ``none`` or another method of `densify.compare`.
+        key: Frame number of the key sweep.
+        frames: Frame numbers of the sweeps used.
+        cloud: Accumulated points at the key's time.
+        depth: Map name -> depth map.
+        metrics: Scores as plain numbers, ready for JSON.
+        costs: Wall time and memory of each stage.
+        baselines: Method -> result of a simpler method on the same registration.
+        flow: Scene flow of every sweep to the next sweep towards the key (``output.flow``).
+        movers: Instance -> points and maps of one moving object (``output.movers``).
+        optical_flow: Map name -> "previous" and "next" -> (H,W,2) pixels to that image
             (``output.optical_flow``).
-        rejected: By name (H,W) `Reason` of the rejected points (``output.rejected``).
-        full: Maps completed with a prior, by name.
-        images: By name (H,W,3) RGB, if there is an image.
-        far_frames: Sweeps beyond the window from which the cloud has static points.
-        far_left_out: Sweeps beyond the window that could not be registered.
-        warnings: Assumptions and suspicions, a sentence each.
+        rejected: Map name -> (H,W) `Reason` of the rejected points (``output.rejected``).
+        full: Map name -> map completed with a prior.
+        images: Map name -> (H,W,3) RGB, for maps that show an image.
+        far_frames: Frame numbers of sweeps beyond the window that contribute static points.
+        far_left_out: Frame numbers of sweeps beyond the window that could not be registered.
+        warnings: Sentences about assumptions and suspected errors.
         stamp_ns: Reference time of the key.
-        views: Camera and pose of each map, by name.
-        truth_m: By name (H,W) true depth, 0 none, if there is truth.
-        T_key_lidar: (4,4) of every sweep of the window, by frame.
-        tracks: Path of each moving object.
+        views: Map name -> camera and pose.
+        truth_m: Map name -> (H,W) ground-truth depth in metres, 0 for none; empty without ground
+            truth.
+        T_key_lidar: Frame number -> (4,4) lidar pose of that sweep of the window in the key frame.
+        tracks: Poses of each moving object.
     """
 
     method: str

@@ -20,21 +20,21 @@ class Sweep:
     """One lidar revolution of N returns.
 
     Attributes:
-        frame: Absolute number.
-        stamp_ns: The reference time, as the data set stamps its sweeps: begin, middle or end.
-        points: (N,3) metres, lidar frame. As read, each at its own firing time; after deskewing,
-            all at ``stamp_ns``.
-        intensity: (N,) float32, 0 to 1.
-        offset_ns: (N,) int64, firing time minus ``stamp_ns``; None where the data cannot tell.
-        lidar: (N,) uint8 number of the scanner that fired.
-        row: (N,) int64 row of the return in the source file. Invalid rows are dropped on reading.
-        scanner_origins: (S,3) metres, lidar frame, start of the rays of each scanner; None where
-            all start at the frame's origin.
-        R_scanner_lidar: (S,3,3) turns the lidar frame's axes into each scanner's, z along the one
-            it spins about, upwards; None where they are the frame's.
-        num_untimed: Number of returns left out because their times cannot be of this sweep.
-        num_near: Number of returns left out because they are nearer than register.min_range_m.
-        num_lone: Number of returns left out as snow, rain or dust.
+        frame: Frame number in the recording.
+        stamp_ns: Reference time: begin, middle or end of the revolution, as the data set defines.
+        points: (N,3) metres, lidar frame. A raw sweep has each point in the lidar frame at its own
+            firing time, a deskewed sweep all points in the frame at ``stamp_ns``.
+        intensity: (N,) float32 of 0 to 1.
+        offset_ns: (N,) int64 firing time minus ``stamp_ns``; None if the data has no point times.
+        lidar: (N,) uint8 index of the scanner that fired.
+        row: (N,) int64 row of the return in the source file, whose invalid rows are not read.
+        scanner_origins: (S,3) metres, lidar frame, position of each of the S scanners; None if all
+            are at the origin.
+        R_scanner_lidar: (S,3,3) rotation from the lidar axes to the axes of each scanner, whose z
+            is its spin axis, upwards; None for the identity.
+        num_untimed: Number of returns dropped because their times lie outside this sweep.
+        num_near: Number of returns dropped because they are nearer than register.min_range_m.
+        num_lone: Number of returns dropped as snow, rain or dust.
     """
 
     frame: int
@@ -61,7 +61,7 @@ class Sweep:
         return len(self.points)
 
     def select(self, keep: Bool | slice) -> Sweep:
-        """Return the returns where ``keep`` (N,) is True, or of a slice."""
+        """Return the sweep with only the returns of an (N,) mask or of a slice."""
         rows = np.arange(len(self))[keep]
         return replace(
             self,
@@ -73,24 +73,24 @@ class Sweep:
         )
 
     def axes(self, lidar: int) -> Float:
-        """Return the rotation (3,3) from the axes of the lidar frame to those of the scanner."""
+        """Return the (3,3) rotation from the lidar axes to the axes of a scanner (by index)."""
         return np.eye(3) if self.R_scanner_lidar is None else self.R_scanner_lidar[lidar]
 
     def origin_m(self, lidar: int) -> Float:
-        """Return (3,) the origin of the scanner's rays, lidar frame."""
+        """Return the (3,) position, lidar frame, of a scanner (by index)."""
         return np.zeros(3) if self.scanner_origins is None else self.scanner_origins[lidar]
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The poses of a lidar.
+    """The lidar poses of n sweeps.
 
     Attributes:
-        frames: Ascending.
-        stamp_ns: (n,) int64.
-        T_world_lidar: (n,4,4).
-        R_level_lidar: (3,3) turns the axes of the lidar until z is up. It is the identity
-            unless the lidar leans.
+        frames: Frame numbers, ascending.
+        stamp_ns: (n,) int64 reference times.
+        T_world_lidar: (n,4,4) poses at the reference times.
+        R_level_lidar: (3,3) rotation that makes the z axis of the lidar point up; the identity
+            unless the lidar is mounted tilted.
     """
 
     frames: tuple[int, ...]
@@ -99,7 +99,7 @@ class Trajectory:
     R_level_lidar: Float = field(default_factory=lambda: np.eye(3))
 
     def part(self, frames: Sequence[int], origin: int) -> Trajectory:
-        """Return the poses of these frames, in the upright world of the frame ``origin``."""
+        """Return the poses of some frames in the levelled lidar frame of the sweep ``origin``."""
         rows = [self.frames.index(f) for f in frames]
         T_new_lidar = np.eye(4)
         T_new_lidar[:3, :3] = self.R_level_lidar
@@ -114,15 +114,15 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class RegisteredSweep:
-    """A deskewed sweep with its pose.
+    """A sweep with its pose, usually deskewed.
 
     Attributes:
-        sweep: Points in the lidar frame at ``sweep.stamp_ns``.
-        T_world_lidar: (4,4).
-        twist_before: (6,) rotation vector and translation per second (rad/s, m/s) of the lidar
-            before its reference time, in the lidar frame. A raw point fired at offset t is at
+        sweep: Sweep with points in the lidar frame at ``sweep.stamp_ns``.
+        T_world_lidar: (4,4) lidar pose at the reference time.
+        twist_before: (6,) velocity (rotation rad/s, translation m/s) of the lidar before the
+            reference time, in the lidar frame. Deskewing moves a raw point fired at offset t to
             ``exp(t · twist) @ p_raw``.
-        twist_after: The same after its reference time.
+        twist_after: (6,) velocity of the lidar after the reference time.
     """
 
     sweep: Sweep
@@ -132,17 +132,17 @@ class RegisteredSweep:
 
     @property
     def frame(self) -> int:
-        """The frame of the sweep."""
+        """Frame number of the sweep."""
         return self.sweep.frame
 
     @property
     def twist(self) -> Float:
-        """(6,) rotation vector and translation per second at the reference time."""
+        """(6,) velocity (rad/s, m/s) of the lidar at the reference time, in the lidar frame."""
         return 0.5 * (self.twist_before + self.twist_after)
 
     @staticmethod
     def without_points(trajectory: Trajectory, frame: int) -> RegisteredSweep:
-        """Return the pose and time of a sweep of the trajectory, without points."""
+        """Return the pose and time of a frame of the trajectory as a sweep without points."""
         i, nothing = trajectory.frames.index(frame), np.zeros(0)
         sweep = Sweep(
             frame=frame,
@@ -158,20 +158,20 @@ class RegisteredSweep:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Registered sweeps of a drive in one world, by ascending frame."""
+    """Registered sweeps in one common world, ascending by frame."""
 
     sweeps: tuple[RegisteredSweep, ...]
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """The frames of the sweeps."""
+        """Frame numbers of the sweeps."""
         return tuple(s.frame for s in self.sweeps)
 
     def __getitem__(self, frame: int) -> RegisteredSweep:
         return self.sweeps[self.frames.index(frame)]
 
     def T_target_source(self, target: int, source: int) -> Float:
-        """Return (4,4) from the lidar frame of one sweep to that of another, by frame number."""
+        """Return the (4,4) pose of sweep ``source`` in the lidar frame of sweep ``target``."""
         if target == source:
             return np.eye(4)
         return inverse(self[target].T_world_lidar) @ self[source].T_world_lidar
@@ -179,20 +179,20 @@ class Stretch:
 
 @dataclass(frozen=True)
 class FlowField:
-    """Scene flow of a sweep's (or point file's) N points to another time, ego-motion removed.
+    """Scene flow, ego-motion removed, of the N points of a sweep (or file) to a target time.
 
-    The flow counts from the sweep's reference time. A moving point that was measured earlier or
-    later is first brought there by ``to_reference``.
+    Vectors are in the frame of the points: for a sweep its lidar frame at the reference time. The
+    flow counts from that reference time. A moving point measured earlier or later first moves by
+    ``to_reference``.
 
     Attributes:
-        displacement: (N,3) metres, in the coordinates of the points; exactly 0 where not moving.
-        moving: (N,) bool, confirmed to move.
-        instance: (N,) int32 number of the moving object, -1 none.
-        lost: (N,) bool, belongs to a moving object that cannot be followed to the target time.
-        to_reference: (N,3) metres, own motion between a point's firing and the sweep's reference
-            time, in the same coordinates; None where nothing is known of it.
-        velocity_m_s: (N,3) at the target time, in the same coordinates; None where nothing is
-            known.
+        displacement: (N,3) metres from the reference time to the target time; exactly 0 if static.
+        moving: (N,) bool, True if the point is confirmed to move.
+        instance: (N,) int32 number of the moving object, -1 for none.
+        lost: (N,) bool, True if the point's object cannot be followed to the target time.
+        to_reference: (N,3) metres that the object itself moves between the point's firing and the
+            reference time; None if unknown.
+        velocity_m_s: (N,3) velocity at the target time; None if unknown.
     """
 
     displacement: Float
@@ -204,14 +204,14 @@ class FlowField:
 
     @property
     def total(self) -> Float:
-        """Return (N,3) metres from the measured position to the one at the target time."""
+        """(N,3) metres from the measured position to the position at the target time."""
         if self.to_reference is None:
             return self.displacement
         return self.to_reference + self.displacement
 
     @staticmethod
     def zero(num_points: int) -> FlowField:
-        """Return the flow of static points."""
+        """Return the flow of points that are all static."""
         return FlowField(
             displacement=np.zeros((num_points, 3)),
             moving=np.zeros(num_points, bool),
@@ -221,25 +221,35 @@ class FlowField:
 
 
 class Motion(Protocol):
-    """The motion of all points of a stretch, found by any engine."""
+    """The motion of all points of a stretch, found by any engine (scene-flow method)."""
 
     def flow(self, frame: int, target: int) -> FlowField:
-        """Return the flow of every point of a sweep to another sweep's reference time."""
+        """Return the flow of the points of sweep ``frame`` to sweep ``target``'s reference time."""
         ...
 
 
 @dataclass(frozen=True)
 class StretchFlow:
-    """Flow between neighbouring sweeps of a stretch, by (frame, target frame)."""
+    """Scene flow between neighbouring sweeps of a stretch.
+
+    Attributes:
+        stretch: The sweeps.
+        steps: (frame, target frame) -> flow of the points of the first sweep.
+    """
 
     stretch: Stretch
     steps: Mapping[tuple[int, int], FlowField]
 
     @staticmethod
     def towards(key: int, stretch: Stretch, motion: Motion) -> StretchFlow:
-        """Return the flow of each sweep to the next one towards the key.
+        """Return the flow of each sweep to the next sweep towards the key.
 
-        The key has the flow to a neighbour.
+        The key sweep itself has the flow to a neighbour.
+
+        Args:
+            key: Frame number of the key.
+            stretch: Sweeps, the key among them.
+            motion: Motion of the points.
         """
         before = [f for f in stretch.frames if f <= key]
         after = [f for f in reversed(stretch.frames) if f >= key]
