@@ -25,11 +25,11 @@ class BoxMargins:
     """Margins around a box.
 
     Attributes:
-        grown_m: Added to each side of a box. A larger one takes in mirrors and feet, and more
-            of the ground.
-        unsure_m: Points up to this much farther outside are uncertain.
-        foot_m: In a moving box, points lower than this above its bottom are uncertain, because
-            they may be the road.
+        grown_m: Margin added to each side of a box. A larger margin takes in mirrors and feet, and
+            more of the ground.
+        unsure_m: Width of the zone outside the grown box where flow is uncertain.
+        foot_m: Height above the bottom of a moving box below which flow is uncertain: the points
+            may be the road.
     """
 
     grown_m: float = 0.1
@@ -44,18 +44,19 @@ def flow_of_boxes(
     next_boxes: Boxes,
     margins: BoxMargins | None = None,
 ) -> tuple[FlowField, Bool]:
-    """Return the flow of the N points of one sweep to the next, and the points of certain flow.
+    """Return the flow of the N points of one sweep to the next, and which flows are certain.
 
     Args:
-        here: The sweep.
-        after: The next sweep in the same world. Its points are not used.
-        boxes: Boxes of the sweep.
-        next_boxes: Boxes of the next sweep.
+        after: Next sweep in the same world. Only its pose and time are used.
+        boxes: Boxes of ``here``.
+        next_boxes: Boxes of ``after``; boxes of one object share the track name.
+        margins: Margins around each box; None for the defaults.
 
     Returns:
-        The field, whose ``instance`` is the row of the box (-1 none), and (N,) bool. It is
-            False in two boxes, just outside one, at the bottom of a moving one, in a box that the
-            next sweep lacks, and where nobody drew boxes.
+        The flow with ego-motion removed, in the lidar frame of ``here``; ``instance`` is the index
+            of the point's box, -1 for no box. Then (N,) bool, True where the flow is certain. It is
+            False for points in two boxes, just outside a box, or at the bottom of a moving box. It
+            is False too in a box that the next sweep lacks, and in image areas without annotation.
     """
     margins = margins or BoxMargins()
     points = here.sweep.points
@@ -93,9 +94,9 @@ def flow_of_boxes(
 
 
 def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator[tuple[Int, Float]]:
-    """Yield the rows of the points in and around each box, and its pose.
+    """Yield the rows of the points in and around each box, and the box's pose (4,4, lidar frame).
 
-    Boxes of one scanner have points of that scanner only.
+    A box drawn for one scanner gets points of that scanner only.
     """
     points = here.sweep.points
     reach_m = np.linalg.norm(boxes.size_m / 2 + margins.grown_m + margins.unsure_m, axis=1)
@@ -111,7 +112,7 @@ def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator
 
 
 def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
-    """Return (K,4,4) the boxes in the lidar frame at the reference time, deskewed as the points."""
+    """Return the (K,4,4) box poses, lidar frame, deskewed to the reference time like the points."""
     if boxes.offset_ns is None:
         return boxes.T_lidar_box
     T = boxes.T_lidar_box.copy()
@@ -122,7 +123,7 @@ def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
 
 
 def _looked_at(view: BoxView | None, points: Float) -> Bool:
-    """Return (N,) True in the image area in which boxes were drawn."""
+    """Return (N,) True for the points (N,3, lidar frame) in the annotated image area."""
     if view is None:
         return np.ones(len(points), bool)
     uv, seen = image_points(view.camera, poses.transform(view.camera.T_cam_lidar, points))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Chain flow between neighbouring sweeps to flow over many, k -> k±1 -> … -> target."""
+"""Chain the flow between neighbouring sweeps, k -> k±1 -> … -> target, to flow over many sweeps."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _MAX_GAP_M = 0.5
 
 @dataclass(frozen=True)
 class ChainedMotion:
-    """The motion of a stretch by flows between neighbours: a `Motion`.
+    """Motion of a stretch, chained from flow between neighbouring sweeps: a `Motion`.
 
     Attributes:
-        step: Returns the flow of sweep number i to number j = i ± 1. It is called once for
-            each, on demand.
+        step: Function that returns the flow of sweep index i to index j = i ± 1, in the lidar frame
+            of sweep i. It is called on demand, once for each (i, j).
     """
 
     stretch: Stretch
@@ -33,14 +33,14 @@ class ChainedMotion:
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of every point of a sweep to another sweep's reference time.
 
-        The flow of the next sweep is looked up at the moved point. The points of an object share
-        its rigid motion there, plus the deviation of the nearest points from it. A point without an
-        object takes the mean flow of the nearest moving ones. A point is lost if its object has no
-        points in the next sweep, or no moving point is within 0.5 m.
+        The flow excludes ego-motion and is in the lidar frame of ``frame``. At each sweep on the
+        way, the onward flow is looked up at the moved point. Points of an object follow the
+        object's rigid motion there, plus the mean deviation of the nearest points. A point without
+        an object takes the mean flow of the nearest moving points. A point is lost if its object
+        has no points in the next sweep, or if no moving point is within 0.5 m.
 
         Args:
-            frame: Frame of the sweep.
-            target: Frame of the other sweep.
+            frame, target: Frame numbers of the two sweeps.
         """
         here, there = self.stretch.frames.index(frame), self.stretch.frames.index(target)
         return self._flow(here, there)
@@ -67,7 +67,7 @@ class ChainedMotion:
         return replace(step, velocity_m_s=velocity_m_s)
 
     def _follow(self, i: int, near: int, onward: FlowField) -> FlowField:
-        """Chain one step of sweep i with the flow of the nearer sweep from there on."""
+        """Chain the step from sweep i to sweep ``near`` with the flow ``onward`` from there."""
         step = self._flow(i, near)
         here, there = self.stretch.sweeps[i], self.stretch.sweeps[near]
         T_there_here = self.stretch.T_target_source(there.frame, here.frame)
@@ -100,9 +100,9 @@ class ChainedMotion:
 
 
 def _object_motion(source: Float, target: Float) -> Float:
-    """Return the (4,4) motion of an object from (N,3) points to others.
+    """Return the (4,4) rigid motion that best moves (N,3) points to their target positions (N,3).
 
-    Fewer than three points, and points on a line, determine no rotation. They are translated.
+    It is a pure translation for fewer than three points or points on a line.
     """
     if np.linalg.matrix_rank(source - source.mean(axis=0), tol=_LINE_M) < 2:
         T = np.eye(4)
@@ -112,5 +112,5 @@ def _object_motion(source: Float, target: Float) -> Float:
 
 
 def _mean(values: Float, rows: Int, weight: Float) -> Float:
-    """Return (N,3) the mean of (M,3) values at rows (N,k), with weights (N,k)."""
+    """Return the (N,3) means of values (M,3) at rows (N,k), with weights (N,k) that sum to 1."""
     return np.asarray(np.einsum("nk,nkj->nj", weight, values[rows]))

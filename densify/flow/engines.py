@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Call any engine of scene flow. `densify.config.plugins` has their table."""
+"""Run the scene flow engine that the settings name; `densify.config.plugins` lists all engines."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from densify.geometry.types import Motion, Stretch
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The input of an engine: registered sweeps in one world, their ground and free space.
+    """Input of a scene flow engine: registered sweeps in one world, their ground and free space.
 
     Attributes:
-        ground: Under all sweeps.
-        asked: Frames whose flow is needed, None for all. The other sweeps only help to find
+        ground: Height map of the ground under all sweeps.
+        asked: Frame numbers whose flow is needed, None for all. The other sweeps only help to find
             motion.
     """
 
@@ -37,24 +37,24 @@ class Scene:
 
     @cached_property
     def candidates(self) -> tuple[Candidates, ...]:
-        """The points of each sweep that may move."""
+        """The points of each sweep that may move: another sweep saw through their position."""
         return find_candidates(self.stretch, self.space, self.ground)
 
     def is_asked(self, i: int) -> bool:
-        """Return True if the flow of sweep number i is needed."""
+        """Return True if the flow of the sweep with index i is needed."""
         return self.asked is None or self.stretch.sweeps[i].frame in self.asked
 
 
 class SharedMotion(Motion, Protocol):
-    """Motion of a long stretch that serves every key in it.
+    """Motion of a long stretch that serves every key frame in it.
 
-    It is a dataclass that is cached on disk without points.
+    It is a dataclass. The disk cache stores it without the points of its sweeps.
     """
 
     def with_stretch(self, stretch: Stretch) -> SharedMotion:
-        """Return the same motion with other copies of its sweeps, which may lack their points.
+        """Return the same motion on another copy of its stretch, for example a copy without points.
 
-        Before it is written to disk the stretch is empty.
+        Before the motion is written to disk, it gets an empty stretch.
         """
         ...
 
@@ -62,31 +62,40 @@ class SharedMotion(Motion, Protocol):
 class EngineModule(Protocol):
     """The functions of an engine's module.
 
-    It may also have ``check_argument(argument: str) -> None``. It is called before anything is
-    computed, and raises InputError for a bad argument.
+    The module may also have ``check_argument(argument: str) -> None``. The function is called
+    before anything is computed, and raises InputError for a bad argument.
     """
 
     def estimate_motion(self, scene: Scene, settings: Config, argument: str) -> Motion:
         """Return the motion of all points of the scene's stretch.
 
         The same input gives the same bytes. Work may be postponed until the motion's ``flow`` is
-        called. If the engine's row says ``shared``, the motion is a `SharedMotion`.
+        called. If the engine's row in the plugin table says ``shared``, the motion is a
+        `SharedMotion`.
 
         Args:
-            argument: The part of ``flow.engine`` after the colon, "" for none.
+            argument: Part of ``flow.engine`` after the colon, "" without a colon.
         """
         ...
 
 
 def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
-    """Return the motion by the engine ``NAME[:ARGUMENT]``, that of ``flow.engine`` for None."""
+    """Return the motion of all points of a scene, estimated by an engine.
+
+    Args:
+        spec: Engine as ``NAME[:ARGUMENT]``; None for the engine of ``flow.engine``.
+    """
     row, argument = engine(spec or settings.flow.engine)
     module = cast(EngineModule, row.work())
     return module.estimate_motion(scene, settings, argument)
 
 
 def check_engine(spec: str) -> None:
-    """Raise InputError if the engine does not exist or cannot use its argument; imports it."""
+    """Import an engine ``NAME[:ARGUMENT]`` and check its argument.
+
+    Raises:
+        InputError: The engine does not exist, or it cannot use the argument.
+    """
     row, argument = engine(spec)
     check = getattr(row.work(), "check_argument", None)
     if check is not None:

@@ -2,7 +2,7 @@
 """Align points with a surface by rigid motions about the vertical.
 
 Segal, Haehnel, Thrun, "Generalized-ICP", RSS 2009, with yaw as the only rotation. A state (4,) is a
-displacement x y z (m) and a yaw (rad) about an object's centre.
+displacement x, y, z (m) and a yaw (rad) about an object's centre.
 """
 
 from __future__ import annotations
@@ -23,20 +23,23 @@ _LOOSE = 10.0  # of the covariance, because points of a surface must not stop a 
 
 
 def apply(state: Float, points: Float, centre: Float) -> Float:
-    """Return (N,3) points of an object, moved by a state (4,) or by one state each (N,4).
+    """Return the (N,3) points of an object, turned about its centre and displaced.
 
     Args:
-        centre: (3,) or (N,3).
+        state: (4,) x, y, z (m) and yaw (rad), or (N,4) with a state for each point.
+        points: (N,3) metres.
+        centre: (3,) centre of the rotation, or (N,3).
     """
     return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
 
 def undo(state: Float, points: Float, centre: Float) -> Float:
-    """Return the inverse of `apply`."""
+    """Return (N,3) points moved back by the inverse of `apply`, with the same arguments."""
     return _turned(points - centre - state[..., :3], -state[..., 3]) + centre
 
 
 def _turned(arms: Float, yaw: float | Float) -> Float:
+    """Return (N,3) vectors ``arms``, turned by ``yaw`` (rad) about the vertical."""
     c, s = np.cos(yaw), np.sin(yaw)
     x, y, z = arms.T
     return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
@@ -46,9 +49,9 @@ def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
     """Return (N,3,3) the inverse covariance (1/m²) of the surface around each point.
 
     Args:
-        points: (M,3).
-        near: (N,k) rows of the neighbours of each point.
-        loose: Factor of the covariance.
+        points: (M,3) points of the surface, metres.
+        near: (N,k) rows in ``points`` of the neighbours that span the surface.
+        loose: Factor of the covariance; above 1 the surface constrains less.
     """
     away = points[near]
     away -= away.mean(axis=1, keepdims=True)
@@ -58,14 +61,19 @@ def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
 
 
 class Model:
-    """The accumulated points of an object, to which other points are aligned."""
+    """Accumulated surface of an object, to which new points are aligned.
+
+    Attributes:
+        points: (M,3) metres in the object's frame, about 1500 at most.
+        information: (M,3,3) inverse covariance (1/m²) of the surface around each point.
+    """
 
     def __init__(self, points: Float) -> None:
         self.points = np.zeros((0, 3))
         self.add(points)
 
     def add(self, points: Float) -> None:
-        """Add (N,3) points in the object's frame."""
+        """Add (N,3) points in the object's frame, thinning all points if there are too many."""
         points = np.concatenate([self.points, points])
         if len(points) > _MAX_MODEL_POINTS:
             points = points[:: len(points) // _MAX_MODEL_POINTS + 1]
@@ -74,21 +82,21 @@ class Model:
         self.information = surface_information(points, near, _LOOSE)
 
     def covers(self, points: Float, within_m: float) -> Bool:
-        """Return (N,) True for the (N,3) points closer to the model than ``within_m``."""
+        """Return (N,) True for (N,3) points (object's frame) within ``within_m`` of the model."""
         distance_m, _ = nearest(self._tree, points, within_m)
         return np.isfinite(distance_m)
 
     def align(
         self, points: Float, centre: Float, predicted: Float, prediction_std: Float
     ) -> Float | None:
-        """Return the state (4,) in which the model fits the points, None for too few matches.
+        """Return the state (4,) that fits the model to the points, None for too few matches.
 
-        The height is not aligned, because an object that few beams hit would climb with the beams.
-        Weights are Tukey's.
+        Displacement x, y and yaw are solved with Tukey weights. The height z stays as predicted: on
+        an object hit by few beams it would follow the beams.
 
         Args:
-            points: (N,3), all at one time.
-            centre: (3,).
+            points: (N,3) world, metres, all at one time.
+            centre: (3,) centre of the rotation, object's frame.
             predicted: (4,) state to start from.
             prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
         """

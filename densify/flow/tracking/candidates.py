@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Candidates: the points that may move, because other sweeps saw through them."""
+"""Find candidates: the points that may move, because other sweeps saw through them."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ T = TypeVar("T", bound=np.generic)
 
 
 class Strips:
-    """Points in scan order, searched by boxes: neighbours in a scan mostly follow each other."""
+    """Index that finds points in a box; fast because neighbours in scan order lie close."""
 
     def __init__(self, points: Float) -> None:
-        """points: (N,3)."""
+        """Index the points (N,3), in scan order."""
         self._points = points
         begins = np.arange(0, len(points), _STRIP)
         if len(points):
@@ -41,7 +41,7 @@ class Strips:
             self._high = np.maximum.reduceat(points, begins)
 
     def rows_inside(self, low: Float, high: Float) -> Int:
-        """Return the ascending rows of the points strictly between two corners (3,)."""
+        """Return the ascending rows of the points inside a box, given by two corners (3,)."""
         if not len(self._points):
             return np.zeros(0, np.int64)
         strips = np.flatnonzero(((self._low < high) & (self._high > low)).all(axis=1))
@@ -53,7 +53,10 @@ class Strips:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The columns of `Obstacles` that do not depend on the world's origin."""
+    """The points above the ground of one sweep, and which may move; attributes as in `Obstacles`.
+
+    These columns do not depend on the world's origin.
+    """
 
     row: Int
     seed: Bool
@@ -67,10 +70,10 @@ class Obstacles:
 
     Attributes:
         row: (C,) index into the sweep's points.
-        points: (C,3) world, rigidly registered.
+        points: (C,3) world, registered and deskewed for ego-motion only.
         time_s: (C,) firing time since the first sweep's reference time.
         seed: (C,) True if another sweep saw through the point.
-        cluster: (C,) label of the cluster of candidates, -1 for points that are no candidates.
+        cluster: (C,) label of the cluster of candidates, -1 for other points.
     """
 
     row: Int
@@ -82,7 +85,7 @@ class Obstacles:
 
     @staticmethod
     def of(stretch: Stretch, i: int, found: Candidates) -> Obstacles:
-        """Place the candidates of sweep i in the world."""
+        """Return the obstacles of sweep i: its points above the ground, in the world."""
         registered = stretch.sweeps[i]
         return Obstacles(
             row=found.row,
@@ -95,25 +98,26 @@ class Obstacles:
 
     @property
     def candidate(self) -> Bool:
-        """Return (C,) True for points of a cluster."""
+        """(C,) True for candidates: seeds and points close to seeds."""
         return self.cluster >= 0
 
     @cached_property
     def strips(self) -> Strips:
-        """Return the points, ready to be searched."""
+        """Index of the points for box queries."""
         return Strips(self.points)
 
 
 @dataclass(frozen=True)
 class Batch:
-    """The obstacles of the sweeps of one batch, see `Clock.batches`.
+    """The obstacles of consecutive sweeps within 0.1 s, see `Clock.batches`.
 
     Attributes:
-        sweeps: Indices.
-        time_ns: Middle of their reference times, since the first sweep.
-        half_s: From there to the first and the last.
-        obstacles: Of all sweeps, sweep by sweep.
-        begins: First row of each sweep.
+        sweeps: Indices of the sweeps.
+        time_ns: Middle between the first and the last reference time, since the stretch's first
+            sweep.
+        half_s: Half the time between the first and the last sweep.
+        obstacles: Obstacles of all sweeps, concatenated; clusters that touch are merged.
+        begins: First row of each sweep in ``obstacles``.
     """
 
     sweeps: tuple[int, ...]
@@ -124,7 +128,7 @@ class Batch:
 
     @staticmethod
     def of(sweeps: Sequence[int], obstacles: Sequence[Obstacles], clock: Clock) -> Batch:
-        """obstacles: of all sweeps of the stretch."""
+        """Build the batch of some sweeps, given the obstacles and the clock of all sweeps."""
         parts = [obstacles[j] for j in sweeps]
         first_ns, last_ns = clock.time_ns[[sweeps[0], sweeps[-1]]].tolist()
         begins = np.cumsum([0] + [len(part.points) for part in parts[:-1]]).tolist()
@@ -132,18 +136,18 @@ class Batch:
         return Batch(tuple(sweeps), middle_ns, half_s, _merged(parts), tuple(begins))
 
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
-        """Return the rows of this batch from a column of each sweep of the stretch."""
+        """Concatenate this batch's arrays among ``columns``, an array for each sweep."""
         return np.concatenate([columns[j] for j in self.sweeps])
 
     def split(self, rows: Int) -> dict[int, Int]:
-        """Return for each sweep its own rows among ascending rows of the batch."""
+        """Split ascending rows of the batch into rows of each sweep's obstacles, by sweep index."""
         parts = np.split(rows, np.searchsorted(rows, self.begins[1:]))
         own = zip(self.sweeps, parts, self.begins, strict=True)
         return {j: part - begin for j, part, begin in own if len(part)}
 
 
 def _merged(parts: Sequence[Obstacles]) -> Obstacles:
-    """Merge clusters of different sweeps whose points come within `LINK_M` of each other."""
+    """Concatenate sweeps, joining clusters that come within `LINK_M` of each other."""
     if len(parts) == 1:
         return parts[0]
     first = np.cumsum([0] + [part.num_clusters for part in parts]).tolist()
@@ -174,10 +178,10 @@ def find_candidates(
     """Return the points above the ground of each sweep, and which of them may move.
 
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
-    since a moving object's points are not all seen through.
+    because usually only a part of a moving object's points is seen through.
 
     Args:
-        among: Sweeps to work on; None for all.
+        among: Indices of the sweeps to work on; None for all.
     """
 
     def of_sweep(i: int) -> Candidates:
@@ -199,11 +203,11 @@ def find_candidates(
 
 
 def closer_rings(points: Float, gap_m: Float) -> Float:
-    """Return the (N,3) points with heights compressed where rings lie too far apart to be linked.
+    """Return the (N,3) points with heights compressed where rings are too far apart to be linked.
 
     Args:
-        points: Relative to the scanner, z up, so that level surfaces stay level.
-        gap_m: (N,) between neighbouring rings.
+        points: (N,3) metres relative to the scanner, z up, so that level surfaces stay level.
+        gap_m: (N,) distance between neighbouring rings at each point.
     """
     squeezed = points.copy()
     squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
@@ -211,7 +215,7 @@ def closer_rings(points: Float, gap_m: Float) -> Float:
 
 
 def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
-    """Return (N,) firing times of rows of sweep i, since the first sweep's reference time."""
+    """Return (N,) firing times, s since the first sweep's reference time, of rows of sweep i."""
     sweep = stretch.sweeps[i].sweep
     offset_ns = np.zeros(len(rows), np.int64) if sweep.offset_ns is None else sweep.offset_ns[rows]
     begin_ns = stretch.sweeps[0].sweep.stamp_ns
@@ -219,9 +223,16 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Link the seeds and the points close to them; return the number of clusters and (N,) labels.
+    """Link the seeds and the points within 0.4 m of seeds into clusters.
 
-    Seeds with few other seeds around, as in a hedge, do not count. -1 for points in no cluster.
+    Seeds with few other seeds around them, as in a hedge, do not count.
+
+    Args:
+        points: (N,3) metres.
+        seed: (N,) True for seeds.
+
+    Returns:
+        The number of clusters, and (N,) labels, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
     near = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, _MIN_SEED_SHARE))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Tracking one cluster of candidates as a rigid object from batch to batch, both ways in time.
+"""Track one cluster of candidates as a rigid object from batch to batch, both ways in time.
 
 The candidates of each batch are aligned with all points of the object so far, starting from the
-pose that constant speed and turn rate predict.
+pose that constant speed and turn rate predict. A batch holds consecutive sweeps within 0.1 s.
 """
 
 from __future__ import annotations
@@ -38,14 +38,13 @@ _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
-    """Return the batch and the rows of each cluster that may start a track, the best first.
+    """Return the clusters that may start a track, the best first, as (batch index, rows).
 
-    Large clusters make good models, and far from the ends of the recording both sides tell how the
-    object moves.
+    Large clusters make good models. Far from the ends of the recording, sweeps on both sides show
+    how the object moves.
 
     Args:
-        batches: Obstacles of each.
-        clock: Of the batches.
+        clock: Times of the batches.
     """
     starts = []
 
@@ -65,9 +64,13 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
 def velocities_beside(
     batch: Batch, members: Int, objects: Sequence[MovingObject]
 ) -> Iterator[Float]:
-    """Yield the velocities (3,) at a cluster of the objects close to it, such as a towing vehicle.
+    """Yield the velocity (3,), m/s, of each object within 1 m of a cluster, as of a tow car.
 
-    Little else tells how fast a long side slides along itself.
+    The measurements alone hardly show how fast a long side slides along itself.
+
+    Args:
+        batch: Batch of the cluster.
+        members: Rows of the cluster in the batch.
     """
     points = batch.obstacles.points[members]
     tree, middle = tree_of(points), points.mean(0, keepdims=True)
@@ -79,11 +82,11 @@ def velocities_beside(
 
 @dataclass(frozen=True)
 class Follower:
-    """Tracks clusters through the batches.
+    """Tracker of clusters through the batches.
 
     Attributes:
-        free: Per sweep (C,) True for points that no track has claimed.
-        clock: Of the batches.
+        free: For each sweep (C,) True for points that no track has claimed.
+        clock: Times of the batches.
     """
 
     batches: Sequence[Batch]
@@ -92,11 +95,12 @@ class Follower:
     clock: Clock
 
     def follow(self, members: Int, start: int, velocity: Float) -> Track:
-        """Track a cluster forwards, then backwards, with all points so far as the model.
+        """Track a cluster forwards, then backwards; the model is made of all points found so far.
 
         Args:
-            members: Rows of batch ``start``.
-            velocity: (3,) m/s at first.
+            members: Rows of the cluster in batch ``start``.
+            start: Index of the batch.
+            velocity: (3,) initial velocity, m/s, world.
         """
         here, rate = self.batches[start].obstacles, np.append(velocity, 0.0)
         seen_s = float(here.time_s[members].mean())
@@ -121,11 +125,11 @@ class Follower:
     def _find(
         self, model: Model, track: Track, rate: Float, n: int
     ) -> tuple[Float, float, Int, Float] | None:
-        """Align the candidates of batch n with the model.
+        """Align the candidates of batch n with the model; ``rate`` (4,) is the state's.
 
         Returns:
-            The state, its time, the rows that fit and where those points were at that time; None
-            where too few fit.
+            The state (4,), its time (s), the K rows that fit, and (K,3) the positions of these
+                points at that time, world. None if too few points fit.
         """
         batch, recent = self.batches[n], self.clock.num_in(_RECENT_S)
         c, centre = batch.obstacles, track.centre
@@ -155,24 +159,22 @@ class Follower:
 
 
 def _at_once(c: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
-    """Move (N,3) points, measured one after the other, to where they all were at one time."""
+    """Return the positions (N,3) of points at one time, given the rate of the object's state."""
     return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
 
 
 def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float, Float, Float]:
-    """Predict from the constant speed and turn rate of the ``num`` states nearest in time.
+    """Predict the state by constant speed and turn rate from the observations nearest in time.
 
-    The velocity turns as the object does (Schubert, Richter, Wanielik, "Comparison and Evaluation
-    of Advanced Motion Models for Vehicle Tracking", FUSION 2008).
+    The velocity turns with the object (Schubert, Richter, Wanielik, "Comparison and Evaluation of
+    Advanced Motion Models for Vehicle Tracking", FUSION 2008).
 
     Args:
-        track: The object so far.
-        rate: (4,) given at the start.
-        num: Number of states.
-        time_s: Time of the prediction.
+        rate: (4,) rate of the state at the start, per second.
+        num: Number of observations to use.
 
     Returns:
-        The state (4,), its rate (4,), and the standard deviation (3,) of x, y and yaw.
+        The state (4,), its rate (4,), and the standard deviation (3,) of x, y (m) and yaw (rad).
     """
     nearest_first = sorted(
         track.observations.items(), key=lambda s: (abs(s[1].seen_s - time_s), s[0])
@@ -191,7 +193,7 @@ def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float,
 
 
 def _turned(rate: Float, later_s: float) -> Float:
-    """Return the rate (4,) so much later, at constant speed and turn rate."""
+    """Return the rate (4,) of a state after ``later_s``, at constant speed and turn rate."""
     cos, sin = np.cos(rate[3] * later_s), np.sin(rate[3] * later_s)
     x, y = rate[:2]
     return np.array([cos * x - sin * y, sin * x + cos * y, *rate[2:]])

@@ -29,8 +29,9 @@ class GroupMotion:
     """The motion of all objects in a stretch: a `Motion`.
 
     Attributes:
-        instance: Per sweep (N,) int32, index of the point's track, -1 for none.
-        bendings: Of the tracks that are not rigid, by index.
+        tracks: Tracks of the confirmed moving objects.
+        instance: For each sweep (N,) int32, the index in ``tracks`` for each point, -1 for static.
+        bendings: Non-rigid motion of the tracks that have one, by index in ``tracks``.
     """
 
     stretch: Stretch
@@ -45,11 +46,11 @@ class GroupMotion:
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of every point of a sweep to another sweep's reference time.
 
-        Points of an object that was last observed more than 0.2 s before the target, or first
-        observed more than that after it, are lost.
+        The flow excludes ego-motion and is in the lidar frame of ``frame``. Points of an object are
+        lost if the target is more than 0.2 s before its first or after its last observation.
 
         Args:
-            frame, target: Frame numbers.
+            frame, target: Frame numbers of the two sweeps.
         """
         here, there = self.stretch.frames.index(frame), self.stretch.frames.index(target)
         registered, instance = self.stretch.sweeps[here], self.instance[here]
@@ -76,22 +77,27 @@ class GroupMotion:
 
 @dataclass(frozen=True)
 class Bending:
-    """The non-rigid motion of one object. sweeps: index of the sweep of each part."""
+    """The non-rigid motion of one object.
+
+    Attributes:
+        sweeps: Sweep index of each part of ``softened``, ascending.
+        softened: Points of the object in each of these sweeps, and how the points bend.
+    """
 
     sweeps: tuple[int, ...]
     softened: Softened
 
     def carry(self, here: int, there: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
-        """Return the points of sweep ``here`` in the object's own frame at two times.
-
-        These are the reference times of that sweep and of sweep ``there``, or of the nearest sweep
-        that observed the object.
+        """Return the (N,3) points of a sweep at two times, both in the object's own frame.
 
         Args:
-            here: Sweep of the points.
-            there: Sweep to whose time they are carried.
-            clock: Of the sweeps.
-            seen_s: (N,) firing times.
+            here: Index of the sweep with the N points.
+            there: Index of the sweep to whose time the points are carried.
+            seen_s: (N,) firing times of the points.
+
+        Returns:
+            The points at the reference time of sweep ``here``, and at the reference time of sweep
+                ``there`` or of the nearest sweep that observed the object.
         """
         n, m = (self.sweeps.index(i) for i in (here, clock.nearest(there, self.sweeps)))
         points = self.softened.parts[n].points
@@ -101,10 +107,10 @@ class Bending:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """Find all moving objects in the stretch.
+    """Find all moving objects in the stretch, as `densify.flow.engines.EngineModule`.
 
-    As `densify.flow.engines.EngineModule`; takes no argument. Works at any sweep rate. Below 10 Hz,
-    objects that turn, bend or are occluded between two sweeps are tracked worse or lost.
+    The engine takes no argument and works at any sweep rate. Below 10 Hz, objects that turn, bend
+    or are occluded between two sweeps are tracked worse or lost.
     """
     return motion_of(scene, scene.candidates)
 
@@ -117,7 +123,9 @@ def motion_of(
     """Find the moving objects among given candidates.
 
     Args:
-        velocities_m_s: Per sweep (C,3) of its candidates, world; None lets the sweeps vote.
+        candidates: Candidates of each sweep.
+        velocities_m_s: For each sweep (C,3) velocities of its C points above the ground, world
+            frame. None estimates them by a vote of neighbouring sweeps.
     """
     stretch, space = scene.stretch, scene.space
     obstacles = [Obstacles.of(stretch, i, found) for i, found in enumerate(candidates)]
@@ -153,7 +161,7 @@ def motion_of(
 
 
 def _rows_of(instance: Instance) -> list[tuple[int, Int]]:
-    """Return each track that (N,) ``instance`` has, and its ascending rows."""
+    """Return (track index, ascending rows of its points) for each track in ``instance`` (N,)."""
     rows = np.flatnonzero(instance >= 0)
     rows = rows[np.argsort(instance[rows], kind="stable")]
     tracks, begins = np.unique(instance[rows], return_index=True)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The log-likelihood ratio that decides whether a track moves, or is static.
+"""Decide by a log-likelihood ratio whether a track moves or is static.
 
-A static object that is seen differently from sweep to sweep, such as a fence or a tree's crown, can
-look as if it moved. Each term is the logarithm of something measured. Their weights, and the price
-of a track, were fitted to tracks of simulated streets whose truth is known::
+A static object that looks different from sweep to sweep, such as a fence or a tree's crown, can
+seem to move. Each term is the logarithm of a measured quantity. The weights w and the prior cost of
+a track, ``price``, were fitted to tracks of simulated streets with known ground truth::
 
     log odds = w · terms - price
 
@@ -38,13 +38,18 @@ Judge = Callable[[Track, "Evidence"], None]
 
 
 class Places(NamedTuple):
-    """How often another return was at a position of the object, and how often it was empty."""
+    """What other sweeps observed at positions of the object.
+
+    Attributes:
+        taken: Number of positions with a return of something else.
+        empty: Number of positions in observed free space.
+    """
 
     taken: int
     empty: int
 
     def log_taken(self) -> float:
-        """Return the logarithm of the odds that a position is taken, 0 where nothing is known."""
+        """Return the log odds that a position is taken, near 0 for few observations."""
         return float(np.log((self.taken + _GIVEN) / (self.empty + _GIVEN)))
 
 
@@ -52,9 +57,9 @@ class Violations(NamedTuple):
     """How often another sweep saw through the points of a track.
 
     Attributes:
-        static: Number of tests that see through a point at its measured position.
-        moved: Number of those that see through it where the motion brings it.
-        tests: Number of tests of either kind.
+        static: Number of tests in which the measured position of a point is seen through.
+        moved: Number of tests in which the position predicted by the motion is seen through.
+        tests: Number of tests, each of both positions.
     """
 
     static: int
@@ -63,17 +68,18 @@ class Violations(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What tells a track that moves from one that is static.
+    """Evidence that tells a moving track from a static one.
 
-    Lengths are in units of the distance up to which points count as neighbours there.
+    Lengths are divided by the neighbour distance: the distance up to which points count as
+    neighbours at the track (`near_m`).
 
     Attributes:
-        violations: Of its points, static and moved.
-        before: Positions of the object before it arrives there.
-        after: Positions of the object after it leaves.
-        travelled: Distance along the path.
-        rough: Residual of the states about the path.
-        slender: Extent along the motion over the height, at least 1.
+        violations: Seen-through counts of the track's points, as static and as moved.
+        before: Observations at positions of the object before it arrives there.
+        after: Observations at positions of the object after it leaves.
+        travelled: Distance between begin and end of the path, in neighbour distances.
+        rough: Residual of the states about the path, in neighbour distances.
+        slender: Ratio of extent along the motion to height, at least 1.
     """
 
     violations: Violations
@@ -84,7 +90,7 @@ class Evidence(NamedTuple):
     slender: float
 
     def terms(self) -> dict[str, float]:
-        """Return the terms of the log odds by name."""
+        """Return the value of each term of the log odds, by the term's name."""
         static, moved, tests = self.violations
         less, more = sorted([self.before.log_taken(), self.after.log_taken()])
         return {
@@ -101,17 +107,17 @@ class Evidence(NamedTuple):
         """Return the log odds that the track moves.
 
         Args:
-            table: Weights by term, and ``price``.
+            table: Weight of each term by name, and the constant ``price`` that is subtracted.
         """
         return sum(table[name] * value for name, value in self.terms().items()) - table["price"]
 
 
 class Verdict(NamedTuple):
-    """Log odds that a track moves.
+    """The log odds that a track moves.
 
     Attributes:
-        log_odds: After the price of a track.
-        at_most: The same if the motion left no violations.
+        log_odds: Log odds that the track moves; above 0 it is confirmed.
+        at_most: Log odds that the track would have if its motion left no violations.
     """
 
     log_odds: float
@@ -123,7 +129,7 @@ class Verdict(NamedTuple):
         return self.log_odds > 0
 
     def is_clearly_below(self, log_odds: float) -> bool:
-        """Return True if a motion of these log odds explains the same points better."""
+        """Return True if another motion, with these log odds, is clearly more likely."""
         return log_odds > max(self.log_odds, 0.0) + _CLEARLY
 
 
@@ -134,14 +140,13 @@ def judge(
     objects: Sequence[MovingObject],
     judged: Judge | None = None,
 ) -> Verdict:
-    """Fit the smooth motion of a track, and judge it. Tracks of fewer than 3 states do not move.
+    """Fit the smooth path of a track, in place, and return the log odds that it moves.
+
+    A track with fewer than 3 observations counts as static: its log odds are minus infinity.
 
     Args:
-        track: To judge; its path is fitted in place.
-        obstacles: Of all sweeps.
-        space: The free space that the sweeps observed.
-        objects: Other confirmed objects.
-        judged: Called with the track and its evidence.
+        track: Track to judge; its ``path`` is replaced.
+        judged: Function called with the track and its evidence.
     """
     if len(track.observations) < _NUM_STATES:
         return Verdict(-np.inf, -np.inf)
@@ -168,7 +173,7 @@ def judge(
 
 
 def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Violations:
-    """Test some points of the track against all sweeps around them."""
+    """Count how often other sweeps see through a sample of the track's points, static and moved."""
     tested = {}
     for batch in space.batches:
         num = _NUM_ASKED // len(batch)
@@ -192,14 +197,12 @@ def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSp
 
 
 def _slenderness(track: Track, obstacles: Sequence[Obstacles], within_m: float) -> float:
-    """Return the extent of the points along their motion over their height, at least 1.
+    """Return the extent of the points along their motion divided by their height, at least 1.
 
-    Nothing of a guard rail tells its motion along itself, and between two rings sweeps see through
-    it.
+    A long, low guard rail shows no motion along itself, and sweeps see through it between two
+    rings.
 
     Args:
-        track: To measure.
-        obstacles: Of all sweeps.
         within_m: Accuracy of the height, m.
     """
     points = track.points_in(obstacles, track.claimed)
@@ -215,18 +218,17 @@ def find_places_left(
     objects: Sequence[MovingObject],
     within_m: float,
 ) -> tuple[Places, Places]:
-    """Count what other sweeps observed at the positions of the track, before and after.
+    """Count what other sweeps observed at the track's positions while the object was elsewhere.
 
-    A wire fence is seen through from beside and not from ahead. The border between the two moves
-    along the fence with the scanner, but the fence stays where it is. Returns of other confirmed
-    objects do not count.
+    Vacated positions are free if the object moved. A static wire fence can imitate this: it is seen
+    through from some directions only. Its vacated positions then hold returns of the fence. Returns
+    of other confirmed objects do not count.
 
     Args:
-        track: To test.
-        obstacles: Of all sweeps.
-        space: The free space that the sweeps observed.
-        objects: Other confirmed objects.
         within_m: Greatest distance from a position to a return that takes it, m.
+
+    Returns:
+        Counts of sweeps before the object arrives at a position, and of sweeps after it left.
     """
     some = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
     tree = tree_of(track.points_in(obstacles, track.claimed))
@@ -261,7 +263,7 @@ def find_places_left(
 def _returns_near(
     places: Float, reach_m: float, c: Obstacles, objects: Sequence[MovingObject]
 ) -> Float:
-    """Return (N,3) the points of a sweep close to some positions, without those of the objects."""
+    """Return the (N,3) points of a sweep close to the positions, without the objects' points."""
     rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
     rows = rows[is_near(tree_of(places), c.points[rows], reach_m)]
     for track, shape in objects:
@@ -272,6 +274,6 @@ def _returns_near(
 
 @cache
 def own_table() -> Mapping[str, float]:
-    """Return the package's own weights, as examples/fit_tracks.py wrote them."""
+    """Return the package's weights by term, and ``price``, from examples/fit_tracks.py."""
     weights: Mapping[str, float] = read_json(_FILE)["weights"]
     return weights

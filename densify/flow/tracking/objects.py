@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tracks: where each object was observed, its smooth motion, and its accumulated shape."""
+"""Tracks of moving objects: observations, smooth motion, and accumulated shape."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
 
 
 def near_m(gap_m: Float | float) -> Any:
-    """Return the distance (m) up to which two points may be of one place.
+    """Return the neighbour distance: how far apart (m) two returns of one place may lie.
 
     Args:
-        gap_m: Between neighbouring rings there.
+        gap_m: Distance between neighbouring rings there; an array gives an array.
     """
     return np.maximum(_NEAR_M, _NEAR_GAPS * gap_m)
 
@@ -46,11 +46,11 @@ class Observation:
     """The pose of an object in one batch of sweeps.
 
     Attributes:
-        state: (4,) x y z displacement (m) and yaw (rad) since the first observation; z follows
-            the ground.
-        seen_s: When that was.
-        time_ns: The batch's own time.
-        sweeps: Those with its points.
+        state: (4,) displacement x, y, z (m) and yaw (rad) since the first observation, world axes;
+            z follows the ground.
+        seen_s: Mean firing time of the object's points, since the first sweep of the stretch.
+        time_ns: Time of the batch, see `Batch`.
+        sweeps: Indices of the sweeps in which the object has points.
     """
 
     state: Float
@@ -61,13 +61,13 @@ class Observation:
 
 @dataclass
 class Track:
-    """One rigid object.
+    """One rigid object. Its own frame is the world at its first observation.
 
     Attributes:
-        centre: (3,) about which it turns, world.
-        observations: By batch, in the order of tracking.
-        claimed: By sweep, the rows of `Obstacles` that are its points.
-        path: Its smooth motion.
+        centre: (3,) centre of its rotation, world at the first observation.
+        observations: Pose in each batch by batch index, in the order of tracking.
+        claimed: Points of the object by sweep index: rows of the sweep's `Obstacles`.
+        path: Smooth motion through the states; set by `smooth`.
     """
 
     centre: Float
@@ -76,13 +76,13 @@ class Track:
     path: Path = field(init=False)
 
     def add(self, n: int, batch: Batch, state: Float, seen_s: float, rows: Int) -> None:
-        """Add the observation in batch n, with its ascending rows."""
+        """Add the observation in batch index n; ``rows`` of its obstacles are ascending."""
         mine = batch.split(rows)
         self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(mine))
         self.claimed |= mine
 
     def smooth(self) -> None:
-        """Fit the path to the states; observations with many points weigh more."""
+        """Fit ``path`` to the states, in place; observations with more points weigh more."""
         batches = sorted(self.observations)
         times_s = np.array([self.observations[n].seen_s for n in batches])
         states = np.stack([self.observations[n].state for n in batches])
@@ -90,19 +90,19 @@ class Track:
         self.path = Path.fit(times_s, states, weights)
 
     def place(self, points: Float, time_s: float | Float) -> Float:
-        """Move (N,3) points from the object's frame to the world at a time, or at one time each."""
+        """Move (N,3) points from the object's frame to the world at a time or (N,) times."""
         return apply(self.path(time_s), points, self.centre)
 
     def undo(self, points: Float, time_s: float | Float) -> Float:
-        """Inverse of `place`."""
+        """Move (N,3) points from the world at a time, or at (N,) times, to the object's frame."""
         return undo(self.path(time_s), points, self.centre)
 
     def carry(self, points: Float, from_s: float | Float, to_s: float | Float) -> Float:
-        """Move (N,3) points of the object from one time to another, world."""
+        """Move (N,3) points of the object, world, from one time to another."""
         return self.place(self.undo(points, from_s), to_s)
 
     def velocity_m_s(self, points: Float, time_s: float) -> Float:
-        """Return (N,3) the velocity of points of the object at that time, world."""
+        """Return the velocities (N,3), world, of the object's points (N,3, world) at a time."""
         state, rate = self.path(time_s), self.path.rate(time_s)
         velocity_m_s = np.tile(rate[:3], (len(points), 1))
         velocity_m_s[:, 0] -= rate[3] * (points[:, 1] - self.centre[1] - state[1])
@@ -110,13 +110,13 @@ class Track:
         return velocity_m_s
 
     def seen_through(self, points: Float, j: int, space: FreeSpace) -> Bool:
-        """Return (N,) True for points in the object's own frame that sweep j sees through."""
+        """Return (N,) True for (N,3) points, object's frame, that sweep j sees through."""
         at_s = space.clock.time_s[j]
         carried = self.place(points, at_s)
         return space.seen_through(carried, j, self.velocity_m_s(carried, at_s))
 
     def points_in(self, obstacles: Sequence[Obstacles], sweeps: Iterable[int]) -> Float:
-        """Return (N,3) the points of these sweeps, in the object's own frame."""
+        """Return the (N,3) points of the object in some sweeps (by index), object's frame."""
         parts = [np.zeros((0, 3))]
         for j in sweeps:
             c, rows = obstacles[j], self.claimed[j]
@@ -124,17 +124,17 @@ class Track:
         return np.concatenate(parts)
 
     def rows_in(self, batch: Batch) -> Int:
-        """Return the rows of a batch that are its points."""
+        """Return the rows of the batch's obstacles that belong to the object."""
         sweeps = zip(batch.sweeps, batch.begins, strict=True)
         own = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
         return np.concatenate([np.zeros(0, np.int64), *own])  # all may have been taken away
 
     def num_points(self, n: int) -> int:
-        """Return the number of its points in batch n."""
+        """Return the number of the object's points in batch index n."""
         return sum(len(self.claimed[j]) for j in self.observations[n].sweeps)
 
     def total_points(self) -> int:
-        """Return the number of points of all sweeps."""
+        """Return the number of the object's points in all sweeps."""
         return sum(map(len, self.claimed.values()))
 
     def duration_s(self) -> float:
@@ -142,17 +142,17 @@ class Track:
         return float(np.ptp([seen.seen_s for seen in self.observations.values()]))
 
     def rise_m(self, ground: HeightMap, state: Float) -> float:
-        """Return how much higher the ground is in that state.
+        """Return how much higher the ground is at a state (4,) than at the start.
 
-        It is the median of the object's place and both sides of it, since the road below an object
-        may never be observed.
+        It is the median over the object's position and 1 m to both sides, because the road below an
+        object may never be observed.
         """
         way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
         start = self.centre[:2] + np.outer([-_BESIDE_M, 0.0, _BESIDE_M], [-way[1], way[0]])
         return float(np.median(ground.under(start + state[:2]) - ground.under(start)))
 
     def seen_at(self, time_ns: int) -> float:
-        """Return when a sweep of that reference time measures, or would measure, the object."""
+        """Estimate when (s) a sweep with a given reference time measures the object."""
         nearest = min(
             self.observations.items(), key=lambda item: (abs(item[1].time_ns - time_ns), item[0])
         )[1]
@@ -161,14 +161,14 @@ class Track:
 
 @dataclass(frozen=True)
 class Shape:
-    """The accumulated points of one object, upright in its own frame.
+    """The accumulated points of one object, in the object's frame with z up.
 
     Attributes:
-        points: (M,3).
-        tree: Of the points.
-        rim: (K,3) those points that reach farthest in each horizontal direction, up and down.
-        edges: (E,3) normals and offsets of the convex outline seen from above; (0,3) where the
-            points span none.
+        points: (M,3) metres.
+        rim: (K,3) points that bound the others: corners of the convex outline, lowest and highest
+            point.
+        edges: (E,3) normals and offsets of the convex outline seen from above; (0,3) if the points
+            span no area.
     """
 
     points: Float
@@ -178,7 +178,7 @@ class Shape:
 
     @staticmethod
     def of(points: Float) -> Shape:
-        """points: (M,3), M at least 1."""
+        """Return the shape of at least one point (M,3), object's frame."""
         try:
             hull = ConvexHull(points[:, :2])
         except (QhullError, ValueError):  # too few points, or all on a line
@@ -188,22 +188,22 @@ class Shape:
         return Shape(points, tree_of(points), rim, hull.equations)
 
     def within_outline(self, points: Float) -> Bool:
-        """Return (N,) True for (N,3) points inside the outline, seen from above."""
+        """Return (N,) True for points (N,3, object's frame) inside the outline, seen from above."""
         if not len(self.edges):
             return np.zeros(len(points), bool)
         inside: Bool = (points[:, :2] @ self.edges[:, :2].T + self.edges[:, 2] < _OUTLINE_M).all(1)
         return inside
 
     def near(self, points: Float, within_m: float) -> Bool:
-        """Return (N,) True for (N,3) points within the outline or closer than ``within_m``."""
+        """Return (N,) True for (N,3) points in the outline or within ``within_m`` of a point."""
         return is_near(self.tree, points, within_m) | self.within_outline(points)
 
     @cached_property
     def side_rad(self) -> float:
-        """Return the direction of one side seen from above, in [0, pi / 2).
+        """The direction of one side seen from above, in [0, pi / 2), object's frame.
 
-        The others are parallel to it or perpendicular. It maximises the sum of squares of the
-        histograms along both axes.
+        The other sides are taken as parallel or perpendicular. The direction makes the histograms
+        of the points along both axes most peaked (greatest sum of squares).
         """
         points = self.points[:: len(self.points) // _SOME_POINTS + 1, :2]
         points = points - points.mean(axis=0)
@@ -227,10 +227,10 @@ class MovingObject(NamedTuple):
     shape: Shape
 
     def heading(self, at_s: float) -> Float:
-        """Return (2,) the unit vector along the object at a time.
+        """Return (2,) the unit vector along the object at a time, world.
 
-        Long objects point along the side nearest to their velocity, others along their velocity:
-        a trailer that turns does not move where it points.
+        An object longer than 3 m points along the side closest to its velocity, because a turning
+        trailer does not move where it points. Other objects point along their velocity.
         """
         ahead = self.track.path.rate(at_s)[:2]
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
@@ -251,13 +251,14 @@ class MovingObject(NamedTuple):
 
 
 class Lane(NamedTuple):
-    """The space ahead of and behind an object, as wide and as high as it is.
+    """The space ahead of and behind an object, as wide and as high as the object.
 
     Attributes:
-        ahead: (2,) unit vector.
-        right_m: Its end to the right, m along the normal of ``ahead``.
-        left_m: Its end to the left.
-        top_m: Its upper end, world.
+        ahead: (2,) unit vector of the heading, world.
+        right_m: Right border: coordinate along the left normal of ``ahead``, m from the world's
+            origin.
+        left_m: Left border, as ``right_m``.
+        top_m: Upper border: height in the world, m.
     """
 
     ahead: Float
@@ -266,7 +267,7 @@ class Lane(NamedTuple):
     top_m: float
 
     def holds(self, points: Float) -> Bool:
-        """Return (N,) True for (N,3) points within."""
+        """Return (N,) True for points (N,3, world) inside the lane."""
         aside = points[:, :2] @ [-self.ahead[1], self.ahead[0]]
         inside: Bool = (aside > self.right_m) & (aside < self.left_m) & (points[:, 2] < self.top_m)
         return inside

@@ -2,8 +2,8 @@
 """Smooth paths through the states of an object.
 
 Penalised B-splines: Eilers, Marx, "Flexible Smoothing with B-splines and Penalties", Statistical
-Science 1996. The third difference is punished, so the stiffest path has constant acceleration.
-Softer paths start and stop.
+Science 1996. The third difference is penalised: the stiffest path has constant acceleration, and
+softer paths can start and stop.
 """
 
 from __future__ import annotations
@@ -28,13 +28,18 @@ _DEGREE = 3
 
 @dataclass(frozen=True)
 class Path:
-    """A cubic spline of time with d coordinates.
+    """A smooth motion: a cubic spline over time with d coordinates.
+
+    The first coordinates are x and y in metres; a `Track` uses d = 4, its state x, y, z (m), yaw
+    (rad).
 
     Attributes:
-        knots_s, coefficients: Of its n B-splines, (n + 4,) and (n,d).
-        begin_s, end_s: Of the fit; outside, the path goes on at constant velocity.
-        residual_m: Root mean square over the states, first two coordinates, corrected for the
-            degrees of freedom.
+        knots_s: (n + 4,) knots of the n B-splines, s.
+        coefficients: (n,d) coefficients of the B-splines.
+        begin_s: First time of the fit. The path continues at constant velocity before it.
+        end_s: Last time of the fit. The path continues at constant velocity after it.
+        residual_m: Root mean square distance of the states in x and y from the path, corrected for
+            the degrees of freedom.
     """
 
     knots_s: Float
@@ -45,10 +50,14 @@ class Path:
 
     @staticmethod
     def fit(times_s: Float, states: Float, weights: Float) -> Path:
-        """Fit (m,d) states at ascending (m,) times, with (m,) weights.
+        """Fit a path as stiff as the states allow.
 
-        The path is as stiff as can be. A softer one is taken if it predicts each state from the
-        others clearly better (leave-one-out error in closed form).
+        A softer path is taken only if its leave-one-out error, in closed form, is at least 20 %
+        lower.
+
+        Args:
+            times_s: (m,) ascending times.
+            states: (m,d) states at these times.
         """
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
         num_spans = max(1, round((end_s - begin_s) / _KNOT_S))
@@ -85,7 +94,7 @@ class Path:
         return self._spline.derivative()
 
     def __call__(self, time_s: float | Float) -> Float:
-        """Return (..., d) at these times."""
+        """Return the states (..., d) at the given times (...) in seconds."""
         inside = np.clip(time_s, self.begin_s, self.end_s)
         state: Float = self._spline(inside)
         if np.any(time_s != inside):
@@ -93,10 +102,10 @@ class Path:
         return state
 
     def rate(self, time_s: float | Float) -> Float:
-        """Return (..., d) per second."""
+        """Return the derivatives (..., d) of the states per second at the given times (...)."""
         rate: Float = self._derivative(np.clip(time_s, self.begin_s, self.end_s))
         return rate
 
     def travelled_m(self) -> float:
-        """Return the distance in the plane from the begin to the end."""
+        """Return the horizontal distance between the first and the last position of the fit."""
         return float(np.linalg.norm((self(self.end_s) - self(self.begin_s))[:2]))

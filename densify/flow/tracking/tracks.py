@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The search for moving objects: clusters of candidates are tracked, and kept if confirmed.
+"""Search for moving objects: clusters of candidates are tracked, and kept if confirmed.
 
-A track is the accumulated points of a cluster and one rigid pose per batch of sweeps. It starts
-from the velocity that most batches agree on, is followed both ways, is smoothed in time, and is
-confirmed only if the smooth motion explains the measurements.
+A track is the accumulated points of a cluster and one rigid pose for each batch (sweeps within 0.1
+s). It starts from the velocity that most batches agree on, is followed both ways, and is smoothed
+in time. It is confirmed only if the smooth motion explains the measurements.
 """
 
 from __future__ import annotations
@@ -52,15 +52,16 @@ def find_tracks(
     """Return the confirmed tracks of all moving objects in the stretch.
 
     Args:
-        velocities_m_s: Per sweep (C,3) of its obstacles, with which clusters start; None lets
-            the neighbouring sweeps vote.
-        judged: Called with each track that was tried, and its evidence.
+        obstacles: Points above the ground of each sweep.
+        velocities_m_s: For each sweep (C,3) velocities of its obstacles, world frame, at which
+            clusters start. None lets the neighbouring sweeps vote.
+        judged: Function called with each track that was tried, and its evidence.
     """
     return _Search(obstacles, space, ground, velocities_m_s, judged).tracks()
 
 
 class _Search:
-    """The batches, the points that no track has claimed, and the objects found so far."""
+    """State of the search: batches, points that no track has claimed, objects found so far."""
 
     def __init__(
         self,
@@ -88,11 +89,12 @@ class _Search:
         return [np.ones(len(c.points), bool) for c in self._obstacles]
 
     def tracks(self) -> list[Track]:
-        """Return the confirmed tracks, the best starts first.
+        """Return the confirmed tracks, those with the best starts first.
 
-        The points of a rejected track start none, at first. Then they may: while two walkers meet
-        they are one cluster, whose track claims both wherever they are alone. Such a track must
-        travel farther than it is long, as no side does that seems to slide along itself.
+        Points of a rejected track start no track in the first pass. In the second pass they may.
+        For example, two walkers that meet are one cluster for a moment, and its track claims both
+        persons at other times too. A track of the second pass must travel farther than it is long,
+        because a static side may seem to slide along itself.
         """
         starts = find_starts([batch.obstacles for batch in self.batches], self.clock)
         untried, not_started = self._all_points(), self._all_points()
@@ -118,7 +120,7 @@ class _Search:
         return track.path.travelled_m() > float(np.linalg.norm(np.ptp(points[:, :2], axis=0)))
 
     def _keep(self, track: Track) -> None:
-        """Keep a confirmed track, unless it is a piece of a guard rail."""
+        """Keep a confirmed track, unless a last test rejects it as a piece of a guard rail."""
         self._gather(track)
         # A piece of a guard rail is recognised by the rest of it.
         if not self._judge(track).moves:
@@ -136,7 +138,7 @@ class _Search:
         return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
 
     def _velocity_of(self, members: Int, n: int) -> Float:
-        """Return the likely velocity (3,) m/s of a cluster of batch n."""
+        """Return the likely velocity (3,), m/s, world, of a cluster (rows of batch n)."""
         c = self.batches[n].obstacles
         if self._velocities_m_s is None:
             group = Group.of(c.points[members], c.time_s[members])
@@ -146,11 +148,12 @@ class _Search:
         return velocity
 
     def _track_of(self, members: Int, n: int) -> tuple[Track, Verdict]:
-        """Return the most likely track of a cluster of batch n.
+        """Return the most likely track of a cluster (rows ``members`` of batch n), and its verdict.
 
-        It starts at the velocity that most sweeps agree on, and at those of the objects beside it,
-        such as its towing vehicle's. If violations are left, it is followed from its ends too: more
-        may be in view there than a side that slides along itself.
+        It starts at the velocity that most sweeps agree on, and at the velocities of adjacent
+        objects such as a towing vehicle. If free-space violations remain, it is followed again from
+        its first and last batch. More of the object may be in view there than one side that slides
+        along itself.
         """
         best = self._follow(members, n, self._velocity_of(members, n))
         for velocity in velocities_beside(self.batches[n], members, self._objects):
@@ -171,9 +174,9 @@ class _Search:
         return track, self._judge(track)
 
     def _gather(self, track: Track) -> None:
-        """Claim the free candidates within or close to the object that its motion explains.
+        """Claim, in place, free candidates in or near the object that its motion explains.
 
-        Otherwise a part of it would start a track of its own.
+        Otherwise these points would start a track of their own.
         """
         shape = self._shape_of(track)
         for j, own in track.claimed.items():
@@ -185,10 +188,10 @@ class _Search:
             track.claimed[j] = np.concatenate([own, self._without_violations(track, j, rows)])
 
     def _claim_in_line(self, track: Track) -> None:
-        """Claim the free clusters of single rings and columns ahead of and behind the object.
+        """Claim, in place, free clusters of single rings or columns ahead of and behind the object.
 
-        On a roof, or a side that falls away from the scanner, they lie too far apart to be linked.
-        Tracked alone, such a cluster would stay where the rays are.
+        On a roof, or on a side that recedes from the scanner, such clusters lie too far apart to be
+        linked. Tracked alone, such a cluster would stay where the rays are.
         """
         space, shape = self._space, self._shape_of(track)
         at_s = next(iter(track.observations.values())).seen_s
@@ -215,12 +218,12 @@ class _Search:
             track.claimed[j] = np.concatenate([track.claimed[j], rows[together]])
 
     def _unclaimed(self, j: int, rows: Int, own: Int) -> Int:
-        """Return the free candidates among rows of sweep j, without the track's own."""
+        """Return the ``rows`` of sweep j that are free candidates, without the track's ``own``."""
         rows = rows[self._free[j][rows] & (self._obstacles[j].cluster[rows] >= 0)]
         return np.setdiff1d(rows, own, assume_unique=True)
 
     def _without_violations(self, track: Track, j: int, rows: Int) -> Int:
-        """Return the rows of sweep j that no sweep close in time sees through, once moved."""
+        """Return the ``rows`` of sweep j that no sweep within 0.3 s sees through, once moved."""
         c = self._obstacles[j]
         for i in self._space.others(j):
             if self._space.clock.near(i, j, _NEAR_S) and len(rows):
@@ -230,12 +233,12 @@ class _Search:
 
 
 def _better(known: tuple[Track, Verdict], found: tuple[Track, Verdict]) -> tuple[Track, Verdict]:
-    """Return the track that was found if it is clearly more likely, otherwise the known one."""
+    """Return the found track and verdict if clearly more likely, otherwise the known ones."""
     return found if known[1].is_clearly_below(found[1].log_odds) else known
 
 
 def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -> Bool:
-    """Return (N,) True where the cluster of a row is hit by one ring, or one column, only."""
+    """Return (N,) True for rows whose cluster is hit by a single ring or column of rays."""
     if not len(rows):
         return np.zeros(0, bool)
     clusters, of_row = np.unique(c.cluster[rows], return_inverse=True)
@@ -257,10 +260,10 @@ def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -
 
 
 def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> None:
-    """Align every observation once more, and keep the result if the motion becomes smoother.
+    """Align every observation again, in place, and keep the result if the motion becomes smoother.
 
-    Followed batch by batch, an object drifts when its other side comes into view. Even batches are
-    aligned with the points of the odd ones, and the other way round.
+    An object that is followed batch by batch drifts when its other side comes into view. Therefore
+    even batches are aligned with the points of the odd batches, and the other way round.
     """
     sweeps: tuple[list[int], list[int]] = [], []
     for n, seen in sorted(track.observations.items()):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The velocity of a cluster, by a vote over the sweeps before and after it."""
+"""Estimate the velocity of a cluster by a vote of the sweeps before and after it."""
 
 from __future__ import annotations
 
@@ -31,11 +31,10 @@ class DistanceField:
     """A voxel grid of the distance to the nearest candidate of a sweep.
 
     Attributes:
-        nearness: (X,Y,Z) 255 at a candidate, 0 beyond the reach; mostly zeros, which take no
-            memory.
-        low: (3,) corner of the grid.
-        tree: Of the candidates.
-        time_s: (N,) their firing times.
+        nearness: (X,Y,Z) voxels of 0.2 m: 255 at a candidate, falling to 0 at 0.6 m from it.
+        low: (3,) corner of the grid, world.
+        tree: Search tree of the N candidates; None without candidates.
+        time_s: (N,) firing times of the candidates.
     """
 
     nearness: Bytes
@@ -45,7 +44,7 @@ class DistanceField:
 
     @staticmethod
     def of(points: Float, time_s: Float) -> DistanceField:
-        """points: (N,3) world."""
+        """Build the field of N candidates from points (N,3, world) and firing times (N,)."""
         if not len(points):
             return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3), None, time_s)
         low = points.min(0) - 2 * LINK_M
@@ -60,9 +59,14 @@ class DistanceField:
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_to(self, found: Bytes, group: Group, velocities: Float) -> None:
-        """Raise ``found`` (V,N), in place, to the nearness of the group's N points.
+        """Raise ``found``, in place, to the nearness of the group's points at each velocity.
 
-        They are moved with each of (V,3) velocities to the time at which this sweep measures them.
+        Each point is moved to the time at which this sweep would measure the group.
+
+        Args:
+            found: (V,N) nearness of each of N points at each of V velocities, 0 to 255.
+            group: Group of the N points.
+            velocities: (V,3) m/s, world.
         """
         if self.tree is None:
             return
@@ -89,8 +93,8 @@ class Group:
 
     Attributes:
         points: (N,3) world.
-        late_s: (N,) firing times minus their mean.
-        middle_s: That mean.
+        late_s: (N,) firing times relative to ``middle_s``.
+        middle_s: Mean firing time of the points.
         middle: (3,) mean of the points.
     """
 
@@ -101,28 +105,29 @@ class Group:
 
     @staticmethod
     def of(points: Float, time_s: Float) -> Group:
-        """Return the group of (N,3) points and their (N,) firing times."""
+        """Return the group of points (N,3, world) with firing times (N,)."""
         middle_s = float(time_s.mean())
         return Group(points, time_s - middle_s, middle_s, points.mean(axis=0))
 
     def thinned(self, most: int) -> Group:
-        """Return the group with about ``most`` of its points, evenly."""
+        """Return the group with at most ``most`` points, evenly chosen."""
         step = len(self.points) // most + 1
         points, late_s = (np.ascontiguousarray(a[::step]) for a in (self.points, self.late_s))
         return Group(points, late_s, self.middle_s, self.middle)
 
 
 def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
-    """Return (3,) m/s, horizontal: the velocity that best explains the neighbouring batches.
+    """Return the horizontal velocity (3,), m/s, that best explains the neighbouring batches.
 
-    First the batches about 0.1 and 0.2 s before and after are asked, in coarse steps. Along a flat
-    side only the ends tell how fast it moves, by less than a voxel in so short a time. Therefore
-    batches up to 0.5 s away are asked in fine steps.
+    First the batches about 0.1 and 0.2 s before and after are compared, in coarse steps of
+    velocity. A flat side shows its speed only at its ends, which move by less than a voxel in this
+    short time. Therefore batches up to 0.5 s away are compared too, in fine steps.
 
     Args:
-        group: Observed in batch n.
-        fields: Of the sweeps of each batch.
-        clock: Of the batches.
+        group: Points of a cluster in batch n.
+        n: Index of the batch.
+        fields: For each batch, the distance fields of its sweeps.
+        clock: Times of the batches.
     """
     near_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
     coarse = 2 * _STEP_M / near_s
@@ -136,13 +141,13 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
 
 
 def _batches_around(n: int, step_s: float, clock: Clock) -> list[int]:
-    """Return the batches one and two steps before and after batch n, where there are any."""
+    """Return the batches one and two steps before and after batch n, where they exist."""
     asked = [clock.at(n, later_s) for later_s in (-2 * step_s, -step_s, step_s, 2 * step_s)]
     return sorted({m for m in asked if m is not None})
 
 
 def _best(group: Group, around: Sequence[Sequence[DistanceField]], velocities: Float) -> Float:
-    """Return the one of (V,3) m/s that brings the group nearest to the candidates."""
+    """Return the velocity (3,) among (V,3) that brings the group nearest to candidates."""
     cost = np.zeros(len(velocities))
     for batch in around:
         nearness = np.zeros((len(velocities), len(group.points)), np.uint8)
@@ -153,7 +158,7 @@ def _best(group: Group, around: Sequence[Sequence[DistanceField]], velocities: F
 
 
 def _grid(n: int) -> Float:
-    """Return (V,3) all horizontal steps of up to n along x and y."""
+    """Return all (V,3) horizontal steps with whole x and y from -n to n."""
     span = np.arange(-n, n + 1.0)
     x, y = np.meshgrid(span, span, indexing="ij")
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
@@ -163,12 +168,12 @@ def _grid(n: int) -> Float:
 def _spread(
     points: Float, low: Float, step: float, offsets: Int, values: Bytes, grid: Bytes
 ) -> None:
-    """Raise the cells of ``grid`` around each of (N,3) points to the (K,) values, in place.
+    """Raise the cells of ``grid`` around each of (N,3) points to the given values, in place.
 
     Args:
         low: (3,) corner of the grid.
-        step: Side of a cell.
-        offsets: (K,3) cells from the point's own.
+        offsets: (K,3) cells of the side ``step`` relative to the point's cell.
+        values: (K,) value for each offset.
     """
     for i in range(len(points)):
         x, y, z = (
@@ -194,9 +199,10 @@ def _look_up(
     nearness: Bytes,
     found: Bytes,
 ) -> None:
-    """Raise ``found`` (V,N), in place, to the cells of (N,3) moved points; 0 outside the grid.
+    """Raise ``found`` (V,N), in place, to the grid's values at the N moved points.
 
-    Each point is moved with the velocity (V,3) for ``elapsed_s`` (V,) minus ``late_s`` (N,).
+    Point i moves at velocity v for ``elapsed_s[v] - late_s[i]``. Cells outside the grid count as 0.
+    The velocities from ``first`` up to ``last`` are handled.
     """
     num_x, num_y, num_z = nearness.shape
     for v in range(first, last):
