@@ -9,11 +9,12 @@ Wilson et al., NeurIPS Datasets 2021::
     LOG/calibration/egovehicle_SE3_sensor.feather, intrinsics.feather
     LOG/annotations.feather                                  optional: tracked boxes
 
-Points are in the vehicle's frame (x forward, y left, z up), float16, compensated to the file's
-stamp, the *start* of the sweep. The poses undo that by ``offset_ns``, the firing time. Two scanners
-turn half a revolution apart, the lower one upside down: lasers 0 to 31 are ``up_lidar``, 32 to 63
-``down_lidar`` (issue 77 of av2-api). Images are undistorted, so k1 to k3 do not apply, and stamped
-at their exposure. Frames and images are numbered from 0 in the order of time.
+Points are in the vehicle's frame (x forward, y left, z up), float16. They are ego-motion
+compensated to the file's stamp, the *start* of the sweep. The reader undoes the compensation with
+the poses and the firing times (``offset_ns``). Two scanners turn half a revolution apart, the lower
+scanner upside down: lasers 0 to 31 are ``up_lidar``, 32 to 63 ``down_lidar`` (issue 77 of av2-api).
+Images are undistorted (k1 to k3 do not apply) and stamped at their exposure. Sweeps and images are
+numbered from 0 in the order of time.
 """
 
 from __future__ import annotations
@@ -42,10 +43,11 @@ _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 
 def open_recording(path: Path, scene: str | None) -> Argoverse2:
-    """See `densify.readers.ReaderModule`.
+    """Open an Argoverse 2 log; sweeps and images are read later, on request.
 
     Args:
-        path: A log, or a split or the whole data set with the log's name as the scene.
+        path: Folder of a log, of a split, or of the whole data set.
+        scene: Name of the log; None if ``path`` is a log or holds a single log.
     """
     if scene is None and (path / _POSES).is_file():
         return Argoverse2(path)
@@ -61,16 +63,16 @@ def open_recording(path: Path, scene: str | None) -> Argoverse2:
 
 
 class Argoverse2(FileSequence):
-    """A log as a `LidarSequence`. The lidar frame is that of the vehicle.
+    """An Argoverse 2 log as a `LidarSequence`.
 
-    The reference time of a sweep is its start.
+    The lidar frame is the vehicle's frame. The reference time of a sweep is its start.
     """
 
     def __init__(self, log: Path) -> None:
-        """Read poses and calibration.
+        """Read the poses and the calibration in the folder of a log.
 
         Raises:
-            InputError: There are no sweeps, or a table is missing or malformed.
+            InputError: The log has no sweeps, or a table is missing or malformed.
         """
         sweeps = checks.numbered_files(log / "sensors" / "lidar", ".feather")
         if not sweeps:
@@ -124,7 +126,9 @@ class Argoverse2(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `LidarSequence`; the test split has none.
+        """Return the annotated boxes of a sweep in the lidar frame, None if it has no boxes.
+
+        The test split has no boxes.
 
         Raises:
             InputError: The table is malformed.
@@ -147,7 +151,7 @@ class Argoverse2(FileSequence):
         return _read(path, {"timestamp_ns": "i", "track_uuid": "s"}, (*BOX_SIZE, *_POSE))
 
     def T_world_cam(self, camera: str, number: int) -> Float:
-        """Return the (4,4) pose of an image at its exposure, from the vehicle's poses."""
+        """Return the (4,4) pose of a camera in the city frame at the exposure of an image."""
         exposed_ns = self.image_stamps_ns(camera)[number]
         return self._track.at(exposed_ns) @ self._T_ego_sensor[camera]
 
@@ -171,7 +175,7 @@ def _poses(
 
 
 def _cameras(log: Path, T_ego_sensor: dict[str, Float]) -> dict[str, Camera]:
-    """Return the cameras that have a folder of images."""
+    """Return the calibrated cameras, by name, that have a folder of images in the log."""
     names = [p.name for p in sorted((log / "sensors" / "cameras").glob("*")) if p.is_dir()]
     if not names:
         return {}

@@ -27,19 +27,18 @@ _TYPES = {"s": ("string", "large_string"), "b": ("binary", "large_binary")}
 
 
 def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str, NDArray[Any]]:
-    """Return columns of a feather file, (N,) each.
+    """Return columns of a feather file by name, (N,) for a table of N rows.
 
     Args:
-        path: The file.
-        columns: Name -> kind: "n" finite numbers, "m" numbers that may be NaN, "i" whole
-            numbers, "s" texts, "b" bytes, "t" truth values, "l" lists of numbers or None, as arrays
-            of objects.
-        what: The recordings that need the file, such as "Argoverse 2 recordings", for the
-            message.
+        path: Path of the feather file.
+        columns: Kind of values expected, by column name: "n" finite numbers, "m" numbers that may
+            be NaN, "i" integers, "s" strings, "b" bytes, "t" booleans, "l" lists of numbers. A
+            column "l" is returned as an object array of arrays or None.
+        what: Kind of recording, such as "Argoverse 2 recordings", for the error message.
 
     Raises:
-        InputError: The file is missing or damaged, or a column is absent, has gaps or holds
-            another kind.
+        InputError: The file is missing or damaged, or a column is missing, has null values or
+            has another kind of values.
     """
     needed("pyarrow", "argoverse", what)
     feather = needed("pyarrow.feather", "argoverse", what)
@@ -49,10 +48,13 @@ def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str,
 def read_parquet(
     path: Path, columns: Mapping[str, str], what: str, where: Mapping[str, int] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Return columns of a parquet file as `read_feather` does (extra ``waymo``).
+    """Return columns of a parquet file by name, (N,) for N selected rows, as `read_feather` does.
 
     Args:
-        where: Column -> value in the wanted rows. Other row groups are not read.
+        path: Path of the parquet file.
+        columns: Kind of values expected, by column name, as in `read_feather`.
+        what: Kind of recording, for the error message.
+        where: Required value by column name; only rows with these values are read.
     """
     parquet = needed("pyarrow.parquet", "waymo", what)
     filters = [(name, "=", value) for name, value in (where or {}).items()]
@@ -69,11 +71,11 @@ def _read(
 ) -> dict[str, NDArray[Any]]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected the columns {', '.join(columns)} in it")
-    open_file(path).close()  # says what is wrong with the file itself
+    open_file(path).close()  # raises a clearer error if the file cannot be opened
     try:
         table = read()
         there = table.column_names
-        table.validate(full=True)  # columns may point beyond the file
+        table.validate(full=True)  # offsets in a damaged column may lie outside the file
     except Exception as error:  # a damaged schema raises anything
         kind = path.suffix.removeprefix(".")
         raise InputError(

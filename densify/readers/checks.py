@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Check the parts that readers share: files by number, cameras, poses and boxes.
+"""Find and check what all readers share: numbered files, cameras, poses and boxes.
 
-Each error is an InputError that begins with the place.
+Each check raises InputError with a message that begins with the file or folder.
 """
 
 from __future__ import annotations
@@ -20,16 +20,15 @@ from densify.readers.timeline import format_frames
 
 T = TypeVar("T")
 
-_ORTHONORMAL_TOLERANCE = 1e-3  # text files carry seven digits, float32 files as many
+_ORTHONORMAL_TOLERANCE = 1e-3  # far above the rounding of text and float32 files (7 digits)
 
 
 def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
-    """Return the files of a folder that are named by a frame number, by ascending frame.
-
-    Without such a folder the result is empty.
+    """Return the files named by a number, such as ``0000000120.bin``, by ascending number.
 
     Args:
-        suffixes: Accepted suffixes, with the dot and in lower case.
+        folder: Folder of the files; if it does not exist, the result is empty.
+        suffixes: Accepted suffixes in lower case, with the dot.
     """
     if not folder.is_dir():
         return {}
@@ -42,19 +41,21 @@ def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
 
 
 def drive_around(path: Path) -> Path | None:
-    """Return the KITTI drive around a place, None without one."""
+    """Return the KITTI raw drive that contains a path at most two levels deep, None if none."""
     return next((p for p in path.absolute().parents[:2] if (p / "velodyne_points").is_dir()), None)
 
 
 def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
-    """Return the entry of a frame.
+    """Return the entry of a frame, such as a file or a stamp.
 
     Args:
-        what: The kind of entry, for the message, such as ``"sweep"``.
-        where: The recording's folder, for the message.
+        entries: Entries by frame number.
+        frame: Number of the requested frame.
+        what: Kind of entry, such as ``"sweep"``, for the error message.
+        where: Folder or file of the entries, for the error message.
 
     Raises:
-        InputError: There is no entry. The message names the existing frames.
+        InputError: The frame has no entry. The message names the existing frames.
     """
     if frame not in entries:
         raise InputError(
@@ -64,7 +65,7 @@ def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
 
 
 def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camera:
-    """Return the camera. Raise InputError, which names the existing cameras, if there is none."""
+    """Return the camera of a name; raise InputError, with the existing names, if it is unknown."""
     if name not in cameras:
         raise InputError(
             f"{where}: no camera {name!r}; cameras that exist: {', '.join(cameras) or 'none'}"
@@ -73,11 +74,10 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
 
 
 def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
-    """Return (H,W,3) uint8 RGB of an image file's bytes, gray in three equal channels.
+    """Decode an image file's bytes to (H,W,3) uint8 RGB; a gray image has three equal channels.
 
     Raises:
-        InputError: It is no whole image or not of the camera's size. The message names the
-            place.
+        InputError: The image is damaged, or its size differs from the camera's.
     """
     bgr = decode_image(data, where)
     image_size(bgr.shape, camera, where)
@@ -85,7 +85,7 @@ def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.
 
 
 def image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> None:
-    """Raise InputError if an image (H,W,...) has another size than the camera."""
+    """Raise InputError if an image's shape (H,W,...) differs from the size of its camera."""
     if shape[:2] != (camera.height_px, camera.width_px):
         raise InputError(
             f"{where}: got an image of {shape[1]} x {shape[0]} px; expected {camera.width_px} x "
@@ -102,14 +102,18 @@ def pinhole(
     where: str,
     **lens: Any,
 ) -> Camera:
-    """Return a camera without skew.
+    """Return a camera with zero skew.
 
     Args:
-        lens: Further arguments of `Camera`, such as its distortion.
+        name: Name of the camera.
+        size_px: Width and height of the images.
+        fx_fy_cx_cy: Focal lengths and principal point (px).
+        T_cam_lidar: (4,4) transform from the lidar frame to the camera frame.
+        where: Name of the calibration file, with which error messages begin.
+        lens: Further arguments of `Camera`, such as ``distortion``.
 
     Raises:
-        InputError: The numbers are not finite, or the focal lengths or the size (width, height) are
-            not positive. The message starts with ``where``.
+        InputError: A number is not finite, or a focal length or the size is not positive.
     """
     fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
@@ -122,10 +126,16 @@ def pinhole(
 
 
 def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str]) -> str:
-    """Return the scene of a place: the one named, or the only one.
+    """Return the name of the requested scene, or of the only scene of a data set.
+
+    Args:
+        reader: Name of the reader, for the error message.
+        path: Path of the data set, for the error message.
+        scene: Name of the requested scene, None if the user named no scene.
+        names: Names of all scenes in the data set.
 
     Raises:
-        InputError: There are several, or none of that name. The message lists them.
+        InputError: The scene does not exist, or none is requested and there are several.
     """
     if scene in names or (scene is None and len(names) == 1):
         return scene or names[0]
@@ -135,7 +145,7 @@ def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str
 
 
 def truth_beside(recording: Path) -> Truth | None:
-    """Return the exact truth in the folder ``truth`` of a simulated recording."""
+    """Return the ground truth in a simulated recording's folder ``truth``, None if none exists."""
     if not (recording / "truth").is_dir():
         return None
     from densify.readers.truth_files import FileTruth
@@ -144,10 +154,10 @@ def truth_beside(recording: Path) -> Truth | None:
 
 
 def parse_numbers(text: str, where: str, count: int) -> Float:
-    """Return the (count,) finite numbers of a line or file.
+    """Parse the (count,) finite numbers, separated by white space, of a line or file.
 
     Raises:
-        InputError: The numbers are others. The message starts with ``where``.
+        InputError: The count or a value is wrong. The message begins with ``where``.
     """
     try:
         values = np.array(text.split(), np.float64)
@@ -161,11 +171,14 @@ def parse_numbers(text: str, where: str, count: int) -> Float:
 
 
 def rigid(T: Any, where: str) -> Float:
-    """Return the (4,4) float64 pose of a (4,4) or (3,4) matrix, or of its 16 or 12 numbers.
+    """Return a rigid transform as a checked (4,4) float64 matrix.
+
+    Args:
+        T: Matrix (4,4) or (3,4), or its 16 or 12 numbers row by row.
+        where: Name of the file or line, with which error messages begin.
 
     Raises:
-        InputError: It is not finite, or its rotation is none. The message starts with
-            ``where``.
+        InputError: A number is not finite, or the upper left (3,3) part is not a rotation.
     """
     T = np.asarray(T, np.float64)
     T = T.reshape(-1, 4) if T.size in (12, 16) else T
@@ -177,11 +190,7 @@ def rigid(T: Any, where: str) -> Float:
 
 
 def rotation(R: Float, where: str) -> Float:
-    """Return the (3,3) matrix.
-
-    Raises:
-        InputError: It is no rotation. The message starts with ``where``.
-    """
+    """Return the (3,3) matrix unchanged; raise InputError if it is not a rotation."""
     error = np.abs(R @ R.T - np.eye(3)).max()
     if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(R) < 0:
         raise InputError(
@@ -192,9 +201,11 @@ def rotation(R: Float, where: str) -> Float:
 
 
 def scanner_axes(T_lidar_scanner: Float) -> Float:
-    """Return (S,3,3) `Returns.R_scanner_lidar` of scanners with these (S,4,4) mounting poses.
+    """Return the (S,3,3) rotations from the lidar frame to the axes of each of S scanners.
 
-    An upside-down scanner is turned about its x axis until z points upwards.
+    Args:
+        T_lidar_scanner: (S,4,4) mounting poses. The axes of an upside-down scanner are turned by
+            180 degrees about its x axis, until z points up.
     """
     R = T_lidar_scanner[:, :3, :3]
     upright = np.where(R[:, 2:, 2:] < 0, R * [1.0, -1.0, -1.0], R)
@@ -204,13 +215,16 @@ def scanner_axes(T_lidar_scanner: Float) -> Float:
 def quaternion_pose(
     w_x_y_z: Sequence[float] | Float, translation_m: Sequence[float] | Float, where: str
 ) -> Float:
-    """Return the (4,4) pose of a unit quaternion and a translation.
+    """Return the (4,4) pose of a quaternion, which is normalised, and a translation.
 
-    The length of the quaternion is made exactly 1.
+    Args:
+        w_x_y_z: (4,) quaternion, scalar part first.
+        translation_m: (3,) translation.
+        where: Name of the file or row, with which error messages begin.
 
     Raises:
-        InputError: The numbers are not finite or not four and three, or the length differs from
-            1 by more than 0.01. The message starts with ``where``.
+        InputError: A number is missing or not finite, or the quaternion's length is not within
+            0.01 of 1.
     """
     from scipy.spatial.transform import Rotation
 
@@ -233,11 +247,11 @@ def quaternion_pose(
 
 
 def upright_poses(centre_m: Float, heading_rad: Float) -> Float:
-    """Return the (K,4,4) poses of boxes whose z axis is that of the frame.
+    """Return the (K,4,4) poses of K boxes that are rotated only about the z axis of the frame.
 
     Args:
-        centre_m: (K,3).
-        heading_rad: (K,) direction of the front, from x towards y.
+        centre_m: (K,3) centres of the boxes.
+        heading_rad: (K,) directions of the boxes' fronts, from x towards y.
     """
     T = np.tile(np.eye(4), (len(centre_m), 1, 1))
     c, s = np.cos(heading_rad), np.sin(heading_rad)
@@ -253,11 +267,17 @@ def boxes(
     where: str,
     lidar: Int | None = None,
 ) -> Boxes:
-    """Return the boxes of a sweep, checked.
+    """Check and return the K boxes of a sweep.
+
+    Args:
+        track: (K,) name of each box's object, the same in all sweeps; "" if it is not tracked.
+        T_lidar_box: (K,4,4) poses of the boxes' centres in the lidar frame, x to the front.
+        size_m: (K,3) length, width and height.
+        where: Name of the file or sweep, with which error messages begin.
+        lidar: (K,) index of the scanner whose points a box encloses, -1 for all; None for all.
 
     Raises:
-        InputError: A box has no size or position, or is there twice. The message starts with
-            ``where``.
+        InputError: A size is not positive, a pose is not finite, or an object has two boxes.
     """
     bad = np.flatnonzero(~((size_m > 0) & (size_m < np.inf)).all(axis=1))
     if len(bad):

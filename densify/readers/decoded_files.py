@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Decode arrays, images and LAS files by libraries.
+"""Decode arrays, images and LAS files safely with NumPy, OpenCV, simplejpeg and laspy.
 
-Each function checks the sizes that a header claims before it takes memory. Every error of a library
-becomes one InputError.
+Each function checks the sizes stated in a file's header before it allocates memory. Every error of
+a library is raised as InputError.
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ from densify.config.file_content import MOST_BYTES, check_size, open_file, read_
 Arrays = dict[str, NDArray[Any]]
 
 MOST_PIXELS = 1 << 27
-_LAS_HEADER = struct.Struct("<96xIIxHI")  # begin of points, records, bytes of a point, points
-_LAS_EXTENDED = struct.Struct("<235xQIQ")  # of version 1.4: further records, points
-_RECORD_BYTES = 54  # the least that a record of variable length takes
+# Offset of the points, number of records, bytes per point, number of points.
+_LAS_HEADER = struct.Struct("<96xIIxHI")
+# LAS 1.4 only: offset and number of extended records, number of points.
+_LAS_EXTENDED = struct.Struct("<235xQIQ")
+_RECORD_BYTES = 54  # smallest size of a variable length record
 
 
 def read_array(path: Path) -> NDArray[Any]:
@@ -45,14 +47,15 @@ def read_array(path: Path) -> NDArray[Any]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
 ) -> Arrays:
-    """Return the arrays of a .npz file by name. Members that are no arrays are left out.
+    """Return the arrays of a .npz file by name.
 
     Args:
-        names: Only these arrays, as far as the file has them.
-        most_bytes: Limit of all arrays together.
+        path: Path of the .npz file.
+        names: Names of the arrays to read, if the file has them; None reads all.
+        most_bytes: Largest total size of the uncompressed arrays.
 
     Raises:
-        InputError: The file is missing or damaged, holds Python objects, or is over the limit.
+        InputError: The file is missing or damaged, contains Python objects, or is too large.
     """
     data = read_bytes(path)
     try:
@@ -82,20 +85,20 @@ def _array(data: bytes) -> NDArray[Any]:
 
 
 def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
-    """Return `decode_image` of a file."""
+    """Return the pixels of a PNG or JPEG file, as `decode_image` does with its bytes."""
     return decode_image(read_bytes(path), path, as_stored)
 
 
 def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDArray[Any]:
-    """Return the pixels of a PNG or JPEG file, (H,W,3) uint8 blue, green, red.
+    """Decode the bytes of a PNG or JPEG file to (H,W,3) uint8 pixels in blue, green, red.
 
     Args:
-        where: The place, for messages.
-        as_stored: Keep the depth of the file; a gray image is (H,W).
+        data: Content of the image file.
+        where: Name of the file, with which error messages begin.
+        as_stored: True keeps the file's data type and channels, such as (H,W) uint16.
 
     Raises:
-        InputError: It is no whole PNG or JPEG file, or has more than `MOST_PIXELS`. The message
-            begins with ``where``.
+        InputError: The data are no complete PNG or JPEG file, or exceed `MOST_PIXELS`.
     """
     import cv2
 
@@ -120,7 +123,7 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
 
 
 def _checked_format(data: bytes, where: Path | str) -> str:
-    """Return PNG or JPEG. Raise InputError for other, too large or damaged files."""
+    """Return "PNG" or "JPEG", the format of an image file; raise an exception if damaged."""
     from PIL import Image
 
     with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
@@ -130,31 +133,31 @@ def _checked_format(data: bytes, where: Path | str) -> str:
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
-    """Return width and height of an image file.
+    """Return the width and height (px) of an image file after decoding all pixels.
 
     Raises:
-        InputError: It is no whole image.
+        InputError: The file is not a complete PNG or JPEG image.
     """
     height, width = read_image(path).shape[:2]
     return width, height
 
 
 def stated_size_px(path: Path) -> tuple[int, int] | None:
-    """Return width and height as the header of an image file states them, None without a header.
+    """Return the width and height (px) stated in an image file's header, None without a header.
 
-    The rest of the file may be damaged.
+    Damage in the rest of the file is not detected.
     """
     from PIL import Image
 
     try:
         with open_file(path) as file, Image.open(file, formats=("PNG", "JPEG")) as image:
             return image.size
-    except (InputError, OSError, ValueError, SyntaxError):  # said where the image is read
+    except (InputError, OSError, ValueError, SyntaxError):  # reported when the image is read
         return None
 
 
 def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
-    """Raise InputError for an image (width, height) that is empty or too large."""
+    """Raise InputError if an image (width, height) is empty or exceeds `MOST_PIXELS`."""
     width, height = size_px
     if min(size_px) < 1 or width * height > MOST_PIXELS:
         raise InputError(
@@ -174,7 +177,7 @@ def read_las(path: Path) -> Any:
     data = read_bytes(path)
     try:
         _check_las(data, path)
-        # The parallel backend would allocate what a chunk claims.
+        # laspy's parallel backend would allocate the size stated in a damaged chunk.
         with laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs) as file:
             num_points, cloud = file.header.point_count, file.read()
         if len(cloud) != num_points:
@@ -187,7 +190,7 @@ def read_las(path: Path) -> Any:
 
 
 def _check_las(data: bytes, path: Path) -> None:
-    """Raise InputError unless the claimed numbers of points, records and chunks fit the file."""
+    """Raise an exception if the points, records and chunks stated in a LAS header do not fit."""
     begin, num_records, num_bytes, num_points = _LAS_HEADER.unpack_from(data)
     kind, version = data[104], data[25]
     if version >= 4:

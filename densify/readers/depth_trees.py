@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Pair depth maps of two folders, and masks with them, by drive, camera and frame.
+"""Pair estimated and true depth maps, and masks, by the drive, camera and frame in their paths.
 
-Each side has one of these layouts::
+The folder of estimated maps and the folder of true maps each have one of these layouts::
 
     <drive>/proj_depth/<product>/image_02/0000000005.png    KITTI's depth trees
     <drive>_sync_<product>_0000000005_image_02.png          KITTI's selected validation images
@@ -38,7 +38,7 @@ _OURS = ("depth", *_FILLED, "confidence")  # no other trees have these
 
 @dataclass(frozen=True)
 class DepthPair:
-    """The files of one image. Without a mask, ``mask`` is None."""
+    """Paths of an image's estimated and true depth map, and of its mask of moving objects."""
 
     predicted: Path
     truth: Path
@@ -47,13 +47,13 @@ class DepthPair:
 
 @dataclass(frozen=True)
 class DepthPairs:
-    """The pairs of two places, and the files without a partner.
+    """Pairs of estimated and true depth maps, and the files that could not be paired.
 
     Attributes:
-        pairs: At least one, ordered by the path of the truth.
-        without_truth: Predicted files without a partner.
-        without_prediction: Truth files without a partner.
-        without_mask: Truth files of pairs without a mask; empty if no masks are given.
+        pairs: One or more pairs, ordered by the path of the true map.
+        without_truth: Paths of estimated maps without a true map.
+        without_prediction: Paths of true maps without an estimated map.
+        without_mask: Paths of paired true maps without a mask; empty if no masks are given.
     """
 
     pairs: tuple[DepthPair, ...]
@@ -74,20 +74,20 @@ class _File:
 def pair_depth_files(
     predicted: Path, truth: Path, mask: Path | None = None, *, filled: bool = False
 ) -> DepthPairs:
-    """Pair the PNG files of two places, and masks with them.
+    """Pair estimated PNG depth maps with true depth maps and with masks.
 
-    The drive and the camera are compared only if the names of both sides have them. Files of
-    unknown layout are left out. Of densify's maps the measured ones are taken, or the filled ones.
-    Of a truth with KITTI's ``groundtruth`` nothing else is taken.
+    The frame in both paths must agree; the drive and the camera too if all paths name them. In a
+    folder with files of a known layout, other files are ignored. If ``truth`` has KITTI's
+    ``groundtruth`` maps, no others are used.
 
     Args:
-        predicted: A file, or a folder with everything below it.
-        truth: The same. Two files are a pair, whatever their names.
-        mask: Masks of moving objects, None for none.
-        filled: Take densify's filled maps.
+        predicted: Path of an estimated map, or of a folder searched with its subfolders.
+        truth: Path of a true map, or of a folder. Two files are paired whatever their names.
+        mask: Folder of masks of moving objects, or one file beside two files; None for no masks.
+        filled: True pairs densify's filled maps, False its maps of measured pixels.
 
     Raises:
-        InputError: A place is missing, names are ambiguous, or nothing pairs.
+        InputError: A path does not exist, the names are ambiguous, or no files can be paired.
     """
     found = _product(_found(predicted, "PREDICTED"), predicted, filled)
     true = _found(truth, "TRUTH")
@@ -118,7 +118,7 @@ def pair_depth_files(
 
 
 def _found(place: Path, what: str) -> list[_File]:
-    """Return the PNG files of a place by path. Plain files count only if there are no others."""
+    """Return the PNG files at a path, in order; plain names only if no file has a known layout."""
     if place.is_file():
         return [_parsed(place)]
     paths = sorted(place.rglob("*.png"))
@@ -151,7 +151,7 @@ def _last(pattern: re.Pattern[str], text: str) -> str | None:
 
 
 def _product(files: Sequence[_File], place: Path, filled: bool) -> list[_File]:
-    """Return one product of densify's own maps; all files of others."""
+    """Return densify's filled or measured maps; all files if another method made them."""
     wanted = [file for file in files if file.product in (_FILLED if filled else _MEASURED)]
     if filled and not wanted:
         raise InputError(
@@ -164,7 +164,10 @@ def _product(files: Sequence[_File], place: Path, filled: bool) -> list[_File]:
 def _match(
     left: Sequence[_File], right: Sequence[_File], left_place: Path, right_place: Path
 ) -> dict[Path, Path]:
-    """Return right path -> left path, matched by frame and by what all files of both sides name."""
+    """Return the left path by right path of each pair with equal frame.
+
+    Drive and camera must be equal too if all paths name them.
+    """
     everything = (*left, *right)
     told = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in everything)]
     here = _keyed(left, ["frame", *told], left_place)

@@ -11,26 +11,25 @@ from densify.config.errors import InputError
 from densify.geometry.types import Int, LidarSequence, Sweep
 from densify.readers.timeline import Timeline, format_frames
 
-_MOST_NAMED = 3  # sweeps that cannot be used, each with its reason
+_MOST_NAMED = 3  # most unusable sweeps that are listed with a reason
 
 
 def describe(sequence: LidarSequence) -> str:
-    """Return the `findings` of a recording as text."""
+    """Return a summary of a recording as aligned lines of text, as `findings` lists it."""
     return in_lines(findings(sequence))
 
 
 def in_lines(lines: Sequence[tuple[str, str]]) -> str:
-    """Return lines of a name and a text, aligned."""
+    """Return (name, text) pairs as lines in which all texts start in the same column."""
     width = max(len(label) for label, _ in lines) + 2
     return "\n".join(f"{label:<{width}}{text}" for label, text in lines)
 
 
 def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
-    """Return what a recording holds, as (name, text) pairs.
+    """Summarise a recording as (name, text) pairs, among them frames, rate, cameras and poses.
 
-    They are frames, rate, points, cameras, stamps, poses and truth, and what the reader found out.
-    The first and the last readable sweep are loaded, and no image. A rate is that of the median
-    time between two sweeps or images.
+    The first and the last readable sweep are loaded, and no image. Rates are computed from the
+    median time between two sweeps or images.
 
     Raises:
         InputError: No sweep can be read.
@@ -61,7 +60,7 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
 
 
 def _readable(sequence: LidarSequence, frames: Sequence[int], unreadable: dict[int, str]) -> Sweep:
-    """Return the first of these sweeps that can be read; add the others to ``unreadable``."""
+    """Return the first readable sweep of ``frames``; add reasons of failures to ``unreadable``."""
     for frame in (frame for frame in frames if frame not in unreadable):
         try:
             return sequence[frame]

@@ -7,14 +7,16 @@ DDAD: Guizilini et al., CVPR 2020::
     ROOT/scene_02/calibration/<hash>.json  extrinsics (on the vehicle) and intrinsics, by name
     ROOT/scene_02/point_cloud/LIDAR/<stamp>.npz    ROOT/scene_02/rgb/CAMERA_01/<stamp>.jpg
 
-- A scene is its folder, or its name behind ``#``. Sweeps and the images of each camera are numbered
-  from 0 in the order of time; a missing file leaves a gap. Each has a pose of its sensor.
+- ``--data`` names a scene's folder, or the data set and the scene after ``#``. Sweeps and the
+  images of each camera are numbered from 0 in the order of time; the number of a missing file
+  stays unused. Every sweep and image has a pose of its sensor.
 - Stamps are ISO dates. DDAD stores tenths of microseconds as microseconds: dates beyond 2200
   are divided by ten.
-- Points have no times. They are in the frame of the sweep's sensor. DDAD merges several
-  solid-state scanners, in the vehicle's frame on the ground. The origin of their rays is not
-  published. Scan lines are smoothest from 1.55 m up, so the cameras' mean position is taken.
-- Images are pinholes without distortion.
+- Points have no times and are in the frame of the sweep's sensor. DDAD merges several solid-state
+  scanners into the vehicle's frame, with its origin on the ground. The origin of the rays is not
+  published. Scan lines are smoothest as seen from 1.55 m above the ground, so the mean position
+  of the cameras is used.
+- Images are of pinhole cameras without distortion.
 """
 
 from __future__ import annotations
@@ -39,10 +41,11 @@ _BOGUS_YEAR = 2200
 
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
-    """See `densify.readers.ReaderModule`.
+    """Open a DGP scene; sweeps and images are read later, on request.
 
     Args:
-        path: A scene's folder, or one that holds some.
+        path: Folder of a scene, or a folder of scenes.
+        scene: Name of the scene's folder; None if ``path`` is a scene or holds a single scene.
     """
     if scene is None and find_scene(path):
         return Dgp(path)
@@ -53,15 +56,15 @@ def open_recording(path: Path, scene: str | None) -> Dgp:
 
 
 def find_scene(folder: Path) -> Path | None:
-    """Return the file that describes the scene of a folder, None without one."""
+    """Return the file ``scene_<hash>.json`` that describes a folder's scene, None if missing."""
     found = [p for p in folder.glob("scene_*.json") if not p.name.startswith("scene_dataset")]
     return min(found, default=None)
 
 
 class _Datum(NamedTuple):
-    """One sweep or image.
+    """One sweep or image, its time, and the (4,4) pose of its sensor at that time.
 
-    size_px: of an image. T_world_sensor: (4,4). columns: of a sweep.
+    ``columns`` are the names of a sweep's columns. ``size_px`` is the (width, height) of an image.
     """
 
     path: Path
@@ -72,17 +75,13 @@ class _Datum(NamedTuple):
 
 
 class Dgp(FileSequence):
-    """A scene as a `LidarSequence` with poses of its images."""
+    """A DGP scene as a `LidarSequence`, with poses of its images."""
 
     def __init__(self, path: Path) -> None:
-        """Read the description and the calibration.
-
-        Args:
-            path: Folder of the scene.
+        """Read the description and the calibration in the folder of a scene.
 
         Raises:
-            InputError: The description or the calibration is missing or malformed, or there are
-                no sweeps.
+            InputError: A file is missing or malformed, or the scene has no sweeps.
         """
         file = find_scene(path)
         if file is None:
@@ -120,7 +119,7 @@ class Dgp(FileSequence):
         )
 
     def T_world_cam(self, camera: str, number: int) -> Float:
-        """Return the data set's own (4,4) pose of an image."""
+        """Return the data set's (4,4) pose of a camera in the world at the time of an image."""
         self.check_image(camera, number)
         return self._images[camera][number].T_world_sensor
 
@@ -140,7 +139,7 @@ _Numbered = dict[str, dict[int, _Datum]]
 
 
 def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
-    """Return the existing sweeps and images, by sensor and number, and the calibration file."""
+    """Return sweeps and images, by sensor and number, and the path of the calibration file."""
     content = read_json(file)
     found: dict[str, _Numbered] = {"point_cloud": {}, "image": {}}
     with described_in(file, "a DGP scene with samples and their data"):
@@ -173,7 +172,7 @@ def _datum(file: Path, kind: str, entry: Mapping[str, Any]) -> _Datum:
 
 
 def _stamp_ns(text: str) -> int:
-    """Return the time of an ISO date. Raises ValueError."""
+    """Return the nanoseconds since 1970 of an ISO date; ValueError if the text is no date."""
     date = datetime.fromisoformat(text.replace("Z", "+00:00"))
     microseconds = (date - datetime(1970, 1, 1, tzinfo=timezone.utc)) // timedelta(microseconds=1)
     return microseconds * (100 if date.year >= _BOGUS_YEAR else 1000)
@@ -186,7 +185,7 @@ def _read_pose(given: Mapping[str, Any], where: str) -> Float:
 
 
 def _read_calibration(file: Path) -> dict[str, tuple[Float, list[float]]]:
-    """Return T_ego_sensor (4,4) and fx fy cx cy by the sensor's name."""
+    """Return each sensor's (4,4) pose in the vehicle frame and fx fy cx cy (px), by its name."""
     given, found = read_json(file), {}
     with described_in(file, "names, and extrinsics and intrinsics of each"):
         sensors = zip(given["names"], given["extrinsics"], given["intrinsics"], strict=True)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Provide the base class of readers of recorded files, which checks requests and contents.
 
-A reader derives from `FileSequence` and says in ``__init__`` what there is. It reads the returns of
-one sweep, one image or one pose at a time. The base class refuses requests for a frame, camera or
-image that does not exist. It also refuses files without valid returns, images of another size, and
-poses that are no rigid motion.
+A reader derives from `FileSequence` and lists the sweeps, cameras and images in ``__init__``. It
+reads the returns of one sweep, one image or one pose at a time. The base class raises InputError
+for a frame, camera or image that does not exist, a sweep without valid returns, an image whose size
+differs from the calibration, and a pose that is not a rigid transform.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ from densify.readers.decoded_files import stated_size_px
 
 @dataclass(frozen=True)
 class Returns:
-    """The N rows of a sweep's file, each as measured, none left out.
+    """All N rows of a sweep's file, valid or not, not deskewed, measured by S scanners.
 
     Attributes:
-        points: (N,3) metres, lidar frame, each at its own firing time.
-        intensity: (N,) 0 to 1.
-        offset_ns: (N,) int64 since the reference time of the sweep, None if unknown.
-        lidar: (N,) number of the scanner that fired.
-        scanner_origins: (S,3) metres; None if rays start at the origin of the frame.
-        R_scanner_lidar: (S,3,3) to the axes of each scanner, which spins about z; None if they
-            are those of the frame.
-        num_untimed: Number of those rows at 0 0 0 whose time cannot be of this sweep.
+        points: (N,3) metres, lidar frame at each point's own firing time; 0 0 0 if invalid.
+        intensity: (N,) intensities, 0 to 1; None if the file has none.
+        offset_ns: (N,) int64 firing times since the sweep's reference time; None if unknown.
+        lidar: (N,) index of the scanner that fired, 0 to S - 1; None for a single scanner.
+        scanner_origins: (S,3) metres, start of each scanner's rays in the lidar frame; None if
+            rays start at 0 0 0.
+        R_scanner_lidar: (S,3,3) rotations from the lidar frame to the axes of each scanner, which
+            spins about its z axis; None if the axes are equal.
+        num_untimed: Number of rows set to 0 0 0 because their time cannot belong to this sweep.
     """
 
     points: Float
@@ -52,14 +53,14 @@ class Returns:
 class FileSequence(ABC):
     """A `LidarSequence` that is read from files.
 
-    A reader sets ``_stamps_ns``, the reference times by frame, or overrides `stamp_ns`.
+    A derived reader sets ``_stamps_ns``, the reference times by frame, or overrides `stamp_ns`.
 
     Attributes:
-        name: Name for people and outputs.
-        where: Place of the recording, for messages.
-        frames: Numbers of the existing sweeps, ascending.
-        cameras: The cameras by name.
-        truth: Exact truth, None if there is none.
+        name: Name of the recording for people and outputs.
+        where: Path of the recording, for messages.
+        frames: Frame numbers of the existing sweeps, ascending.
+        cameras: Cameras by name.
+        truth: Ground truth of a simulated recording, None for other recordings.
     """
 
     _stamps_ns: Mapping[int, int] | Sequence[int] | Int
@@ -75,12 +76,12 @@ class FileSequence(ABC):
         files: Mapping[int, Path] | None = None,
         images: Mapping[str, Mapping[int, Path]] | None = None,
     ) -> None:
-        """Take what the reader found.
+        """Store the files and times that the reader found; the class describes the other arguments.
 
         Args:
-            exposed_ns: Exposure of each existing image, by camera and image number.
-            files: File of each sweep, if it has one of its own.
-            images: PNG or JPEG files by camera and image number. A reader without them
+            exposed_ns: Exposure time of each existing image, by camera and image number.
+            files: File of each sweep by frame, None if sweeps share files.
+            images: PNG or JPEG files by camera and image number. A reader without such files
                 overrides `_encoded_image`.
         """
         self.name = name
@@ -104,24 +105,21 @@ class FileSequence(ABC):
 
     @abstractmethod
     def _returns(self, frame: int) -> Returns:
-        """Return the rows of an existing sweep.
-
-        Any error of a malformed file becomes an InputError that names the file.
-        """
+        """Read all rows of an existing sweep; an exception is reported as a malformed file."""
 
     def _checked_returns(self, frame: int) -> tuple[Path, Returns]:
-        """Return the file of a sweep, for messages, and its rows."""
+        """Return the path of a sweep's file, for messages, and all rows of the file."""
         self.check_frame(frame)
         path = self._files.get(frame, self.where)
         with described_in(path, f"sweep {frame} in the data set's own form"):
             return path, self._returns(frame)
 
     def sweep_bytes(self) -> dict[int, int]:
-        """See `LidarSequence`; empty where sweeps share files."""
+        """Return the size of each sweep's file (bytes) by frame, empty if sweeps share files."""
         return {frame: path.stat().st_size for frame, path in self._files.items()}
 
     def check_first_images(self) -> None:
-        """Raise InputError if the first image of a camera is not of the size of its calibration."""
+        """Raise InputError if the size of a camera's first image differs from its calibration."""
         for name, files in self._image_files.items():
             path = next(iter(files.values()))
             size_px = stated_size_px(path)
@@ -129,33 +127,33 @@ class FileSequence(ABC):
                 checks.image_size(size_px[::-1], self.cameras[name], path)
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
-        """Return the (H,W,3) RGB of an existing image."""
+        """Return an existing image, (H,W,3) uint8 RGB."""
         path, data = self._encoded_image(camera.name, number)
         return checks.decoded_image(data, camera, path)
 
     def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
-        """Return the file of an existing image, for messages, and its bytes."""
+        """Return the path of an existing image's file, for messages, and the file's bytes."""
         path = self._image_files[camera][number]
         return path, read_bytes(path)
 
     def _pose(self, frame: int) -> Float:
-        """Return the (4,4) T_world_lidar of an existing sweep."""
+        """Return the (4,4) T_world_lidar of an existing sweep; InputError without poses."""
         raise InputError(
             f"{self.where}: no poses; let the sweeps register themselves with "
             f"--set register.source=kiss-icp"
         )
 
     def __getitem__(self, frame: int) -> Sweep:
-        """Return the valid returns of a sweep in file order.
+        """Read a sweep and return its valid points, in file order, at their own firing times.
 
-        Rows whose position is not finite are dropped, and rows at the origin of the frame, with
-        which many formats pad. An intensity that is not finite is 0.
+        Rows at 0 0 0, which many formats use as padding, and rows with a position that is not
+        finite are dropped. Intensities that are not finite become 0.
 
         Raises:
-            InputError: The frame does not exist, or its file is damaged or holds no returns.
+            InputError: The sweep does not exist, its file is damaged, or no row is valid.
         """
         path, returns = self._checked_returns(frame)
-        x, y, z = returns.points.T  # by columns: sums over rows of three take several times as long
+        x, y, z = returns.points.T  # by columns: reductions over rows of three are far slower
         valid = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
         row = np.flatnonzero(valid)
         if not len(row):
@@ -187,38 +185,38 @@ class FileSequence(ABC):
         )
 
     def num_rows(self, frame: int) -> int:
-        """See `LidarSequence`."""
+        """Return the number of rows, valid or not, in the file of a sweep."""
         return len(self._checked_returns(frame)[1].points)
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """Return the exposure time of each existing image, by its number."""
+        """Return the exposure time of each existing image of a camera, by image number."""
         checks.camera_named(self.cameras, camera, self.where)
         return self._exposed_ns.get(camera, {})
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
-        """Return (H,W,3) RGB. Raise InputError for an unknown camera, a missing or unfit image."""
+        """Read an image as (H,W,3) RGB; raise InputError if it is missing or of another size."""
         calibrated = self.check_image(camera, number)
         return self._image(calibrated, number)
 
     def T_world_lidar(self, frame: int) -> Float:
-        """Return the (4,4) pose of the data set at the reference time of the sweep.
+        """Return the data set's (4,4) pose of the lidar in the world at a sweep's reference time.
 
         Raises:
-            InputError: There is none, or it is no rigid motion.
+            InputError: The sweep has no pose, or the pose is not a rigid transform.
         """
         self.check_frame(frame)
         return checks.rigid(self._pose(frame), f"{self.where}: pose of frame {frame}")
 
     def check_frame(self, frame: int) -> None:
-        """Raise InputError, which names the existing frames, for a frame that does not exist."""
+        """Raise InputError, with the existing frame numbers, if the sweep does not exist."""
         if frame not in self._frames:
             checks.of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
 
     def check_image(self, camera: str, number: int) -> Camera:
-        """Return the camera.
+        """Return the camera of an image.
 
         Raises:
-            InputError: The camera or the image does not exist. The message names those that do.
+            InputError: The camera or the image does not exist. The message lists the existing ones.
         """
         calibrated = checks.camera_named(self.cameras, camera, self.where)
         checks.of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)

@@ -1,23 +1,27 @@
 # SPDX-License-Identifier: MIT
-"""Read flow files: scene flow between two sweeps, of densify or of another method.
+"""Read flow files: scene flow between two sweeps, from densify or from another method.
 
-``000119_000120.npz`` holds the flow of the points of sweep 119 to the time of sweep 120::
+``000119_000120.npz`` holds the flow of N points of sweep 119 (source) to the reference time of
+sweep 120 (target). It has residual_flow or total_flow; the other arrays are optional::
 
-    residual_flow  (N,3) metres, ego-motion removed, in the source's lidar frame, or instead of it
-    total_flow     (N,3) metres with ego-motion, from the source's lidar frame to the target's
-    row            (N,) row of each point in the sweep's file; without it N is their number
-    moving         (N,) bool; without it points with a residual flow of 0.05 m or more
-    object         (N,) moving object, the same number in every file, -1 none; without it none
-    valid          (N,) bool, of labels: the point's flow is known; read for scoring alone
-    to_reference   (N,3) metres, own motion from the firing to the sweep's reference time, or 0
+    residual_flow  (N,3) metres, ego-motion removed, in the source's lidar frame
+    total_flow     (N,3) metres with ego-motion: target minus source coordinates, each in the
+                   lidar frame of its sweep
+    row            (N,) row index of each point in the sweep's file; default 0 to N - 1
+    moving         (N,) bool; default True for a residual flow of 0.05 m or more
+    object         (N,) number of the moving object, the same in every file; -1, the default, is
+                   no object
+    valid          (N,) bool, the ground-truth flow of the point is known; used only for scoring
+    to_reference   (N,3) metres, the point's own motion from its firing time to the sweep's
+                   reference time; default 0
 
-True flow for scoring is in flow files, or in Argoverse 2's labels as BucketedSceneFlowEval stores
-them::
+Ground-truth flow for scoring is read from flow files, or from the Argoverse 2 labels of
+BucketedSceneFlowEval::
 
-    DIR/[LOG/]STAMP.feather  flow_tx_m flow_ty_m flow_tz_m without ego-motion, in the vehicle's
-                             frame at the stamp; is_valid; classes_0 in `CATEGORIES`, -1 the
-                             background; a row for each of the sweep's file. Named by stamps, or
-                             0000000000, 0000000001, …
+    DIR/[LOG/]STAMP.feather  flow_tx_m flow_ty_m flow_tz_m, ego-motion removed, in the vehicle's
+                             frame at the stamp; is_valid; classes_0, an index of `CATEGORIES` or
+                             -1 for background. The table has one row per row of the sweep's file.
+                             Files are named by stamps, or 0000000000, 0000000001, …
 """
 
 from __future__ import annotations
@@ -42,31 +46,40 @@ from densify.scores.challenge import CLASSES, IGNORED
 
 MOVES_M = 0.05
 FARTHEST_M = 1000.0
-"""The longest step between sweeps that is believed."""
+"""Longest flow vector that is accepted; a longer vector raises InputError."""
 _WIDE = ("residual_flow", "total_flow", "to_reference")
 _KNOWN = (*_WIDE, "row", "moving", "object", "valid")
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Read the flow files of a folder as an engine, see `densify.flow.engines.EngineModule`."""
+    """Return the motion of all points from the flow files in the folder ``argument``.
+
+    This is the flow engine ``npz:FOLDER`` (`densify.flow.engines.EngineModule`).
+    """
     check_argument(argument)
     step = partial(read_step, Path(argument), scene.stretch)
     return ChainedMotion(scene.stretch, step)
 
 
 def check_argument(argument: str) -> None:
-    """Raise InputError unless the folder is there."""
+    """Raise InputError if the folder of flow files does not exist."""
     if not Path(argument).is_dir():
         raise InputError(f"flow.engine npz:{argument}: no such folder; expected flow files in it")
 
 
 def read_step(folder: Path, stretch: Stretch, here: int, there: int) -> FlowField:
-    """Return the flow of sweep number ``here`` to number ``there``.
+    """Read the flow of a sweep's points to another sweep, ego-motion removed, in its lidar frame.
 
-    Points without a row in the file are static.
+    Points that are missing in the flow file are static.
+
+    Args:
+        folder: Folder of the flow files.
+        stretch: Registered sweeps.
+        here: Index in ``stretch.sweeps`` of the sweep.
+        there: Index in ``stretch.sweeps`` of the other sweep.
 
     Raises:
-        InputError: The file is missing, damaged, or of another form.
+        InputError: The flow file is missing, damaged or malformed.
     """
     frame, target = stretch.frames[here], stretch.frames[there]
     sweep, T_here_there = stretch.sweeps[here].sweep, stretch.T_target_source(frame, target)
@@ -81,16 +94,16 @@ def read_step(folder: Path, stretch: Stretch, here: int, there: int) -> FlowFiel
 def sweep_columns(
     path: Path, row: NDArray[np.int64], points: NDArray[np.float64], T_here_there: NDArray[Any]
 ) -> dict[str, NDArray[Any]]:
-    """Return the columns of a flow file at the (N,) rows of a sweep.
+    """Read a flow file's arrays by name for the N points of a sweep, in the sweep's order.
 
-    They are residual_flow, moving, object and valid, completed where the file lacks one, and
-    to_reference if the file has it. Points of other rows have flow 0 and object -1, and are not
-    valid.
+    The module describes the arrays. Missing residual_flow, moving, object and valid are added. A
+    point that is missing in the file has flow 0 and object -1, and is not valid.
 
     Args:
-        row: (N,) rows of the sweep.
-        points: (N,3) points of the sweep, in metres.
-        T_here_there: (4,4) pose of the lidar frame of the target in that of the source.
+        path: Path of the flow file.
+        row: (N,) row index of each point in the sweep's file.
+        points: (N,3) points in the source's lidar frame (m).
+        T_here_there: (4,4) pose of the target's lidar frame in the source's lidar frame.
     """
     arrays = load_flow_file(path)
     num_points = len(next(iter(arrays.values())))
@@ -122,10 +135,10 @@ def sweep_columns(
 
 
 def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a flow file.
+    """Return the arrays of a flow file by name, as stored, after checking shapes and values.
 
     Raises:
-        InputError: The file is missing, damaged, or of another form.
+        InputError: The file is missing, damaged or malformed.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
@@ -188,7 +201,7 @@ CATEGORIES = {
     "WHEELED_DEVICE": "WHEELED_VRU",
     "WHEELED_RIDER": "WHEELED_VRU",
 }
-"""Argoverse 2's categories and the classes that the challenge of 2024 puts them in; None: left out
+"""Class in the Argoverse 2 challenge of 2024 for each category; None if the category is ignored
 (`av2_metacategories` of the package bucketed-scene-flow-eval)."""
 
 _CLASS_OF = np.array(
@@ -200,12 +213,12 @@ _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 @dataclass(frozen=True)
 class LabelledFlow:
-    """The true flow of the N points of a registered sweep.
+    """The ground-truth flow of the N points of a registered sweep.
 
     Attributes:
-        flow: (N,3) metres to the next sweep, ego-motion removed, lidar frame.
-        classes: (N,) uint8 as in `densify.scores.challenge`.
-        valid: (N,) bool, the flow is known.
+        flow: (N,3) metres to the next sweep, ego-motion removed, in the sweep's lidar frame.
+        classes: (N,) uint8 index in `densify.scores.challenge.CLASSES`, or its ``IGNORED``.
+        valid: (N,) bool, the ground-truth flow of the point is known.
     """
 
     flow: Float
@@ -214,14 +227,16 @@ class LabelledFlow:
 
 
 def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
-    """Return the labels of the flow of one sweep to the next sweep of the stretch.
+    """Read the ground-truth flow of a sweep to the next sweep.
 
     Args:
-        place: A folder as described above.
-        name: Name of the recording, whose folder may be in ``place``.
+        place: Folder of flow files ``FRAME_NEXT.npz`` or of Argoverse 2 labels.
+        name: Name of the recording, also of a subfolder that may hold its labels.
+        stretch: Registered sweeps, with the sweep and the next one.
+        frame: Frame number of the sweep.
 
     Raises:
-        InputError: There are no labels of that sweep, or they are damaged or of another sweep.
+        InputError: The sweep has no labels, or the labels are damaged or too few.
     """
     if not place.is_dir():
         raise InputError(f"--truth {place}: no such folder; expected true flow in it")
@@ -245,10 +260,7 @@ def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> Label
 
 
 def _read_feather(path: Path, row: NDArray[np.int64]) -> LabelledFlow:
-    """Return the labels of a feather file.
-
-    row: (N,) of the sweep's points in its file.
-    """
+    """Read an Argoverse 2 label file for N points with the row indices ``row`` (N,)."""
     kinds = {**dict.fromkeys(_FLOW, "m"), "is_valid": "t", "classes_0": "i"}
     columns = read_feather(path, kinds, "Argoverse 2's flow labels")
     flow = np.stack([columns[axis].astype(np.float64) for axis in _FLOW], axis=1)
