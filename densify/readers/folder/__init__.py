@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Any folder of sweeps, and the densify.yaml beside them."""
+"""Read any folder of sweeps, described by an optional ``densify.yaml``."""

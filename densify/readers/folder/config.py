@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Read ``densify.yaml`` beside a recording of no known form.
+"""Read ``densify.yaml`` beside a recording that no other reader recognises.
 
-It says what the files do not say themselves. Every key is optional; `densify.readers.folder.reader`
-says what is then found or assumed. An error names file, line and key.
+The file states what the recording's own files leave open. Every YAML key is optional;
+`densify.readers.folder.reader` describes the defaults. An error names file, line and key.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _AXES = {s + a: (-1.0 if s else 1.0) * np.eye(3)[i] for s in ("", "-") for i, a 
 
 C = TypeVar("C")
 Check = tuple[Callable[[Any], Any], str]
-"""A function that returns the value of a key, or raises ValueError or the like for a wrong one; and
-the value that is expected, for people."""
+"""A function that converts the value of a YAML key, and the expected value in words. The function
+raises an exception, such as ValueError, for a wrong value."""
 
 
 def _only(kind: type, value: Any) -> Any:
@@ -62,7 +62,10 @@ def _names(value: Any) -> tuple[str, ...]:
 
 
 def _axes(value: Any) -> Float:
-    """Return (3,3) of three names such as [z, -x, -y]: the file's axes for the lidar's x, y, z."""
+    """Return the (3,3) rotation from stored to lidar axes, by three names such as [z, -x, -y].
+
+    The names are the stored axes along the lidar's x, y and z axis.
+    """
     R = np.array([_AXES[name] for name in _names(value)])
     if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3)):
         raise ValueError
@@ -122,29 +125,31 @@ _CHECKS: dict[str, Check] = {
     "row_time_s": _NUMBER,
     "clock_offset_s": _NUMBER,
 }
-"""Every key that is no text, with the check of its value."""
+"""Check of each YAML key whose value is not a plain text."""
 
 
 @dataclass(frozen=True)
 class SweepFiles:
-    """Section ``sweeps``. An empty text or 0 means: found by itself.
+    """Section ``sweeps``. By default ("" or 0) the reader finds the value in the files.
 
     Attributes:
-        files: Folder of the sweeps.
-        columns: Of files without names.
-        scale_m: Metres of a unit of the points.
-        axes: (3,3) turns (or mirrors) stored points to the lidar frame, x forward, y left, z
-            up; None leaves them.
-        intensity: Name of the column.
-        time: Name of the column.
-        lidar: Name of the column.
-        intensity_scale: Value of full brightness.
-        time_unit: See `densify.readers.point_fields.find_times`; time_is and reference too.
-        stamps: ``names`` (of the files), or a file with one time for each sweep.
+        files: Path of the folder of the sweeps.
+        columns: Names of the columns, for files that do not name them.
+        scale_m: Length of one unit of the stored points, in metres.
+        axes: (3,3) matrix that turns (or mirrors) stored points into the lidar frame, x forward,
+            y left, z up; None for the identity.
+        intensity: Name of the column with intensities.
+        intensity_scale: Stored intensity that becomes 1.
+        time: Name of the column with the firing times of the points.
+        time_unit: Unit of the firing times, in `densify.readers.point_fields.UNIT_NS`.
+        time_is: "relative" for times since the stamp, "absolute" for times since an epoch.
+        reference: Moment of the sweep that its stamp marks: "start", "middle" or "end".
+        lidar: Name of the column with the index of the scanner.
+        stamps: ``names`` if file names are stamps, or the path of a file with a stamp per sweep.
         stamps_unit: Unit of the stamps.
         rate_hz: Rate of sweeps without stamps; 0 for 10 Hz.
-        compensated: The points are compensated to the stamp by the vehicle's motion.
-        scanner_origins: (S,3) metres, None if rays start at 0 0 0.
+        compensated: True if the points are ego-motion compensated to the stamp.
+        scanner_origins: (S,3) metres, start of each scanner's rays; None for 0 0 0.
     """
 
     files: str = ""
@@ -170,9 +175,10 @@ class Poses:
     """Section ``poses``.
 
     Attributes:
-        file: The file, "" to search for it.
-        T_frame_lidar: (4,4) pose of the lidar in the frame whose poses these are.
-        inverse: The file has T_lidar_world, not T_world_lidar.
+        file: Path of the pose file, "" to search for it.
+        stamps_unit: Unit of the stamps of the poses, "" to detect it.
+        T_frame_lidar: (4,4) pose of the lidar in the frame of the poses; None for the identity.
+        inverse: True if the file stores T_lidar_world instead of T_world_lidar.
     """
 
     file: str = ""
@@ -185,14 +191,17 @@ class Poses:
 class CameraFiles:
     """One camera of the section ``cameras``.
 
+    `Camera` describes model, distortion, max_angle_deg and row_time_s.
+
     Attributes:
-        size: Width and height in pixels.
-        K: (3,3).
-        T_cam_lidar: (4,4).
-        files: Folder of its images.
-        stamps: ``names``, ``sweeps`` (an image is exposed at the stamp of the sweep of its
-            number), or a file; "" to search for them.
-        clock_offset_s: Added to the stamps, to bring them to the clock of the sweeps.
+        size: Width and height of the images in pixels.
+        K: (3,3) intrinsics in pixels.
+        T_cam_lidar: (4,4) transform from the lidar frame to the camera frame.
+        files: Path of the folder of images.
+        stamps: ``names`` if file names are stamps; ``sweeps`` if an image has the stamp of the
+            sweep of the same number; or the path of a file; "" to search for a file.
+        stamps_unit: Unit of the stamps of the images, "" to detect it.
+        clock_offset_s: Seconds added to the images' stamps, to convert them to the sweeps' clock.
     """
 
     size: tuple[int, int]
@@ -209,10 +218,7 @@ class CameraFiles:
 
 
 class _File(NamedTuple):
-    """A file that is read, with the line of each key.
-
-    lines: by the dotted names of the keys.
-    """
+    """The densify.yaml being read, with the line of each key by its dotted name, for messages."""
 
     path: Path
     lines: Mapping[str, int]
@@ -226,9 +232,12 @@ class _File(NamedTuple):
         return self.error(key, f"got {shown}, expected {expected}")
 
     def mapping(self, key: str, value: Any, known: Collection[str] | None) -> dict[str, Any]:
-        """Return the mapping that is the value of a key, empty for None.
+        """Return the mapping that is the value of a YAML key, empty for None.
 
-        known: the keys that it may have, None for any.
+        Args:
+            key: Dotted name of the YAML key.
+            value: Value of the YAML key.
+            known: Names allowed in the mapping, None for any name.
         """
         value = {} if value is None else value
         if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
@@ -243,7 +252,7 @@ class _File(NamedTuple):
         return value
 
     def filled(self, kind: type[C], key: str, value: Any) -> C:
-        """Return the dataclass whose fields are the keys of a mapping."""
+        """Return a dataclass ``kind`` filled with the checked values of a YAML mapping."""
         known = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
         found = {}
         for name, given in self.mapping(key, value, known).items():
@@ -264,8 +273,8 @@ class FolderConfig:
     """The contents of densify.yaml.
 
     Attributes:
-        path: The file, None if there is none.
-        cameras: Each with its files, by name.
+        path: Path of densify.yaml, None if the folder has no such file.
+        cameras: Calibration and file settings of each camera, by name.
     """
 
     path: Path | None = None
@@ -275,10 +284,10 @@ class FolderConfig:
 
     @staticmethod
     def read(folder: Path) -> FolderConfig:
-        """Return the configuration of a folder.
+        """Read the densify.yaml of a folder; return the defaults if the folder has none.
 
         Raises:
-            InputError: Anything is wrong. The message names file, line and key.
+            InputError: A key or a value is wrong. The message names file, line and key.
         """
         path = folder / NAME
         if not path.is_file():

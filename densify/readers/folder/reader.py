@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Read any folder of sweeps: numbered files of points, with stamps, poses and images beside them.
 
-What the files do not say stands in a small ``densify.yaml``, see `densify.readers.folder.config`.
+A small ``densify.yaml`` states what the files leave open, see `densify.readers.folder.config`.
 
-points: in the lidar's frame, as fired. With ``compensated`` they are compensated to the stamp. That
-    is undone if points have times and poses have stamps; else the times are left out.
-numbers and stamps: as the names say, or from 0 in the order of time where names are times
-    (``1317042651.468569638.pcd``). Times come from names, a file such as ``timestamps.txt``, or the
-    rate. The stamp is the reference time. Times of points count from it, or are absolute on its
-    clock, in the unit in which a sweep takes about a period.
-poses: KITTI's 3x4, 4x4, TUM, or tables with quaternions: interpolated by their stamps, or without
-    stamps one for each sweep or number.
+points: in the lidar's frame, not deskewed. With ``compensated`` they are ego-motion compensated to
+    the stamp. The reader undoes this if points have times and poses have stamps. Otherwise it
+    discards the times.
+numbers and stamps: as the file names state. If the names are times
+    (``1317042651.468569638.pcd``), files are numbered from 0 in the order of time. Stamps come from
+    names, a file such as ``timestamps.txt``, or the rate. The stamp is the reference time. Times
+    of points count from the stamp, or are absolute on its clock. Their unit is the unit in which a
+    sweep takes about a period.
+poses: KITTI's 3x4, 4x4, TUM, or tables with quaternions. Poses with stamps are interpolated. Poses
+    without stamps belong to the sweeps in order, or to the numbers from 0.
 images: need a calibration; stamped by names, a file, or the sweeps of the same numbers.
 """
 
@@ -51,12 +53,12 @@ _UNTIMED = (
 
 @dataclass(frozen=True)
 class SweepColumns:
-    """The columns of a series of sweeps.
+    """The columns of the sweeps of a folder, and their meaning.
 
     Attributes:
-        series: The files.
+        series: Files and stamps of the sweeps.
         settings: Section ``sweeps`` of densify.yaml.
-        config: Path of densify.yaml.
+        config: Path of densify.yaml, None if the folder has none.
     """
 
     series: Series
@@ -65,10 +67,10 @@ class SweepColumns:
     _own_stamps_ns: dict[int, int] = field(default_factory=dict)
 
     def returns(self, frame: int, stamp_ns: int) -> Returns:
-        """Return the rows of a sweep.
+        """Read all rows of a sweep with reference time ``stamp_ns``, in the lidar frame.
 
         Raises:
-            InputError: The file is damaged, or lacks columns of the first.
+            InputError: The file is damaged, or lacks a column that other sweeps have.
         """
         path = self.series.paths[frame]
         columns = self._columns(path)
@@ -108,12 +110,13 @@ class SweepColumns:
         )
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep (ns).
+        """Return the reference time of a sweep.
 
-        It is that of the series, or else the absolute times of the points tell it, or the number.
+        The time is the sweep's stamp. Without stamps it is computed from absolute times of the
+        points, or else from the frame number and the rate.
 
         Raises:
-            InputError: Its points have to be read and cannot be.
+            InputError: The times of the points are needed and cannot be read.
         """
         if self.series.stamps_ns is not None:
             return self.series.stamps_ns[frame]
@@ -130,10 +133,10 @@ class SweepColumns:
 
     @cached_property
     def _own_clock(self) -> PointTimes | None:
-        """The absolute times of points, which stamp the sweeps; None if there are none."""
+        """The column of absolute point times that replaces missing stamps, None without one."""
         try:
             times = self.layout.times
-        except InputError:  # raised again where a sweep is read
+        except InputError:  # raised again when a sweep is read
             return None
         return times if times is not None and times.absolute else None
 
@@ -148,7 +151,7 @@ class SweepColumns:
         return f"number, at {how} {1e9 / self.period_ns:g} Hz (rate_hz)"
 
     def assumed(self) -> list[str]:
-        """Return the assumptions about the stamps, a sentence each."""
+        """Return the assumptions about missing stamps, a sentence each."""
         if self.series.stamps_ns or self._own_clock is not None or self.settings.rate_hz:
             return []
         return [
@@ -158,14 +161,14 @@ class SweepColumns:
 
     @cached_property
     def period_ns(self) -> int:
-        """The time from sweep to sweep, by their stamps or else their rate."""
+        """The median time between consecutive stamps, or the period of the rate without stamps."""
         stamps_ns = list((self.series.stamps_ns or {}).values())
         if len(stamps_ns) > 1:
             return max(1, int(np.median(np.diff(stamps_ns))))
         return round(1e9 / (self.settings.rate_hz or _ASSUMED_HZ))
 
     def unused(self) -> list[str]:
-        """Return the unused columns, with their ranges, for people."""
+        """Return the names of unused columns with the range of their values, for people."""
         return [
             f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
             for name, column in next(iter(self._samples.values())).items()
@@ -174,12 +177,12 @@ class SweepColumns:
 
     @cached_property
     def _samples(self) -> dict[int, Columns]:
-        """The columns of sweeps from all over the recording, by number."""
+        """The columns of a few sweeps spread over the recording, by frame number."""
         paths = self.series.paths
         return sample_columns([*paths], lambda frame: self._columns(paths[frame]))
 
     def _columns(self, path: Path) -> Columns:
-        """Read all columns of numbers, (N,) each, also those beside the points of an .npz file."""
+        """Read a file's numeric columns, (N,) each, with the other (N,) arrays of an .npz file."""
         table = read_table(path, self.settings.columns)
         beside = {n: a for n, a in table.beside.items() if a.shape == (len(table),)}
         columns = {**table.columns, **beside}
@@ -196,19 +199,19 @@ class SweepColumns:
 
 
 def open_recording(path: Path, scene: str | None) -> Folder:
-    """See `densify.readers.ReaderModule`; a folder has no scenes."""
+    """Open a folder of sweeps; ``scene`` is unused, since a folder has no scenes."""
     return Folder(path)
 
 
 class Folder(FileSequence):
-    """A folder of sweeps as a `LidarSequence`; `findings` says what was found."""
+    """A folder of sweeps as a `LidarSequence`; `findings` states what the reader detected."""
 
     def __init__(self, path: Path | str) -> None:
-        """Read names, densify.yaml, stamps and poses. Sweeps and images are read on demand.
+        """Read file names, densify.yaml, stamps and poses. Sweeps and images are read on request.
 
         Raises:
-            InputError: There are no sweeps, or the other files are malformed or contradict each
-                other.
+            InputError: The folder has no sweeps, or its other files are malformed or contradict
+                each other.
         """
         folder = Path(path)
         self._config = FolderConfig.read(folder)
@@ -243,7 +246,7 @@ class Folder(FileSequence):
         return self._columns.stamp_ns(int(frame))
 
     def gaps(self) -> list[str]:
-        """See `LidarSequence`."""
+        """Return missing parts of the recording and what is assumed instead, a sentence each."""
         told, drive = self._columns.assumed(), checks.drive_around(self.where)
         if drive is not None:
             told.append(
@@ -255,7 +258,7 @@ class Folder(FileSequence):
         return told + [f"{name}: {text}" for name, text in self._by_sweeps.items()]
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """See `LidarSequence`."""
+        """Return what the reader detected, such as columns and stamps, as (name, text) pairs."""
         layout, first = self._columns.layout, self._sweeps.paths[self.frames[0]]
         fields = [f"{part} = {name}" for part, name in vars(layout.fields).items() if name]
         unused = ", ".join(self._columns.unused())
@@ -294,7 +297,7 @@ class Folder(FileSequence):
         return super()._pose(frame)
 
     def _read_poses(self) -> None:
-        """Read the path of the lidar if the poses have stamps, else its pose by frame."""
+        """Read the pose file into ``_track`` if its poses have stamps, else by frame number."""
         known, frames = self._config.poses, self.frames
         self._poses: PoseFile | None = None
         self._track: PoseTrack | None = None
@@ -324,9 +327,9 @@ class Folder(FileSequence):
 def _stamped_by_sweeps(
     name: str, images: Series, frames: Sequence[int], given: CameraFiles
 ) -> dict[str, str]:
-    """Return the assumption about images without stamps, by the name of the camera.
+    """Return a note that images have the stamps of sweeps, by the camera's name.
 
-    There is none if densify.yaml asks for it.
+    The result is empty if densify.yaml requests these stamps.
     """
     if given.stamps == "sweeps":
         return {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find the files of a plain folder: sweeps, their stamps, poses, and images."""
+"""Find the files of a plain folder: sweeps, stamps, poses, and images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from densify.readers.point_files import SUFFIXES
 from densify.readers.stamp_files import Named, StampFile, named
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-_DEPTH = 2  # folders below the one named
+_DEPTH = 2  # levels of subfolders that are searched
 _NO_SWEEPS = ("truth", "labels", "label", "poses", "calib", "calibration")
 _STAMP_FILES = [f"{n}.{s}" for n in ("timestamps", "times", "stamps") for s in ("txt", "csv")]
 _POSE_FILES = [
@@ -30,9 +30,9 @@ class Series:
     """Files of sweeps or images in the order of time.
 
     Attributes:
-        paths: By number.
-        stamps_ns: By number, None if neither names nor a file tell.
-        told_by: The source of the stamps, for people.
+        paths: Path of each file, by its number.
+        stamps_ns: Stamp of each file, by its number; None if neither names nor a file state it.
+        told_by: Source of the stamps, for people; "" without stamps.
     """
 
     paths: Mapping[int, Path]
@@ -41,13 +41,14 @@ class Series:
 
 
 def find_sweeps(folder: Path, files: str) -> list[Path]:
-    """Return the numbered files of points, of the most certain suffix.
+    """Return the numbered point files of a folder, all of the preferred suffix.
 
     Args:
-        files: Their folder, "" to search in this one and two folders down.
+        folder: Folder of the recording.
+        files: Subfolder of the sweeps; "" to search the folder and two levels of subfolders.
 
     Raises:
-        InputError: There are none, or several folders have some.
+        InputError: No sweeps are found, or several folders hold sweeps of that suffix.
     """
     if files:
         existing(folder, files, "sweeps: {files: ...}", is_folder=True)
@@ -72,28 +73,31 @@ def find_sweeps(folder: Path, files: str) -> list[Path]:
 
 
 def find_images(folder: Path) -> dict[str, list[Path]]:
-    """Return the folders with images, this one and two folders down, and their images."""
+    """Return the image files by folder, in this folder and two levels of subfolders."""
     found = {str(p.relative_to(folder)): images_in(p) for p in _folders(folder)}
     return {name: images for name, images in found.items() if images}
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Return the images of a folder."""
+    """Return the image files directly in a folder, ordered by path."""
     return sorted(_files(folder, _IMAGE_SUFFIXES))
 
 
 def find_pose_file(folder: Path, name: str) -> Path | None:
-    """Return the pose file of this name, or one of a usual name; None without one."""
+    """Return the pose file ``name``, or for "" a file of a usual name; None if none exists."""
     if name:
         return existing(folder, name, "poses: {file: ...}")
     return next((folder / n for n in _POSE_FILES if (folder / n).is_file()), None)
 
 
 def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path:
-    """Return the path that densify.yaml names under a key.
+    """Return the path that densify.yaml names; raise InputError if the path does not exist.
 
-    Raises:
-        InputError: It does not exist.
+    Args:
+        folder: Folder that contains the path.
+        name: Relative path in densify.yaml.
+        key: YAML key of the path, for the error message.
+        is_folder: True if the path must be a folder, False if it must be a file.
     """
     path = folder / name
     if not (path.is_dir() if is_folder else path.is_file()):
@@ -105,18 +109,20 @@ def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path
 def in_time(
     root: Path, paths: Sequence[Path], stamps: str, unit: str, shared: bool = True
 ) -> Series:
-    """Return files in the order of time.
+    """Order files by time and find their stamps.
 
-    Files whose names are times are numbered from 0, others as their names say.
+    Files whose names are times are numbered from 0, other files as their names state.
 
     Args:
-        stamps: ``names``; ``sweeps``, for none of their own; the name of a file, below the root
-            or beside the files; "" to search for one.
-        shared: Search in the root too.
+        root: Folder of the recording.
+        paths: Files of sweeps, or images of one camera.
+        stamps: ``names`` if file names are stamps; ``sweeps`` for files without stamps; a stamp
+            file below the root or beside the files; "" to search for a stamp file.
+        unit: Unit of the stamps, "" to detect it.
+        shared: True to search a stamp file in the root too.
 
     Raises:
-        InputError: A name or a line is missing, two files have one number, or the stamps do not
-            ascend.
+        InputError: A file has no stamp, two files have one number, or stamps do not ascend.
     """
     by_names = stamps == "names"
     names = [named(path, unit if by_names else "") for path in paths]
@@ -149,7 +155,7 @@ def in_time(
 
 
 def _numbered(names: Sequence[Named]) -> dict[int, Named]:
-    """Return the files by their numbers, or from 0 in the order of time if names are times."""
+    """Return the files by number; files whose names are times are numbered from 0 in order."""
     if any(name.number is None for name in names):
         return dict(enumerate(sorted(names, key=lambda name: (name.stamp_ns or 0, name.path))))
     ordered = sorted(names, key=lambda name: (name.number, name.path))
@@ -163,7 +169,10 @@ def _numbered(names: Sequence[Named]) -> dict[int, Named]:
 
 
 def _matched(file: StampFile, paths: Mapping[int, Path]) -> dict[int, int]:
-    """Return the time of each file: by name, by row in the order of numbers, or by number."""
+    """Return the stamp of each file, by its number.
+
+    A line of the stamp file is assigned by file name, or by order, or by the file's number.
+    """
     if file.names is not None:
         by_name = {Path(n).stem: ns for n, ns in zip(file.names, file.stamp_ns, strict=True)}
         missing = [path for path in paths.values() if path.stem not in by_name]
@@ -191,7 +200,7 @@ def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | Non
 
 
 def _folders(root: Path) -> Iterator[Path]:
-    """Yield the folder and those below it, by name, without links to folders."""
+    """Yield the folder and its subfolders down to `_DEPTH`, by name, without links."""
     for place, folders, _ in os.walk(root):
         folders[:] = sorted(f for f in folders if f[0] != "." and f not in _NO_SWEEPS)
         if len(Path(place).relative_to(root).parts) == _DEPTH:
@@ -200,7 +209,7 @@ def _folders(root: Path) -> Iterator[Path]:
 
 
 def _files(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
-    """Yield visible files of these suffixes, without broken links."""
+    """Yield the visible files of a folder with one of the suffixes, without broken links."""
     for path in folder.iterdir() if folder.is_dir() else ():
         if path.name[0] != "." and path.suffix.lower() in suffixes and os.path.isfile(path):
             yield path
