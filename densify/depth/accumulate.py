@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Accumulate the points of all sweeps at the key's reference time.
+"""Accumulate the points of all sweeps at the reference time of the key sweep.
 
-Also fit the tracks of moving objects over the window.
+Also fit the track of each moving object over the window.
 """
 
 from __future__ import annotations
@@ -17,20 +17,22 @@ from densify.geometry.types import Cloud, Float, FlowField, ObjectTrack, Stretch
 _CONFIDENCE_PER_S = 0.7
 _CONFIDENCE_MOVED = 0.8
 _LEAST_SEEN = 3  # points of an object in one sweep; fewer do not determine its rotation
-_BEYOND_PERCENT = 1.0  # percent of its points outside its box, on each side
+_BEYOND_PERCENT = 1.0  # percent of the points outside the object's box, on each side
 
 
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
-    """Return one cloud in the key frame.
+    """Return the points of all sweeps as one cloud in the lidar frame of the key sweep.
 
-    Static points keep their rigid positions, to the last bit. Confidence is a relative score. It
-    falls with the time from the key, and is lower for moved points.
+    Moving points are displaced by their scene flow. Static points keep their rigid positions, bit
+    for bit. The confidence is a relative score. It falls with the time between a sweep and the key
+    sweep, and is lower for displaced points.
 
     Args:
-        stretch: The window.
-        fields: Scene flow of each sweep to the key.
-        key: Frame of the key.
-        drop_lost: Leave out moving points without a track. Else they keep their rigid position.
+        stretch: Registered sweeps of the window.
+        fields: Scene flow of each sweep to the reference time of the key sweep.
+        key: Frame number of the key sweep.
+        drop_lost: True leaves out moving points that cannot be followed to the key sweep, False
+            keeps their rigid positions.
     """
     parts = []
     for registered, flow in zip(stretch.sweeps, fields, strict=True):
@@ -70,10 +72,12 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
 
 
 class _ObjectPoints(NamedTuple):
-    """The points of an object in one sweep, key frame.
+    """The N points of an object in one sweep, key sweep's lidar frame.
 
-    They are (N,3) at the reference time of the sweep and at that of the key, with their velocity
-    (3,).
+    Attributes:
+        there: (N,3) positions in metres at the reference time of this sweep.
+        at_key: (N,3) positions in metres at the reference time of the key sweep.
+        velocity_m_s: (3,) median velocity of the points.
     """
 
     there: Float
@@ -84,15 +88,16 @@ class _ObjectPoints(NamedTuple):
 def object_tracks(
     stretch: Stretch, fields: Sequence[FlowField], key: int
 ) -> tuple[ObjectTrack, ...]:
-    """Return the tracks of objects by instance.
+    """Return the track of each moving object, ordered by instance number.
 
-    The pose at a sweep is the rigid motion that fits the flow of its points to the key best, in
-    least squares. Sweeps with fewer than three points of an object are left out, and so are objects
-    without any other sweep. The x axis of an object points along its velocity, or along its path
-    over the window if that is longer.
+    The pose at a sweep comes from the rigid motion that best fits, in least squares, the flow of
+    the object's points to the key sweep. Sweeps with fewer than three of these points have no pose.
+    Objects without such a sweep are left out. The x axis of an object points along its velocity, or
+    along its path over the window if that is longer.
 
     Args:
-        fields: Scene flow of each sweep to the key.
+        fields: Scene flow of each sweep to the reference time of the key sweep.
+        key: Frame number of the key sweep.
     """
     seen: dict[int, dict[int, _ObjectPoints]] = {}
     for registered, flow in zip(stretch.sweeps, fields, strict=True):
@@ -126,6 +131,7 @@ def object_tracks(
 def _track(
     instance: int, seen: dict[int, _ObjectPoints], key: int, stamps_ns: dict[int, int]
 ) -> ObjectTrack:
+    """Return the track of an object from its points and the sweeps' reference times by frame."""
     at_key = np.concatenate([s.at_key for s in seen.values()])
     T_there_key = {
         frame: poses.fit_rigid(s.at_key, s.there)

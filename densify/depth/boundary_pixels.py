@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Decide by the image which pixels close to a depth discontinuity are kept.
+"""Decide by the camera image which pixels close to a depth discontinuity are kept.
 
-The first known pixel in each of 16 directions votes on the depth of a pixel. It votes for the depth
-if its surface, extended, has that depth there, else against it. A vote weighs less the more the
-colours change between the two pixels, as in a bilateral grid or in geodesic matting. Without an
-edge of the image between them, two pixels belong to the same surface.
+The first pixel with a depth in each of 16 directions votes on the measured depth of a boundary
+pixel. The surface of the voter is extended to the boundary pixel. If it has the measured depth
+there, the vote is for that depth, else against it. The vote weighs less the more the image's
+colours change between both pixels, as in a bilateral grid or in geodesic matting. Two pixels
+without an image edge between them belong to the same surface.
 """
 
 from __future__ import annotations
@@ -22,21 +23,21 @@ from densify.geometry.arrays import Bool, Float32, Int
 from densify.geometry.compiled import Kernel, inlined
 
 MOST_CONFIDENCE = 0.2
-"""A boundary pixel has no more, any other measured pixel no less."""
+"""Greatest confidence of a boundary pixel, least confidence of any other measured pixel."""
 _NUM_ROUNDS = 2
 _RIM_WEIGHT = 0.5  # greatest weight of the vote of a boundary pixel
 _LEAST_SHARE = 0.97  # share of the votes for a pixel that is kept
 _FEW = 100  # number of boundary pixels below which the image is not aligned
 _SUREST = 2.5  # greatest -log10 of the share of the votes against
 VOTERS_REACH = 6.0
-"""Gaps between rays within which pixels vote."""
-_DECAY = 1.2  # gaps between rays at which a vote counts half
+"""Greatest distance of a voting pixel, in spacings of neighbouring rays."""
+_DECAY = 1.2  # distance at which a vote counts half, in spacings of neighbouring rays
 _SAME_M, _SAME_FRACTION = 0.2, 0.05  # tolerance within which a surface agrees with a depth
 _COLOURS = 6.0  # standard deviation of the colours of a surface, in L*a*b*
 _THROUGH = 0.001  # weight of a vote across an edge of the image
-_DOUBT = 0.04  # constant vote, half of it for
-_ASIDE = 0.6  # gaps by which the image may be shifted against the depth
-_STRIDE = 3.0  # compared colours for each gap between rays, on the way to a voter
+_DOUBT = 0.04  # weight of a constant vote, half of it for the depth and half against
+_ASIDE = 0.6  # tested shift of the image, in spacings of neighbouring rays
+_STRIDE = 3.0  # number of compared colours per spacing of rays, on the path to a voter
 _ROUNDED = 1 - 1e-6  # tolerance for rounding of a share
 _MISFIT = (
     "image edges do not lie where depth has edges (calibration, clock, blur?): pixels at depth "
@@ -49,17 +50,17 @@ _MOVED = (
 
 
 def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
-    """Return the layers with the boundary pixels (``rim_m``) that ``project.rims`` accepts.
+    """Return the layers with those boundary pixels (``rim_m``) accepted that the image confirms.
 
-    97 % of the votes accept a pixel. Boundary pixels vote too, with half the weight, and in a
-    second round by their own share of votes. An image that is up to three steps off is shifted,
-    with a warning. An image that does not fit or is blurred is not used, with a warning. ``lab`` is
-    kept only if it is used. The ``confidence`` of boundary pixels becomes 0 to 0.2, by the share of
-    the votes against them.
+    A pixel is accepted if 97 % of the votes are for its depth. Boundary pixels vote too, with half
+    the weight, and in a second round by their own share of votes. Their ``confidence`` becomes 0 to
+    0.2 by this share. An image that is offset by up to three search steps is shifted, with a
+    warning. An image that is blurred or does not fit is ignored, with a warning. The returned
+    ``lab`` is None if the image was not used.
 
     Args:
-        rims: ``image`` accepts pixels that the image assigns to the measured surface, ``keep``
-            also all others that are not occluded, ``strict`` none.
+        rims: ``image`` accepts pixels that the image confirms, ``keep`` also all others that no
+            nearer patch covers, ``strict`` none.
     """
     pixel = np.flatnonzero(layers.rim_m)
     share, lab, warnings = np.full(len(pixel), np.float32(0.5)), None, layers.warnings
@@ -94,7 +95,11 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
 
 
 def shares(layers: Layers, pixel: Int) -> Float32:
-    """Return the (R,) share of the votes for each boundary pixel ``pixel`` (R,)."""
+    """Return the (R,) share of the votes for the depth of each boundary pixel.
+
+    Args:
+        pixel: (R,) flat indices of the boundary pixels in the image.
+    """
     voters = _voters(layers, np.maximum(layers.depth_m, layers.rim_m))
     share, weight = np.ones(len(pixel), np.float32), np.ones_like(layers.depth_m)
     for _ in range(_NUM_ROUNDS):
@@ -111,13 +116,13 @@ def voted_for(
     least_share: float,
     surely: bool = False,
 ) -> Bool:
-    """Return (P,) True where ``least_share`` of the votes or more is for the depth of a pixel.
+    """Return (P,) True where at least ``least_share`` of the votes are for the depth of a pixel.
 
     Args:
-        known_m: (H,W) depth of the voters, 0 none.
-        pixel: (P,) the pixels.
-        depth_m: (P,) their depths.
-        surely: See `vote`.
+        known_m: (H,W) depths of the voting pixels in metres, 0 none.
+        pixel: (P,) flat indices of the pixels in the image.
+        depth_m: (P,) depths that are voted on, in metres.
+        surely: True for the cautious count of `vote`.
     """
     weight = np.ones_like(known_m)
     share = vote(layers, _voters(layers, known_m), pixel, depth_m, weight, surely)
@@ -125,12 +130,12 @@ def voted_for(
 
 
 class Voters(NamedTuple):
-    """Pixels with a known depth.
+    """Pixels with a known depth, which vote on other pixels.
 
     Attributes:
-        steps: (16,H,W) of `densify.depth.neighbours.first_known`.
-        inverse: (H,W) 1/m.
-        tilt: (H,W,2) slope of inverse depth, 1/m per px.
+        steps: (16,H,W) steps to the first known pixel, of `densify.depth.neighbours.first_known`.
+        inverse: (H,W) inverse depth in 1/m, 0 where the depth is unknown.
+        tilt: (H,W,2) slope of the inverse depth to the right and down, 1/m per px.
     """
 
     steps: NDArray[np.uint8]
@@ -146,14 +151,15 @@ def _voters(layers: Layers, known_m: Float32) -> Voters:
 def vote(
     layers: Layers, voters: Voters, pixel: Int, depth_m: Float32, weight: Float32, surely: bool
 ) -> Float32:
-    """Return the (P,) share of the votes for the depths of pixels.
+    """Return the (P,) weighted share of the votes for the depths of pixels.
 
     Args:
-        pixel: (P,) the pixels.
-        depth_m: (P,) their depths.
-        weight: (H,W) of each voter.
-        surely: Take the least share of several positions of the image, as it is or 0.6 gaps to
-            any side, and one vote against. Otherwise the share without voters is 0.
+        pixel: (P,) flat indices of the pixels in the image.
+        depth_m: (P,) depths that are voted on, in metres.
+        weight: (H,W) weight of the vote of each known pixel.
+        surely: True takes the least share of five positions of the image (unshifted, and shifted by
+            0.6 ray spacings to each side), with a small constant vote. False takes the unshifted
+            image; the share is 0 without voters.
     """
     share = np.zeros(len(pixel), np.float32)
     lab = np.zeros((0, 0, 3), np.float32) if layers.lab is None else layers.lab
@@ -165,7 +171,7 @@ def vote(
 
 @inlined
 def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
-    """Return the steps from a pixel, which may be known itself, to the first other known one."""
+    """Return the number of steps in direction d from pixel (v, u) to the next other known pixel."""
     here = np.int64(steps[d, v, u])
     height, width = steps.shape[1:]
     for k in range(1, 3 if here == 0 else 1):
@@ -180,10 +186,10 @@ def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 @inlined
 def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill the steps to the voter in each direction (0 without one), and whether it votes for.
+    """Fill in the voter of each direction and its vote; return the numbers for and against.
 
-    A voter votes for the depth of the pixel if its surface, extended to the pixel, has that depth.
-    Return the numbers of votes for and against.
+    A voter votes for the depth of pixel (v, u) if its surface, extended there, has that depth.
+    steps: (16,) to the voter, 0 if there is none. agrees: (16,) True for a vote for the depth.
     """
     same = _SAME_M + _SAME_FRACTION * depth
     num_for, num_against = 0, 0
@@ -203,10 +209,10 @@ def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-
 
 @inlined
 def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
-    """Return the weight that the image leaves of a vote: exp(-c² / 2 s²) + ``_THROUGH``.
+    """Return the weight exp(-c² / 2 s²) + ``_THROUGH`` of a vote by the colours of the image.
 
-    c is the largest colour distance on the path of k steps, s is ``_COLOURS``. The image is
-    continued beyond its border.
+    c is the largest colour distance from the start along k steps in direction d, s is ``_COLOURS``.
+    Outside its border the image continues with its border pixels.
     """
     if lab.size == 0:
         return 1 + _THROUGH
@@ -232,7 +238,8 @@ def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
 def _vote(first, last, pixel, inverse, voters, weight, lab, gap_px, surely, share):  # type: ignore[no-untyped-def]
     """Fill ``share`` (P,) float32, as in `vote`.
 
-    inverse: (P,) depth, 1/m. lab: (H,W,3), empty without an image. gap_px: (H,W) between rays.
+    inverse: (P,) inverse depth voted on, 1/m. lab: (H,W,3), empty without an image. gap_px: (H,W)
+    spacing of rays in pixels.
     """
     width, num = gap_px.shape[1], len(DIRECTIONS)
     steps, agrees = np.zeros(num, np.int64), np.zeros(num, np.bool_)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Close car windows.
+"""Close car windows with the plane of their frame.
 
 Lasers pass through glass and measure seats, headrests and the background. Most uses of a depth map,
-and KITTI's stereo benchmark, count these depths as outliers. A car window is a hole in one smooth
-surface. Its rim lies in a plane. More rays of the key sweep are lost in it than on the rim, because
-glass and dark paint send nothing back. A gap of a fence loses no ray.
+and KITTI's stereo benchmark, count these depths as outliers. A car window appears as a hole in one
+smooth surface, and the rim of the hole lies in a plane. More rays of the key sweep have no return
+in the hole than on the rim, because glass and dark paint reflect little. In the gaps of a fence no
+ray is lost.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from densify.geometry import cameras, poses
 from densify.geometry.arrays import Bool, Float, Float32
 
 # Shares of rays without a return: in the window bands of 207 cars of KITTI's stereo benchmark, and
-# the least on ordinary surfaces.
+# the least assumed on ordinary surfaces.
 _LOST_IN_GLASS, _LEAST_LOST = 0.4, 0.03
 _LEAST_LOG_ODDS = 3.0  # odds of 20 to 1, because one hole in twenty is a window
-_IN_PLANE = 0.75  # share of the rim that must be in the plane
+_IN_PLANE = 0.75  # share of the rim's pixels that must be in the plane
 _NUM_ROUNDS = 5  # of the robust fit
 _EIGHT, _CROSS = np.ones((3, 3), bool), ndimage.generate_binary_structure(2, 1)
 
 
 def share_lost(key_image: RangeImage) -> Callable[[Float], Float] | None:
-    """Return a function that gives the share of lost rays of the key sweep around points.
+    """Return a function that gives the share of missing returns of the key sweep around points.
 
-    It takes points (N,3), key frame, and returns (N,) shares from 0 to 1. The result is None for
-    scanners that do not spin, because the directions of their lost rays are unknown.
+    It takes (N,3) points, key sweep's lidar frame, and returns (N,) shares from 0 to 1. The result
+    is None for scanners that do not spin, because the directions of missing returns are unknown.
     """
     turning = RangeImage(tuple(s for s in key_image.scanners if len(s.offset_s) == 1))
     if not turning.scanners:
@@ -54,13 +55,13 @@ def share_lost(key_image: RangeImage) -> Callable[[Float], Float] | None:
 def close_windows(
     layers: Layers, exposure: Exposure, share_lost: Callable[[Float], Float]
 ) -> Layers:
-    """Return the layers with the plane of the rim in each car window.
+    """Return the layers with each car window filled by the plane of its rim.
 
-    Measurements behind a window are removed. ``layers.solid`` marks the windows, ``layers.glass``
-    the measured pixels that are removed.
+    Measurements behind a window are removed. ``solid`` marks the pixels of windows, ``glass`` the
+    removed measurements.
 
     Args:
-        share_lost: See `share_lost`.
+        share_lost: Function from points to shares of missing returns, see `share_lost`.
     """
     changed = ("depth_m", "filled_m", "confidence", "tilt")
     window, glass = np.zeros((2, *layers.filled_m.shape), bool)
@@ -85,9 +86,10 @@ def close_windows(
 
 
 def _close(layers: Layers, hole: Bool, depth_m: Float32, slopes: Float, least: np.float32) -> Bool:
-    """Put a plane into a hole, but not behind known pixels.
+    """Put a plane into a hole except where something is in front of it; change ``layers`` in place.
 
-    Return (h,w) True where a measured pixel is removed. least: confidence of the rim.
+    Return (h,w) True where a measured pixel is removed. depth_m: (h,w) depth of the plane. slopes:
+    (2,) slopes of its inverse depth, 1/m per px. least: least confidence of the rim.
     """
     known_m = layers.filled_m
     takes = hole & ((known_m == 0) | (known_m > depth_m + _agree_m(depth_m)))
@@ -100,21 +102,21 @@ def _close(layers: Layers, hole: Bool, depth_m: Float32, slopes: Float, least: n
 
 
 def _agree_m(depth_m: Float | Float32) -> Float:
-    """Return the greatest deviation (N,) in metres between points of one surface."""
+    """Return the (N,) greatest deviation in metres between points of one surface."""
     return AGREE_M + AGREE_FRACTION * depth_m.astype(np.float64)
 
 
 def _num_rays(layers: Layers, pixels: Bool) -> float:
-    """Return the number of rays of a sweep through the pixels (H,W)."""
+    """Return the expected number of rays of one sweep through the pixels that are True."""
     return float((1 / layers.spacing_px[pixels].prod(axis=1)).sum())
 
 
 def _log_odds(lost: float, on_rim: float) -> float:
     """Return the mean log-likelihood ratio of a ray, for glass against a surface like the rim.
 
-    The arguments are shares of the rays without a return, in the hole and on the rim. A missing
-    return adds log(P(none | glass) / P(none | surface)). A return adds the log ratio of 1 -
-    P(none). P(none | glass) is the measured share if that is larger than the usual one.
+    The arguments are shares of missing returns in the hole and on the rim. A missing return adds
+    log(P(missing | glass) / P(missing | surface)), a return the log ratio of 1 - P(missing).
+    P(missing | glass) is the share in the hole if that is above the usual one.
     """
     ordinary = max(on_rim, _LEAST_LOST)
     in_glass = min(max(lost, _LOST_IN_GLASS), 1 - _LEAST_LOST)
@@ -127,8 +129,8 @@ def _log_odds(lost: float, on_rim: float) -> float:
 def _holes(layers: Layers) -> Iterator[tuple[tuple[slice, slice], Bool, Bool]]:
     """Yield each hole in a smooth surface of the filled map that enough rays hit.
 
-    A hole is a box of the image, (h,w) the hole in it, and (h,w) its rim, as wide as a gap between
-    rays.
+    A hole is its box (rows and columns of the image), (h,w) the hole within the box, and (h,w) its
+    rim, as wide as the spacing of neighbouring rays.
     """
     label, _ = ndimage.label(_smooth(layers.filled_m), _EIGHT)
     away_px = max(1, round(float(np.median(layers.gap_px))))
@@ -147,17 +149,17 @@ def _holes(layers: Layers) -> Iterator[tuple[tuple[slice, slice], Bool, Bool]]:
 
 
 def _smooth(known_m: Float32) -> Bool:
-    """Return (H,W) the known pixels without those behind a depth discontinuity."""
+    """Return (H,W) True at known pixels that are not just behind a depth discontinuity."""
     front_m = ndimage.grey_erosion(np.where(known_m > 0, known_m, np.inf), footprint=_CROSS)
     smooth: Bool = (known_m > 0) & (known_m <= front_m + _agree_m(front_m))
     return smooth
 
 
 def _plane_of(known_m: Float32, rim: Bool) -> Float | None:
-    """Return (3,) the plane in which most of a rim (h,w) lies, None without one.
+    """Return the (3,) plane in which most of a rim (h,w) lies, None if the rim is not planar.
 
-    It is given by the inverse depth in the first pixel of the box and its slopes to the right and
-    down.
+    It is the inverse depth (1/m) in the first pixel of the box, and its slopes to the right and
+    down (1/m per px).
     """
     row, column = np.nonzero(rim)
     depth_m = known_m[rim].astype(np.float64)
@@ -172,7 +174,7 @@ def _plane_of(known_m: Float32, rim: Bool) -> Float | None:
 
 
 def _points(exposure: Exposure, uv: Float, depth_m: Float32) -> Float:
-    """Return (N,3) key-frame positions of static pixels (N,2) at these depths (N,)."""
+    """Return (N,3) positions, key sweep's lidar frame, of static pixels (N,2) at depths (N,)."""
     ray = cameras.rays(exposure.camera, uv.astype(np.float64))
     along = depth_m / exposure.depth_m(ray)
     return poses.transform(poses.inverse(exposure.T_cam_key), along[:, None] * ray)

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Compute confidence: the probability that a pixel is an outlier by KITTI's rule.
+"""Compute the confidence of pixels: the probability that a pixel is an outlier by KITTI's rule.
 
-The stages of a map rank its pixels by the number of sweeps and points that agree, the distance to a
-depth discontinuity, roughness, the distance of the fill, and the votes of the image. The
-probability is a sum of two terms: a share for the rank, and a share in proportion to the
-contradiction around the pixel. Both fall with the rank. They were measured against exact truth by
-group of pixels: the origin of the depth, and the roughness around. ``examples/fit_confidence.py``
-makes these tables, ``confidence.json`` beside this file.
+The stages of a map rank its pixels. The rank rises with the number of sweeps and points that agree,
+the distance to a depth discontinuity and the votes of the image. It falls with roughness and with
+the distance over which a pixel is filled.
 
-The order of the ranks within a map stays, of measured and of filled pixels. Each rank gets the mean
-probability of the map's own pixels at that rank, made to fall with the rank.
+The probability of an outlier is a sum of two terms: a share for the rank, and a share times the
+contradiction by measured pixels around. Both fall with the rank. Both were measured against exact
+ground truth for each group of pixels, by the origin of the depth and the roughness around.
+``examples/fit_confidence.py`` writes these tables to ``confidence.json`` beside this file.
+
+Within the measured and within the filled pixels of a map, confidence keeps the order of the ranks.
+Each rank gets the mean probability of the map's own pixels at that rank, made to fall with the
+rank.
 """
 
 from __future__ import annotations
@@ -37,33 +40,33 @@ from densify.scores.depth_metrics import (
 )
 
 DECADES = 5.0
-"""Confidence 1 is one wrong pixel in 10^5, each fifth less ten times as many."""
+"""Confidence 1 means one outlier in 10^5 pixels; each 0.2 less means ten times as many."""
 _RAGGED = np.array([0.1, 0.5])
 GROUPS = tuple(
     f"{how}, rough from {ragged:g}"
     for how in ("window", "beyond", "filled")
     for ragged in (0, *_RAGGED)
 )
-"""How pixels came to their depth, and the share of what is measured around that is at edges."""
+"""Origin of a pixel's depth, and share of boundary pixels among the measured pixels around."""
 CAUSES = ("anyway", "contradicted")
-"""Shares that are wrong: anyway, and for each whole by which a place is contradicted."""
+"""Terms of the share of outliers: without contradiction, and per unit of contradiction."""
 NUM_RANKS = 200
 NUM_MEASURED = sum(not group.startswith("filled") for group in GROUPS)
-"""Groups of measured pixels; the others are of filled ones."""
+"""Number of groups of measured pixels; the other groups are of filled pixels."""
 
 _FILE = Path(__file__).with_name("confidence.json")
-_AROUND = 4.0  # size of the surroundings, in gaps between rays to all sides
-_TILT = 0.01  # decades over all ranks, for different confidences at different ranks
+_AROUND = 4.0  # half size of the surroundings, in spacings of neighbouring rays
+_TILT = 0.01  # decades from rank 0 to 1, so that different ranks have different confidences
 _NUM_STEPS = 20
-_GIVEN = 2.0  # number of pixels around that are assumed to agree, as a prior
+_GIVEN = 2.0  # number of agreeing pixels around that is assumed, as a prior
 
 
 def contradicted(layers: Layers, focal_px: float) -> Float32:
-    """Return (H,W) the share of the measured pixels around that contradict a filled pixel.
+    """Return the (H,W) share of the measured pixels around that contradict a pixel's depth.
 
-    A measured pixel contradicts if its surface would make the filled one an outlier. The
-    surroundings are a gap between rays to all sides. Boundary pixels count too. Closed car windows
-    have no contradiction, because the background may be measured through them.
+    A measured pixel contradicts if its surface, extended to the pixel, would make the pixel an
+    outlier by KITTI's rule. Measured pixels within one spacing of rays count, boundary pixels too.
+    The share is 0 in closed car windows, because the background may be measured through them.
     """
     measured_m = np.maximum(layers.depth_m, layers.rim_m)
     inverse, known = (
@@ -82,10 +85,11 @@ def contradicted(layers: Layers, focal_px: float) -> Float32:
 
 @Kernel
 def _contradicted(first, last, pixel, inverse, known, tilt, half_px, apart, share):  # type: ignore[no-untyped-def]
-    """Fill ``share`` (H,W) float32 for each ``pixel`` (P,).
+    """Fill ``share`` (H,W) float32 at each flat index in ``pixel`` (P,).
 
-    inverse and known: (H,W) float32, 1/m, of the pixels and of those around, 0 none. half_px: size
-    of the surroundings, of which up to 11 pixels across are compared. apart: inverse depth, 1/m.
+    inverse and known: (H,W) inverse depth of the filled and of the measured map, 1/m, 0 none.
+    half_px: half size of the surroundings; up to 11 by 11 pixels are compared. apart: inverse depth
+    that is 3 px of disparity, 1/m.
     """
     height, width = known.shape
     step = max(1, -(-half_px // 5))
@@ -110,20 +114,20 @@ def _contradicted(first, last, pixel, inverse, known, tilt, half_px, apart, shar
 
 
 def rank_pixels(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
-    """Return the rank and the group of a map's pixels, and the contradiction around them.
+    """Return the rank, the group and the contradiction of each pixel of a map.
 
-    Contradiction and roughness are means over four gaps between rays to all sides.
+    Contradiction and roughness are means within four spacings of rays to all sides.
 
     Args:
-        far: (H,W) measured by sweeps beyond the window.
-        contradicted: (H,W), see `contradicted`.
+        far: (H,W) True at pixels measured by sweeps beyond the window.
+        contradicted: (H,W) share of contradicting pixels, see `contradicted`.
     """
     rim, measured = layers.rim_m > 0, (layers.depth_m > 0) | (layers.rim_m > 0)
     shown = layers.filled_m > 0
     size = 2 * max(2, round(_AROUND * float(np.median(layers.gap_px)))) + 1
 
     def mean(values: Float32 | Bool, of: Bool) -> Float32:
-        """Return (H,W) means over the pixels ``of`` around."""
+        """Return the (H,W) mean of the values over the surrounding pixels where ``of`` is True."""
         sums, num = (
             ndimage.uniform_filter(part.astype(np.float32), size, mode="constant")
             for part in (np.where(of, values, 0), of)
@@ -138,11 +142,12 @@ def rank_pixels(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
 
 
 def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float32:
-    """Return (H,W) confidence, ``-log10(P) / 5`` with the probability P of an outlier.
+    """Return the (H,W) confidence ``-log10(P) / 5`` with the probability P of an outlier.
 
     Args:
-        shown: (H,W) pixels with a confidence; 0 elsewhere.
-        tables: (G,2,R) by group, term and step of the rank; None for the package's own.
+        shown: (H,W) True at pixels with a depth; the confidence is 0 elsewhere.
+        tables: (G,2,R) share of outliers by group, term and step of the rank; None for the
+            package's own.
     """
     rank, group = found.rank[shown], found.group[shown]
     log_wrong = curves(amounts(found, shown), _own_tables() if tables is None else tables)
@@ -156,7 +161,7 @@ def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float
 
 
 def steps_of(rank: Float32) -> NDArray[np.int64]:
-    """Return the step of each rank."""
+    """Return the index, 0 to R - 1, of the step of each rank."""
     return np.minimum((rank * NUM_RANKS).astype(np.int64), NUM_RANKS - 1)
 
 
@@ -166,7 +171,7 @@ def amounts(found: Ranked, of: Bool) -> Float:
     The product with a table is the expected number of outliers.
 
     Args:
-        of: (H,W) the pixels that count.
+        of: (H,W) True at pixels that count.
     """
     place = found.group[of].astype(np.int64) * NUM_RANKS + steps_of(found.rank[of])
     size = len(GROUPS) * NUM_RANKS
@@ -175,13 +180,13 @@ def amounts(found: Ranked, of: Bool) -> Float:
 
 
 def curves(pixels: Float, tables: Float) -> Float:
-    """Return (2,R) log10 of the probability of an outlier, by step of the rank.
+    """Return (2,R) log10 of the probability of an outlier by step of the rank.
 
     The rows are for measured and for filled pixels.
 
     Args:
-        pixels: (G,2,R) of `amounts`.
-        tables: (G,2,R).
+        pixels: (G,2,R) sums of `amounts`.
+        tables: (G,2,R) shares of outliers.
     """
     num = pixels[:, 0]
     wrong_num = np.minimum((pixels * tables).sum(axis=1), num)
@@ -193,9 +198,9 @@ def curves(pixels: Float, tables: Float) -> Float:
 
 
 def falling(num: Float, wrong_num: Float) -> Float:
-    """Return (R,) ``wrong_num / num``, made to fall with the rank by isotonic regression.
+    """Return the (R,) ratio ``wrong_num / num``, made to fall with the rank by isotonic regression.
 
-    Steps without pixels are between their neighbours.
+    Steps without pixels are interpolated. num and wrong_num: (R,) pixels, outliers among them.
     """
     some = num > 0
     if not some.any():
@@ -212,32 +217,32 @@ def _own_tables() -> Float:
 
 
 def own_file() -> dict[str, Any]:
-    """Return the package's own tables, written by examples/fit_confidence.py."""
+    """Return the content of the package's tables, written by examples/fit_confidence.py."""
     return read_json(_FILE)
 
 
 def tables_of(written: dict[str, Any]) -> Float:
-    """Return (G,2,R) the share of outliers, from the content of such a file."""
+    """Return the (G,2,R) share of outliers from the content of a file as `own_file` returns."""
     middle = (np.arange(NUM_RANKS) + 0.5) / NUM_RANKS
     knots = [[np.array(written["tables"][g][c]).T for c in CAUSES] for g in GROUPS]
     return np.array([[np.interp(middle, *ends) for ends in row] for row in knots])
 
 
 def wrong(confidence: Float | Float32) -> Float:
-    """Return the probability of an outlier at a confidence."""
+    """Return the probability of an outlier at each confidence, in the shape of the argument."""
     probability: Float = 10.0 ** (-DECADES * np.asarray(confidence, np.float64))
     return probability
 
 
 def without_times(maps: DepthMap, smear_m: float, camera: Camera, share: float = 1.0) -> DepthMap:
-    """Return a map of sweeps without times of points, less confident where it is near.
+    """Return the map with lower confidence at near pixels, for sweeps without times of points.
 
-    The motion within these sweeps moves a depth by an unknown amount, any up to ``smear_m`` either
-    way. Near pixels tolerate less of it than far ones.
+    The vehicle's motion within such a sweep moves depths by an unknown amount up to ``smear_m`` in
+    either direction. Near pixels tolerate less of it than far pixels.
 
     Args:
-        smear_m: Half the way along the camera's axis from sweep to sweep.
-        share: Share of the sweeps that have no times.
+        smear_m: Half the travel in metres along the camera's axis from sweep to sweep.
+        share: Share of the sweeps without times.
     """
     depth_m, shown = maps.filled_m.astype(np.float64), maps.filled_m > 0
     px_m = depth_m**2 / (camera.focal_px * KITTI_BASELINE_M)
@@ -258,13 +263,13 @@ def expected_outliers(maps: DepthMap) -> dict[str, float | None]:
 
 
 def reliability(maps: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[str, Any]]:
-    """Return expected and true outliers by confidence, over the filled pixels with a truth.
+    """Return expected and true outliers by confidence, over the filled pixels with ground truth.
 
-    Each step of 0.05 with pixels has ``confidence`` (its begin), ``num_compared``, the ``expected``
-    share of outliers, and the true ``outliers``.
+    Each interval of 0.05 with pixels has ``confidence`` (its start), ``num_compared`` pixels, and
+    the ``expected`` and the true share of ``outliers``.
 
     Args:
-        truth_m: (H,W) metres, 0 none.
+        truth_m: (H,W) true depth in metres, 0 none.
     """
     compared = (truth_m > 0) & (maps.filled_m > 0)
     confidence = maps.confidence[compared]

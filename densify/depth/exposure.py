@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Find the images of a key, and project points at the exposure of an image.
+"""Select the images that belong to a key sweep, and project points at the exposure of an image.
 
-A key takes the image exposed nearest to its sweep, or every image nearer to it than to any other.
+A key sweep takes the image exposed nearest to it, or every image nearer to it than to any other
+sweep.
 """
 
 from __future__ import annotations
@@ -31,15 +32,16 @@ from densify.geometry.types import (
 
 _log = logging.getLogger("densify")
 _USUAL = ProjectSettings()
-_JITTER = 1.5  # half a period is at most this much longer than half the shorter one beside it
+_JITTER = 1.5  # greatest ratio of a used half period to half the shorter neighbouring period
 _NUM_ROW_STEPS = 4  # of the search for the row that observes a point
 
 
 @dataclass(frozen=True)
 class Shot:
-    """The subject of a depth map: an image by its number, at ``stamp_ns``.
+    """The image and time that a depth map shows.
 
-    Without a number it is the time of the key sweep.
+    Attributes:
+        number: Number of the image, None if the map shows the time of the key sweep.
     """
 
     camera: Camera
@@ -53,12 +55,15 @@ def key_shots(
     key: int,
     settings: ProjectSettings = _USUAL,
 ) -> dict[str, Shot]:
-    """Return the depth maps of a key by name.
+    """Return the shot of each depth map of a key sweep, by the name of the map.
 
-    The map of a camera has the name of the camera and shows the image exposed nearest to the key
+    By default each camera has one map, with its name. It shows the image exposed nearest to the key
     sweep, the earlier of two. With ``project.per=image`` there is a map CAMERA/NUMBER for each
-    image nearer to this sweep than to any other. Without an image within about half a period the
-    map shows the time of the sweep.
+    image nearer to the key sweep than to any other. Without an image within about half a period the
+    default map shows the time of the sweep.
+
+    Args:
+        key: Frame number of the key sweep.
     """
     stamp_ns = sequence.stamp_ns(key)
     begin_ns, end_ns = _own_time_ns(sequence, key)
@@ -90,7 +95,7 @@ def key_shots(
 
 
 def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str, NDArray[np.uint8]]:
-    """Return (H,W,3) RGB of the shots that are images, by name."""
+    """Return the (H,W,3) RGB image of each shot that has one, by the name of the map."""
     images = {n: (s.camera.name, s.number) for n, s in shots.items() if s.number is not None}
     if hasattr(sequence, "prepare"):
         sequence.prepare((), list(images.values()))
@@ -98,7 +103,7 @@ def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str,
 
 
 def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
-    """Return begin and end of the time that is nearer to the key sweep than to another sweep."""
+    """Return start and end of the time that is nearer to the key sweep than to another sweep."""
     frames = list(sequence.frames)
     at = frames.index(key)
     stamps_ns = {}
@@ -121,9 +126,9 @@ class InView(NamedTuple):
     """The K points of a cloud in an image.
 
     Attributes:
-        rows: (K,) rows of the cloud, ascending.
-        points_cam: (K,3) as in `Sight`.
-        uv: (K,2) as in `Sight`.
+        rows: (K,) row numbers of the points in the cloud, ascending.
+        points_cam: (K,3) positions as in `Sight`.
+        uv: (K,2) pixel coordinates as in `Sight`.
     """
 
     exposure: Exposure
@@ -136,9 +141,9 @@ class Sight(NamedTuple):
     """Projected points.
 
     Attributes:
-        points_cam: (N,3) metres, camera frame, at the exposure.
-        uv: (N,2) px, NaN without a pixel.
-        inside: (N,) on the image, with a depth.
+        points_cam: (N,3) positions in metres, camera frame, at the exposure.
+        uv: (N,2) column and row in px, NaN if a point has no projection.
+        inside: (N,) True for points on the image that have a depth.
     """
 
     points_cam: Float
@@ -151,12 +156,13 @@ class Exposure:
     """A camera at the time of a shot.
 
     Attributes:
-        T_cam_key: (4,4), with the ego-motion from the key's reference time.
-        late_s: Seconds after the key's reference time.
-        twist: (6,) of the camera, rad/s and m/s in its own frame.
-        number: Number of the image.
-        measure: Depth is camera ``z`` or ``range``.
-        others: "previous" and "next" image, if the window reaches them.
+        T_cam_key: (4,4) from the key sweep's lidar frame to the camera at the shot, with
+            ego-motion.
+        late_s: Seconds from the key sweep's reference time to the shot.
+        twist: (6,) angular and linear velocity of the camera, rad/s and m/s in its own frame.
+        number: Number of the image, None if the map shows no image.
+        measure: Kind of depth, camera ``z`` or ``range``.
+        others: Exposures of the "previous" and "next" image, if the window covers them.
     """
 
     camera: Camera
@@ -171,10 +177,10 @@ class Exposure:
     def of(
         sequence: LidarSequence, stretch: Stretch, key: int, shot: Shot, settings: Config
     ) -> Exposure:
-        """Return the exposure of a shot.
+        """Return the exposure of a shot for the key sweep with frame number ``key``.
 
-        The vehicle moves on from the nearest sweep with the twist of that sweep. A recorded pose of
-        the image is used instead if there is one.
+        The camera pose is extrapolated from the key sweep with the vehicle's twist. A recorded pose
+        of the image is used instead if there is one.
         """
         others: dict[str, Exposure] = {}
         if settings.output.optical_flow and shot.number is not None:
@@ -197,10 +203,11 @@ class Exposure:
         return _exposure(sequence, stretch, key, key, shot, settings, others)
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
-        """Project points (N,3) with velocities (N,3), key frame, at the key's reference time.
+        """Project points (N,3) with velocities (N,3), given in the key sweep's lidar frame.
 
-        A rolling shutter observes each point at the time of its row or column, when camera and
-        point have moved on. Points beside or behind a wide lens have no z and are not inside.
+        The points are at the reference time of that sweep. Moving points advance by their velocity
+        to the exposure. With a rolling shutter the exposure is that of each point's own row or
+        column. Points beside or behind a wide lens have no z and are not inside.
         """
         late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)
@@ -219,14 +226,14 @@ class Exposure:
         return Sight(there, uv, inside & (self.depth_m(there) > NEAREST_M))
 
     def sees(self, cloud: Cloud) -> InView:
-        """Return the part of a cloud, at the key's reference time, in the image."""
+        """Return the part of a cloud, at the key sweep's reference time, in the image."""
         sight = self.see(cloud.points, cloud.velocity_m_s)
         rows = np.flatnonzero(sight.inside)
         points_cam, uv = (a.take(rows, axis=0) for a in (sight.points_cam, sight.uv))
         return InView(self, rows, points_cam, uv)
 
     def depth_m(self, points_cam: Float) -> Float:
-        """Return (N,) depth of points (N,3), in ``measure``."""
+        """Return the (N,) depth of points (N,3), camera frame: z or range, by ``measure``."""
         return depth_along(points_cam, self.measure)
 
 
@@ -239,10 +246,7 @@ def _exposure(
     settings: Config,
     others: Mapping[str, Exposure] | None = None,
 ) -> Exposure:
-    """Return the exposure of a shot by the twist of one sweep.
-
-    frame: of the sweep from which the vehicle moves on.
-    """
+    """Return the exposure of a shot, extrapolated from the sweep with this frame number."""
     camera, registered = shot.camera, stretch[frame]
     late_s = float(shot.stamp_ns - registered.sweep.stamp_ns) * 1e-9
     twist = registered.twist_before if late_s < 0 else registered.twist_after

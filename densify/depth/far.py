@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Select the static points of sweeps beyond a key's window, and the part that a key needs."""
+"""Select static points of sweeps beyond the window, and the part that a key sweep needs."""
 
 from __future__ import annotations
 
@@ -32,34 +32,34 @@ from densify.geometry.types import (
 )
 
 _MOST_RANGE_M = 60.0
-_MOST_SPACING_M = 0.05  # many sweeps measure a surface, and larger patches hide edges
-_GROUP_M = 2.5  # travel within which sweeps observe the same, with the same errors
+_MOST_SPACING_M = 0.05  # enough, as many sweeps measure a surface; larger patches hide edges
+_GROUP_M = 2.5  # travel within which sweeps count as one observation, as they share errors
 _CONFIDENCE = 0.5
 _SLACK_M = 0.5
 _SAME_DEPTH = 0.05  # step of depth, as a share; a pixel needs one point in each
 _PRIME = 2_654_435_761  # its multiples visit any smaller number of points in mixed order
-_FEW_FILLED = 3  # of nine cells that must be filled, for a sweep beyond the window
-# Travel between witnesses and from the tested sweep: most of a car, or its rear half.
+_FEW_FILLED = 3  # least number of filled cells of nine, for a sweep beyond the window
+# Travel between testing sweeps, and from the tested sweep: most of a car, or its rear half.
 _WITNESSES_M, _WITNESS_M, _LEAST_WITNESS_M = 5.0, 3.5, 2.0
 
 
 def in_reach(sweep: Sweep) -> Bool:
-    """Return (N,) True for returns near enough for a good registration."""
+    """Return (N,) True for returns within 60 m of the lidar, which are registered well."""
     x, y, z = sweep.points.T
     return x * x + y * y + z * z < _MOST_RANGE_M**2
 
 
 def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
-    """Return (N,) for each sweep, True where another sweep saw through the point.
+    """Return for each sweep (N,) True where another sweep along the road saw through the point.
 
-    Points ahead of a sweep are compared with the next witness at least 3.5 m farther, points behind
-    it with the previous one. By then even a vehicle that drives along has left most of the place.
-    At the ends of the road the witness is the last sweep, 2 m away or more, or the one on the other
-    side.
+    Some sweeps, 5 m of travel apart, test the points of the others. Points ahead of a sweep are
+    tested by the next of them at least 3.5 m farther, points behind it by the previous. By then
+    even a vehicle that drives along has left most of its place. At the ends of the road it is the
+    last testing sweep, 2 m away or more, or the one on the other side.
 
     Args:
-        sweeps: Deskewed, in the order of the road.
-        travel_m: (S,) their positions along the road, ascending.
+        sweeps: Deskewed sweeps in the order of the road.
+        travel_m: (S,) position of each sweep along the road, ascending.
     """
     asked = [0] if sweeps else list[int]()
     for i, at_m in enumerate(travel_m.tolist()):
@@ -69,6 +69,7 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
         images = dict(zip(asked, pool.map(lambda i: RangeImage.of(sweeps[i]), asked), strict=True))
 
     def gone(i: int) -> Bool:
+        """Return (N,) True for the points of sweep i that were seen through."""
         one, witnesses = sweeps[i], _witnesses(i, asked, travel_m)
         points, free = one.sweep.points, np.zeros(len(one.sweep), bool)
         whose = np.zeros(len(points), np.int64)
@@ -86,7 +87,7 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
 
 
 def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
-    """Return the witnesses before and after a sweep, or only one of them."""
+    """Return the indices of the testing sweeps before and after sweep i, or only one of them."""
     apart_m = np.array([travel_m[j] - travel_m[i] for j in asked])
     sides = []
     for off_m in (-apart_m, apart_m):
@@ -101,7 +102,10 @@ def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
 def standing(
     sensors: Sensors, registered: RegisteredSweep, travel_m: float, gone: Bool
 ) -> StandingWorld:
-    """Return the points of one sweep in the world, without those ``gone`` (N,), see `departed`."""
+    """Return the static points of one sweep in the world frame, without ``gone`` points (N,).
+
+    ``gone`` is a mask of `departed`. travel_m: position of the sweep along the road.
+    """
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     one = np.zeros(len(sweep), np.int32)
     normal, spacing_m = tangents(
@@ -122,7 +126,7 @@ def standing(
 
 
 def joined(parts: Sequence[StandingWorld]) -> StandingWorld:
-    """Return parts of one world as one, by ascending frame."""
+    """Join parts of one static world, ordered by frame number."""
     parts = [_NOTHING, *sorted(parts, key=lambda part: part.frames)]
     counts = np.cumsum([0, *(len(part.frames) for part in parts)])
     sources = [p.source + np.int32(first) for p, first in zip(parts, counts, strict=False)]
@@ -147,9 +151,9 @@ _NOTHING = StandingWorld(
 
 
 def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
-    """Return (N,) False where a camera certainly does not observe a point (N,3) of the world.
+    """Return (N,) False for points (N,3), world frame, that a camera certainly does not observe.
 
-    The camera may be up to ``slack_m`` elsewhere. A lens that is no pinhole may observe all points.
+    The camera may be up to ``slack_m`` elsewhere. For a lens that is no pinhole all are True.
     """
     if camera.model != "pinhole":
         return np.ones(len(points), bool)
@@ -172,14 +176,16 @@ def far_cloud(
     exposures: Mapping[str, Exposure],
     standing_only: bool,
 ) -> tuple[Cloud, Patches]:
-    """Return the points beyond the window that a camera observes, and their patches; key frame.
+    """Return the points beyond the window that a camera observes, and their patches.
 
-    One point of every depth in a pixel is enough.
+    Both are in the key sweep's lidar frame. One point per pixel and step of depth is kept.
 
     Args:
-        T_key_found: (4,4) to the key from the world of ``found``.
-        stretch: The window.
-        standing_only: Without points that the first or the last sweep of the window saw
+        found: Static points along the road.
+        T_key_found: (4,4) from the world frame of ``found`` to the key sweep's lidar frame.
+        stretch: Registered sweeps of the window.
+        key: Frame number of the key sweep.
+        standing_only: True leaves out points that the first or the last sweep of the window saw
             through.
     """
     beyond = ~np.isin(found.frames, stretch.frames)
@@ -222,7 +228,7 @@ def far_cloud(
 
 
 def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
-    """Return the rows, ascending, of the points (N,3) of the world that a camera needs.
+    """Return the row numbers, ascending, of the points (N,3), world frame, that a camera needs.
 
     It needs one in every pixel and step of depth, from sweeps in mixed order.
     """
@@ -234,13 +240,16 @@ def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
     depth = exposure.depth_m(sight.points_cam[sight.inside])
     place = np.column_stack([sight.uv[sight.inside], np.log(depth) / _SAME_DEPTH])
     cell = np.rint(place.astype(np.float32))
-    # Neighbouring pixels must be from many sweeps, which have to agree.
+    # A pixel is supported only by several sweeps, so neighbouring pixels take different sweeps.
     mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
     return rows[thinned(cell, mixed, 1.0, 1)]
 
 
 def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:
-    """Return (M,) True where one of these sweeps saw through a point (M,3), key frame."""
+    """Return (M,) True for points (M,3), key sweep's lidar frame, that a given sweep saw through.
+
+    key: frame number of the key sweep. witnesses: frame numbers of the given sweeps.
+    """
     free = np.zeros(len(points), bool)
     for frame in witnesses:
         there = poses.transform(stretch.T_target_source(frame, key), points)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Interpolate between the measured pixels of a depth map.
 
-The two-sided fill takes planes through the measured pixels of a window. The star fill takes holes
-that known pixels surround. The votes of measured pixels check both.
+The two-sided fill fits a plane to the measured pixels of a window. The star fill closes holes that
+known pixels surround. Both are checked by the votes of measured pixels.
 """
 
 from __future__ import annotations
@@ -21,26 +21,27 @@ from densify.geometry.arrays import Float, Float32
 from densify.geometry.compiled import Kernel, inlined
 
 FILL_CONFIDENCE = 0.5
-"""Confidence of a pixel filled from afar, as a share of the least around it."""
+"""Confidence of a pixel filled with the largest window, as a share of the least one within it."""
 _GROWTH = (1 / 3, 2 / 3, 1.0)  # half sizes of the windows, in spacings of rays
 _EDGE_M, _EDGE_FRACTION = 0.2, 0.05  # greatest deviation from a plane; the larger one counts
 _LEAST_SHARE, _LEAST_STAR_SHARE = 0.9, 0.8  # share of the votes
-_AROUND, _LEAST_KNOWN = 0.35, 0.3  # gaps between rays to all sides; share of the pixels there
+_AROUND, _LEAST_KNOWN = 0.35, 0.3  # spacings of rays to all sides; share of known pixels there
 _RIDGE_PX2 = 1e-7
 _MIN_PLANE_PX = 6  # fewer do not distinguish a plane from a step
 _MOST_PX = 120  # greatest half size of a window
 _ROWS = 8  # rows that are skipped together if they hold no measured pixel
-_STAR_REACH = 1.0  # reach in spacings of rays
-_STAR_MET, _STAR_GAP = 8, 7  # directions with a known pixel; neighbouring ones without
+_STAR_REACH = 1.0  # greatest distance of a known pixel, in spacings of rays
+_STAR_MET, _STAR_GAP = 8, 7  # directions with a known pixel; neighbouring directions without
 _STAR_SPREAD = 0.1  # greatest difference between the predictions, as a share of inverse depth
 _STRIP_PX = 6  # height of an empty strip along the image's lower border
 _ABOVE = 12  # index of the direction upwards
 
 
 def fill(layers: Layers, reach: float) -> Layers:
-    """Return the layers with the two-sided fill where nine tenths of the votes are for it.
+    """Fill the pixels that have measured pixels on both sides and nine tenths of the votes.
 
     Args:
+        layers: Map with measured pixels; it is not changed.
         reach: Half size of the largest window, in spacings of rays.
     """
     measured = np.where(layers.depth_m > 0, layers.confidence, np.float32(0))
@@ -52,11 +53,11 @@ def fill(layers: Layers, reach: float) -> Layers:
 
 
 def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
-    """Drop pixels filled since ``before_m`` (H,W) for which fewer than ``least_share`` vote.
+    """Drop pixels filled since ``before_m`` (H,W) with less than ``least_share`` of the votes.
 
-    Measured pixels vote; filled ones would vote for themselves. Boundary pixels that were not
-    accepted may only vote against, unless they are occluded. Therefore the pillar of a car with few
-    measured pixels is not filled over.
+    Only measured pixels vote, because filled pixels would confirm themselves. Boundary pixels that
+    were not accepted may only vote against, unless they are occluded. This protects the pillar of a
+    car, which has few measured pixels.
     """
     filled = (layers.filled_m > 0) & (before_m == 0)
     pixel = np.flatnonzero(filled)
@@ -70,7 +71,7 @@ def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
 
 
 def without_isolated(layers: Layers) -> Layers:
-    """Drop filled pixels if fewer than three tenths of the pixels around are known."""
+    """Drop filled pixels if fewer than three tenths of the surrounding pixels have a depth."""
     known = layers.filled_m > 0
     row, column = np.nonzero(known & (layers.depth_m == 0))
     gap_px = layers.spacing_px[row, column].max(axis=1)
@@ -86,10 +87,14 @@ def without_isolated(layers: Layers) -> Layers:
 
 
 class _Known(NamedTuple):
-    """Measured pixels row by row. Those of row r left of column c come before ``before[r, c]``.
+    """The K measured pixels of a map, row by row.
 
-    before: (H,W+1) int32. num: (H+1,W+1) int32 integral image. column: (K,) int32. inverse: (K,)
-    float64, 1/m. confidence: (K,) float32.
+    Attributes:
+        before: (H,W+1) int32 number of measured pixels above row r or left of column c in row r.
+        num: (H+1,W+1) int32 integral image of the measured pixels.
+        column: (K,) int32 column of each pixel.
+        inverse: (K,) float64 inverse depth of each pixel, 1/m.
+        confidence: (K,) float32 confidence of each pixel.
     """
 
     before: NDArray[np.int32]
@@ -100,7 +105,7 @@ class _Known(NamedTuple):
 
 
 class _Inside(NamedTuple):
-    """The measured pixels in a window: inverse depth (1/m), columns and rows from its centre."""
+    """The measured pixels in a window: inverse depth (1/m), columns and rows from the centre."""
 
     inverse: Float
     right: Float
@@ -113,24 +118,25 @@ def fill_between(
 ) -> tuple[Float32, Float32, Float32]:
     """Interpolate empty pixels that have measured pixels on both sides.
 
-    An empty pixel is filled if its window holds measured pixels in a column to the left, in one to
-    the right, in a row above and in one below, and if no depth discontinuity runs through them.
-    There is a discontinuity if deviations from a plane differ by more than 0.2 m and 5 % of the
-    nearest depth, or the depths themselves for fewer than six pixels. The pixel gets the depth of
-    the plane, limited to the range of the window: nothing is extrapolated. Weights fall to zero
-    just outside the window. The window grows in thirds of the spacing of rays, up to ``reach`` of
-    it, and the smallest sufficient one is taken.
+    The window of an empty pixel must hold measured pixels in a column to the left, in a column to
+    the right, in a row above and in a row below. No depth discontinuity may run through them. There
+    is a discontinuity if deviations from a plane differ by more than 0.2 m and 5 % of the nearest
+    depth. With fewer than six pixels the depths themselves are compared.
+
+    The pixel gets the depth of the plane, limited to the range of depths in the window: nothing is
+    extrapolated. Weights fall to zero just outside the window. The window grows in thirds of the
+    ray spacing, then to ``reach`` spacings, and the smallest sufficient one is taken.
 
     Args:
-        depth_m: (H,W) metres, 0 none.
-        confidence: (H,W).
-        tilt: (H,W,2) slope of inverse depth, 1/m per px.
-        spacing_px: (H,W,2) between rays, across and down.
-        reach: Greatest half size of the window, in spacings.
+        depth_m: (H,W) measured depth in metres, 0 none.
+        confidence: (H,W) confidence of the measured pixels.
+        tilt: (H,W,2) slope of inverse depth to the right and down, 1/m per px.
+        spacing_px: (H,W,2) spacing of neighbouring rays, across and down.
+        reach: Greatest half size of the window, in spacings of rays.
 
     Returns:
-        depth_m, confidence and tilt with the filled pixels. Their confidence is the least in
-            the window, and lower for a larger window.
+        Copies of depth_m, confidence and tilt with the filled pixels. Their confidence is the least
+            in the window, and lower for a larger window.
     """
     filled_m, filled_confidence, tilt = depth_m.copy(), confidence.copy(), tilt.copy()
     share = np.zeros(depth_m.shape, np.float32)
@@ -163,7 +169,7 @@ def _any(num, top, bottom, left, right):  # type: ignore[no-untyped-def]
 
 @inlined
 def _surrounded(num, top, bottom, left, right, row, column):  # type: ignore[no-untyped-def]
-    """Return True if there are measured pixels to the left, to the right, above and below."""
+    """Return True if a window has measured pixels to the left, to the right, above and below."""
     return (
         _any(num, top, bottom, left, column)
         and _any(num, top, bottom, column + 1, right)
@@ -221,8 +227,8 @@ def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
 def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, share):  # type: ignore[no-untyped-def]
     """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`.
 
-    known: `_Known`. reaches: (n,) half sizes of the windows in spacings, ascending. share: (H,W)
-    float32, set to the size of the window as a share of the largest.
+    known: `_Known`. reaches: (n,) half sizes of the windows in spacings of rays, ascending. share:
+    (H,W) float32 output, size of the window used as a share of the largest.
     """
     height, width = filled_m.shape
     most = (2 * _MOST_PX + 1) ** 2
@@ -262,12 +268,12 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, s
 def fill_stars(layers: Layers) -> Layers:
     """Fill holes from the first known pixel, measured or filled, in each of 16 directions.
 
-    The inverse depth of each known pixel is extended along its surface, and weighted by one over
-    its steps. A hole is filled if known pixels are within a spacing of the rays in at least eight
-    directions, with at most seven neighbouring directions without. All must predict the same depth
-    to 10 %, and eight of ten votes must be for it. In an empty strip of up to six rows along the
-    lower border of the image two directions fewer are enough. The confidence is half the least of
-    the known pixels.
+    A hole is filled if at least eight directions have a known pixel within a spacing of rays, and
+    at most seven neighbouring directions have none. The surface of each known pixel is extended to
+    the hole. These predictions must agree to 10 % of inverse depth, and eight tenths of the votes
+    must confirm their mean, weighted by one over the steps. In an empty strip of up to six rows
+    along the image's lower border two directions fewer are enough. The confidence is half the least
+    of the known pixels.
     """
     known = layers.filled_m > 0
     inverse = np.divide(1, layers.filled_m, out=np.zeros_like(layers.filled_m), where=known)
@@ -295,11 +301,11 @@ def _widest_gap(met):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  # type: ignore[no-untyped-def]
-    """Predict the depth of empty pixels from the first known ones around them.
+    """Predict the depth of empty pixels from the first known pixels around them.
 
-    pixel: (P,) row by row. steps: (16,H,W) of `first_known`. inverse: (H,W) 1/m. known: (H,W)
-    confidence. found: (2,P) float32, depth in m and least confidence, 0 where the predictions
-    differ.
+    pixel: (P,) flat indices of the empty pixels, ascending. steps: (16,H,W) of `first_known`.
+    inverse: (H,W) inverse depth, 1/m. known: (H,W) confidence. found: (2,P) float32 output, depth
+    in m and least confidence, 0 where the predictions differ.
     """
     height, width = inverse.shape
     met = np.zeros(len(DIRECTIONS), np.bool_)

@@ -10,19 +10,22 @@ from densify.geometry.arrays import Bool, Float
 
 
 def half_spaces(corners: Float) -> Float:
-    """Return (F,4) normal n and offset d of the sides of a hull; n · x + d ≤ 0 inside."""
+    """Return the (F,4) unit normal n and offset d of the sides of a convex hull.
+
+    A point x is inside if n · x + d ≤ 0 for all sides. corners: (V,3).
+    """
     return np.unique(ConvexHull(corners).equations, axis=0)
 
 
 def crossing(spaces: Float, start: Float, way: Float) -> tuple[Float, Float]:
-    """Return (K,) the t at which lines start + t · way enter a convex body, and leave it.
+    """Return the (K,) t at which lines start + t · way enter a convex body, and leave it.
 
     A line that misses the body leaves before it enters.
 
     Args:
-        spaces: (F,4) of `half_spaces`.
-        start: (K,3) or (3,).
-        way: (K,3).
+        spaces: (F,4) sides of the body, from `half_spaces`.
+        start: (K,3) start of each line, or (3,) of all.
+        way: (K,3) direction of each line.
     """
     enter, leave = np.full(len(way), -np.inf), np.full(len(way), np.inf)
     for side in spaces:
@@ -36,7 +39,13 @@ def crossing(spaces: Float, start: Float, way: Float) -> tuple[Float, Float]:
 
 
 def passes_near(corners: Float, start: Float, way: Float) -> Bool:
-    """Return (K,) True for lines that pass within the sphere around the corners (V,3)."""
+    """Return (K,) True for lines that pass through a sphere around the corners of a body.
+
+    Args:
+        corners: (V,3) corners of the body.
+        start: (K,3) start of each line.
+        way: (K,3) direction of each line.
+    """
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius_m = np.linalg.norm(corners - middle, axis=1).max()
     off = np.linalg.norm(np.cross(start - middle, way), axis=1)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Convert a camera's image to L*a*b*, and align it with the depth map.
+"""Convert a camera image to L*a*b*, and align it with the depth map.
 
-The image is shifted in steps of a third of the gap between rays. At the right shift its edges lie
-on the depth discontinuities, and the sum of its changes there is much larger than at all other
-shifts.
+The image is shifted in steps of a third of the spacing of neighbouring rays. The score of a shift
+is the sum of the image's colour changes on depth discontinuities. At the right shift this sum is
+much larger than at all others.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from densify.geometry.types import Float, Float32, Int
 _BLUR_PX = 0.6  # standard deviation; it removes noise and the pattern of the colour filter
 _LEAST_LIGHT = 70.0  # L of the lightest hundredth; a darker image is lightened
 _REACH = 14  # steps to all sides
-_ASIDE, _ELSEWHERE = 3.2, 6.0  # steps: greatest offset of a fit, least of a comparison
+_ASIDE, _ELSEWHERE = 3.2, 6.0  # steps: greatest accepted shift, least shift of the comparison
 # In standard deviations of the shifts elsewhere. Good images have 3.1 to 11 at no shift, and at
 # most 1.9 more nearby. Mirrored images reach 3.0.
 _LEAST, _LEAST_ASIDE, _CLEARLY = 3.05, 5.0, 1.9
 _TREND = 3  # degree of the polynomial of the slow trend
 _MOST = 6000  # number of compared edges of each kind
-_JUMPS_COUNT = 0.4  # weight of each kind of jumps, relative to boundary pixels
+_JUMPS_COUNT = 0.4  # weight of each kind of depth jumps, relative to boundary pixels
 _ONE_SURFACE, _JUMP = (0.1, 0.02), (0.3, 0.05)  # metres plus share of the depth
 _GAP, _STRICT_GAP = 3, 10  # steps between neighbouring pixels, without boundary pixels
 _EDGE_PX = 1.5  # standard deviation of the blur for the direction of a discontinuity
@@ -35,10 +35,10 @@ _REBLUR_PX, _MOST_BLUR, _EDGES_LOOKED_AT = 1.5, 2.0, 0.03  # px; steps; share of
 
 
 def lab(image: NDArray[np.uint8]) -> Float32:
-    """Return (H,W,3) float32 CIE L*a*b*, L from 0 to 100, of an (H,W,3) RGB image.
+    """Convert an (H,W,3) RGB image to (H,W,3) float32 CIE L*a*b* with L from 0 to 100.
 
-    It is slightly blurred, and lightened if it is dark. Distances measure how different colours
-    look.
+    The result is slightly blurred, and lightened if it is dark. In L*a*b* the distance of two
+    colours measures how different they look.
     """
     blurred = cv2.GaussianBlur(image.astype(np.float32) / 255, (0, 0), _BLUR_PX)
     colours = cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB).astype(np.float32, copy=False)
@@ -47,7 +47,13 @@ def lab(image: NDArray[np.uint8]) -> Float32:
 
 
 class Aligned(NamedTuple):
-    """An image (H,W,3), shifted to fit, and its offset before."""
+    """An image, shifted to fit the depth map, and its offset before.
+
+    Attributes:
+        lab: (H,W,3) shifted image in L*a*b*.
+        right_px: Pixels by which the image was too far to the right.
+        down_px: Pixels by which the image was too low.
+    """
 
     lab: Float32
     right_px: int = 0
@@ -64,12 +70,13 @@ class Aligned(NamedTuple):
 def align_image(layers: Layers) -> Aligned | None:
     """Return the image of the layers, shifted to fit, None if it does not fit or is blurred.
 
-    The score of a shift is the change of the image on depth discontinuities, in standard deviations
-    of the scores far away. The best shift must be at most 3.2 steps away. With a score of 3.05 or
-    more the image stays in place, unless the best score is more than 1.9 higher. Otherwise it is
-    shifted if the best score is at least 5. An image whose edges have a blur of more than two steps
-    is not used: the sharper an edge, the more another blur lowers its gradient (Zhuo and Sim,
-    "Defocus map estimation from a single image", 2011).
+    The score of a shift is in standard deviations of the scores of distant shifts. The best shift
+    must be at most 3.2 steps away. With a score of 3.05 or more the image stays in place, unless
+    the best score is more than 1.9 higher. Otherwise it is shifted if the best score is at least 5.
+
+    An image whose edges have a blur of more than two steps is not used. The sharper an edge, the
+    more another blur lowers its gradient (Zhuo and Sim, "Defocus map estimation from a single
+    image", 2011).
     """
     lab, step_px = layers.lab, max(1, round(0.3 * float(np.median(layers.gap_px))))
     if lab is None or _blur_px(lab) > _MOST_BLUR * step_px:
@@ -92,7 +99,10 @@ def align_image(layers: Layers) -> Aligned | None:
 
 
 def _standing_out(sums: Float) -> Float:
-    """Return (29,29) the sums in standard deviations of those elsewhere, without slow trend."""
+    """Return the (29,29) scores of all shifts, in standard deviations of distant shifts.
+
+    sums: (29,29) of `_edge_sums`; a slow trend is removed.
+    """
     offsets = np.arange(-_REACH, _REACH + 1)
     right, down = np.meshgrid(offsets, offsets)
     elsewhere = np.hypot(right, down) > _ELSEWHERE
@@ -104,11 +114,11 @@ def _standing_out(sums: Float) -> Float:
 
 
 def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
-    """Return (29,29) the changes of the shifted image across depth discontinuities.
+    """Return (29,29) the colour changes of the shifted image across depth discontinuities.
 
-    The shifts are steps down and to the right. Discontinuities are boundary pixels, and jumps
-    between neighbouring known pixels, with boundary pixels and without. Each kind counts as a
-    multiple of its mean.
+    Rows are steps down, columns steps to the right. Discontinuities are boundary pixels, and depth
+    jumps between neighbouring known pixels, with boundary pixels and without. The sums of each kind
+    are divided by their mean.
     """
     known_m = np.maximum(layers.depth_m, layers.rim_m)
     strict_m = np.where(layers.rim_m == 0, layers.depth_m, np.float32(0))
@@ -130,9 +140,9 @@ def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
 def _sums(
     changes: Float32, row: Int, column: Int, right: float | Float32, down: float | Float32
 ) -> Float:
-    """Return (29,29) the changes at rows and columns (E,) along ``right`` and ``down``.
+    """Return (29,29) the sums of colour changes at E shifted pixels along a direction.
 
-    The direction is (E,), or the same everywhere.
+    row and column: (E,) of the pixels, in steps. right and down: (E,) direction, or one for all.
     """
     width, (x, y) = changes.shape[2], changes.reshape(2, -1)
     offsets = np.arange(-_REACH, _REACH + 1)
@@ -144,15 +154,15 @@ def _sums(
 
 
 def _some(values: Int) -> Int:
-    """Return the values, or 6,000 evenly spaced ones of them."""
+    """Return the values, or at most 6,000 evenly spaced ones among them."""
     return values[:: len(values) // _MOST + 1]
 
 
 def _jumps(depth_m: Float32, gap: int, step_px: int) -> tuple[Int, Int]:
-    """Return rows and columns, in steps, of jumps of depth (H,W) from one surface to another.
+    """Return rows and columns, in steps, of depth jumps (H,W) from one surface to another.
 
-    They are between neighbouring known pixels of a row, at most ``gap`` steps apart. Both surfaces
-    continue, which leaves out most of leaves.
+    The jumps are between neighbouring known pixels of a row, at most ``gap`` steps apart. Both
+    surfaces must continue, which excludes most foliage.
     """
     row, column = np.nonzero(depth_m)
     known_m = depth_m[row, column]
@@ -186,7 +196,7 @@ def _reduced(image: Float32, step_px: int) -> Float32:
 
 
 def _across(depth_m: Float32, step_px: int) -> Float32:
-    """Return (2,H,W) the direction right and down of the greatest change of depth, reduced."""
+    """Return (2,H,W) the unit direction (right, down) of the greatest change of depth, reduced."""
     known = depth_m > 0
     inverse = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=known)
     sums, weight = (
@@ -198,7 +208,7 @@ def _across(depth_m: Float32, step_px: int) -> Float32:
 
 
 def _changes(lab: Float32) -> Float32:
-    """Return (2,H,W) the gradient of the channel that changes most, relative to those around."""
+    """Return (2,H,W) the gradient of the strongest channel, relative to its surroundings."""
     change, size = _gradient(lab[..., 0]), np.zeros(lab.shape[:2], np.float32)
     for channel in np.moveaxis(lab, 2, 0):
         gradient = _gradient(channel)

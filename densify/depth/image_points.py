@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Collect the accumulated points in one image, with their surface patches and occlusion."""
+"""Collect the accumulated points within one image, with their surface patches and occlusion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from densify.geometry.poses import rotate
 from densify.geometry.types import Bool, Camera, Cloud, Float, Float32, Int, Patches
 
 HIDDEN_M, HIDDEN_FRACTION = 0.2, 0.06
-"""A point this much behind the nearest surface, both added, is hidden."""
+"""Least distance of an occluded point behind the nearest surface: metres plus share of depth."""
 _FOOTPRINT = 0.4  # half size of a patch, in spacings of rays
 _SLACK_M = 0.05  # added to the footprint, for errors of registration and flow
 _MAX_HALF_PX = 24.0  # a point close to the lens must not occlude the whole image
@@ -27,20 +27,20 @@ _MOST_SWEEPS = np.iinfo(np.int64).bits - 1  # number of sweeps that are counted 
 
 @dataclass(frozen=True)
 class PointsInImage:
-    """The K points in the image.
+    """The K points of a cloud in an image.
 
     Attributes:
-        index: (K,) rows of the cloud.
-        uv: (K,2) px.
-        depth: (K,) m.
+        index: (K,) row numbers of the points in the cloud.
+        uv: (K,2) column and row in px.
+        depth: (K,) depth in m.
         focal_px: (K,2) local scale, px per metre at a depth of 1 m.
-        slope: (K,2) of the tangent plane's inverse depth, 1/m per px.
-        spacing_px: (K,2) between neighbouring rays.
-        moving: (K,) bool.
-        frame: (K,) source sweep.
-        sweep: (K,) number of the source, see `_witness`.
-        age_ns: (K,) see `_ages_ns`.
-        far: (K,) from a sweep beyond the window.
+        slope: (K,2) slope of the tangent plane's inverse depth to the right and down, 1/m per px.
+        spacing_px: (K,2) spacing of neighbouring rays, across and down.
+        moving: (K,) True for moving points.
+        frame: (K,) frame number of the source sweep.
+        sweep: (K,) number of the source, 0 to 62, see `_witness`.
+        age_ns: (K,) time between the source sweep and the key sweep, see `_ages_ns`.
+        far: (K,) True for points of sweeps beyond the window.
     """
 
     index: Int
@@ -65,7 +65,7 @@ class PointsInImage:
         )
 
     def at(self, rows: Int) -> Int:
-        """Return the positions of rows of the cloud, all in the image, among these points."""
+        """Return the indices among these points of points with these row numbers in the cloud."""
         place = np.zeros(int(self.index.max(initial=-1)) + 1, np.int64)
         place[self.index] = np.arange(len(self.index))
         found: Int = place[rows]
@@ -73,15 +73,15 @@ class PointsInImage:
 
     @property
     def inverse(self) -> Float:
-        """The (K,) inverse depths."""
+        """The (K,) inverse depths in 1/m."""
         return 1 / self.depth.astype(np.float64)
 
 
 def points_in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> PointsInImage:
-    """Return the points of the cloud in the view.
+    """Return the points of the cloud in the view, with the patches' size and slope in pixels.
 
     Args:
-        vetoed: Leave out those that the key sweep saw through.
+        vetoed: True leaves out points that the key sweep saw through.
     """
     row = np.rint(view.uv[:, 1]).astype(np.uint16)
     kept = np.argsort(row, kind="stable")
@@ -115,7 +115,7 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) 
 def _pinhole(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> tuple[Float, Float, Float]:
-    """Return focal_px, slope and spacing_px for the camera z of a rectified image.
+    """Return focal_px, slope and spacing_px of `PointsInImage` for z depth in a rectified image.
 
     Patches count as facing the camera.
     """
@@ -131,7 +131,7 @@ def _pinhole(
 def _any_lens(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> tuple[Float, Float, Float]:
-    """Return focal_px, slope and spacing_px by the Jacobian J (2,3) of the projection at points p.
+    """Return focal_px, slope and spacing_px of `PointsInImage` by the Jacobian J (2,3) at points p.
 
     If a point moves on the plane n · p = d until the image moves by one pixel, p moves by δ = J⁺ -
     p (n · J⁺) / d, the inverse depth by -δ_z / z², and the inverse range by -p · δ / r³.
@@ -158,10 +158,10 @@ def _any_lens(
 
 
 def _witness(patches: Patches, far: Bool) -> NDArray[np.int32]:
-    """Return (M,) the number, of 63, that identifies the source of a point.
+    """Return the (M,) source number of each point, 0 to 62.
 
-    There is one for each sweep of the window, and for each part of the road beyond it. Distant
-    parts may share one.
+    Each sweep of the window has its own number, and so has each part of the road beyond it. Distant
+    parts may share a number.
     """
     num_near = min(int(patches.sweep[~far].max(initial=-1)) + 1, _MOST_SWEEPS - 1)
     shared = num_near + patches.place % (_MOST_SWEEPS - num_near)
@@ -169,10 +169,10 @@ def _witness(patches: Patches, far: Bool) -> NDArray[np.int32]:
 
 
 def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32], far: Bool) -> Int:
-    """Return (K,) times between the key and the points' sweeps.
+    """Return the (K,) times between the points' sweeps and the key sweep.
 
-    Sweeps of the window less than 10 ms apart count as equally old, because clocks that jitter must
-    not decide between the sweeps before and after the key.
+    Sweeps of the window whose times differ by less than 10 ms count as equally old. Otherwise clock
+    jitter would decide between the sweeps before and after the key sweep.
     """
     near = ~far
     of_sweep = np.zeros(int(sweep[near].max(initial=-1)) + 1, np.int64)
@@ -186,9 +186,9 @@ def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32], far: Bool) -> Int:
 
 
 def distance_behind(points: PointsInImage, camera: Camera) -> Float:
-    """Return (K,) distance of each point behind the nearest patch over its pixel.
+    """Return the (K,) distance of each point behind the nearest patch over its pixel.
 
-    It is a share of the tolerance. A point above 1 is occluded.
+    The distance is a share of the tolerance: above 1 the point is occluded.
     """
     slack_px = _SLACK_M * points.focal_px / points.depth[:, None]
     half_px = np.clip(_FOOTPRINT * points.spacing_px + slack_px, 0.5, _MAX_HALF_PX)
@@ -205,15 +205,17 @@ def distance_behind(points: PointsInImage, camera: Camera) -> Float:
 
 @Kernel
 def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
-    """Raise canvas (H,W) float32 to the greatest inverse depth of the patches over a pixel.
+    """Raise ``canvas`` (H,W) float32 in place to the greatest inverse depth of the patches there.
 
-    A patch covers the pixel centres within ``half_px`` of its point, with inverse depth ``inverse +
-    slope · offset``, between half of ``inverse`` and all of it: a patch is never nearer than its
-    point. uv, slope.
+    A patch covers the pixel centres within ``half_px`` of its point. Its inverse depth is ``inverse
+    + slope · offset``, between half of ``inverse`` and all of it: no patch is nearer than its
+    point.
 
     Args:
-        half_px: (K,2).
-        inverse: (K,).
+        uv: (K,2) column and row of the points in px.
+        inverse: (K,) inverse depth of the points in 1/m.
+        slope: (K,2) slope of the inverse depth, 1/m per px.
+        half_px: (K,2) half width and height of the patches.
     """
     height, width = canvas.shape
     for i in range(len(inverse)):
@@ -234,9 +236,15 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
 def sorted_by_pixel(
     points: PointsInImage, rank: Int, confidence: Float32, camera: Camera
 ) -> tuple[Int, Int]:
-    """Return ``start`` and ``order``: the points of pixel p are ``order[start[p]:start[p + 1]]``.
+    """Sort the points by pixel, the best point of each pixel first.
 
-    The least in ``rank`` (K,) comes first, then the nearest.
+    Args:
+        rank: (K,) rank of each point. The lowest comes first, then the nearest.
+        confidence: (K,) confidence, which decides between points equal in all else.
+
+    Returns:
+        ``start`` (H·W+1,) and ``order`` (K,): the points of pixel p are ``order[start[p]:start[p +
+            1]]``.
     """
     column, row = np.rint(points.uv).astype(np.int64).T
     start = np.empty(camera.height_px * camera.width_px + 1, np.int64)

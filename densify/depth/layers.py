@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Hold a depth map in the making, which the stages of `densify.depth.project` hand on."""
+"""Hold a depth map in the making, which the stages of `densify.depth.project` pass on."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from densify.geometry.types import Bool, Float32
 
 @dataclass(frozen=True)
 class Layers:
-    """The map of one camera with all properties of its pixels; (H,W) each, depths in m, 0 none.
+    """The map of one camera and the properties of its pixels; (H,W) each, depths in m, 0 none.
 
     Attributes:
-        depth_m: Accepted as measured.
-        rim_m: Boundary pixels: measured so close to a depth discontinuity that they may show
-            the background. A pixel stays here when it is accepted.
-        behind_patch: This boundary pixel is measured behind the patch of a nearer point.
-        filled_m: Accepted and interpolated pixels.
-        confidence: 0 to 1.
-        point: Row of the cloud that measured the pixel, -1 none.
+        depth_m: Depth of pixels that are accepted as measured.
+        rim_m: Depth of boundary pixels, measured so close to a depth discontinuity that they may
+            show the background. Accepted boundary pixels stay in this layer too.
+        behind_patch: True if a boundary pixel is measured behind the patch of a nearer point.
+        filled_m: Depth of accepted and of interpolated pixels.
+        confidence: Confidence or rank of each pixel, 0 to 1.
+        point: Row number, in the cloud, of the point that measured the pixel; -1 none.
         tilt: (H,W,2) slope of the surface's inverse depth to the right and down, 1/m per px.
-        spacing_px: (H,W,2) between neighbouring rays of one sweep, across and down, everywhere.
-        lab: (H,W,3) the image in L*a*b*, None without one.
-        warnings: What could not be done as asked.
-        solid: Closed car windows, and moving bodies.
-        glass: A measured pixel was removed from a car window.
-        key_only: Only the key sweep has returns of the surface.
+        spacing_px: (H,W,2) spacing of neighbouring rays of one sweep, across and down, at all
+            pixels.
+        lab: (H,W,3) camera image in L*a*b*, None if there is no image.
+        warnings: Messages on parts of the request that could not be done.
+        solid: True in closed car windows and on moving bodies.
+        glass: True where a measured pixel was removed from a car window.
+        key_only: True if only the key sweep has returns of the surface.
     """
 
     depth_m: Float32
@@ -49,19 +50,22 @@ class Layers:
 
     @property
     def gap_px(self) -> Float32:
-        """The (H,W) distance between neighbouring rays, in the wider direction."""
+        """The (H,W) spacing of neighbouring rays, geometric mean of both directions."""
         return np.sqrt(self.spacing_px[..., 0] * self.spacing_px[..., 1])
 
     def part(self, box: tuple[slice, slice]) -> Layers:
-        """Return the layers of a box of the image, as views: a change there changes these."""
+        """Return a box of the layers as views: writing to the box changes these layers.
+
+        box: rows and columns of the image.
+        """
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         images = {n: v[box] for n, v in values.items() if isinstance(v, np.ndarray)}
         return Layers(**values | images)
 
     def without(self, dropped: Bool) -> Layers:
-        """Remove the pixels ``dropped`` (H,W) from the filled map.
+        """Return the layers with the pixels ``dropped`` (H,W) removed from the filled map.
 
-        Measured ones become boundary pixels that are not accepted.
+        Measured pixels among them become boundary pixels that are not accepted.
         """
         dropped = dropped & (self.filled_m > 0)
         rim_m = np.where(dropped & (self.depth_m > 0), self.depth_m, self.rim_m)

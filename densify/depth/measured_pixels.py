@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Compute the depth that the points of an image give its pixels.
+"""Compute the depth that the points in an image give its pixels.
 
-Of the points in a pixel that are not occluded, the one measured nearest in time to the key wins.
-Its depth is that of the plane through the points around that agree with it, at the centre of the
-pixel. The pixel is measured if enough sweeps agree. Close to a depth discontinuity it is a boundary
-pixel.
+Among the points in a pixel that are not occluded, the point measured nearest in time to the key
+sweep wins. A plane is fitted to the surrounding points that agree with it, and the pixel gets the
+depth of the plane at its centre. The pixel is measured if enough sweeps agree. Close to a depth
+discontinuity it becomes a boundary pixel.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Camera, Reason
 
 AGREE_M, AGREE_FRACTION = 0.1, 0.01
-"""Points on one surface deviate less than this, both added."""
-_SUPPORT_REACH, _PLANE_REACH = 0.8, 0.5  # of agreeing sweeps, of the plane; spacings of rays
-_EDGE_REACH, _EDGE_SLACK_M = 0.35, 0.015  # of a discontinuity: spacings along the azimuth
+"""Greatest deviation between points on one surface: metres plus share of the depth."""
+_SUPPORT_REACH, _PLANE_REACH = 0.8, 0.5  # radius of support, of the plane; spacings of rays
+_EDGE_REACH, _EDGE_SLACK_M = 0.35, 0.015  # radius of a discontinuity: spacings in azimuth; slack
 _EDGE_WINDOW_PX = 1.5  # width beyond the edge in which points must continue the surface
 # Points beyond the window continue a surface behind a nearer one. Therefore both are stricter.
 _FAR_SUPPORT, _FAR_EDGE = 6, 1.5
@@ -42,8 +42,8 @@ _LEAST_WINDOW_PX, _LEAST_FIT_PX, _MOST_PX = 3, 2.0, 24
 _MOVING_SLACK = 4.0  # motion is known less well than static surfaces
 _MOVING_WITNESS_NS = 120_000_000  # greatest time from the key
 _GOES_ON = 1.2  # spacings within which a surface must continue
-_ALL_ROUND = 3.0  # in reaches of edges; farther than this no edge is near
-_LEAST_ALONE = 5  # agreeing returns of the key sweep around one, itself included, of nine
+_ALL_ROUND = 3.0  # in radii of a discontinuity; farther than this none is near
+_LEAST_ALONE = 5  # agreeing returns of the key sweep among nine: a return and its neighbours
 _NEVER_NS = int(np.iinfo(np.int64).max)
 
 
@@ -51,11 +51,12 @@ class MeasuredPixels(NamedTuple):
     """The H·W pixels of an image, row by row.
 
     Attributes:
-        winner: int, point in the image that gives the depth, -1 none.
-        depth_m: float32.
-        confidence: float32.
-        inside: No depth discontinuity is near.
-        behind_patch: As in `densify.depth.layers.Layers`; key_only too.
+        winner: (H·W,) index, in `PointsInImage`, of the point that gives the depth; -1 none.
+        depth_m: (H·W,) float32 depth in metres.
+        confidence: (H·W,) float32 rank from 0 to 1.
+        inside: (H·W,) True if no depth discontinuity is near.
+        behind_patch: (H·W,) mask as in `densify.depth.layers.Layers`.
+        key_only: (H·W,) mask as in `densify.depth.layers.Layers`.
     """
 
     winner: Int
@@ -67,7 +68,7 @@ class MeasuredPixels(NamedTuple):
 
     @staticmethod
     def at(camera: Camera, pixel: Int, *columns: np.ndarray) -> MeasuredPixels:
-        """Return the pixels (P,) with these columns (P,), and the others without a depth."""
+        """Return an image with columns (P,) at flat indices ``pixel`` (P,), empty elsewhere."""
         num = camera.height_px * camera.width_px
         images = [np.full(num, -1, np.int64), *(np.zeros(num, c.dtype) for c in columns[1:])]
         for image, column in zip(images, columns, strict=True):
@@ -78,7 +79,12 @@ class MeasuredPixels(NamedTuple):
 def nearest_pixels(
     points: PointsInImage, own: Float32, camera: Camera, reason: NDArray[np.uint8]
 ) -> MeasuredPixels:
-    """Return the nearest point of each pixel as it is; fill in the ``reason`` of the others."""
+    """Return the nearest point of each pixel, without occlusion or support tests.
+
+    Args:
+        own: (K,) confidence of the points.
+        reason: (M,) `Reason` of each point of the cloud, changed in place to NOT_CHOSEN.
+    """
     start, order = sorted_by_pixel(points, np.zeros(len(own), np.int64), own, camera)
     pixel = np.flatnonzero(np.diff(start))
     nearest = order[start[pixel]]
@@ -95,14 +101,15 @@ def visible_pixels(
     support: int,
     reason: NDArray[np.uint8],
 ) -> MeasuredPixels:
-    """Return the pixels that visible points measure; fill in the ``reason`` of the others.
+    """Return the pixels that visible points measure.
 
     Points beyond the window come second. They measure pixels that the window leaves empty, away
-    from depth discontinuities, and support those that few sweeps of the window measured.
+    from depth discontinuities, and support pixels that few sweeps of the window measured.
 
     Args:
         own: (K,) confidence of the points.
-        support: Number of sweeps that must agree.
+        support: Least number of sweeps that agree with a point.
+        reason: (M,) `Reason` of each point of the cloud, changed in place for points in the image.
     """
     near = np.flatnonzero(~points.far)
     pixels, why = _settled(points.select(~points.far), own[near], camera, support)
@@ -126,11 +133,11 @@ def _settled(
     support: int,
     taken: Bool | None = None,
 ) -> tuple[MeasuredPixels, NDArray[np.uint8]]:
-    """Return the pixels that points measure, and the `Reason` of every point.
+    """Return the pixels that points measure, and the (K,) `Reason` of every point.
 
-    Several returns of the key sweep are enough support, because an object that moves unnoticed was
-    elsewhere at other times. taken: (H·W,) pixels to leave alone; with them the others get the
-    stricter rules of points beyond the window.
+    Several returns of the key sweep are enough support, because an undetected moving object was
+    elsewhere at other times. taken: (H·W,) pixels to leave alone. If given, the others get the
+    stricter rules for points beyond the window.
     """
     many = int(points.sweep.max(initial=0)) + 1
     least = min(support, max(1, many // 2))
@@ -167,11 +174,17 @@ def _settled(
 
 
 class _Visible(NamedTuple):
-    """K points in an image, sorted by pixel, occluded ones last in each pixel.
+    """K points in an image, sorted by pixel, occluded points last in each pixel.
 
-    start: of `sorted_by_pixel`. uv: (K,2) px. inverse: (K,) depth, 1/m. slope: (K,2) of it, 1/m per
-    px. spacing_px: (K,2) between rays. edge_px: (K,) added to the reach of a depth discontinuity.
-    sweep: (K,) 0 to 62. hidden and moving: (K,). age_ns: (K,) from the key.
+    Attributes:
+        start: (H·W+1,) index of each pixel's first point, of `sorted_by_pixel`.
+        uv: (K,2) column and row in px.
+        inverse: (K,) inverse depth in 1/m.
+        slope: (K,2) slope of the inverse depth, 1/m per px.
+        spacing_px: (K,2) spacing of neighbouring rays.
+        edge_px: (K,) pixels added to the radius of a depth discontinuity.
+        sweep: (K,) number of the source, 0 to 62.
+        age_ns: (K,) time from the key sweep.
     """
 
     start: Int
@@ -194,9 +207,9 @@ def _found(
     least: int,
     taken: Bool | None,
 ) -> tuple[Int, Int, Float32]:
-    """Return the pixels (P,) with points, the first point of each (P,), and (7,P) of `_settle`.
+    """Return the pixels (P,) with points, the best point of each (P,), and (7,P) of `_settle`.
 
-    With pixels ``taken``, these are left out, and so are those with occluded points alone.
+    If ``taken`` is given, its pixels are left out, and so are pixels with only occluded points.
     """
     last = int(points.age_ns.max(initial=0)) + 1
     late = points.age_ns > 0
@@ -235,13 +248,13 @@ def _window(reach_px):  # type: ignore[no-untyped-def]
 
 @inlined
 def _fit(reach_px):  # type: ignore[no-untyped-def]
-    """Return the distance at which the weight has fallen to zero."""
+    """Return the distance at which the weight in the plane fit has fallen to zero."""
     return min(max(reach_px, _LEAST_FIT_PX), _MOST_PX) + 1
 
 
 @inlined
 def _extend(reach, u, v):  # type: ignore[no-untyped-def]
-    """Raise the reach of points in eight directions."""
+    """Raise the extent of the surface in eight directions by a point at (u, v)."""
     reach[0], reach[1] = max(reach[0], u), max(reach[1], -u)
     reach[2], reach[3] = max(reach[2], v), max(reach[3], -v)
     a, b = np.sqrt(0.5) * (u + v), np.sqrt(0.5) * (u - v)
@@ -251,7 +264,7 @@ def _extend(reach, u, v):  # type: ignore[no-untyped-def]
 
 @inlined
 def _count(seen):  # type: ignore[no-untyped-def]
-    """Return the number of sweeps, bits of ``seen``."""
+    """Return the number of sweeps, the bits set in ``seen``."""
     num_sweeps = 0
     while seen:
         num_sweeps += seen & 1
@@ -261,13 +274,14 @@ def _count(seen):  # type: ignore[no-untyped-def]
 
 @inlined
 def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach):  # type: ignore[no-untyped-def]
-    """Compare the points around a pixel with the tangent plane of point i.
+    """Compare the points around pixel (v0, u0) with the tangent plane of point i.
 
-    The plane is ``centre`` in the pixel. Fills the moments m (9,) and the extent of the surface,
-    reach (8,). Returns a bit for each sweep that agrees, the age of the youngest, the number of
-    points in the fit, their weighted squares, True if a point is close behind, and for a moving
-    point the number of returns of the key sweep around that agree. witness_ns: greatest age of a
-    point behind that shows a discontinuity; `_NEVER_NS` for static points.
+    The plane has inverse depth ``centre`` in the pixel, and points within ``agree`` of it agree.
+    witness_ns: greatest age of a point behind the plane that shows a discontinuity; `_NEVER_NS` for
+    static points. The moments m (9,) of the fit and the extent of the surface, reach (8,), are
+    filled in. Return a bit for each sweep that agrees, the age of the youngest, the number of
+    points in the fit, their weighted sum of squares, True if a point is close behind, and for a
+    moving point the number of agreeing returns of the key sweep.
     """
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
@@ -320,14 +334,14 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
 
 @Kernel
 def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-untyped-def]
-    """Find the depth of each pixel from the points around that agree with its first point.
+    """Find the depth of each pixel from the surrounding points that agree with its first point.
 
-    points: `_Visible`. few: if fewer sweeps agree, a return of the key sweep is judged by the key
-    sweep only, as a moving point is. taken: (P,) pixels to leave alone. found: (7,P) float32: depth
-    (m), number of sweeps that agree, age of the youngest (ns), points in the fit, their root mean
-    square residual (m), extent of the surface to all sides as a share of the reach of
-    discontinuities, and number of agreeing returns of the key sweep. Occluded points agree with
-    occluded ones only.
+    If fewer than ``few`` sweeps agree, a return of the key sweep is compared with that sweep only,
+    as a moving point is. Occluded points agree with occluded points only. points: `_Visible`.
+    taken: (P,) pixels to leave alone. found: (7,P) float32 output: depth (m), number of sweeps that
+    agree, age of the youngest (ns), number of points in the fit, their root mean square residual
+    (m), extent of the surface as a multiple of the radius of discontinuities, and number of
+    agreeing returns of the key sweep.
     """
     m, reach = np.zeros(9), np.zeros(8)
     for p in range(first, last):

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Close the surfaces of moving objects: nothing behind them shows through.
+"""Close the surfaces of moving objects, so that no background shows through them.
 
-Lidar gets no return from much of a near car: dark paint, glass. Other sweeps measured the
-background there, while the car was elsewhere. Therefore every moving object is a body: the convex
-hull of all its points of the window, at the key's time. The rays of all sweeps are moved along with
-the object. Where they end on the body, it is closed. Between the legs of a pedestrian or under a
-bumper they pass through.
+Much of a near car gives no lidar return: dark paint, glass. Other sweeps measured the background
+there while the car was elsewhere. Therefore every moving object has a body: the convex hull of all
+its points of the window, at the key sweep's time. The rays of all sweeps are moved along with the
+object. The body is closed where they end on it. Between a pedestrian's legs or under a bumper they
+pass through, and it stays open.
 
 In the image, pixels well inside the closed part show the body. The image decides the pixels along
 its silhouette. The surface is the front of the hull, moved smoothly onto the object's own returns.
@@ -36,25 +36,29 @@ from densify.geometry import cameras, poses
 from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.types import Cloud
 
-_AROUND_M, _LEAST_AROUND = 0.25, 6  # a point of the body has six others of the body around
+_AROUND_M, _LEAST_AROUND = 0.25, 6  # a point of the body has six other such points around
 _POSE_M = 0.03  # standard deviation of the pose of the body
 _LIMBS_S = 0.1  # time from the key within which limbs keep their positions
 _PRIOR = 0.05  # number of rays that end on the body, assumed everywhere
-_WHOLE = 0.8  # share of its front at which a body is closed as a whole, as a car is
-_LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # share of rays that end on it; at glass it is a third
+_WHOLE = 0.8  # closed share of the front from which a body is closed as a whole, as a car is
+_LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # share of rays that end on the body; a third at glass
 _VOTES_OF_WHOLE, _VOTES_OF_OPEN = 0.75, 0.97  # share of the votes along the silhouette
 _DEEP_M = 0.6  # farther behind the front of the hull are seats, axles and the far side
 _STIFF, _HELD = 3.0, 0.01  # weights of a smooth and of a small offset, against one return
-_AGREES = 2.0  # tolerance, in those of two static points of a surface
+_AGREES = 2.0  # tolerance, as a multiple of the tolerance between two static points of a surface
 
 
 class MovingBody(NamedTuple):
-    """A moving object at the key's reference time; key frame, metres.
+    """A moving object at the key sweep's reference time, in its lidar frame, metres.
 
-    corners: (V,3) of its convex hull. velocity_m_s: (3,). entries: (K,3) where rays enter the hull.
-    ends: (K,) True if the ray ends on the object, False if it passes through. weight: (K,) of the
-    ray: less far from the key in time, and where it passes just below the surface of the hull; 0 if
-    it ends on the object, but far behind the front, as on wheels. frame: (K,) source sweep.
+    Attributes:
+        corners: (V,3) corners of the convex hull.
+        velocity_m_s: (3,) velocity of the object without ego-motion.
+        entries: (K,3) positions where rays enter the hull.
+        ends: (K,) True if the ray ends on the object, False if it passes through.
+        weight: (K,) weight of the ray, lower far from the key sweep in time and just below the
+            hull's surface; 0 if the ray ends far behind the front, as on wheels.
+        frame: (K,) frame number of the ray's sweep.
     """
 
     corners: Float
@@ -66,10 +70,9 @@ class MovingBody(NamedTuple):
 
 
 def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
-    """Return the bodies of moving objects by instance.
+    """Return the bodies of moving objects by instance number.
 
-    cloud: at the key's reference time. rays: of the window. Objects whose points span no volume
-    have no body.
+    Objects whose points span no volume have no body. cloud: at the key sweep's reference time.
     """
     instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)]).tolist()
     own = {k: cloud.select(cloud.moving & (cloud.instance == k)) for k in instances}
@@ -95,7 +98,7 @@ def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
 def without_sweep(
     bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
 ) -> dict[int, MovingBody]:
-    """Return the bodies with the evidence of the other sweeps alone. cloud: their points."""
+    """Return the bodies from the other sweeps alone. cloud: points of these sweeps."""
     told = {}
     for k, body in bodies.items():
         corners = _corners(cloud.points[cloud.moving & (cloud.instance == k)])
@@ -107,7 +110,7 @@ def without_sweep(
 
 
 def _corners(points: Float) -> Float:
-    """Return (V,3) corners of the convex hull of the points (N,3) that have others around."""
+    """Return the (V,3) hull corners of the points (N,3) that have other points around."""
     away_m, _ = KDTree(points).query(points, [_LEAST_AROUND + 1])  # the first is the point
     points = points[np.ravel(away_m) <= _AROUND_M]
     try:
@@ -129,10 +132,11 @@ _NOT_MET = _Met(np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0), np.zeros(0, np
 
 
 class _Sweep(NamedTuple):
-    """The returns of one sweep, key frame.
+    """The returns of one sweep, key sweep's lidar frame.
 
-    origin: (3,) of the scanner at the reference time. azimuth: (N,) radians, seen from there.
-    range_m: (N,) level distance from there. moved_m: greatest motion of the scanner from there.
+    origin: (3,) of the lidar at the reference time. azimuth: (N,) radians, seen from there.
+    range_m: (N,) horizontal distance from there. moved_m: greatest motion of the scanner from
+    there.
     """
 
     cloud: Cloud
@@ -151,9 +155,9 @@ class _Sweep(NamedTuple):
         return _Sweep(part, rays, origin, np.arctan2(y, x), np.hypot(x, y), float(moved_m))
 
     def met(self, instance: int, corners: Float, T_key_there: Float) -> _Met:
-        """Return the rays that meet a hull, with their entries at the key's time.
+        """Return the rays that meet a hull, with their entry points at the key sweep's time.
 
-        corners: (V,3) of the hull at the key. T_key_there: motion of the object from this sweep.
+        corners: (V,3) of the hull then. T_key_there: (4,4) motion of the object from this sweep.
         """
         part = self.cloud.select(self._toward(poses.transform(poses.inverse(T_key_there), corners)))
         start = poses.transform(T_key_there, self.rays.starts(part))
@@ -172,7 +176,7 @@ class _Sweep(NamedTuple):
         return _Met(start + enter[:, None] * way, ends, weight, part.frame)
 
     def _toward(self, corners: Float) -> Bool:
-        """Return (N,) True for all returns whose rays may meet a hull with these corners (V,3)."""
+        """Return (N,) True for returns whose rays may meet a hull with these corners (V,3)."""
         x, y = (corners - self.origin)[:, :2].T
         middle_x, middle_y = x.mean(), y.mean()
         radius_m = np.hypot(x - middle_x, y - middle_y).max() + self.moved_m
@@ -187,11 +191,11 @@ class _Sweep(NamedTuple):
 def close_bodies(
     layers: Layers, cloud: Cloud, exposure: Exposure, bodies: Mapping[int, MovingBody]
 ) -> Layers:
-    """Return the layers with the surfaces of moving bodies. cloud: at the key's reference time.
+    """Return the layers with the surfaces of moving bodies; ``solid`` marks their pixels.
 
     Points clearly in front of a body stay. Elsewhere inside the outline of its hull only
-    measurements of moving objects stay. Pixels at which one of the body's own returns is on its
-    surface count as measured. ``solid`` marks the bodies.
+    measurements of moving objects stay. Pixels with a return of the body on its surface count as
+    measured. cloud: at the key sweep's reference time.
     """
     changed = ("depth_m", "filled_m", "confidence", "tilt", "point")
     layers = replace(layers, **{name: getattr(layers, name).copy() for name in changed})
@@ -207,7 +211,7 @@ def close_bodies(
 
 
 def far_inside(bodies: Iterable[MovingBody], exposure: Exposure, depth_m: Float32) -> Bool:
-    """Return (H,W) True where a depth (H,W) is far behind the front of a body, as behind glass."""
+    """Return (H,W) True where ``depth_m`` (H,W) is far behind a body's front, as behind glass."""
     far = np.zeros(depth_m.shape, bool)
     for body in bodies:
         front = _Front.of(body, exposure, 0)
@@ -219,7 +223,7 @@ def far_inside(bodies: Iterable[MovingBody], exposure: Exposure, depth_m: Float3
 
 
 def outlines(bodies: Iterable[MovingBody], exposure: Exposure) -> Bool:
-    """Return (H,W) the pixels within the outlines of the hulls."""
+    """Return (H,W) True at pixels within the outlines of the bodies' hulls."""
     shown = np.zeros((exposure.camera.height_px, exposure.camera.width_px), bool)
     for body in bodies:
         front = _Front.of(body, exposure, 0)
@@ -231,7 +235,7 @@ def outlines(bodies: Iterable[MovingBody], exposure: Exposure) -> Bool:
 class _Front(NamedTuple):
     """The front of a hull in the image.
 
-    box: rows and columns (h,w) of the image. inverse: (h,w) of its depth, 1/m, 0 outside.
+    box: rows and columns of the image, h by w pixels. inverse: (h,w) inverse depth, 1/m, 0 outside.
     """
 
     box: tuple[slice, slice]
@@ -239,7 +243,7 @@ class _Front(NamedTuple):
 
     @staticmethod
     def of(body: MovingBody, exposure: Exposure, margin_px: int) -> _Front | None:
-        """Return the front, None if the body is out of view. margin_px: of the box, all round."""
+        """Return the front, None if the body is out of view. margin_px: margin around the box."""
         camera = exposure.camera
         sight = exposure.see(body.corners, _each(body.velocity_m_s, body.corners))
         if not sight.inside.any():
@@ -262,7 +266,7 @@ class _Front(NamedTuple):
         return _Front(box, inverse.reshape(row.shape)) if inside.any() else None
 
     def pixels(self, exposure: Exposure, points: Float, velocity_m_s: Float32) -> _Pixels:
-        """Return the positions of points (N,3), key frame, within the box."""
+        """Return the pixels within the box of points (N,3), key sweep's lidar frame."""
         sight = exposure.see(points, velocity_m_s)
         column, row = np.rint(np.where(sight.inside, sight.uv.T, -1)).astype(np.int64)
         row, column = row - self.box[0].start, column - self.box[1].start
@@ -273,7 +277,7 @@ class _Front(NamedTuple):
         return _Pixels(which, (row[which], column[which]), depth_m)
 
     def closed(self, body: MovingBody, exposure: Exposure, spacing_px: Float32) -> Float:
-        """Return (h,w) the share of the rays that end on the body, of those that enter there."""
+        """Return the (h,w) share of the rays entering at a pixel that end on the body."""
         blur_px = np.maximum(RAY_BLUR * np.median(spacing_px, axis=(0, 1)), 1.0)
         at = self.pixels(exposure, body.entries, _each(body.velocity_m_s, body.entries))
         front_m = 1 / np.maximum(self.inverse[at.place], 1e-6)
@@ -288,7 +292,7 @@ class _Front(NamedTuple):
 
 
 class _Pixels(NamedTuple):
-    """Points in a box of the image: rows of the points, their rows and columns, their depth."""
+    """Points in a box of the image: indices of the points, their rows and columns, their depth."""
 
     which: Int
     place: tuple[Int, Int]
@@ -298,9 +302,9 @@ class _Pixels(NamedTuple):
 def _close(
     layers: Layers, cloud: Cloud, exposure: Exposure, rows: Int, body: MovingBody, front: _Front
 ) -> Bool:
-    """Put the surface of one body into ``layers``, the box of its front; return (h,w) where.
+    """Put the surface of one body into ``layers``, the box of its front; return (h,w) its pixels.
 
-    rows: of its points in the cloud.
+    rows: row numbers of the body's points in the cloud.
     """
     surface = _surface(layers, rows, front)
     surface_m = (1 / surface).astype(np.float32)
@@ -326,7 +330,7 @@ def _close(
 
 
 def _surface(layers: Layers, rows: Int, front: _Front) -> Float:
-    """Return (h,w) the inverse depth (1/m) of the surface of the body with these ``rows``."""
+    """Return the (h,w) inverse depth (1/m) of the surface of the body with points ``rows``."""
     inside = front.inverse > 0
     known_m = np.maximum(layers.depth_m, layers.rim_m)
     own = inside & (known_m > 0) & np.isin(layers.point, rows)
@@ -339,11 +343,11 @@ def _surface(layers: Layers, rows: Int, front: _Front) -> Float:
 def _shown(
     layers: Layers, cloud: Cloud, surface: Float, agree_m: Float32, share: Float
 ) -> tuple[Bool, Bool]:
-    """Return (h,w) the pixels that show a body, and those of them at which its returns count.
+    """Return (h,w) the pixels that show a body, and (h,w) those where its returns count.
 
     Other content inside its outline is removed from ``layers``. surface: (h,w) inverse depth of the
-    body, 1/m. agree_m: (h,w) tolerance of depth behind it. share: (h,w) of the rays that end on it,
-    0 outside its outline.
+    body, 1/m. agree_m: (h,w) tolerance of depth behind it. share: (h,w) share of the rays that end
+    on it, 0 outside its outline.
     """
     inside, now_m, surface_m = share > 0, layers.filled_m, (1 / surface).astype(np.float32)
     whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
@@ -365,7 +369,7 @@ def _shown(
 
 
 def _well_inside(closed: Bool, away_px: float) -> Bool:
-    """Return the pixels farther than this from those that are not closed, or not in the box."""
+    """Return the closed pixels farther than ``away_px`` from any open pixel of the box."""
     padded = np.pad(closed, 1, mode="edge").astype(np.uint8)
     distance_px = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     inside: Bool = distance_px > away_px
@@ -373,9 +377,9 @@ def _well_inside(closed: Bool, away_px: float) -> Bool:
 
 
 def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
-    """Return (h,w) the smooth offset o of the pixels ``inside``.
+    """Return the (h,w) smooth offset o of the pixels ``inside``.
 
-    It is the least of Σ known (o - offset)² + stiff Σ |∇o|² + held Σ o².
+    It minimises Σ known (o - offset)² + stiff Σ |∇o|² + held Σ o².
     """
     number = np.cumsum(inside).reshape(inside.shape) - 1
     across, down = inside[:, :-1] & inside[:, 1:], inside[:-1] & inside[1:]

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Find the first known pixel in sixteen directions, and fit planes through known pixels.
 
-A plane in space is linear in inverse depth over the image. Therefore planes are fitted in inverse
-depth.
+A plane in space is linear in inverse depth over the image, so planes are fitted in inverse depth.
 """
 
 from __future__ import annotations
@@ -14,12 +13,12 @@ from densify.geometry.arrays import Bool
 from densify.geometry.compiled import Kernel, inlined
 
 NONE = int(np.iinfo(np.uint8).max)
-"""Steps where there is no known pixel within 254."""
+"""Value of the number of steps if no known pixel is within 254 steps."""
 _LEAST, _MOST = 0.7, 1.4  # range of the extended inverse depth, relative to the start
 
 
 def _directions() -> NDArray[np.int64]:
-    """Return (16,2,2) columns and rows, see `DIRECTIONS`."""
+    """Return (16,2,2) offsets as in `DIRECTIONS`."""
     axis, diagonal = (1, 0), (1, 1)
     quarter = [(axis, (2, 0)), (axis, (2, 1)), (diagonal, (2, 2)), ((0, 1), (1, 2))]
     turn = np.array([[0, -1], [1, 0]])
@@ -28,14 +27,14 @@ def _directions() -> NDArray[np.int64]:
 
 
 DIRECTIONS = _directions()
-"""(16,2,2) (columns, rows) of the first step and of the first two together, clockwise from the
-right. Each step goes to one of the eight neighbours."""
+"""(16,2,2) offsets (columns, rows) after one step and after two steps in 16 directions, clockwise
+from the right. Each step goes to one of the eight neighbours."""
 
 
 def first_known(known: Bool) -> NDArray[np.uint8]:
-    """Return (16,H,W) the steps to the first known pixel in each of `DIRECTIONS`.
+    """Return the (16,H,W) steps to the first known pixel in each of `DIRECTIONS`.
 
-    They are 0 at a known pixel itself, and `NONE` without any.
+    The number is 0 at a known pixel, and `NONE` if there is no known pixel in the direction.
     """
     padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
     steps = padded[:, 2:-2, 2:-2]
@@ -46,9 +45,9 @@ def first_known(known: Bool) -> NDArray[np.uint8]:
 
 @Kernel
 def _march(steps):  # type: ignore[no-untyped-def]
-    """Fill the steps to known pixels.
+    """Fill in the steps to known pixels.
 
-    steps: (16,H,W), 0 at known pixels, with a border of two pixels that stays as it is.
+    steps: (16,H+4,W+4), 0 at known pixels, with a border of two pixels that stays unchanged.
     """
     height, width = steps.shape[1:]
     for d in range(len(DIRECTIONS)):
@@ -72,7 +71,7 @@ def _march(steps):  # type: ignore[no-untyped-def]
 
 @inlined
 def offset(d, k):  # type: ignore[no-untyped-def]
-    """Return columns and rows after k steps in direction d."""
+    """Return the offset in columns and rows after k steps in direction d."""
     du = (k // 2) * DIRECTIONS[d, 1, 0] + (k % 2) * DIRECTIONS[d, 0, 0]
     dv = (k // 2) * DIRECTIONS[d, 1, 1] + (k % 2) * DIRECTIONS[d, 0, 1]
     return du, dv
@@ -80,11 +79,13 @@ def offset(d, k):  # type: ignore[no-untyped-def]
 
 @inlined
 def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
-    """Return the inverse depth of the surface in pixel (v, u), extended by du columns and dv rows.
+    """Return the inverse depth of a pixel if the surface of pixel (v, u) is extended to it.
+
+    du and dv: columns and rows from the pixel to (v, u).
 
     Args:
-        inverse: (H,W) 1/m.
-        tilt: (H,W,2) slope of it, 1/m per px.
+        inverse: (H,W) inverse depth in 1/m.
+        tilt: (H,W,2) slope of the inverse depth to the right and down, 1/m per px.
     """
     there = inverse[v, u]
     here = there - tilt[v, u, 0] * du - tilt[v, u, 1] * dv
@@ -93,7 +94,7 @@ def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
 
 @inlined
 def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
-    """Return the slopes of the least-squares plane from centred second moments."""
+    """Return both slopes of the least-squares plane from centred second moments."""
     determinant = uu * vv - uv * uv
     return (vv * uw - uv * vw) / determinant, (uu * vw - uv * uw) / determinant
 
@@ -102,12 +103,12 @@ def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
 def plane(n, u, v, uu, uv, vv, w, uw, vw, ridge):  # type: ignore[no-untyped-def]
     """Return the inverse depth at the origin and both slopes of the least-squares plane.
 
-    The arguments are sums over the pixels of the weight and of its products with columns u, rows v
-    and inverse depths w.
+    The other arguments are sums over pixels: of the weight (n), and of the weight times products of
+    column offset u, row offset v and inverse depth w, as their names say.
 
     Args:
-        ridge: px² added to both variances, so that pixels on one line do not tilt the plane
-            across it.
+        ridge: Variance in px² added in both directions, so that pixels on one line do not tilt the
+            plane across the line.
     """
     u, v, w = u / n, v / n, w / n
     uu, vv, uv = uu / n - u * u + ridge, vv / n - v * v + ridge, uv / n - u * v

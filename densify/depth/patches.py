@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Compute the surface patch of each accumulated point.
 
-It is as large as the gap to the neighbouring rays of its own sweep, with the slant of its
-neighbours. On a plane the inverse range is normal · direction. Its derivatives by azimuth and
-elevation give the normal.
+A patch is as large as the spacing of the neighbouring rays of its own sweep, and tangent to the
+neighbouring points. On a plane the inverse range is normal · direction, so its derivatives by
+azimuth and elevation give the normal.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Bool, Cloud, Float, Float32, Patches
 
 FREE = 0.3, 0.015
-"""A point is seen through if it is nearer than all returns around by this much: the larger of a
+"""Least distance of a seen-through point in front of all returns around: the larger of a
 distance in metres and a share of the range."""
 _STEEP = 5.7  # greatest slope, 10 degrees of incidence; a steeper surface on one side is a step
 _BEND_M, _BEND = 0.10, 0.25  # greatest change of the slope, in metres and as a share
-_AROUND, _MOST_CELLS = 5.0, 20  # spacings within which rays without order have neighbours
+_AROUND, _MOST_CELLS = 5.0, 20  # radius of neighbours of unordered rays: spacings, most cells
 _RIDGE = 0.005  # share of the mean square distance of the neighbours
 
 
@@ -36,19 +36,20 @@ def patches(
     key_image: RangeImage | None = None,
     wanted: Bool | None = None,
 ) -> Patches:
-    """Return the patches of a cloud.
+    """Return the surface patches of a cloud.
 
-    A patch is tangent to the neighbours of the same scanner and sweep. If they are on no single
-    surface, it faces the scanner. A point of another sweep is free if the key sweep saw through it.
-    Only rays of the key count, because others rightly saw through the position that a moving object
-    reached later.
+    A patch is tangent to the neighbouring returns of the same scanner and sweep. If the neighbours
+    are on no single surface, the patch faces the scanner. ``free`` marks points of other sweeps
+    that the key sweep saw through. Only the key sweep decides, because other sweeps rightly saw
+    through positions that a moving object reached later.
 
     Args:
-        key: Frame of the key.
-        sensors: The scanners.
-        origins: (S,3) origins of the scanners, key frame, by frame.
-        key_image: Range image of the key sweep; without it nothing is ``free``.
-        wanted: (M,) points in view of a camera, all for None. Other points have only ``sweep``.
+        cloud: M accumulated points.
+        key: Frame number of the key sweep.
+        origins: (S,3) origins of the scanners, key sweep's lidar frame, by frame number.
+        key_image: Range image of the key sweep; if None, no point is ``free``.
+        wanted: (M,) True for points in view of a camera, None for all. Other points get only their
+            sweep number.
     """
     frames, inverse = np.unique(cloud.frame, return_inverse=True)
     sweep: NDArray[np.int32] = inverse.ravel().astype(np.int32)
@@ -66,7 +67,12 @@ def patches(
 
 
 def seen_through_by_key(points: Float, velocity_m_s: Float32, key_image: RangeImage) -> Bool:
-    """Return (N,) True for the points (N,3), key frame, that the key sweep saw through."""
+    """Return (N,) True for the points that the key sweep saw through.
+
+    Args:
+        points: (N,3) positions in metres, key sweep's lidar frame, at its reference time.
+        velocity_m_s: (N,3) velocities of the points in the same frame, without ego-motion.
+    """
     return key_image.sees_through(points, *FREE, velocity_m_s=velocity_m_s)
 
 
@@ -78,16 +84,16 @@ def tangents(
     sensors: Sensors,
     origins: Sequence[Float],
 ) -> tuple[Float32, Float32]:
-    """Return normals (M,3) and spacings (M,2) of the points ``wanted`` (M,).
+    """Return normals (M,3) and ray spacings (M,2) of the points ``wanted`` (M,), 0 for others.
 
-    A normal has any length: the plane is normal · (p - origin) = 1. Spacings are metres between
-    neighbouring rays, across and along elevation.
+    A point p is on the tangent plane if normal · (p - origin) = 1. Spacings are metres between
+    neighbouring rays, along the azimuth and along the elevation.
 
     Args:
-        points: (M,3) at their rigid positions.
-        lidar: (M,) number of the scanner.
-        sweep: (M,) index in ``origins``.
-        origins: (S,3) for each sweep.
+        points: (M,3) rigid positions in metres.
+        lidar: (M,) number of the scanner of each point.
+        sweep: (M,) index of each point's sweep in ``origins``.
+        origins: (S,3) origins of the scanners for each sweep, in the frame of the points.
     """
     normal = np.zeros((len(points), 3), np.float32)
     spacing_m = np.zeros((len(points), 2), np.float32)
@@ -114,7 +120,7 @@ def tangents(
 def _look(first, last, points, origins, place, seen):  # type: ignore[no-untyped-def]
     """Fill ``seen`` (3,N) float32 with azimuth, elevation (rad) and range (m) of points (N,3).
 
-    The origins are (P,3), numbered by ``place`` (N,).
+    Each point is seen from origin ``origins[place[i]]``, with origins (P,3) and place (N,).
     """
     for i in range(first, last):
         x = points[i, 0] - origins[place[i], 0]
@@ -139,7 +145,7 @@ def _cell(azimuth, elevation, grid):  # type: ignore[no-untyped-def]
 
 @inlined
 def _spacing(azimuth, elevation, table):  # type: ignore[no-untyped-def]
-    """Return spacings in rad, across and along, of a `densify.free_space.sensor.RayTable`."""
+    """Return the ray spacings in rad, along azimuth and elevation, from a `RayTable`."""
     row = min(max(int((elevation - table.low_rad) / table.bin_rad), 0), table.along.shape[0] - 1)
     columns = table.along.shape[1]
     column = int((azimuth + np.pi) * (columns / (2 * np.pi))) % columns
@@ -157,9 +163,9 @@ def _before(seen, i, j):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _nearest_in_cells(seen, members, grid, cells):  # type: ignore[no-untyped-def]
-    """Fill ``cells`` (R,C) int32 with the nearest of ``members`` (indices) in each, -1 none.
+    """Fill ``cells`` (R,C) int32 with the index of the nearest member in each cell, -1 none.
 
-    Between equally near ones the direction decides, not the order of the points.
+    members: (n,) indices of points. Between equally near points the direction decides.
     """
     cells[:] = -1
     for i in members:
@@ -171,7 +177,7 @@ def _nearest_in_cells(seen, members, grid, cells):  # type: ignore[no-untyped-de
 
 @inlined
 def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
-    """Return the point in the first filled cell at the given distances, -1 none."""
+    """Return the index of the point in the first filled cell at the given offsets, -1 none."""
     for k in range(len(rows)):
         r = row + rows[k]
         if 0 <= r < cells.shape[0]:
@@ -183,10 +189,10 @@ def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
 
 @inlined
 def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
-    """Return the slope from the changes of inverse range per radian on both sides (NaN: none).
+    """Return the slope of inverse range per radian from its slopes on both sides (NaN: unknown).
 
-    If both are on one surface it is their mean, else the lesser one, unless that is a step in
-    depth.
+    If both sides are on one surface it is their mean. Otherwise it is the lesser one, or 0 if that
+    is a step in depth. step: usual angle in rad.
     """
     metres = step * range_m * range_m  # of range per step, by a unit of slope
     if abs(one - other) * metres <= _BEND_M + _BEND * abs(one + other) * metres:
@@ -215,7 +221,10 @@ def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-unty
 
 @inlined
 def _put(i, seen, table, level, rise, normal, spacing):  # type: ignore[no-untyped-def]
-    """Fill a point's row from the change of inverse range per radian of azimuth and elevation."""
+    """Fill in normal and spacing of point i from its slopes of inverse range per radian.
+
+    level and rise: slopes along the azimuth and the elevation.
+    """
     azimuth, elevation, range_m = seen[0, i], seen[1, i], seen[2, i]
     across, along = _spacing(azimuth, elevation, table)
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
@@ -231,7 +240,7 @@ def _put(i, seen, table, level, rise, normal, spacing):  # type: ignore[no-untyp
 def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
     """Fill normal (N,3) and spacing (N,2) of points from neighbours on the ring, above and below.
 
-    members: (n,) indices. seen: (3,N). cells: of `_nearest_in_cells`.
+    members: (n,) indices of the points. seen: (3,N) of `_look`. cells: of `_nearest_in_cells`.
     """
     right, left = np.array([-2, -1, -3]), np.array([2, 1, 3])
     same = np.zeros(3, np.int64)
@@ -255,10 +264,10 @@ def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, s
 
 @Kernel
 def _tangents_anywhere(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
-    """Fill normal and spacing of points of rays without order.
+    """Fill normal and spacing of points of a scanner without rings, as `_tangents_on_rings` does.
 
-    It is least squares over the points around, then over those that the first plane fits. If it
-    does not fit half of them, the patch faces the scanner.
+    A plane is fitted by least squares to the points around, then to those points that it fits. If
+    the plane does not fit half of them, the patch faces the scanner.
     """
     num_rows, num_columns = cells.shape
     for k in range(first, last):
