@@ -75,8 +75,8 @@ def read_step(folder: Path, stretch: Stretch, here: int, there: int) -> FlowFiel
     Args:
         folder: Folder of the flow files.
         stretch: Registered sweeps.
-        here: Index in ``stretch.sweeps`` of the sweep.
-        there: Index in ``stretch.sweeps`` of the other sweep.
+        here: Index in ``stretch.sweeps`` of the source sweep, whose points are returned.
+        there: Index in ``stretch.sweeps`` of the target sweep.
 
     Raises:
         InputError: The flow file is missing, damaged or malformed.

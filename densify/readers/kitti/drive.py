@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Read the parts that KITTI's layouts share.
+"""Read what KITTI's data sets share: sweeps of the HDL-64E, images, stamps, calibration and poses.
 
-These are sweeps of the HDL-64E, images, stamps, calibration, and poses by GPS and inertial unit
-(oxts).
+Poses are measured by a GPS/IMU unit (oxts).
 """
 
 from __future__ import annotations
@@ -31,19 +30,24 @@ _STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
 
 
 class Drive(FileSequence):
-    """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped when it faces forward."""
+    """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped when it faces forward.
+
+    A subclass may set ``revolution_ns``, the duration of one revolution.
+    """
 
     revolution_ns: int = NOMINAL_PERIOD_NS
 
     def __init__(
         self, name: str, where: Path, sweeps: Path, truth: Path, images: Mapping[str, Path]
     ) -> None:
-        """Raise InputError if there are no sweeps.
+        """Find the sweeps and images; raise InputError if there are no sweeps.
 
         Args:
+            name: Name of the recording for people and outputs.
+            where: Path of the recording, for messages.
             sweeps: Folder of the .bin files.
-            truth: Folder that may hold exact truth.
-            images: Folders by camera.
+            truth: Folder whose subfolder ``truth`` may hold ground truth of a simulation.
+            images: Folder of images by camera name.
         """
         files = checks.numbered_files(sweeps, ".bin")
         if not files:
@@ -64,7 +68,10 @@ class Drive(FileSequence):
 
 
 def read_points(path: Path) -> tuple[Float, np.ndarray]:
-    """Return (N,3) metres, zeros where a position is not finite, and (N,) reflectance."""
+    """Read the (N,3) points (m, lidar frame) and (N,) reflectances (0 to 1) of a .bin file.
+
+    Points with a position that is not finite are returned as 0 0 0.
+    """
     data = read_bytes(path)
     if len(data) % 16:
         raise InputError(
@@ -77,21 +84,25 @@ def read_points(path: Path) -> tuple[Float, np.ndarray]:
 
 
 def turned_ns(points: Float, revolution_ns: int) -> Int:
-    """Return the firing times (N,) of (N,3) raw points since the scanner faced forward.
+    """Return the (N,) int64 firing times of points since the scanner faced forward.
 
-    They are ``-azimuth / 2π`` of the revolution.
+    They are ``-azimuth / 2π`` of a revolution, thus negative in its first half.
+
+    Args:
+        points: (N,3) points in the lidar frame, not deskewed.
+        revolution_ns: Duration of one revolution.
     """
     revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     return np.rint(revolution * revolution_ns).astype(np.int64)
 
 
 def read_stamps(path: Path) -> dict[int, int]:
-    """Return the stamps (ns) of a timestamps file by line from 0, which is the frame's number.
+    """Return the stamps (ns since 1970) of a timestamps file, by frame number.
 
-    Lines that are no stamps are left out.
+    Line k, counted from 0, belongs to frame k. Lines that are no stamps are skipped.
 
     Raises:
-        InputError: No line is a stamp.
+        InputError: The file has lines, but no line is a stamp.
     """
     lines = [line.strip() for line in read_text(path).splitlines()]
     stamps_ns = {}
@@ -111,18 +122,18 @@ def read_stamps(path: Path) -> dict[int, int]:
 
 
 def usual_period_ns(stamps_ns: Iterable[int]) -> int:
-    """Return the median time from one stamp to the next, the nominal one for fewer than two."""
+    """Return the median time between consecutive stamps; 100 ms for fewer than two stamps."""
     steps_ns = np.diff(list(stamps_ns))
     return int(np.median(steps_ns)) if len(steps_ns) else NOMINAL_PERIOD_NS
 
 
 def parse_oxts(text: str, where: str) -> Float:
-    """Return the (30,) numbers of an oxts record.
+    """Return the (30,) numbers of an oxts record, one measurement of the GPS/IMU unit.
 
-    They begin with latitude and longitude (deg), altitude (m), roll, pitch and yaw (rad).
+    The first six are latitude and longitude (deg), altitude (m), roll, pitch and yaw (rad).
 
     Raises:
-        InputError: The record is malformed. The message starts with ``where``.
+        InputError: The record is malformed. The message begins with ``where``.
     """
     values = checks.parse_numbers(text, where, 30)
     if abs(values[0]) >= 90:
@@ -131,13 +142,13 @@ def parse_oxts(text: str, where: str) -> Float:
 
 
 def T_mercator_imu(oxts: Float, first: Float) -> Float:
-    """Return the (4,4) pose on the Mercator plane (east, north, up).
+    """Return the (4,4) pose of the GPS/IMU unit on the Mercator plane (x east, y north, z up).
 
-    It is that of the devkit's convertOxtsToPose.
+    The pose is the same as in KITTI's devkit (convertOxtsToPose).
 
     Args:
-        oxts: (30,) the record.
-        first: (30,) the first record of the drive, whose latitude gives the scale.
+        oxts: (30,) record of the GPS/IMU unit.
+        first: (30,) first record of the drive, whose latitude determines the scale.
     """
     lat_deg, lon_deg, alt_m, roll, pitch, yaw = oxts[:6]
     scale_m = _EARTH_RADIUS_M * np.cos(np.deg2rad(first[0]))
@@ -153,7 +164,7 @@ def T_mercator_imu(oxts: Float, first: Float) -> Float:
 class Calibration:
     """A calibration file of lines ``KEY: numbers``, with or without the colon.
 
-    A malformed entry raises InputError, with file and key, when it is used.
+    A missing or malformed entry raises InputError, with file and key, when it is requested.
     """
 
     path: Path
@@ -161,7 +172,7 @@ class Calibration:
 
     @staticmethod
     def read(path: Path) -> Calibration:
-        """Return the entries of a file."""
+        """Read a calibration file; raise InputError if the file is missing."""
         if not path.is_file():
             raise InputError(
                 f"{path}: missing; expected KITTI's calibration there (it is a download of its own)"
@@ -170,40 +181,43 @@ class Calibration:
         return Calibration(path, {found[1]: found[2] for found in matches if found})
 
     def numbers(self, key: str, *shape: int) -> Float:
-        """Return the numbers of a key in this shape."""
+        """Return the numbers of an entry as an array of the given shape."""
         if key not in self.entries:
             raise InputError(f"{self.path}: no key {key}; got {', '.join(self.entries)}")
         where = f"{self.path}: {key}"
         return checks.parse_numbers(self.entries[key], where, int(np.prod(shape))).reshape(shape)
 
     def rotation(self, key: str) -> Float:
-        """Return (4,4) of the (3,3) rotation of a key."""
+        """Return the (4,4) transform of an entry with nine numbers, a (3,3) rotation."""
         T = np.eye(4)
         T[:3, :3] = checks.rotation(self.numbers(key, 3, 3), f"{self.path}: {key}")
         return T
 
     def motion(self, key: str) -> Float:
-        """Return (4,4) of the twelve numbers of a key, its upper rows."""
+        """Return the (4,4) transform of an entry with twelve numbers, its upper three rows."""
         return checks.rigid(self.numbers(key, 3, 4), f"{self.path}: {key}")
 
     def pose(self) -> Float:
-        """Return (4,4) of the keys R and T."""
+        """Return the (4,4) transform of the entries R (rotation) and T (translation)."""
         T = self.rotation("R")
         T[:3, 3] = self.numbers("T", 3)
         return T
 
     def size_px(self, key: str) -> tuple[int, int]:
-        """Return width and height."""
+        """Return the width and height of an entry with an image size."""
         width, height = self.numbers(key, 2)
         return int(width), int(height)
 
     def rectified_camera(
         self, key: str, name: str, size_px: tuple[int, int], T_rect_lidar: Float
     ) -> Camera:
-        """Return the camera of a projection matrix.
+        """Return the rectified camera of an entry with a projection matrix P = K [I | t].
 
         Args:
-            T_rect_lidar: (4,4) to the rectified camera 0, from which P = K [I | t] moves by t.
+            key: Key of the entry with P.
+            name: Name of the camera.
+            size_px: Width and height of the images.
+            T_rect_lidar: (4,4) transform from the lidar frame to the frame of rectified camera 0.
         """
         P = self.numbers(key, 3, 4)
         onto, T_cam_rect = P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), np.eye(4)

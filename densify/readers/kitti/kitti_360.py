@@ -9,12 +9,13 @@ Its drives are scenes::
     data_poses/2013_05_28_drive_0000_sync/poses.txt
     calibration/{calib_cam_to_pose.txt, calib_cam_to_velo.txt, perspective.txt, image_02.yaml, ...}
 
-- Frames are file numbers, with gaps; line ``frame`` (from 0) of a timestamp file is its stamp, the
-  middle of the turn.
-- Points are the HDL-64E's, as measured; their times follow from the azimuth and the usual period.
-- image_00 and image_01 are rectified; image_02 and image_03 are fisheyes to the sides by Mei's
-  model, used up to 90 degrees off the axis.
-- Poses are the vehicle's (inertial unit's). There are none where it stood; they are interpolated.
+- Frame numbers are file numbers; some are missing. Line ``frame`` (from 0) of a timestamp file is
+  the stamp of ``frame``, the middle of the revolution.
+- Points of the HDL-64E are not deskewed. Their firing times follow from the azimuth and the median
+  period.
+- image_00 and image_01 are rectified. image_02 and image_03 are fisheyes to the sides (Mei's
+  model), used up to 90 degrees off the axis.
+- Poses are the GPS/IMU unit's and are interpolated, since frames at standstill have no pose.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ _HALF_VIEW_DEG = 90.0
 
 
 def open_recording(path: Path, scene: str | None) -> Kitti360:
-    """See `densify.readers.ReaderModule`.
+    """Open a KITTI-360 drive; sweeps and images are read later, on request.
 
     Args:
-        path: The folder that holds data_3d_raw/.
-        scene: A drive such as ``2013_05_28_drive_0000_sync``.
+        path: Folder that contains data_3d_raw/.
+        scene: Name of a drive, ``2013_05_28_drive_0000_sync``; None if there is a single drive.
     """
     names = sorted(p.parent.name for p in (path / "data_3d_raw").glob("*/velodyne_points"))
     if not names:
@@ -57,17 +58,18 @@ def open_recording(path: Path, scene: str | None) -> Kitti360:
 
 
 class Kitti360(Drive):
-    """A drive as a `LidarSequence`."""
+    """A KITTI-360 drive as a `LidarSequence`."""
 
     def __init__(self, path: Path, drive: str) -> None:
-        """Read stamps, poses and calibration of a drive.
+        """Read stamps and calibration of a drive.
 
         Args:
-            path: The folder that holds data_3d_raw/.
+            path: Folder that contains data_3d_raw/.
+            drive: Name of the drive, such as ``2013_05_28_drive_0000_sync``.
 
         Raises:
-            InputError: The drive holds no sweeps, or its stamps or the calibration of cameras
-                with images are missing or malformed.
+            InputError: The drive has no sweeps, or its stamps or the calibration of cameras with
+                images are missing or malformed.
         """
         velodyne = path / "data_3d_raw" / drive / "velodyne_points"
         around = path / "data_2d_raw" / drive
@@ -85,7 +87,7 @@ class Kitti360(Drive):
         }
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the time at which the scanner faced forward."""
+        """Return the time (ns since 1970) at which the scanner faced forward in a sweep."""
         self.check_frame(frame)
         return checks.of_frame(self._recorded_ns, frame, "stamp", self._stamp_file)
 
@@ -96,7 +98,7 @@ class Kitti360(Drive):
 
     @cached_property
     def _track(self) -> PoseTrack:
-        """The path of the vehicle, at the stamps of the sweeps of the same number."""
+        """The poses of the vehicle, each at the stamp of the sweep with the same number."""
         T_world_pose = {}
         for number, line in enumerate(read_text(self._pose_file).splitlines(), 1):
             where = f"{self._pose_file}: line {number}"
@@ -112,7 +114,7 @@ class Kitti360(Drive):
 
 
 def _T_pose_lidar(folder: Path) -> Float:
-    """Return (4,4) the scanner in the vehicle's frame, by way of camera 0."""
+    """Return the (4,4) pose of the scanner in the vehicle's frame, computed through camera 0."""
     path = folder / "calib_cam_to_velo.txt"
     where = f"{path}: the transform from camera 0 to the scanner"
     T_lidar_cam = checks.rigid(checks.parse_numbers(read_text(path), where, 12), where)
@@ -133,7 +135,7 @@ def _camera(folder: Path, name: str) -> Camera:
 
 
 def _fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
-    """Return a fisheye camera. OpenCV writes ``%YAML:1.0`` where YAML has ``%YAML 1.0``."""
+    """Read a fisheye camera from OpenCV's YAML, whose first line YAML libraries reject."""
     given, _ = parse_yaml(read_text(path).replace("%YAML:1.0", "", 1), path)
     with described_in(path, "image_width, image_height, xi, k1 k2 p1 p2, gamma1 gamma2 u0 v0"):
         lens, onto = given["distortion_parameters"], given["projection_parameters"]

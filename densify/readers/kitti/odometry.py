@@ -6,13 +6,13 @@ SemanticKITTI (Behley et al., ICCV 2019) has the same sequences::
     dataset/sequences/00/velodyne/000000.bin   image_2/000000.png   calib.txt   times.txt
     dataset/poses/00.txt   or SemanticKITTI's  dataset/sequences/00/poses.txt
 
-- Frames are file numbers. ``times.txt`` has seconds since the first, when camera and scanner faced
-  forward; without it frame k is at k times 100 ms.
-- Points are the HDL-64E's, compensated to that time, without times. With poses the compensation is
-  undone in a few rounds: the time of a point follows from its azimuth at firing, which depends on
-  its time. Without poses ``offset_ns`` is None.
-- Images are rectified, as large as the first. ``calib.txt`` has their projections and ``Tr``,
-  camera 0 from the scanner. Poses are camera 0's, T_first_now: the scanner's are Tr⁻¹ P Tr.
+- Frame numbers are file numbers. ``times.txt`` has seconds since the first frame, at which camera
+  and scanner faced forward. Without this file frame k is at k times 100 ms.
+- Points of the HDL-64E are ego-motion compensated to that time and have no firing times. The reader
+  undoes the compensation with the poses, by fixed-point iteration: the firing time of a point
+  depends on its azimuth at firing, and vice versa. Without poses ``offset_ns`` is None.
+- Images are rectified and have the size of the first image. ``calib.txt`` has their projections and
+  ``Tr``, T_cam_lidar of camera 0. A pose P is T_first_now of camera 0; the scanner's is Tr⁻¹ P Tr.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ _NUM_ROUNDS = 3  # the azimuth changes by degrees at most
 
 
 def open_recording(path: Path, scene: str | None) -> KittiOdometry:
-    """See `densify.readers.ReaderModule`.
+    """Open a KITTI odometry sequence; sweeps and images are read later, on request.
 
     Args:
-        path: A sequence's folder, or one that holds some, or ``sequences/`` with some.
-        scene: A sequence's number such as ``00``.
+        path: Folder of a sequence, folder of sequences, or folder that contains ``sequences/``.
+        scene: Number of the sequence, such as ``00``; None if ``path`` has a single sequence.
     """
     if (path / "velodyne").is_dir() and scene is None:
         return KittiOdometry(path)
@@ -64,16 +64,13 @@ def open_recording(path: Path, scene: str | None) -> KittiOdometry:
 
 
 class KittiOdometry(Drive):
-    """A sequence as a `LidarSequence`."""
+    """A KITTI odometry sequence as a `LidarSequence`."""
 
     def __init__(self, path: Path) -> None:
-        """Read times, poses and calibration of a sequence.
-
-        Args:
-            path: Folder of the sequence.
+        """Read the stamps and the calibration in the folder of a sequence.
 
         Raises:
-            InputError: There are no sweeps, or times or the calibration of existing images are
+            InputError: There are no sweeps, or the stamps or the calibration of existing images are
                 missing or malformed.
         """
         images = {p.name: p for p in sorted(path.glob("image_[0-3]"))}
@@ -96,12 +93,12 @@ class KittiOdometry(Drive):
         }
 
     def gaps(self) -> list[str]:
-        """See `LidarSequence`."""
+        """Return a sentence about the assumed rate if times.txt is missing."""
         told = f"{self.where} has no times.txt: sweeps are taken for 100 ms apart"
         return [] if self._times_ns else [told]
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the time at which the scanner faced forward, since the first frame."""
+        """Return the time, since the first frame, at which the scanner faced forward in a sweep."""
         self.check_frame(frame)
         return self._time_ns(frame)
 
@@ -122,7 +119,7 @@ class KittiOdometry(Drive):
         return Returns(points, intensity, offset_ns)
 
     def _track_around(self, frame: int) -> PoseTrack | None:
-        """Return the scanner's path around a frame, from the poses beside it; None without two."""
+        """Return the scanner's poses at a frame and its neighbours, None for fewer than two."""
         path, lines = self._pose_lines
         near = [f for f in (frame - 1, frame, frame + 1) if f in lines]
         if len(near) < 2:
@@ -159,7 +156,7 @@ class KittiOdometry(Drive):
 
 
 def _read_times_ns(path: Path) -> dict[int, int]:
-    """Return stamps by line, from 0. Raise InputError if a line is no number or does not ascend."""
+    """Return stamps by line number from 0; InputError if a line is no number or does not ascend."""
     times_ns = StampFile.read(path, "s").stamp_ns
     for number, (before, now) in enumerate(pairwise(times_ns), 2):
         if now <= before:

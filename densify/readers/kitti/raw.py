@@ -2,8 +2,8 @@
 """Read KITTI raw drives as downloaded: a folder, with the calibration files in its parent.
 
 Geiger, Lenz, Stiller, Urtasun, "Vision meets Robotics: The KITTI Dataset", IJRR 2013. Frame numbers
-are file numbers, and files may be missing. Line ``frame`` (from 0) of each timestamp file belongs
-to ``frame``.
+are file numbers, and files may be missing. Line ``frame`` (from 0) of a timestamp file is the stamp
+of ``frame``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ forward. Drives 0002 and 0013 of 2011_09_26 record 10.50 ms (image_02) and 9.96 
 
 
 def open_recording(path: Path, scene: str | None) -> KittiRaw:
-    """See `densify.readers.ReaderModule`; a drive has no scenes."""
+    """Open a KITTI raw drive; ``scene`` is unused, since a drive has no scenes."""
     return KittiRaw(path)
 
 
@@ -45,19 +45,19 @@ class KittiRaw(Drive):
     """A KITTI raw drive as a `LidarSequence`.
 
     The stamp of a sweep is the middle of the revolution (``velodyne_points/timestamps.txt``, or k
-    times 100 ms). The time of a point follows from its azimuth and ``timestamps_start.txt``,
-    ``..._end.txt``; without these files ``offset_ns`` is None. Poses come from ``oxts/``. The world
-    is the frame of the inertial unit at the first oxts file.
+    times 100 ms). The firing time of a point follows from its azimuth, ``timestamps_start.txt`` and
+    ``timestamps_end.txt``; if a stamp file is missing, ``offset_ns`` is None. Poses come from
+    ``oxts/``. The world is the frame of the GPS/IMU unit at the first oxts file.
     """
 
     def __init__(self, path: Path | str) -> None:
-        """Read calibration and stamps; everything else is read on demand.
+        """Read calibration and stamps; everything else is read on request.
 
         Args:
-            path: The drive's folder, ``.../2011_09_26/2011_09_26_drive_0013_sync``.
+            path: Folder of the drive, ``.../2011_09_26/2011_09_26_drive_0013_sync``.
 
         Raises:
-            InputError: It holds no sweeps, or calibration or stamps are malformed.
+            InputError: The drive has no sweeps, or calibration or stamps are malformed.
         """
         drive = Path(path)
         velodyne = drive / "velodyne_points"
@@ -73,7 +73,7 @@ class KittiRaw(Drive):
         self._exposed_ns = {name: self._exposures_ns(name) for name in self._image_files}
 
     def gaps(self) -> list[str]:
-        """See `LidarSequence`."""
+        """Return missing files and what is assumed instead, a sentence each."""
         missing = [p.name for n, p in self._stamp_files.items() if n not in self._recorded]
         told = [f"{self.where / 'velodyne_points'} has no {', '.join(missing)}"] * bool(missing)
         if "" not in self._recorded:
@@ -85,11 +85,7 @@ class KittiRaw(Drive):
         ]
 
     def stamp_ns(self, frame: int) -> int:
-        """Return a sweep's reference time.
-
-        Raises:
-            InputError: The frame has no stamp.
-        """
+        """Return the reference time of a sweep; raise InputError if the frame has no stamp."""
         return self._recorded_ns("", frame) if self._recorded else frame * NOMINAL_PERIOD_NS
 
     def _recorded_ns(self, kind: str, frame: int) -> int:
@@ -110,10 +106,10 @@ class KittiRaw(Drive):
         return Returns(points, intensity, offset_ns)
 
     def _exposures_ns(self, camera: str) -> dict[int, int]:
-        """Return the exposure times of the existing images.
+        """Return the exposure times of the camera's existing images, by frame number.
 
-        They are the recorded stamps less `KITTI_TRIGGER_LATENCY_NS`, or the reference time of the
-        sweep if no stamp is recorded.
+        The exposure time is the recorded stamp minus `KITTI_TRIGGER_LATENCY_NS`, or the reference
+        time of the sweep if no stamp is recorded.
         """
         path, numbers = self.where / camera / "timestamps.txt", self._image_files[camera]
         exposed_ns = self._recorded.get("", {f: f * NOMINAL_PERIOD_NS for f in numbers})
@@ -123,10 +119,10 @@ class KittiRaw(Drive):
         return {frame: exposed_ns[frame] for frame in numbers if frame in exposed_ns}
 
     def _pose(self, frame: int) -> Float:
-        """Return the pose by GPS and inertial unit.
+        """Return the (4,4) T_world_lidar, interpolated between oxts records.
 
-        An oxts record is up to 20 ms away from the sweep of its number, which is 0.3 m at 15 m/s.
-        Therefore the pose is interpolated between the records around the sweep.
+        The oxts record of a frame number is up to 20 ms away from the sweep, 0.3 m at 15 m/s.
+        Without usable stamps the record's own pose is returned.
         """
         if not self._oxts:
             return super()._pose(frame)
@@ -161,9 +157,9 @@ class KittiRaw(Drive):
 
 
 def _beside(drive: Path) -> Path:
-    """Return the folder of the calibration.
+    """Return the folder of the calibration files, the parent of the drive.
 
-    It lies beside the drive as it is named, or beside the target of a link without any.
+    If the drive is a link and its parent has no calibration, return the parent of its target.
     """
     named, target = drive.absolute().parent, drive.resolve().parent
     return named if any(named.glob("calib_*.txt")) else target
@@ -174,10 +170,10 @@ def _camera_folders(drive: Path) -> list[str]:
 
 
 def _read_cameras(drive: Path) -> dict[str, Camera]:
-    """Return the cameras with a folder in the drive and a rectified calibration in its parent.
+    """Return the rectified cameras, by name, that have images and a calibration.
 
-    Of a drive without image folders all calibrated cameras are returned. ``T_cam_lidar`` is camera
-    0's rectification after ``calib_velo_to_cam``, moved by the camera's offset in ``P_rect``.
+    A drive without folders of images gets all calibrated cameras. ``T_cam_lidar`` is the product of
+    the camera's offset in ``P_rect``, camera 0's rectification and ``calib_velo_to_cam``.
     """
     folder, names = _beside(drive), _camera_folders(drive)
     files = [folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"]

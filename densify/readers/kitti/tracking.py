@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Read KITTI tracking (Geiger, Lenz, Urtasun, CVPR 2012).
 
-The place is the folder ``training`` or ``testing``, whose sequences are scenes::
+The path is the folder ``training`` or ``testing``, whose sequences are scenes::
 
     velodyne/0000/000000.bin   image_02/0000/000000.png   calib/0000.txt   oxts/0000.txt
     label_02/0000.txt    optional: tracked boxes, a line for each object and frame
 
-- Frames are file numbers; sweeps can be absent. Frame k and its images are at k times 100 ms.
-- Points are the HDL-64E's, as measured; their times follow from the azimuth, a turn lasting 100 ms.
-- Images are rectified, as large as the first. ``calib`` has their projections, R_rect, Tr_velo_cam
-  and Tr_imu_velo. Poses come from oxts; the world is the inertial unit's frame at frame 0.
+- Frame numbers are file numbers; sweeps can be missing. Sweep and images k are at k times 100 ms.
+- Points of the HDL-64E are not deskewed. Their firing times follow from the azimuth and a
+  revolution of 100 ms.
+- Images are rectified and have the size of the first image. ``calib`` has their projections,
+  R_rect, Tr_velo_cam and Tr_imu_velo. Poses come from oxts; the world is the frame of the GPS/IMU
+  unit at frame 0.
 - A label line is ``frame track type truncated occluded alpha left top right bottom height width
-  length x y z rotation_y [score]``: x y z of the middle of the box's bottom in the rectified camera
-  0, rotation_y about y, 0 where the front is along x, at the time at which the scanner faced it.
-  Only objects in view of image_02 are labelled; ``DontCare`` rectangles may hold more.
+  length x y z rotation_y [score]``. x y z is the middle of the box's bottom in rectified camera 0,
+  at the time at which the scanner faced the object. rotation_y is the heading about y, 0 along x.
+  Only objects in view of image_02 have boxes; ``DontCare`` rectangles may hold more objects.
 """
 
 from __future__ import annotations
@@ -45,11 +47,11 @@ _T_CAM_UPRIGHT = np.array(  # from x right, y forward, z up
 
 
 def open_recording(path: Path, scene: str | None) -> KittiTracking:
-    """See `densify.readers.ReaderModule`.
+    """Open a KITTI tracking sequence; sweeps and images are read later, on request.
 
     Args:
-        path: The folder that holds velodyne/.
-        scene: A sequence such as ``0000``.
+        path: Folder that contains velodyne/.
+        scene: Name of the sequence, such as ``0000``; None if there is a single sequence.
     """
     names = sorted(p.name for p in (path / "velodyne").glob("*") if p.is_dir())
     if not names:
@@ -58,17 +60,13 @@ def open_recording(path: Path, scene: str | None) -> KittiTracking:
 
 
 class KittiTracking(Drive):
-    """A sequence as a `LidarSequence`, at the nominal rate.
+    """A KITTI tracking sequence as a `LidarSequence`, with sweeps 100 ms apart.
 
     The stamp of a sweep is the time at which the scanner faced forward.
     """
 
     def __init__(self, path: Path, scene: str) -> None:
-        """Read the calibration of a sequence.
-
-        Args:
-            path: The folder that holds velodyne/.
-            scene: The sequence.
+        """Read the calibration of a sequence, in the folder ``path`` that contains velodyne/.
 
         Raises:
             InputError: There are no sweeps, or the calibration of existing images is missing or
@@ -88,7 +86,7 @@ class KittiTracking(Drive):
         }
 
     def gaps(self) -> list[str]:
-        """See `LidarSequence`."""
+        """Return the assumption about the rate, since the data set has no stamps."""
         return ["KITTI tracking has no stamps: sweeps are taken for 100 ms apart"]
 
     def _pose(self, frame: int) -> Float:
@@ -105,9 +103,10 @@ class KittiTracking(Drive):
         return T_world_imu @ poses.inverse(T_lidar_imu)
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `LidarSequence`; ``testing`` has none.
+        """Return the labelled boxes of a sweep in the lidar frame, None without labels.
 
-        Without images the smallest size of KITTI's is assumed.
+        Objects are labelled only in view of image_02; without images its smallest size is assumed.
+        A box is where the object was when the scanner faced it, at the box's ``offset_ns``.
 
         Raises:
             InputError: Labels or the calibration are missing or malformed.
@@ -137,7 +136,7 @@ class KittiTracking(Drive):
 
     @cached_property
     def _T_rect_lidar(self) -> Float:
-        """The (4,4) pose of the scanner in the rectified camera 0."""
+        """The (4,4) transform from the lidar frame to the frame of rectified camera 0."""
         return self._calibration.rotation("R_rect") @ self._calibration.motion("Tr_velo_cam")
 
     def _camera(self, name: str, size_px: tuple[int, int]) -> Camera:
@@ -145,7 +144,11 @@ class KittiTracking(Drive):
 
 
 def read_labels(path: Path) -> tuple[Float, Bool]:
-    """Return the (n,16) numbers of the lines, without the type, and an (n,) mask of ``DontCare``.
+    """Read a label file with n lines.
+
+    Returns:
+        (n,16) numbers of the lines, without the type and the score; (n,) mask, True for
+        ``DontCare`` rectangles, in which objects have no boxes.
 
     Raises:
         InputError: A line is malformed.
