@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Read recorded poses from text files, and interpolate the pose of a vehicle at any time.
 
-The files are KITTI's 3x4, 4x4, TUM's, and tables with a quaternion. Many data sets store each sweep
-compensated, as if it had been measured at one moment. That smears moving objects, hides their
-times, and bends rings. `PoseTrack.as_fired` undoes it.
+Pose files hold 3x4 matrices (KITTI), 4x4 matrices, TUM lines, or tables with a quaternion.
+
+Many data sets store each sweep ego-motion compensated, as if measured at one time. Compensation
+smears moving objects, hides the points' times, and bends rings. `PoseTrack.as_fired` undoes it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from densify.geometry.types import Float, Int
 from densify.readers import checks
 from densify.readers.stamp_files import TIME_COLUMNS, TextTable
 
-_MAX_BEYOND_NS = 200_000_000  # a pose is extrapolated at constant velocity for so long
+_MAX_BEYOND_NS = 200_000_000  # longest extrapolation of a pose, at constant velocity
 
 _PLACES = tuple((a, f"t{a}", f"p{a}", f"pos_{a}", f"position_{a}") for a in "xyz")
 _TURNS = tuple((f"q{a}", f"q_{a}", f"rot_{a}", f"orientation_{a}") for a in "wxyz")
@@ -30,12 +31,12 @@ _TURNS = tuple((f"q{a}", f"q_{a}", f"rot_{a}", f"orientation_{a}") for a in "wxy
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """The path of a vehicle.
+    """The path of a vehicle as n poses over time.
 
     Attributes:
-        where: The file, for messages.
-        stamp_ns: (n,) int64, ascending.
-        T_world_ego: (n,4,4).
+        where: File of the poses, for messages.
+        stamp_ns: (n,) int64 times of the poses, ascending.
+        T_world_ego: (n,4,4) poses of the vehicle (in some readers of the lidar) in the world.
     """
 
     where: str
@@ -50,7 +51,7 @@ class PoseTrack:
             )
 
     def at(self, time_ns: int) -> Float:
-        """Return (4,4) T_world_ego, interpolated between two poses.
+        """Return the pose T_world_ego (4,4) at a time, inter- or extrapolated at constant velocity.
 
         Raises:
             InputError: The time is more than 0.2 s before the first pose or after the last.
@@ -68,20 +69,22 @@ class PoseTrack:
         return poses.interpolate(self.T_world_ego[i], self.T_world_ego[i + 1], fraction)
 
     def as_fired(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Return (N,3) points in the vehicle frame at their own firing times, compensation undone.
-
-        Rows of zeros, with which formats pad, stay zeros.
+        """Undo ego-motion compensation: move points to the vehicle frame at their firing times.
 
         Args:
-            points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``.
-            stamp_ns: Time of that frame.
-            offset_ns: (N,) firing times since then.
+            points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``. Points at 0 0 0
+                (padding) stay unchanged.
+            stamp_ns: Reference time of the sweep.
+            offset_ns: (N,) firing times since ``stamp_ns``.
+
+        Returns:
+            (N,3) metres, each point in the vehicle frame at its own firing time.
         """
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
 
     def compensated(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Return (N,3) points in the vehicle frame at ``stamp_ns``, the inverse of `as_fired`."""
+        """Move (N,3) points as fired to the vehicle frame at ``stamp_ns``; undoes `as_fired`."""
         return self._carry(points, stamp_ns, offset_ns, inverse=False)
 
     def _carry(self, points: Float, stamp_ns: int, offset_ns: Int, inverse: bool) -> Float:
@@ -93,7 +96,7 @@ class PoseTrack:
         times_ns = [low, *inside, max(high, low + 1)]
         T_ref_ego = np.stack([T_ref_world @ self.at(t) for t in times_ns])
         since_ns = np.array([t - stamp_ns for t in times_ns], np.float64)
-        fired_ns, row = np.unique(offset_ns, return_inverse=True)  # beams fire together
+        fired_ns, row = np.unique(offset_ns, return_inverse=True)  # many points share a firing time
         turns = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))(fired_ns)[row]
         places_m = T_ref_ego[:, :3, 3].T
         shift_m = np.stack([np.interp(fired_ns, since_ns, p) for p in places_m], 1)[row]
@@ -104,12 +107,13 @@ class PoseTrack:
 
 @dataclass(frozen=True)
 class PoseFile:
-    """Poses as they are written, T_world_body unless more is known.
+    """The n poses of a text file, in the frames that the file uses (usually T_world_body).
 
     Attributes:
-        form: Form of the file, for people.
-        T: (n,4,4).
-        stamps_ns: Their times, None if the file has none.
+        path: File of the poses; the first file if each sweep has its own.
+        form: Name of the file's format, for messages.
+        T: (n,4,4) poses in file order.
+        stamps_ns: n times of the poses, None for a file without times.
     """
 
     path: Path
@@ -119,10 +123,11 @@ class PoseFile:
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
-        """Return the poses of a file.
+        """Read a file with one pose on each line, in any of the supported formats.
 
         Args:
-            unit: Of the times, "" to find it.
+            path: Text file of KITTI, 4x4 or TUM lines, or a table with named columns.
+            unit: Unit of the times (s, ms, us or ns), "" to find the unit.
 
         Raises:
             InputError: The file is malformed. The message names file and line.
@@ -153,7 +158,7 @@ class PoseFile:
 
     @staticmethod
     def read_each(paths: Sequence[Path]) -> PoseFile:
-        """Return the poses of files with one pose each.
+        """Read files with one pose each: 3x4 or 4x4 matrices, or x y z qx qy qz qw.
 
         Raises:
             InputError: A file is malformed.

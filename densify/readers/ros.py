@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Read ROS 1 bags and ROS 2 bags (.db3, .mcap) by the rosbags package, without ROS (extra ``ros``).
 
-``ros:PATH[#points=/topic,/topic&images=/topic,/topic&poses=/topic]``. A topic is chosen if it is
-the only one that fits, and must be named else. ``images=none`` and ``poses=none`` leave them out.
+``ros:PATH[#points=/topic,/topic&images=/topic,/topic&poses=/topic]``. If several topics fit, name
+the topic. ``images=none`` reads no images, ``poses=none`` no poses.
 
-points: PointCloud2 of any layout, or Livox's CustomMsg, in their header's frame, as fired from its
-    origin. Several lidars make one sweep in the frame of the first named: each of its messages
-    takes the others' nearest in time. /tf_static gives the origins of their rays.
-stamps: of the header (of the recording where that is 0): the reference time. Times of points count
-    from it, or are absolute (`densify.readers.point_fields`). Sweeps and images are numbered from 0
-    in the order of their stamps.
-images: Image or CompressedImage with the CameraInfo beside them: raw ones with K and D,
-    ``image_rect`` with P and R, in the frame of their header, fixed to the lidar's by /tf_static or
-    a /tf that never moves. A P that moves the camera sideways (stereo) is taken to agree.
-poses: Odometry, PoseStamped, or /tf: of the lidar by fixed frames, interpolated to the stamps.
+points: PointCloud2 of any layout, or Livox's CustomMsg, in the frame of the header, each point as
+    fired from the origin of this frame. Several lidars form one sweep in the frame of the first
+    named lidar: each message of the first is joined with the messages of the other lidars that are
+    nearest in time. /tf_static gives the lidars' positions, the origins of the rays.
+stamps: The time in the header (if 0, the time of recording) is the reference time. Point times
+    count from the stamp, or are absolute (`densify.readers.point_fields`). Sweeps and images are
+    numbered from 0 in the order of their stamps.
+images: Image or CompressedImage with the CameraInfo of the same namespace. Raw images use K and D,
+    ``image_rect`` uses P and R. The camera frame of the header is joined to the lidar frame by
+    /tf_static, or by a /tf that never moves. A stereo P with a sideways shift is assumed to agree.
+poses: Odometry, PoseStamped, or /tf, converted to the lidar by fixed frames and interpolated.
 """
 
 from __future__ import annotations
@@ -48,21 +49,23 @@ _USUAL_PERIOD_NS = 100_000_000
 
 
 def open_recording(path: Path, scene: str | None) -> RosBag:
-    """See `densify.readers.ReaderModule`.
+    """Open a ROS bag, as `densify.readers.ReaderModule` specifies.
 
     Args:
-        scene: Which topics, see above.
+        path: File or folder of the bag.
+        scene: Chosen topics, such as ``points=/lidar&images=none&poses=tf``; None to find them.
     """
     return RosBag(path, scene)
 
 
 class Lidar(NamedTuple):
-    """The topic of a lidar.
+    """A lidar of the bag.
 
     Attributes:
-        entries: Its messages.
-        T_first_lidar: (4,4) to the frame of the first lidar.
-        period_ns: Median step of its messages.
+        frame: Frame in the header of the messages.
+        entries: Index of the messages, by ascending stamp.
+        T_first_lidar: (4,4) pose of this lidar in the frame of the first lidar.
+        period_ns: Median time between consecutive messages.
     """
 
     topic: str
@@ -74,14 +77,17 @@ class Lidar(NamedTuple):
 
 
 class RosBag(FileSequence):
-    """A bag as a `LidarSequence`."""
+    """A ROS bag as a `LidarSequence`; the lidar frame is the frame of the first lidar."""
 
     def __init__(self, path: Path, options: str | None = None) -> None:
-        """Read the bag once, for the stamps of its messages.
+        """Index the bag: read all stamps, transforms and calibrations, and sample sweeps.
+
+        Args:
+            options: Chosen topics as in `open_recording`; None to find the topics.
 
         Raises:
-            InputError: The bag is damaged, or its topics, frames or calibrations are not
-                sufficient.
+            InputError: The bag is damaged, the lidar topic is not clear, or a named topic lacks a
+                frame or calibration.
         """
         self._bag = Bag(path)
         self._topics = topics = Topics.choose(self._bag, options)
@@ -114,7 +120,7 @@ class RosBag(FileSequence):
         super().__init__(path.resolve().name, path, frames, cameras, stamps, truth)
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """See `LidarSequence`."""
+        """Return the chosen topics and assumptions as pairs of a label and a text."""
         lines = []
         for lidar in self._lidars:
             found = lidar.layout
@@ -146,7 +152,7 @@ class RosBag(FileSequence):
         )
 
     def _returns_of(self, lidar: Lidar, entry: Entry, stamp_ns: int) -> Returns:
-        """Return a message's points in the first lidar's frame, timed since the sweep's stamp."""
+        """Return a message's points in the first lidar's frame, with times since ``stamp_ns``."""
         where = f"{self._bag.path}: {lidar.topic} at {entry.stamp_ns} ns"
         columns = cloud_columns(self._bag.message(lidar.topic, entry), where)
         found, valid = lidar.layout.returns(columns, where, entry.stamp_ns)
@@ -158,7 +164,7 @@ class RosBag(FileSequence):
         return replace(found, points=points, offset_ns=offset_ns)
 
     def gaps(self) -> list[str]:
-        """See `LidarSequence`."""
+        """Return a sentence for each topic whose headers lack stamps."""
         num = self._bag.num_unstamped
         return [
             f"{topic}: {num[topic]} headers have no stamp: taken is when they were recorded"
@@ -197,7 +203,7 @@ class RosBag(FileSequence):
 
     @cached_property
     def _track_and_words(self) -> tuple[PoseTrack | None, str]:
-        """Return the path of the first lidar, and its source in words."""
+        """Poses of the first lidar (None without poses), and their source or the reason as text."""
         chosen, lidar = self._topics.poses, self._lidars[0].frame
         if not chosen:
             return None, "none, as asked for"
@@ -220,6 +226,7 @@ class RosBag(FileSequence):
         return None, f"none: /tf does not tell where {lidar} was{hint}"
 
     def _lidar(self, topic: str) -> Lidar:
+        """Find frame, mounting and point fields of a lidar from some of its messages."""
         where, entries = f"{self._bag.path}: {topic}", self._index[topic]
         found = sample_columns(
             entries, lambda entry: cloud_columns(self._bag.message(topic, entry), where)
@@ -241,7 +248,7 @@ class RosBag(FileSequence):
         return Lidar(topic, frame, entries, T, period_ns, layout)
 
     def _camera(self, topic: str) -> Camera:
-        """Return the camera of a topic. Raise InputError without calibration or mounting."""
+        """Return the camera of a topic; raise InputError without images, CameraInfo or mounting."""
         place, places = place_of(topic), [place_of(t) for t in self._topics.images]
         where, info = f"{self._bag.path}: {topic}", f"{place}/camera_info"
         message = next(self._bag.messages(info), None) if info in self._bag.topics else None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Read messages of ROS 1 and ROS 2 bags by the rosbags package, without ROS.
 
-A bag is read once, for the time stamp in the header of every message that matters. Messages are
-then read one at a time.
+A bag is scanned once to index the header stamps of all messages of the used topics. Messages are
+then decoded one at a time.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
 
 
 class Entry(NamedTuple):
-    """The place of a message.
+    """Index entry that finds one message of a topic.
 
     Attributes:
-        stamp_ns: Of its header, or of its recording if that is 0.
-        log_ns: Time of its recording.
-        turn: Number among the messages of its topic that were recorded at that time.
+        stamp_ns: Time in the header of the message; the time of recording if the header has 0.
+        log_ns: Time at which the message was recorded.
+        turn: Index of the message among the topic's messages with the same ``log_ns``.
     """
 
     stamp_ns: int
@@ -62,10 +62,10 @@ class Entry(NamedTuple):
 
 
 class Topic(NamedTuple):
-    """A topic.
+    """A topic of a bag.
 
     Attributes:
-        type: Such as sensor_msgs/msg/PointCloud2, for both versions of ROS.
+        type: Message type in ROS 2 notation, such as sensor_msgs/msg/PointCloud2.
     """
 
     name: str
@@ -74,24 +74,24 @@ class Topic(NamedTuple):
 
 
 class Bag:
-    """A bag.
+    """A ROS 1 or ROS 2 bag, opened for reading.
 
     Attributes:
         path: A .bag, .db3 or .mcap file, the folder of a ROS 2 bag, or a folder of .bag files
             that are parts of one recording.
-        topics: By name.
-        num_unstamped: By topic, the number of indexed messages whose header has no stamp.
+        topics: Topics that have messages, by name.
+        num_unstamped: Number of indexed messages whose header has no stamp, by topic.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a bag. Raise InputError if it is no bag, or a damaged one."""
+        """Open a bag; raise InputError if the path is no bag or the bag is damaged."""
         self.path = path
         self._files = _bag_files(path)
         self._is_ros2 = not (self._files[0].suffix == ".bag" and self._files[0].is_file())
         self._types = message_types(self._is_ros2)
         for file in self._files:
             for part in [file] if file.is_file() else file.glob("*.*"):
-                open_file(part).close()  # says what is wrong with the file itself
+                open_file(part).close()  # raises a clear error for an unreadable file
         package = needed(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
         self._lock = RLock()
         self.num_unstamped = Counter[str]()
@@ -104,11 +104,14 @@ class Bag:
             raise self._unreadable(error) from error
 
     def of_type(self, *types: str) -> list[Topic]:
-        """Return the topics of one of these types, by name."""
+        """Return the topics whose message type is one of ``types``, sorted by name."""
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Return the messages of these topics by ascending stamp."""
+        """Index the messages of the topics: entries by topic, with ascending stamps.
+
+        The method also counts the messages without stamps in ``num_unstamped``.
+        """
         found: dict[str, list[Entry]] = {topic: [] for topic in topics}
         for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
             before = found[topic][-1] if found[topic] else None
@@ -122,7 +125,7 @@ class Bag:
         return {topic: sorted(entries) for topic, entries in found.items()}
 
     def message(self, topic: str, entry: Entry) -> Any:
-        """Return a message. Raise InputError if it cannot be read."""
+        """Decode the message of an index entry; raise InputError if it is missing or damaged."""
         found = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
         if len(found) <= entry.turn:
             raise InputError(f"{self.path}: no message of {topic} at {entry.log_ns} ns any more")
@@ -130,13 +133,14 @@ class Bag:
         return self._decoded(raw, type_, topic)
 
     def messages(self, topic: str) -> Iterator[Any]:
-        """Yield all messages of a topic, in the order of their recording."""
+        """Yield all decoded messages of a topic in the order of recording."""
         for name, _, raw, type_ in self._messages([topic]):
             yield self._decoded(raw, type_, name)
 
     def _messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes, str]]:
+        """Yield topic, recording time (ns), raw bytes and message type, by recording time."""
         parts = []
         for reader in self._readers:
             wanted = [c for c in reader.connections if c.topic in topics]
@@ -146,14 +150,14 @@ class Bag:
             try:
                 for connection, log_ns, raw in heapq.merge(*parts, key=lambda part: part[1]):
                     yield connection.topic, log_ns, raw, connection.msgtype
-            except Exception as error:  # as above
+            except Exception as error:  # the parser may raise any type
                 raise self._unreadable(error) from error
 
     def _decoded(self, raw: bytes, type_: str, topic: str) -> Any:
         decode = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
         try:
             return decode(raw, type_)
-        except Exception as error:  # as above
+        except Exception as error:  # the parser may raise any type
             raise InputError(
                 f"{self.path}: {topic}: a message of {len(raw)} bytes is no whole {type_} "
                 f"({reason(error)})"
@@ -164,9 +168,9 @@ class Bag:
 
 
 def message_types(is_ros2: bool) -> Any:
-    """Return the types of messages as ROS defines them.
+    """Return the rosbags type store with the standard, /tf and Livox message types.
 
-    Definitions in a bag are not used, because rosbags makes code of definitions.
+    Definitions in a bag are not used, because rosbags turns definitions into executable code.
     """
     typesys = needed("rosbags.typesys", "ros", "ROS bags")
     stores = typesys.Stores
@@ -178,7 +182,7 @@ def message_types(is_ros2: bool) -> Any:
 
 
 def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
-    """Return the topics with messages, of all parts of the recording, by name."""
+    """Return the topics with messages over all files of the recording, by name."""
     found: dict[str, Topic] = {}
     for connection in (c for reader in readers for c in reader.connections if c.msgcount):
         name = connection.topic
@@ -189,9 +193,9 @@ def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
 
 
 def _bag_files(path: Path) -> list[Path]:
-    """Return the files to open: the file, the folder of a ROS 2 bag, or the bags in a folder.
+    """Return the paths to open: a file, a ROS 2 bag's folder, or all .bag files in a folder.
 
-    Raises InputError if there are none.
+    Raises InputError for a path without a bag.
     """
     suffixes = (".bag", ".db3", ".mcap")
     if (path.is_file() and path.suffix in suffixes) or (path / "metadata.yaml").is_file():
@@ -211,10 +215,10 @@ def _bag_files(path: Path) -> list[Path]:
 
 
 def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
-    """Return the stamp in the header that a message begins with."""
-    if is_ros2:  # an encapsulation of four bytes, whose second tells the order
+    """Return the stamp (ns) of the header with which a raw message begins, 0 if not set."""
+    if is_ros2:  # a CDR header of 4 bytes comes first; byte 1 is the byte order
         seconds, nanoseconds = struct.unpack_from("<iI" if raw[1] & 1 else ">iI", raw, 4)
-    else:  # a sequence number
+    else:  # a sequence number of 4 bytes comes first
         seconds, nanoseconds = struct.unpack_from("<II", raw, 4)
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
@@ -224,10 +228,11 @@ class Topics:
     """The topics of a bag that are used.
 
     Attributes:
-        points: Of the lidars. The messages of the first are the sweeps.
-        images: Of the cameras.
-        poses: A topic, ``tf``, or "" for none.
-        named: The topics that the user named; a problem with them is an error.
+        points: Topics of the lidars. Each message of the first topic is a sweep.
+        images: Topics of the cameras' images.
+        poses: Topic of the poses, ``tf`` for /tf, or "" to read no poses.
+        named: Options that the user gave (points, images, poses). A problem with a named topic is
+            an error; other unusable topics are skipped.
     """
 
     points: tuple[str, ...]
@@ -237,14 +242,14 @@ class Topics:
 
     @staticmethod
     def choose(bag: Bag, options: str | None) -> Topics:
-        """Return the topics to use.
+        """Choose the topics to read, by the user's options and the message types.
 
         Args:
-            options: The text after ``#``.
+            options: Text after ``#`` in ``--data``, such as ``points=/lidar&poses=tf``.
 
         Raises:
-            InputError: A topic does not exist, several could be the sweeps, or there are no
-                sweeps.
+            InputError: A named topic does not exist or has another type, or not exactly one topic
+                of point clouds exists and the user named no topic.
         """
         given = dict(parse_qsl(options or "", keep_blank_values=True))
         wrong = [key for key in given if key not in ("points", "images", "poses")]
@@ -268,7 +273,7 @@ class Topics:
 
 
 def _only_cloud(bag: Bag) -> str:
-    """Return the topic of the points, if there is one."""
+    """Return the only topic of point clouds; raise InputError for no or several topics."""
     found = bag.of_type(*_CLOUDS)
     if len(found) == 1:
         return found[0].name
@@ -284,7 +289,7 @@ def _only_cloud(bag: Bag) -> str:
 
 
 def _guessed_images(topics: Sequence[str]) -> list[str]:
-    """Return the best topic of each camera: rectified before raw, whole before compressed."""
+    """Return one image topic for each camera, preferably rectified, then uncompressed."""
     best: dict[str, str] = {}
     for topic in sorted(topics, key=lambda t: ("rect" not in t, t.endswith("/compressed"), t)):
         if not _NO_PICTURES.search(topic.lower()):
@@ -293,7 +298,7 @@ def _guessed_images(topics: Sequence[str]) -> list[str]:
 
 
 def place_of(topic: str) -> str:
-    """Return the namespace: ``/front/image_raw/compressed`` -> ``/front``, as its calibration."""
+    """Return the camera's namespace: ``/front/image_raw/compressed`` gives ``/front``."""
     return topic.removesuffix("/compressed").rpartition("/")[0]
 
 

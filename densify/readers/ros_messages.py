@@ -20,7 +20,7 @@ from densify.readers.ros_bag import Bag
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _LIVOX = {"x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "offset_time": "u4", "line": "u1"}
-_MODELS = {  # densify's name of a lens's model, and possible numbers of coefficients
+_MODELS = {  # densify's lens model, and allowed numbers of coefficients
     "plumb_bob": ("pinhole", (4, 5)),
     "radtan": ("pinhole", (4, 5)),
     "rational_polynomial": ("pinhole", (8, 12, 14)),
@@ -51,12 +51,12 @@ _FIXED_M = 1e-6  # frames that move less, in metres or radians, are fixed
 
 
 def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
-    """Return the fields of a PointCloud2 or Livox's CustomMsg by name, (N,) each as stored.
+    """Return the fields of a PointCloud2 or Livox CustomMsg by name, an array (N,) each as stored.
 
-    Fields of several numbers are left out.
+    Fields with several numbers for a point are left out.
 
     Raises:
-        InputError: The layout contradicts itself.
+        InputError: A field lies outside the bytes of a point, or data is too short.
     """
     if not hasattr(message, "point_step"):
         rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
@@ -81,7 +81,7 @@ def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
 
 
 def _rows(message: Any, step: int, item_bytes: int, where: str) -> NDArray[np.uint8]:
-    """Return the rows of a message's data without their padding, (height, width · item_bytes)."""
+    """Return a message's data without row padding, as bytes (height, width · item_bytes)."""
     data, used = np.ascontiguousarray(message.data, np.uint8), message.width * item_bytes
     if step < used or len(data) < message.height * step:
         raise InputError(
@@ -93,10 +93,10 @@ def _rows(message: Any, step: int, item_bytes: int, where: str) -> NDArray[np.ui
 
 
 def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
-    """Return the (H,W,3) of an Image or CompressedImage.
+    """Return an Image or CompressedImage message as (H,W,3) uint8 RGB.
 
     Raises:
-        InputError: Its encoding is not known, or it is damaged.
+        InputError: The encoding is not supported, or the data is damaged.
     """
     import cv2
 
@@ -121,15 +121,15 @@ def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
 
 
 def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, where: str) -> Camera:
-    """Return the camera of a CameraInfo, with its binning and region of interest.
+    """Convert a CameraInfo message to a camera, adjusted for binning and region of interest.
 
     Args:
-        T_optical_lidar: (4,4) to the frame of the message.
-        rectified: The images are rectified, and the calibration is P, turned by R. Else it is K
-            with D.
+        T_optical_lidar: (4,4) pose of the lidar in the optical frame named by the message.
+        rectified: True for rectified images, which use P and the rotation R; False for raw images,
+            which use K and the distortion D.
 
     Raises:
-        InputError: The model is unknown, or the numbers are no calibration.
+        InputError: The distortion model is unknown, or the calibration is not valid.
     """
     matrix = {  # ROS 1 writes K, ROS 2 k
         key: np.asarray(getattr(info, key if hasattr(info, key) else key.upper()), np.float64)
@@ -153,6 +153,7 @@ def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, whe
 
 
 def _lens(named: str, distortion: tuple[float, ...], where: str) -> tuple[str, tuple[float, ...]]:
+    """Return densify's lens model and coefficients for ROS's distortion model and D."""
     model, counts = _MODELS.get(named, ("pinhole", ()))
     if not any(distortion) and model == "pinhole":
         return "pinhole", ()
@@ -167,9 +168,9 @@ def _lens(named: str, distortion: tuple[float, ...], where: str) -> tuple[str, t
 
 
 def _binned(camera: Camera, info: Any) -> Camera:
-    """Return the camera of an image that is a part of the sensor or has fewer pixels.
+    """Adjust a camera to the region of interest and the binning of a CameraInfo.
 
-    A pixel of the image is the mean of several. Therefore centres shift by half a pixel.
+    Binning averages several sensor pixels, which moves pixel centres relative to the corner.
     """
     roi, by = info.roi, np.array([max(1, info.binning_x), max(1, info.binning_y)])
     size = [roi.width or camera.width_px, roi.height or camera.height_px]
@@ -185,11 +186,12 @@ def _binned(camera: Camera, info: Any) -> Camera:
 
 @dataclass(frozen=True)
 class Transforms:
-    """The transforms of a bag.
+    """The tree of coordinate frames of a bag.
 
     Attributes:
-        fixed: T_parent_child by child, with its parent.
-        moving: The same over time.
+        where: Path of the bag, for messages.
+        fixed: Name of the parent frame and the constant pose T_parent_child (4,4), by child frame.
+        moving: Name of the parent frame and the path T_parent_child over time, by child frame.
     """
 
     where: str
@@ -198,10 +200,10 @@ class Transforms:
 
     @staticmethod
     def read(bag: Bag) -> Transforms:
-        """Read all of /tf_static and /tf. Frames that never move in /tf are fixed too.
+        """Read all transforms of /tf_static and /tf. A frame that never moves in /tf is fixed.
 
         Raises:
-            InputError: A transform is no rigid motion.
+            InputError: A transform is not a rigid motion.
         """
         found = Transforms(str(bag.path))
         heard: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
@@ -225,7 +227,7 @@ class Transforms:
         return found
 
     def between(self, target: str, source: str) -> Float | None:
-        """Return (4,4) T_target_source over fixed frames, None if they are not connected."""
+        """Return T_target_source (4,4) along fixed frames; None if no fixed frames join the two."""
         ways: dict[str, list[tuple[str, Float]]] = defaultdict(list)
         for child, (parent, T) in self.fixed.items():
             ways[child].append((parent, T))
@@ -240,9 +242,13 @@ class Transforms:
         return found.get(target)
 
     def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
-        """Return the path of a frame by /tf in the nearest moving parent, and the parent's name.
+        """Return the path of a frame over time, from /tf; None if the frame never moves.
 
-        The nearest parent is ``odom`` rather than ``map``, which jumps at loop closures.
+        The path is relative to the nearest moving parent in the tree: usually ``odom``, not
+        ``map``, which jumps at loop closures.
+
+        Returns:
+            Name of this parent, and the poses T_parent_frame over time.
         """
         T_body_frame, body, passed = np.eye(4), frame, {frame}
         while body in self.fixed and body not in self.moving:
@@ -258,13 +264,17 @@ class Transforms:
 
 
 def recorded_track(bag: Bag, topic: str, transforms: Transforms, lidar: str) -> PoseTrack:
-    """Return the path of the lidar by a topic of odometry or poses.
+    """Read the path T_world_lidar from a topic of odometry or poses.
 
-    Odometry is that of its child frame. A pose without one is that of the lidar.
+    Odometry gives the pose of its child frame, which fixed transforms join to the lidar. Poses
+    without a child frame are assumed to be poses of the lidar itself.
+
+    Args:
+        lidar: Name of the lidar's frame.
 
     Raises:
-        InputError: That frame is not connected to the lidar's, or there are fewer than two
-            poses.
+        InputError: No fixed frames join the child frame to the lidar, or the topic has fewer than
+            two poses.
     """
     found, where = dict[int, Float](), f"{bag.path}: {topic}"
     for message in bag.messages(topic):
@@ -287,12 +297,12 @@ def _track(where: str, by_stamp: dict[int, Float]) -> PoseTrack:
 
 
 def plain(frame: str) -> str:
-    """Return the name of a frame as ROS 2 writes it."""
+    """Return the name of a frame without leading and trailing slashes, as in ROS 2."""
     return frame.strip("/")
 
 
 def stamp_of(header: Any) -> int:
-    """Return the stamp of a header in nanoseconds."""
+    """Return the stamp of a message header in nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 

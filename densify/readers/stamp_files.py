@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Read times in the names of files and in text files.
 
-Times since 1970 (the years 2000 to 2099) tell their unit by their size. Others are in seconds
-unless a unit is given.
+The unit of times since 1970 is found from their size, for the years 2000 to 2099. Other times are
+in seconds unless a unit is given.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from densify.config.file_content import read_text
 from densify.readers.point_fields import UNIT_NS
 
 _EPOCH_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)
-_LONGEST_STEP_NS = 3_900_000_000  # from sweep to sweep, or image to image
+_LONGEST_STEP_NS = 3_900_000_000  # between sweeps or images
 _SECONDS_AND_NS = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})(?!\d)")
 _FILE_COLUMNS = ("filename", "file", "name", "image", "sweep", "path")
 TIME_COLUMNS = ("timestamp", "time", "stamp", "t")
-_MAX_NUMBER_DIGITS = 18  # a longer number is no frame's
+_MAX_NUMBER_DIGITS = 18  # a longer number is no frame number
 _MOST_NS = 2**63
 
 
@@ -32,8 +32,8 @@ class Named(NamedTuple):
     """A file and the number or time in its name.
 
     Attributes:
-        number: None without one.
-        stamp_ns: None if it is no time since 1970.
+        number: Number in the name; None for a name with a time or without digits.
+        stamp_ns: Time in the name in nanoseconds; None for a name without a time.
     """
 
     path: Path
@@ -42,13 +42,14 @@ class Named(NamedTuple):
 
 
 def named(path: Path, unit: str = "") -> Named:
-    """Return the number or the time in the name of a file.
+    """Find the frame number or the time in the name of a file.
 
     ``0000000120`` and ``cloud_12`` are numbers. ``1317042651.468569638``, ``1317042651_468569638``
     and ``1317042651468`` are times since 1970.
 
     Args:
-        unit: If given, the last number in the name is a time in this unit.
+        unit: Unit of the last number in the name (s, ms, us or ns), which is then a time; "" to
+            recognise times since 1970 only.
     """
     words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
     if unit:
@@ -66,7 +67,7 @@ def named(path: Path, unit: str = "") -> Named:
 
 
 def in_ns(text: str, unit: str) -> int:
-    """Return a decimal number of this unit as nanoseconds, every digit kept. Raises ValueError."""
+    """Convert a decimal number in ``unit`` to ns, exactly; raise ValueError if impossible."""
     try:
         value = Decimal(text)
     except InvalidOperation:
@@ -80,7 +81,7 @@ def in_ns(text: str, unit: str) -> int:
 
 
 def date_ns(text: str) -> int:
-    """Return a date and time in UTC as nanoseconds since 1970, every digit kept.
+    """Convert an ISO date and time in UTC to nanoseconds since 1970 without loss of digits.
 
     Raise ValueError for other texts, and for years beyond 64 bits, which numpy would wrap.
     """
@@ -91,7 +92,7 @@ def date_ns(text: str) -> int:
 
 
 def _epoch_unit(text: str) -> str:
-    """Return the unit in which this is a time since 1970, "" without one."""
+    """Return the unit in which a number is a time from 2000 to 2099, "" if no unit fits."""
     for unit in UNIT_NS:
         try:
             if _EPOCH_NS[0] <= in_ns(text, unit) < _EPOCH_NS[1]:
@@ -102,11 +103,12 @@ def _epoch_unit(text: str) -> str:
 
 
 class TextTable(NamedTuple):
-    """Words of a text file, separated by blanks, commas, semicolons or tabs.
+    """Table of a text file, with columns separated by blanks, commas, semicolons or tabs.
 
     Attributes:
-        names: Of the columns, in lower case, if the first line has them.
-        lines: Number of each row.
+        names: Names of the columns in lower case; empty without a line of names.
+        lines: Line number of each row in the file, from 1.
+        rows: Words of each row.
     """
 
     path: Path
@@ -116,13 +118,14 @@ class TextTable(NamedTuple):
 
     @staticmethod
     def read(path: Path, known: Collection[str]) -> TextTable:
-        """Return the table of a file.
+        """Read the table of a file.
 
         Args:
-            known: A first line with one of these words names the columns, or one behind a #.
+            known: Possible names of columns. The first line names the columns if it contains one of
+                these names or starts with ``#``.
 
         Raises:
-            InputError: There are no rows, or a row has fewer words than the first.
+            InputError: The file has no rows, or a row has fewer words than the first row.
         """
         names: list[str] = []
         lines: list[int] = []
@@ -147,18 +150,19 @@ class TextTable(NamedTuple):
         return TextTable(path, names, lines, rows)
 
     def column(self, choices: Collection[str]) -> int | None:
-        """Return the number of the first column with one of these names."""
+        """Return the index of the first of the names in ``choices`` that is a column, else None."""
         found = (self.names.index(name) for name in choices if name in self.names)
         return next((i for i in found if i < len(self.rows[0])), None)
 
     def times_ns(self, column: int, unit: str) -> tuple[tuple[int, ...], str]:
-        """Return the times of a column, dates or numbers, and their unit.
+        """Return the times of a column in nanoseconds, and the unit in the file ("date" for dates).
 
         Args:
-            unit: "" for the unit of times since 1970, or else seconds.
+            column: Index of the column.
+            unit: Unit of the numbers; "" to find the unit of times since 1970, else use seconds.
 
         Raises:
-            InputError: A word is no time, or the usual step in an assumed unit is too long.
+            InputError: A word is no time, or the median step is too long for assumed seconds.
         """
         times = [words[column] for words in self.rows]
         dates = "-" in times[0][1:] and ":" in times[0]
@@ -185,8 +189,9 @@ class StampFile(NamedTuple):
     """The times of a text file, line by line.
 
     Attributes:
-        unit: Of the times.
-        names: File that each line belongs to, if the lines have names.
+        stamp_ns: Time of each line in nanoseconds.
+        unit: Unit of the times in the file: s, ms, us, ns or date.
+        names: Name of the sweep or image file of each line; None if lines have only times.
     """
 
     path: Path
@@ -196,12 +201,12 @@ class StampFile(NamedTuple):
 
     @staticmethod
     def read(path: Path, unit: str = "") -> StampFile:
-        """Return the times of a file: one time a line, or columns with a time and possibly a name.
+        """Read the times of a file with a time on each line, among other columns or alone.
 
         Times are numbers, or dates such as 2011-09-26 13:10:51.158069617.
 
         Args:
-            unit: See `TextTable.times_ns`.
+            unit: Unit of the numbers, "" to find the unit as in `TextTable.times_ns`.
 
         Raises:
             InputError: The file is malformed. The message names file and line.

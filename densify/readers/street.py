@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Provide the built-in street as a recording. Frames are rendered on demand and cached.
+"""Provide the built-in simulated street as a recording. Frames are rendered on demand and cached.
 
-``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``. It lasts 16 seconds: at
-10 Hz frames 0 to 159. The cache is in the cache directory of the user, or in the folder named by
-the environment variable DENSIFY_CACHE_DIR. It can be deleted at any time: a frame rendered again is
-the same, byte for byte.
+``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``. The recording lasts 16
+seconds (frames 0 to 159 at 10 Hz). The cache is in the cache directory of the user, or in the
+folder named by the environment variable DENSIFY_CACHE_DIR. The cache can be deleted at any time,
+because rendering is reproducible byte for byte.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _NUMBERS = "expected degrees of tilt from -45 to 45, hz 5, 10, 20, seed a whole 
 
 
 class Street:
-    """The built-in street; members as in `LidarSequence`."""
+    """The built-in simulated street; members as in `LidarSequence`."""
 
     def __init__(
         self,
@@ -48,19 +48,19 @@ class Street:
         tilt_deg: float = 0.0,
         cameras: tuple[str, ...] = USUAL,
     ) -> None:
-        """Open the street.
+        """Set up the street; sweeps and images are rendered on demand.
 
         Args:
-            preset: street, static (nothing else moves), crossing (the ego vehicle stands) or
-                highway.
-            seed: Another scene of that kind.
-            sensor: Of `densify.street.sensors.SENSORS`.
-            hz: 5, 10 or 20 sweeps per second.
-            tilt_deg: Pitch of the sensor's mount, nose down; the cameras stay.
-            cameras: Of `densify.street.cameras.CAMERAS`.
+            preset: Kind of scene: street, highway, static (only the ego vehicle moves) or crossing
+                (the ego vehicle does not move).
+            seed: Seed of the random scene.
+            sensor: Name of a lidar in `densify.street.sensors.SENSORS`.
+            hz: Sweeps per second: 5, 10 or 20.
+            tilt_deg: Pitch of the lidar's mount in degrees, nose down; cameras are not tilted.
+            cameras: Names of cameras in `densify.street.cameras.CAMERAS`.
 
         Raises:
-            InputError: A value does not exist.
+            InputError: A name is unknown, or a number is outside its range.
         """
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)
@@ -84,10 +84,10 @@ class Street:
 
     @staticmethod
     def from_spec(spec: str) -> Street:
-        """Return the street of ``street``, ``street:crossing?seed=2&sensor=vlp16`` and so on.
+        """Create a street from a text such as ``street:crossing?seed=2&sensor=vlp16``.
 
         Raises:
-            InputError: The text is something else.
+            InputError: The text has another form, or an option or value is unknown.
         """
         head, _, query = spec.partition("?")
         reader, _, preset = head.partition(":")
@@ -117,28 +117,28 @@ class Street:
         )
 
     def keep_nothing(self) -> None:
-        """Stop using the cache folder, because nobody will need this street again."""
+        """Disable the cache folder, for a street that is rendered only once."""
         self._cache = None
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep."""
+        """Return the reference time of a sweep (ns)."""
         self.check(frame)
         return self.simulator.stamp_ns(frame)
 
     def returns(self, frame: int) -> Returns:
-        """Return the returns of a sweep, with the bodies that they are from."""
+        """Return the lidar returns of a sweep as fired, with the simulated bodies that they hit."""
         self.check(frame)
         return self._returns(frame)
 
     def prepare(self, frames: Sequence[int], images: Sequence[tuple[str, int]] = ()) -> None:
-        """Render missing frames into the cache, on all cores."""
-        _ = self.simulator.scene.world.triangles  # otherwise each thread might make them
+        """Render missing sweeps and images (camera, number) into the cache, on all cores."""
+        _ = self.simulator.scene.world.triangles  # made once, before threads start
         with ThreadPoolExecutor(num_threads()) as pool:
             list(pool.map(lambda image: self.picture(*image), images))
             list(pool.map(self.returns, frames))
 
     def picture(self, camera: str, number: int) -> Picture:
-        """Return the image of a camera with its exact depth and its bodies."""
+        """Return an image with the exact depth and the simulated body at each pixel."""
         stamps_ns = self.image_stamps_ns(camera)
         if number not in stamps_ns:
             raise InputError(
@@ -147,17 +147,17 @@ class Street:
         return self._picture(camera, number)
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
-        """Return (H,W,3) RGB."""
+        """Return image ``number`` of a camera as (H,W,3) uint8 RGB."""
         return self.picture(camera, number).image
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """Return the exposure times of the camera, by image number from 0."""
+        """Return the exposure times (ns) of a camera's images, by image number from 0."""
         _check("camera", camera, self.cameras)
         return self.simulator.image_stamps_ns(camera)
 
     @cached_property
     def bodies(self) -> Bodies:
-        """The poses of every body at every frame's reference time."""
+        """Poses of the scanner and of all simulated bodies at the reference time of each frame."""
         return self._kept("bodies", self._posed, lambda: self.simulator.bodies)
 
     def _kept_returns(self, frame: int) -> Returns:
@@ -176,7 +176,7 @@ class Street:
         return kept(self._cache, step, lambda: inputs, rendered)
 
     def T_world_lidar(self, frame: int) -> Float:
-        """Return the true (4,4) pose at the sweep's reference time."""
+        """Return the true pose T_world_lidar (4,4) at the sweep's reference time."""
         self.check(frame)
         return self.bodies.T_world_lidar[frame]
 
@@ -188,32 +188,36 @@ class Street:
 
 @dataclass(frozen=True)
 class StreetTruth:
-    """Exact truth of a street; members as in `Truth`."""
+    """Exact ground truth of a simulated street; members as in `Truth`."""
 
     _street: Street
 
     def sweep(self, frame: int) -> SweepTruth:
-        """Return the truth of a sweep.
+        """Return the ground truth of a sweep's N raw points, row by row.
 
-        Its points are the raw points at the reference time, each moved with its body.
+        Each point is moved from its firing time to the reference time with its body. Positions are
+        in the lidar frame at the reference time.
         """
         returns = self._street.returns(frame)
         points = self._street.simulator.in_bodies(frame, returns)
         return self._street.bodies.sweep(frame, returns.body, returns.instance, points)
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return (N,3) displacements, exactly 0 for points that are static between the frames."""
+        """Return the true scene flow (N,3) in metres of a sweep's points to the time of ``target``.
+
+        Flow excludes ego-motion and is in the lidar frame of ``frame``; it is 0 for static points.
+        """
         self._street.check(target)
         returns = self._street.returns(frame)
         points = self._street.simulator.in_bodies(frame, returns)
         return self._street.bodies.displacement(frame, target, returns.body, points)
 
     def depth_m(self, camera: str, number: int) -> Float32:
-        """Return (H,W) the exact depth of an image, 0 for none."""
+        """Return an image's true depth (H,W) in metres by `Camera.measure`, 0 without a surface."""
         return self._street.picture(camera, number).depth_m
 
     def moving_mask(self, camera: str, number: int) -> Bool:
-        """Return (H,W) True at moving objects of an image."""
+        """Return a mask (H,W) of an image, True for pixels of moving objects."""
         body = self._street.picture(camera, number).body
         simulator, frames = self._street.simulator, self._street.frames
         since_ns = simulator.image_stamps_ns(camera)[number] - simulator.stamp_ns(0)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Know the times of a recording's sweeps, their neighbours, and the part that a run reads.
+"""Order the sweeps of a recording by time, find neighbouring sweeps, and read sweeps and cameras.
 
-Neighbours are found by stamps, not by numbers: a drive without every second file has half the rate.
+Neighbours are found by stamps: a drive without every second file is a recording of half the rate.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from densify.config.errors import InputError
 from densify.free_space.lone_returns import without_lone
 from densify.geometry.types import Camera, Int, LidarSequence, Sweep, Trajectory
 
-_HOLE_PERIODS = 3.1  # three periods and some jitter
+_HOLE_PERIODS = 3.1  # a longer step is a hole in time: 3 periods and some jitter
 _MOST_RANGES = 8
-_NOMINAL_PERIOD_NS = 100_000_000  # of a recording of one sweep
+_NOMINAL_PERIOD_NS = 100_000_000  # period of a recording with one sweep
 
 
 class WindowFrames(NamedTuple):
-    """Sweeps around a key.
+    """The window of sweeps around a key frame.
 
     Attributes:
-        frames: Ascending, with the key.
-        cuts: Reasons for a smaller window than asked for, a clause each.
+        frames: Frame numbers in the window, ascending, including the key frame.
+        cuts: Reasons why the window is smaller than requested, a clause for each cut side.
     """
 
     frames: tuple[int, ...]
@@ -37,7 +37,7 @@ class WindowFrames(NamedTuple):
 
 
 def runs(frames: Iterable[int]) -> list[range]:
-    """Return ascending frames as ranges without missing numbers."""
+    """Group ascending frame numbers into ranges of consecutive numbers."""
     found: list[range] = []
     for frame in frames:
         if found and frame == found[-1].stop:
@@ -48,7 +48,7 @@ def runs(frames: Iterable[int]) -> list[range]:
 
 
 def format_frames(frames: Iterable[int]) -> str:
-    """Return frame numbers for people: ``96-135, 140``. Long lists are cut in the middle."""
+    """Format frame numbers for messages, as ``96-135, 140``; long lists are shortened."""
     texts = [f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs(sorted(frames))]
     if len(texts) > _MOST_RANGES:
         texts = [*texts[: _MOST_RANGES - 1], "...", texts[-1]]
@@ -56,7 +56,7 @@ def format_frames(frames: Iterable[int]) -> str:
 
 
 def check_window(window: int) -> None:
-    """Raise InputError unless it is a number of sweeps on each side of a key."""
+    """Raise InputError unless the window is a whole number of sweeps, 0 or more."""
     if isinstance(window, bool) or not isinstance(window, int | np.integer) or window < 0:
         raise InputError(
             f"--window {window!r}: expected a whole number of sweeps on each side of the key, 0 or "
@@ -65,7 +65,7 @@ def check_window(window: int) -> None:
 
 
 def check_key(key: int) -> None:
-    """Raise InputError unless it is the number of a frame."""
+    """Raise InputError unless the key frame is a whole number."""
     if isinstance(key, bool) or not isinstance(key, int | np.integer):
         raise InputError(f"--key {key!r}: expected a frame's number, a whole one")
 
@@ -75,11 +75,10 @@ class Timeline:
     """The reference times of a recording.
 
     Attributes:
-        name: Of the recording.
-        frames: (n,) of all its sweeps, ascending.
-        stamp_ns: (n,) int64 reference times.
-        unknown: Frame -> reason for which its stamp is unknown or out of order. Its row in
-            ``stamp_ns`` is interpolated.
+        name: Name of the recording.
+        frames: Numbers of all n sweeps, ascending.
+        stamp_ns: (n,) int64 reference times of the sweeps; interpolated for ``unknown`` sweeps.
+        unknown: Reason why a stamp is unknown or out of order, by frame number.
     """
 
     name: str
@@ -89,7 +88,7 @@ class Timeline:
 
     @staticmethod
     def of(sequence: LidarSequence) -> Timeline:
-        """Return the timeline of a recording, by its stamps alone."""
+        """Read the stamps of a recording's sweeps, without points; replace unusable stamps."""
         frames, unknown = tuple(sequence.frames), {}
         stamps_ns = np.zeros(len(frames), np.int64)
         for row, frame in enumerate(frames):
@@ -113,18 +112,18 @@ class Timeline:
 
     @cached_property
     def period_ns(self) -> int:
-        """Return the median time from one sweep to the next."""
+        """Median time between consecutive sweeps."""
         if len(self.frames) < 2:
             return _NOMINAL_PERIOD_NS
         return max(1, int(np.median(np.diff(self.stamp_ns))))
 
     def num_in(self, duration_s: float) -> int:
-        """Return the usual number of sweeps in that time; half a sweep counts."""
+        """Return the number of sweeps in a duration at the median rate, rounded."""
         return int(duration_s * 1e9 / self.period_ns + 0.5)
 
     @cached_property
     def row(self) -> Mapping[int, int]:
-        """Return frame -> index in ``frames``."""
+        """Index in ``frames`` by frame number."""
         return {frame: row for row, frame in enumerate(self.frames)}
 
     def stamp_of(self, frame: int) -> int:
@@ -132,15 +131,15 @@ class Timeline:
         return int(self.stamp_ns[self.row[frame]])
 
     def within(self, begin_ns: int, end_ns: int) -> list[int]:
-        """Return the frames with begin_ns <= stamp < end_ns."""
+        """Return the frame numbers with begin_ns <= stamp < end_ns, ascending."""
         inside = (self.stamp_ns >= begin_ns) & (self.stamp_ns < end_ns)
         return [self.frames[row] for row in np.flatnonzero(inside)]
 
     def runs(self, frames: Collection[int]) -> list[list[int]]:
-        """Return the frames, ascending, in series without gaps.
+        """Split frame numbers into ascending series of consecutive sweeps.
 
-        A gap is a sweep that is missing from ``frames``, or a hole in time of more than three usual
-        periods.
+        A series ends where a sweep of the recording is missing from ``frames``, or before a hole in
+        time of more than 3.1 median periods.
         """
         runs: list[list[int]] = []
         for row in sorted(self.row[f] for f in frames):
@@ -151,15 +150,15 @@ class Timeline:
         return [[self.frames[row] for row in run] for run in runs]
 
     def before(self, frame: int, num: int) -> list[int]:
-        """Return the ``num`` frames directly before this one, fewer behind a hole in time."""
+        """Return up to ``num`` frames directly before a frame, ascending, up to a hole in time."""
         return [self.frames[row] for row in self._next_to(frame, -1, num)[::-1]]
 
     def after(self, frame: int, num: int) -> list[int]:
-        """Return the ``num`` frames directly after this one, fewer before a hole in time."""
+        """Return up to ``num`` frames directly after a frame, ascending, up to a hole in time."""
         return [self.frames[row] for row in self._next_to(frame, 1, num)]
 
     def _next_to(self, frame: int, step: int, num: int) -> list[int]:
-        """Return up to ``num`` rows on one side of a frame, from it to a hole in time."""
+        """Return up to ``num`` indices on a frame's side, nearest first, up to a hole in time."""
         start, end = self.row[frame], len(self.frames) if step > 0 else -1
         rows = range(start + step, end, step)[:num]
         holes = (n for n, row in enumerate(rows) if self._hole_before(max(row, row - step)))
@@ -168,16 +167,16 @@ class Timeline:
     def window(
         self, key: int, window: int, left_out: Mapping[int, str] | None = None
     ) -> WindowFrames:
-        """Return the key and ``window`` existing sweeps on each side of it.
+        """Return the key frame and up to ``window`` sweeps before and after the key frame.
 
-        A side ends early at the end of the recording, at a hole in time, and at a sweep that is
-        left out.
+        A side ends early at the end of the recording, a hole in time, or an unusable sweep.
 
         Args:
-            left_out: Frame -> reason for which it cannot be used.
+            window: Number of sweeps on each side.
+            left_out: Reason why a sweep cannot be used, by frame number.
 
         Raises:
-            InputError: The key does not exist.
+            InputError: The key frame does not exist, or the window is not valid.
         """
         check_window(window)
         if key not in self.row:
@@ -192,9 +191,9 @@ class Timeline:
     def _side(
         self, key: int, step: int, window: int, left_out: Mapping[int, str]
     ) -> tuple[list[int], str]:
-        """Return the frames on one side of the key, outwards.
+        """Return the frames on one side of the key frame, nearest first.
 
-        Also return the reason for which there are fewer than ``window``, "" for none.
+        The second value is the reason for fewer than ``window`` frames, "" for a full side.
         """
         side = [self.frames[row] for row in self._next_to(key, step, window)]
         for n, frame in enumerate(side):
@@ -217,13 +216,13 @@ class Timeline:
 
 
 def _out_of_order(stamps_ns: Int) -> list[int]:
-    """Return the rows, ascending, outside the longest series of ascending stamps.
+    """Return the indices of stamps outside the longest ascending subsequence.
 
-    The result is empty if they are half of all rows or more.
+    Return no indices if these stamps are half of all stamps or more.
     """
     if np.all(np.diff(stamps_ns) > 0):
         return []
-    best: list[int] = []  # the row of the lowest stamp at which a series of each length ends
+    best: list[int] = []  # by length: index of the lowest stamp that ends such a series
     before: list[int] = []
     for row, stamp_ns in enumerate(stamps_ns.tolist()):
         length = bisect_left(best, stamp_ns, key=lambda end: int(stamps_ns[end]))
@@ -239,7 +238,9 @@ def _out_of_order(stamps_ns: Int) -> list[int]:
 
 
 def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) -> Sweep:
-    """Return a sweep of the returns `in_range`, without times if it is not to be deskewed.
+    """Read a sweep with only the returns kept by `in_range`.
+
+    Without ``settings.deskew`` the sweep has no firing times (``offset_ns`` is None).
 
     Raises:
         InputError: The sweep cannot be read.
@@ -249,9 +250,10 @@ def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) 
 
 
 def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
-    """Return the sweep without returns of the own vehicle and without very far returns.
+    """Remove returns nearer than ``min_range_m`` (the own vehicle) or farther than ``max_range_m``.
 
-    Both are measured from the scanner. In snow, rain and dust it is without lone returns too.
+    Ranges are measured from the scanner that fired. In snow, rain and dust, returns without
+    neighbours are removed too. The returned copy counts the removed near and lone returns.
     """
     origins_m = sweep.scanner_origins
     x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T
@@ -262,12 +264,12 @@ def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
-    """Return the cameras of these names.
+    """Return the cameras with the given names, in this order.
 
-    For None return all with images, or all cameras if none has images.
+    If ``names`` is None, return all cameras with images, or all cameras if there are no images.
 
     Raises:
-        InputError: A camera does not exist. The message names those that do.
+        InputError: A camera does not exist. The message names the existing cameras.
     """
     if isinstance(names, str) or not isinstance(names, Iterable | None):
         one = [*sequence.cameras][:1]
@@ -283,7 +285,7 @@ def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list
 
 
 def recorded_trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep]) -> Trajectory:
-    """Return the data set's own poses of the sweeps."""
+    """Return the recorded poses of the sweeps at their reference times, as a trajectory."""
     return Trajectory(
         frames=tuple(s.frame for s in sweeps),
         stamp_ns=np.array([s.stamp_ns for s in sweeps], np.int64),

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Read and write exact truth beside a recording: the motion of bodies, and the body of each point.
+"""Read and write exact ground truth of a simulated recording: body motion and each point's body.
 
-Layout of a ``truth/`` folder, with the frame numbers of the recording::
+A body is a rigid part of the scene; body 0 is the static world. Layout of a ``truth/`` folder, with
+the frame numbers of the recording::
 
-    bodies.npz             T_world_lidar (F,4,4) the scanner at the reference time of frames 0..F-1,
-                           T_world_body (F,B,4,4) every body then (body 0 is the static world),
-                           moving (F,B) whether the body's object moves around that time
-    points/0000000120.npz  of each point of the sweep, row by row: body (N,) int32,
+    bodies.npz             T_world_lidar (F,4,4): scanner poses at the reference times of F frames
+                           T_world_body (F,B,4,4): poses of B bodies at the reference times
+                           moving (F,B) bool: the body's object moves around the reference time
+    points/0000000120.npz  arrays for the N raw points of the sweep, row by row: body (N,) int32,
                            instance (N,) int32 (-1 none), point (N,3) float64 in the body's frame
-    depth/image_02/0000000120.npz  depth_m (H,W) float32 camera z at the camera's own time, 0 none,
-                           moving (H,W) bool
+    depth/image_02/0000000120.npz  depth_m (H,W) float32: camera z at the exposure, 0 if empty
+                           moving (H,W) bool: pixels of moving objects
 """
 
 from __future__ import annotations
@@ -29,27 +30,25 @@ _BODIES = ("T_world_lidar", "T_world_body", "moving")
 
 
 def write_bodies(folder: Path, bodies: Bodies) -> None:
-    """Write the poses of bodies.
-
-    Args:
-        folder: The ``truth`` folder, made if needed.
-    """
+    """Write the poses of the scanner and all bodies to ``bodies.npz`` in the ``truth`` folder."""
     _save(folder / "bodies.npz", **{name: getattr(bodies, name) for name in _BODIES})
 
 
 def write_points(
     folder: Path, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], point: Float
 ) -> None:
-    """Write the body of each point of a sweep.
+    """Write the body, object and body-fixed position of each of a sweep's N raw points.
 
     Args:
-        point: (N,3) in the frame of its body.
+        body: (N,) index of the body of each point.
+        instance: (N,) number of the object of each point, -1 for points of no object.
+        point: (N,3) metres, position in the frame of the point's body.
     """
     _save(_points_path(folder, frame), body=body, instance=instance, point=point)
 
 
 def write_depth(folder: Path, camera: str, frame: int, depth_m: Float32, moving: Bool) -> None:
-    """Write the depth of a camera and a mask of moving objects, (H,W) each."""
+    """Write an image's true depth (H,W) in metres and a mask (H,W) of moving objects."""
     _save(_depth_path(folder, camera, frame), depth_m=depth_m, moving=moving)
 
 
@@ -67,34 +66,38 @@ def _depth_path(folder: Path, camera: str, frame: int) -> Path:
 
 
 class FileTruth:
-    """`Truth` from a truth folder."""
+    """Ground truth (`Truth`) read from a ``truth`` folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Open a truth folder. Raise InputError if its bodies.npz is missing or damaged."""
+        """Read ``bodies.npz`` of a truth folder; raise InputError if it is missing or damaged."""
         self._folder = folder
         self.bodies = Bodies(*_load(folder / "bodies.npz", *_BODIES))
 
     def sweep(self, frame: int) -> SweepTruth:
-        """Return the truth of a sweep."""
+        """Return the ground truth of a sweep's N raw points, in the lidar frame at its stamp."""
         body, instance, point = self._points(frame)
         return self.bodies.sweep(frame, body, instance, point)
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return (N,3) true displacements."""
+        """Return the true scene flow (N,3) in metres of a sweep's points to the time of ``target``.
+
+        Flow excludes ego-motion and is in the lidar frame of ``frame``.
+        """
         body, _, point = self._points(frame)
         return self.bodies.displacement(frame, target, body, point)
 
     def depth_m(self, camera: str, frame: int) -> Float32:
-        """Return (H,W) the exact depth of an image, 0 for none."""
+        """Return the true depth (H,W) of an image in metres, 0 for pixels without a surface."""
         depth_m: Float32 = _load(_depth_path(self._folder, camera, frame), "depth_m")[0]
         return depth_m
 
     def moving_mask(self, camera: str, frame: int) -> Bool:
-        """Return (H,W) True at moving objects of an image."""
+        """Return a mask (H,W) of an image, True for pixels of moving objects."""
         moving: Bool = _load(_depth_path(self._folder, camera, frame), "moving")[0]
         return moving
 
     def _points(self, frame: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Float]:
+        """Return body (N,), instance (N,) and body-fixed position (N,3) of a sweep's points."""
         self.bodies.check(frame)
         path, num_bodies = _points_path(self._folder, frame), self.bodies.moving.shape[1]
         body, instance, point = _load(path, "body", "instance", "point")

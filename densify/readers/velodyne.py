@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Read packets of a Velodyne scanner, a ``.pcap`` file, by velodyne-decoder.
 
-It needs the extra ``velodyne``. The packets do not tell the model reliably: name it, as in
-``velodyne:FILE.pcap#HDL-32E``.
+It needs the extra ``velodyne``. The packets do not identify the model reliably. Therefore name the
+model, as in ``velodyne:FILE.pcap#HDL-32E``.
 
-A sweep is a turn that begins and ends straight behind, to a packet, numbered from 0, decoded on
-demand. Turns cut off at the ends of the file are left out. The stamp is the computer's, of the last
-packet. ``offset_ns`` is from the packets' clock and the firing order of the model. Points are as
-measured, in the scanner's frame: x forward (azimuth 0), y left, z up. There are neither cameras nor
-poses.
+A sweep is a turn that begins and ends straight behind the scanner, to the accuracy of a packet.
+Sweeps are numbered from 0 and decoded on demand. Incomplete turns at the ends of the file are left
+out. The stamp of a sweep is the time at which the computer captured its last packet. ``offset_ns``
+is computed from the packets' clock and the firing order of the model. Points are as measured, in
+the scanner's frame: x forward (azimuth 0), y left, z up. There are no cameras and no poses.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ MODELS = {
     "VLP-32C": "VLP32C",
     "VLS-128": "VLS128",
 }
-"""A user's name of a model, and the decoder's."""
+"""Names of models in the decoder, by the names that users give."""
 
-_PAYLOAD = 1206  # bytes of a packet of returns
-_MAX_HEADERS = 64  # bytes before it: Ethernet, perhaps a VLAN's, IP, UDP
-_FLAGS = (b"\xff\xee", b"\xff\xdd")  # that it begins with
-_BEHIND = 18_000  # hundredths of a degree
-_WHOLE = 0.9  # of the usual number of packets
+_PAYLOAD = 1206  # bytes of a packet with returns
+_MAX_HEADERS = 64  # bytes of Ethernet, VLAN, IP and UDP headers before the packet
+_FLAGS = (b"\xff\xee", b"\xff\xdd")  # first bytes of a packet with returns
+_BEHIND = 18_000  # azimuth straight behind, hundredths of a degree
+_WHOLE = 0.9  # smallest share of the usual packets in a complete turn
 _PCAP = {  # magic number -> byte order, nanoseconds per unit of the fraction
     b"\xd4\xc3\xb2\xa1": ("<", 1000),
     b"\xa1\xb2\xc3\xd4": (">", 1000),
@@ -50,11 +50,11 @@ _PCAP = {  # magic number -> byte order, nanoseconds per unit of the fraction
 
 
 def open_recording(path: Path, scene: str | None) -> Velodyne:
-    """See `densify.readers.ReaderModule`.
+    """Open a Velodyne capture, as `densify.readers.ReaderModule` specifies.
 
     Args:
-        path: The capture.
-        scene: The model.
+        path: Capture, a ``.pcap`` file.
+        scene: Name of the scanner's model, one of `MODELS`.
     """
     if scene not in MODELS:
         got = "no model" if scene is None else f"the model {scene}"
@@ -66,13 +66,13 @@ def open_recording(path: Path, scene: str | None) -> Velodyne:
 
 
 class Velodyne(FileSequence):
-    """A capture as a `LidarSequence`. The stamp of a sweep is the capture of its last packet."""
+    """A Velodyne capture as a `LidarSequence`, stamped at the last packet of each sweep."""
 
     def __init__(self, path: Path, model: str) -> None:
-        """Open a capture.
+        """Find the packets and turns of a capture; sweeps are decoded on demand.
 
         Args:
-            model: A row of `MODELS`.
+            model: Name of the scanner's model, one of `MODELS`.
 
         Raises:
             InputError: The file is no capture, or holds less than one turn.
@@ -112,10 +112,11 @@ class Velodyne(FileSequence):
 
 
 def _find_packets(path: Path) -> tuple[Int, Int, Int]:
-    """Return the (P,) packets of returns.
+    """Find the P packets with returns in a capture.
 
-    Returns of each the position of its payload, its capture time (ns), and the azimuth of its first
-    firing (hundredths of a degree).
+    Returns:
+        Three arrays (P,): byte offset of the packet's payload in the file, capture time (ns), and
+        azimuth of the packet's first firing (hundredths of a degree).
     """
     found = []
     with open_file(path) as file:
@@ -149,7 +150,7 @@ def _find_packets(path: Path) -> tuple[Int, Int, Int]:
 
 
 def _turns(azimuth: Int) -> list[range]:
-    """Return the packets of each whole turn."""
+    """Return the packet indices of each complete turn, from azimuths (P,) in 0.01 degrees."""
     from_behind = (azimuth - _BEHIND) % 36_000
     first = [0, *(np.flatnonzero(np.diff(from_behind) < -_BEHIND) + 1).tolist(), len(azimuth)]
     turns = [range(a, b) for a, b in pairwise(first)]

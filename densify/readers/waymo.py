@@ -6,21 +6,22 @@ Sun et al., CVPR 2020::
     ROOT/{lidar,lidar_calibration,vehicle_pose}/CONTEXT.parquet
     ROOT/{camera_image,camera_calibration,lidar_box}/CONTEXT.parquet    optional
 
-ROOT is ``training``, ``validation`` or ``testing``; a segment is named by ``#CONTEXT``. Frames are
-numbered from 0 in the order of time, images by their frame.
+ROOT is ``training``, ``validation`` or ``testing``. A segment is named by ``#CONTEXT``. Frames are
+numbered from 0 in the order of time. An image has the number of its frame.
 
-Lidars 0 to 4: TOP, FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. A return is a pixel of a range image, with
-the azimuth by its column and the inclination by its row (range_image_utils.py of the data set);
-first and second returns follow each other. Points are in the vehicle's frame (x forward, y left, z
-up) *when fired*: not compensated. TOP's columns are spread over the frame's period from
-``frame_timestamp_micros``; the others are taken as measured at the frame's pose. Intensity has no
-bound, so its tanh is used.
+Lidars 0 to 4 are TOP, FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. A return is a pixel of a range image; its
+column gives the azimuth, its row the inclination (range_image_utils.py of the data set). The first
+returns of a lidar are followed by its second returns. Points are in the vehicle's frame (x forward,
+y left, z up) *when fired*, without compensation. The columns of TOP are spread evenly over the
+frame's period from ``frame_timestamp_micros``. The other lidars' returns are assumed to be measured
+at the sweep's stamp. Intensity has no upper bound and is mapped by tanh.
 
-``vehicle_pose`` belongs to the middle of the spin. It is that of the FRONT image (issue 464 of
-waymo-open-dataset), so the stamp is that image's ``pose_timestamp``, or half a period after the
-frame's stamp without images. Cameras have lenses (k1 k2 p1 p2 k3) and shutters that usually run
-sideways; an image's pose is carried to the middle of its exposure. Pixel 0 of the calibration is
-the left edge of the first pixel. Built on published formulas; not tried on real files.
+``vehicle_pose`` is the pose at the middle of the spin and equals the pose of the FRONT image (issue
+464 of waymo-open-dataset). The sweep's stamp is the ``pose_timestamp`` of this image, or without
+images half a period after the frame's stamp. Cameras have distortion (k1 k2 p1 p2 k3) and rolling
+shutters, usually sideways. An image's pose is moved to the middle of its exposure. Coordinate 0 of
+the calibration is the left edge of the first pixel. Built on published formulas; not tried on real
+files.
 """
 
 from __future__ import annotations
@@ -55,36 +56,37 @@ T_OPTICAL_WAYMO = np.array(  # Waymo's camera frame is x forward, y left, z up
     [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 DOWN, RIGHT, UP, LEFT = 1, 2, 3, 4
-"""Directions of a rolling shutter."""
+"""Readout directions of a rolling shutter, as numbered in the data set."""
 
 _LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 
 
 @dataclass(frozen=True)
 class Components:
-    """The tables of one segment, in ``root``, the folder of the split."""
+    """The Parquet tables of the segment named ``context``; ``root`` is the split's folder."""
 
     root: Path
     context: str
 
     def file(self, component: str) -> Path:
-        """Return the path of a component."""
+        """Return the Parquet file of a component, such as ``lidar_box``."""
         return self.root / component / f"{self.context}.parquet"
 
     def read(
         self, component: str, columns: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Return columns of a component, see `densify.readers.arrow_columns.read_parquet`."""
+        """Return columns of a component; see `densify.readers.arrow_columns.read_parquet`."""
         return read_parquet(self.file(component), columns, "Waymo recordings", where)
 
 
 class Laser(NamedTuple):
-    """A lidar.
+    """The calibration of a lidar.
 
     Attributes:
-        T_vehicle_laser: (4,4).
-        inclinations_rad: From the lowest beam up, or None for beams spread evenly between
-            ``bounds_rad``.
+        T_vehicle_laser: (4,4) pose of the lidar in the vehicle's frame.
+        inclinations_rad: (H,) inclinations of the beams, from the lowest beam up; None for beams
+            spread evenly between ``bounds_rad``.
+        bounds_rad: Inclinations of the lower and upper limit of the field of view.
     """
 
     T_vehicle_laser: Float
@@ -92,7 +94,7 @@ class Laser(NamedTuple):
     bounds_rad: tuple[float, float]
 
     def directions(self, size: tuple[int, ...]) -> Float:
-        """Return (H,W,3) unit vectors in the laser's frame of the pixels of a range image."""
+        """Return the ray directions of an (H,W) range image, (H,W,3) unit vectors, lidar frame."""
         (height, width), beams = size, self.inclinations_rad
         if beams is None:
             low, high = self.bounds_rad
@@ -109,9 +111,10 @@ class Image(NamedTuple):
     """The times and the pose of an image.
 
     Attributes:
-        pose_ns: Time of T_world_vehicle (4,4).
-        exposed_ns: Exposure of its middle.
-        readout_s: From the first row or column to the last.
+        pose_ns: Time of the pose ``T_world_vehicle``.
+        exposed_ns: Exposure time of the middle row or column.
+        readout_s: Time between the exposures of the first and the last row or column.
+        T_world_vehicle: (4,4) pose of the vehicle in the world.
     """
 
     pose_ns: int
@@ -121,7 +124,7 @@ class Image(NamedTuple):
 
 
 def read_lasers(parts: Components) -> dict[int, Laser]:
-    """Return the lidars by number, from 1."""
+    """Return the lidars' calibrations by Waymo's number, from 1 (TOP)."""
     head = "[LiDARCalibrationComponent]"
     extrinsic, beams = f"{head}.extrinsic.transform", f"{head}.beam_inclination"
     columns = {LASER: "i", extrinsic: "l", f"{beams}.values": "l"}
@@ -139,12 +142,12 @@ def read_lasers(parts: Components) -> dict[int, Laser]:
 
 
 def read_boxes(parts: Components) -> dict[int, Boxes]:
-    """Return the boxes by the frame's stamp in µs, in the vehicle's frame at its pose.
+    """Return the boxes of all annotated frames, by ``frame_timestamp_micros``.
 
-    Frames without boxes are absent.
+    Boxes are in the vehicle's frame at the frame's ``vehicle_pose``.
 
     Raises:
-        InputError: The component is malformed.
+        InputError: The component ``lidar_box`` is missing or malformed.
     """
     numbers = (*BOX_CENTRE, *BOX_SIZE, BOX_HEADING)
     rows = parts.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
@@ -162,10 +165,10 @@ def read_boxes(parts: Components) -> dict[int, Boxes]:
 
 
 def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]]:
-    """Return times and poses of the images, without pixels, by camera and frame number.
+    """Return times and poses of the images, without pixels, by camera name and frame number.
 
     Args:
-        starts_us: (n,) stamps of the frames.
+        starts_us: ``frame_timestamp_micros`` of the n frames, ascending.
     """
     head = "[CameraImageComponent]"
     pose, shutter = f"{head}.pose.transform", f"{head}.rolling_shutter_params"
@@ -188,7 +191,7 @@ def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]
 
 
 def read_cameras(parts: Components, images: Mapping[str, Mapping[int, Image]]) -> dict[str, Camera]:
-    """Return the cameras that have images."""
+    """Return the calibrated cameras that have images, by name, with their rolling shutters."""
     head = "[CameraCalibrationComponent]"
     lens = [f"{head}.intrinsic.{n}" for n in _LENS]
     size = [f"{head}.{n}" for n in ("width", "height", "rolling_shutter_direction")]
@@ -217,15 +220,16 @@ def read_cameras(parts: Components, images: Mapping[str, Mapping[int, Image]]) -
 
 
 def _whole_us(seconds: float) -> int:
-    """Return nanoseconds; seconds since 1970 as float64 are good to 0.25 µs."""
+    """Convert seconds since 1970 to ns in whole µs; float64 resolves about 0.25 µs."""
     return round(seconds * 1e6) * 1000
 
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
-    """See `densify.readers.ReaderModule`.
+    """Open a segment of Waymo, as `densify.readers.ReaderModule` specifies.
 
     Args:
-        path: The folder of a split.
+        path: Folder of a split, such as ``training``.
+        scene: Name of the segment (CONTEXT); None if there is only one segment.
     """
     files = sorted((path / "lidar").glob("*.parquet"))
     if not files:
@@ -237,13 +241,13 @@ def open_recording(path: Path, scene: str | None) -> Waymo:
 
 
 class Waymo(FileSequence):
-    """A segment as a `LidarSequence`. The lidar frame is that of the vehicle.
+    """A Waymo segment as a `LidarSequence`; the lidar frame is the vehicle's frame.
 
-    The stamp of a sweep is about the middle of the spin, the time of the recorded pose.
+    The stamp of a sweep is the time of the recorded pose, about the middle of the spin.
     """
 
     def __init__(self, root: Path, context: str) -> None:
-        """Read stamps, poses and calibration.
+        """Read stamps and calibrations; sweeps, images and poses are read on demand.
 
         Raises:
             InputError: A component is missing or malformed.
@@ -278,10 +282,10 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """See `LidarSequence`; the test split has none.
+        """Return a sweep's boxes in the vehicle's frame; None if not annotated (test split).
 
         Raises:
-            InputError: They are malformed.
+            InputError: The boxes are malformed.
         """
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))
@@ -291,7 +295,7 @@ class Waymo(FileSequence):
         return read_boxes(self._parts) if self._parts.file("lidar_box").is_file() else {}
 
     def T_world_cam(self, camera: str, number: int) -> Float:
-        """Return the (4,4) pose at the exposure of the image's middle."""
+        """Return the pose T_world_cam (4,4) at the middle of the exposure of image ``number``."""
         image = self._images[camera][number]
         T_world_vehicle = image.T_world_vehicle
         if len(self.frames) > 1:
@@ -322,7 +326,7 @@ class Waymo(FileSequence):
         )
 
     def _range_images(self, frame: int) -> dict[tuple[int, int], Float]:
-        """Return (H,W,4) by lidar and return."""
+        """Return (H,W,4) by lidar and return, from 1; channels: range (m), intensity, 2 unused."""
         names = {number: f"[LiDARComponent].range_image_return{number}" for number in (1, 2)}
         columns = {f"{name}.{part}": "l" for name in names.values() for part in ("values", "shape")}
         start_us = int(self._starts_us[frame])
@@ -338,7 +342,7 @@ class Waymo(FileSequence):
         return found
 
     def _offset_ns(self, frame: int, laser: int, size: tuple[int, ...]) -> Int:
-        """Return (H,W) firing times since the sweep's stamp."""
+        """Return firing times (H,W) in ns since the sweep's stamp, 0 for lidars other than TOP."""
         height, width = size[:2]
         if laser != 1:
             return np.zeros((height, width), np.int64)
@@ -348,7 +352,7 @@ class Waymo(FileSequence):
 
     @cached_property
     def _T_world_vehicle(self) -> dict[int, Float]:
-        """The poses of the vehicle by frame."""
+        """Poses T_world_vehicle (4,4) of the vehicle at the sweeps' stamps, by frame."""
         name = "[VehiclePoseComponent].world_from_vehicle.transform"
         rows, where = (
             self._parts.read("vehicle_pose", {STAMP: "i", name: "l"}),
