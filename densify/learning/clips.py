@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Prepare clips for a network: a few neighbouring sweeps of a recording.
 
-They are registered and deskewed, without the ground. With labels they have the flow of every sweep
-to its neighbours.
+The sweeps are registered and deskewed, without the ground. With labels, each sweep has its flow to
+the sweeps before and after it.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ _POSES_GIVEN = {"register": {"source": "dataset"}}
 
 @dataclass(frozen=True)
 class ClipSweep:
-    """The points of a sweep above the ground.
+    """The n points of a sweep above the ground.
 
     Attributes:
-        points: (n,3) metres, world axes about the clip's origin.
-        height_m: (n,) above the ground.
-        origin_m: (3,) the scanner.
-        time_s: Since the first sweep.
-        flow: (2,n,3) metres, to the previous sweep and to the next, 0 without one; None without
-            labels.
-        moving: (n,); None without labels.
+        points: (n,3) metres, world axes, origin at the scanner's position in the clip's key frame.
+        height_m: (n,) height above the ground.
+        origin_m: (3,) position of the scanner, in the coordinates of ``points``.
+        time_s: Time since the clip's first sweep.
+        flow: (2,n,3) metres, world axes, ego-motion removed: flow to the previous sweep and to the
+            next sweep, 0 where that sweep is missing. None without labels.
+        moving: (n,) bool, None without labels.
     """
 
     points: Float32
@@ -61,8 +61,8 @@ class ClipMaker:
     """Make clips by number: the same number gives the same clip, in any process.
 
     Attributes:
-        data: Specs of recordings, or `STREETS`.
-        teacher: As in `make_clip`.
+        data: Specifications of recordings, or `STREETS`.
+        teacher: Source of the labels, as in `make_clip`.
     """
 
     data: tuple[str, ...]
@@ -70,11 +70,11 @@ class ClipMaker:
     teacher: str = "objective"
 
     def __call__(self, number: int) -> Clip:
-        """Make one clip.
+        """Make the clip of a number.
 
         Raises:
-            InputError: A recording cannot be read, or lacks the truth that is asked for.
-            ComputationError: None of several places can be registered.
+            InputError: A recording cannot be read or lacks the required ground truth.
+            ComputationError: No neighbouring sweeps could be registered at 8 random places.
         """
         rng = np.random.default_rng([self.seed, number])
         spec = self.data[int(rng.integers(len(self.data)))]
@@ -101,7 +101,7 @@ class ClipMaker:
 
 
 def _new_street(spec: str, rng: np.random.Generator) -> Street:
-    """Open a street whose seed is drawn at random."""
+    """Open a simulated street whose seed is drawn at random."""
     preset = str(rng.choice(_PRESETS, p=_SHARES))
     options = "".join(f"&{option}" for option in spec.partition("?")[2].split("&") if option)
     if "seed=" in options:
@@ -113,11 +113,12 @@ def _new_street(spec: str, rng: np.random.Generator) -> Street:
 
 
 def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
-    """Return the sweeps around a key.
+    """Return the clip of up to 7 sweeps around a key frame.
 
     Args:
-        teacher: "truth" or "engine" labels them with the truth or with the scene flow of this
-            package's engine; another word leaves them without labels.
+        key: Frame number of the middle sweep.
+        teacher: Source of the labels: "truth" for the recording's ground truth, "engine" for the
+            scene flow of the engine ``groups``. Other words give no labels.
     """
     stretch = Recording(sequence, settings, NUM_SWEEPS // 2, [key]).window(key)
     heights, frames = ground(stretch), stretch.frames

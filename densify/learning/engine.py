@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Use a trained network as an engine: its flow proposes, `densify.flow.tracking` decides.
 
-Where the network finds moving points, groups start with its velocity. They are followed and
-confirmed as by the engine ``groups``. The network alone moves nothing.
+Groups of points that move according to the network start at the network's velocity. They are
+tracked and confirmed as by the engine ``groups``. The network's flow alone moves no point.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ MOVES_M_S = 0.5
 
 
 def check_argument(argument: str) -> None:
-    """Raise InputError unless the argument names a model."""
+    """Raise InputError unless the argument is the path of a model file."""
     read_model(Path(argument))
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """See `densify.flow.engines.EngineModule`.
+    """Return the motion of the scene, as `densify.flow.engines.EngineModule`.
 
     Args:
-        argument: The model's file.
+        argument: Path of the model file.
     """
     model, sweeps = read_model(Path(argument)), scene.stretch.sweeps
     rows = zip(sweeps, scene.candidates, strict=True)
@@ -50,10 +50,12 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
 
 
 def flows_of(model: Model, standing: list[AboveGround], origins: list[Float]) -> list[Float]:
-    """Return (n,3) metres for each sweep to the next, of the last one to the previous; world.
+    """Return for each sweep the flow (n,3) to the next sweep, metres, world, ego-motion removed.
+
+    The last sweep has its flow to the previous sweep.
 
     Args:
-        origins: (3,) world, the scanner at each sweep.
+        origins: Position (3,) of the scanner at each sweep, world.
     """
     flows = []
     for i, own in enumerate(standing):
@@ -74,10 +76,14 @@ def _neighbor(i: int, count: int) -> int:
 def _grouped(
     scene: Scene, i: int, candidates: Candidates, standing: AboveGround, velocity_m_s: Float
 ) -> tuple[Candidates, Float]:
-    """Return the points of sweep i that may start a track, and their (n,3) velocities, m/s.
+    """Return the candidates of sweep i for tracking, and their (n,3) velocities, m/s, world.
 
-    Clusters that move according to the network may start a track. Clusters of the free-space
-    evidence alone may only join a track that was started elsewhere.
+    Clusters that move according to the network may start a track, at their median velocity.
+    Clusters from free-space violations alone may only join a track that was started elsewhere.
+
+    Args:
+        standing: The n points above the ground.
+        velocity_m_s: (n,3) velocities by the network, world.
     """
     moves = np.linalg.norm(velocity_m_s, axis=1) >= MOVES_M_S
     registered = scene.stretch.sweeps[i]

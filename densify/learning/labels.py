@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make scene flow labels from tracked boxes: the flow of each sweep to the next one."""
+"""Make scene flow labels from tracked boxes: the flow of each sweep to the next sweep."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ from densify.pipeline.recording import Recording
 
 @dataclass(frozen=True)
 class Label:
-    """The label of one sweep.
+    """The scene flow label of one sweep with N points.
 
     Attributes:
         after: The next sweep.
-        sure: (N,) mask of the points that count.
-        T_next_here: (4,4) from the lidar frame of the sweep to that of the next sweep.
+        field: Flow to the next sweep, in the sweep's lidar frame, ego-motion removed.
+        sure: (N,) True for points whose flow is certain.
+        T_next_here: (4,4) from the lidar frame of the sweep to the lidar frame of the next sweep.
     """
 
     registered: RegisteredSweep
@@ -40,12 +41,13 @@ class Label:
 def label_sweeps(
     sequence: LidarSequence, frames: Sequence[int], config: Config, progress: Progress | None = None
 ) -> Iterator[tuple[int, Label | ComputationError | InputError]]:
-    """Yield the label of each sweep, or the error that prevents it, with its frame.
+    """Yield (frame number, label) of each sweep, or (frame number, error) if labelling fails.
 
     Sweeps without a next sweep or without boxes are left out.
 
     Args:
-        config: Says where poses come from.
+        frames: Frame numbers to label.
+        config: Settings, which say where the poses come from.
 
     Raises:
         InputError: The recording has no boxes.
@@ -82,11 +84,14 @@ def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: in
 
 
 def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
-    """Write a flow file with ``valid``, complete or not at all.
+    """Write the label's flow file ``FRAME_NEXT.npz`` into a folder and return its path.
+
+    It holds the flow without and with (``total_flow``) ego-motion, and ``valid`` for certain flow.
+    The file appears only when it is complete.
 
     Raises:
-        InputError: The file exists.
-        OutputError: It cannot be written.
+        InputError: The file exists and ``overwrite`` is False.
+        OutputError: The file cannot be written.
     """
     sweep, field = label.registered.sweep, label.field
     path = folder / f"{sweep.frame:06d}_{label.after.frame:06d}.npz"

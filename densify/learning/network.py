@@ -3,9 +3,9 @@
 
 It follows FastFlow3D (Jund et al., "Scalable Scene Flow from Point Clouds in the Real World", RA-L
 2022) and DeFlow (Zhang et al., ICRA 2024), and is small enough for a CPU. The points of each sweep
-are encoded one by one and averaged over the cells of a grid of 0.4 m. The grids of all sweeps go
-through one U-Net, which can compare them. Each source point reads the result at its position,
-joined to its own code, and two more layers give its flow.
+are encoded separately and averaged over the cells of a grid of 0.4 m. The grids of all sweeps go
+through one U-Net, which can compare them. Each source point reads the result at its position and
+joins it with its own code. Two more layers compute the point's flow.
 
 A model file is numpy's archive of arrays, read without running any code. ``header`` holds JSON
 (format, version, network, how it was trained), ``weights/NAME`` the network's arrays.
@@ -51,12 +51,11 @@ _LARGEST_HEIGHT_M = 4.0
 
 
 class NetworkCloud(NamedTuple):
-    """One sweep of n points.
+    """One sweep of n points as input of the network.
 
     Attributes:
-        points: (n,3) float32 metres, world axes (z up) about the scanner at the time of the
-            *source* sweep.
-        height_m: (n,) float32 above the ground.
+        points: (n,3) float32 metres, world axes (z up), origin at the *source* sweep's scanner.
+        height_m: (n,) float32 height above the ground.
     """
 
     points: Tensor
@@ -64,12 +63,12 @@ class NetworkCloud(NamedTuple):
 
 
 class AboveGround(NamedTuple):
-    """The points of a sweep above the ground.
+    """The n points of a sweep above the ground.
 
     Attributes:
-        row: (n,) in the sweep.
+        row: (n,) index into the sweep's points.
         points: (n,3) metres, world.
-        height_m: (n,) above the ground.
+        height_m: (n,) height above the ground.
     """
 
     row: Int
@@ -78,23 +77,26 @@ class AboveGround(NamedTuple):
 
     @staticmethod
     def of(registered: RegisteredSweep, ground: HeightMap, row: Int | None = None) -> AboveGround:
-        """Return the points above the ground, or those of the rows (n,)."""
+        """Return the points above the ground, or the points of the given rows (n,)."""
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
         row = np.flatnonzero(height_m >= ABOVE_GROUND_M) if row is None else row
         return AboveGround(row, points[row], height_m[row])
 
     def cloud(self, origin: Float) -> NetworkCloud:
-        """Return the input of a network, about the origin (3,)."""
+        """Return the points as network input, relative to an origin (3,), world."""
         points = torch.from_numpy((self.points - origin).astype(np.float32))
         return NetworkCloud(points, torch.from_numpy(np.ascontiguousarray(self.height_m)))
 
 
 def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> list[int | None]:
-    """Return the numbers of the sweeps that a network gets for the flow from source to target.
+    """Return the indices of the sweeps that the network needs for the flow from source to target.
 
-    Source and target come first, then the sweeps before the source in that direction of time, None
-    beyond the first and the last sweep.
+    Source and target come first, then the sweeps before the source (after it if the target is
+    earlier). An index beyond the first or last sweep becomes None.
+
+    Args:
+        num_wanted: Number of sweeps that the network takes.
     """
     step = source - target
     wanted = [source, target, *(source + step * n for n in range(1, num_wanted - 1))]
@@ -106,7 +108,7 @@ Sweeps = Sequence[NetworkCloud | None]
 
 
 class Voxels(nn.Module):
-    """The network, 0.5 million weights."""
+    """The scene flow network, with 0.5 million weights."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -127,7 +129,10 @@ class Voxels(nn.Module):
             self.decode[-1].bias.zero_()  # type: ignore[operator, union-attr]
 
     def forward(self, sweeps: Sweeps) -> Tensor:
-        """Return the flow (n,3) of the first sweep to the second, metres, 0 out of reach."""
+        """Return the flow (n,3) of the first sweep's points to the second sweep, metres.
+
+        It excludes ego-motion, is in the world axes of the input, and is 0 beyond the grid.
+        """
         given = [*sweeps[:NUM_SWEEPS], *[None] * (NUM_SWEEPS - len(sweeps))]
         source = given[0]
         if source is None:
@@ -153,7 +158,7 @@ class Voxels(nn.Module):
         return flow.index_copy(0, first.row, decoded)
 
     def _unet(self, image: Tensor) -> Tensor:
-        """Return (1,32,128,128) codes of an image (1,C,256,256)."""
+        """Return the (1,32,128,128) codes of an image (1,C,256,256)."""
         levels = [image]
         for block in self.down:
             levels.append(block(levels[-1]))
@@ -172,7 +177,7 @@ def build(seed: int = 0) -> Voxels:
 
 
 class _Block(nn.Module):
-    """Two convolutions, normalised by groups, which needs no batch."""
+    """Two convolutions with group normalisation, which works without batches."""
 
     def __init__(self, num_in: int, num_out: int, stride: int) -> None:
         super().__init__()
@@ -191,11 +196,12 @@ class _Block(nn.Module):
 
 
 class _Pillars:
-    """The points of one sweep in reach, sorted by cell.
+    """The m points of one sweep within the grid, sorted by cell.
 
-    row: (m,) of the sweep. cell: (m,) number of the cell. features: (m,6) offset from the centre of
-    the cell in cells, height, and offset from the scanner in hundreds of metres. filled, size: (f,)
-    number and point count of each cell with points. of_point: (m,) index of the filled cell.
+    row: (m,) index into the sweep's points. cell: (m,) number of the cell. features: (m,6) offset
+    from the cell's centre in cells, scaled height, and offset from the scanner in hundreds of
+    metres. filled, size: (f,) number and point count of each cell with points. of_point: (m,) row
+    in filled.
     """
 
     def __init__(self, row: Tensor, cell: Tensor, features: Tensor) -> None:
@@ -218,7 +224,7 @@ class _Pillars:
         return _Pillars(row, number, features)
 
     def as_grid(self, encoded: Tensor) -> Tensor:
-        """Return (cells, C+1): the mean code of the points in each cell, and their number."""
+        """Return (cells, C + 1): each cell's mean code, and the scaled log of its point count."""
         zeros = encoded.new_zeros(len(self.size), encoded.shape[1])
         sums = zeros.index_add(0, self.of_point, encoded)
         size = self.size[:, None].to(sums.dtype)
@@ -228,7 +234,7 @@ class _Pillars:
 
 
 def _at(image: Tensor, pillars: _Pillars) -> Tensor:
-    """Return (m,C) an image (1,C,128,128), interpolated at each point."""
+    """Return the (m,C) values of an image (1,C,128,128), interpolated at each point."""
     cell = torch.stack([pillars.cell % NUM_CELLS, pillars.cell // NUM_CELLS], dim=1)
     at = (cell + pillars.features[:, :2] + 0.5) * (2.0 / NUM_CELLS) - 1.0
     found = functional.grid_sample(
@@ -247,16 +253,16 @@ class Model:
     """A network with its weights.
 
     Attributes:
-        made: How it was trained, plain values for JSON.
+        made: How the network was trained, plain values for JSON.
     """
 
     network: Voxels
     made: Mapping[str, Any] = field(default_factory=dict)
 
     def flow(self, sweeps: Sweeps) -> Float:
-        """Return the (n,3) flow of the first sweep to the second, metres.
+        """Return the (n,3) flow of the first sweep to the second in metres, as `Voxels.forward`.
 
-        It has the same bytes on any number of cores.
+        The result has the same bytes on any number of cores.
         """
         with on_one_thread(), torch.inference_mode():
             found: Float = self.network(sweeps).double().numpy()
@@ -266,10 +272,10 @@ class Model:
 def write_model(path: Path, model: Model) -> None:
     """Write a model file. The same model gives the same bytes.
 
-    The file appears when it is complete.
+    The file appears only when it is complete.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     header = {"format": FORMAT, "version": VERSION, "network": NETWORK, "made": model.made}
     text = json.dumps(header, sort_keys=True).encode()
@@ -285,7 +291,7 @@ def read_model(path: Path) -> Model:
     """Return the model of a file.
 
     Raises:
-        InputError: It is another file, a damaged one, or another version.
+        InputError: The file is missing, damaged, of another version, or not a model.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a model that densify train flow wrote")

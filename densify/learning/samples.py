@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Draw pairs of sweeps to train on, in an order that follows from a seed alone.
 
-The pairs of several clips come mixed, in both directions of time, and several times. Each time they
-are turned about the vertical, mirrored and scaled at random.
+The pairs of several clips are mixed, in both directions of time, and drawn several times. Each time
+they are turned about the vertical, mirrored and scaled at random.
 
-The losses of the teachers are here too. ``objective`` is the published objective in m² per point
-(Pontes, Hays, Lucey, 3DV 2020, sections 3 and 4), with alpha = 4 (10 without learning) and a graph
-of 50 neighbours. It needs no labels. ``engine`` and ``truth`` compare with a known flow. Nearly all
-points are static, and a plain mean teaches a network to be static. Therefore the loss, in metres,
-is a sum of means over static points, points slower than 1 m/s, and faster ones (DeFlow, Zhang et
-al., ICRA 2024, eq. 5).
+The losses of the teachers (sources of supervision) are here too. ``objective`` is the published
+objective in m² per point (Pontes, Hays, Lucey, 3DV 2020, sections 3 and 4), with alpha = 4 (10
+without learning) and a graph of 50 neighbours. It needs no labels. ``engine`` and ``truth`` compare
+with a known flow. Nearly all points are static, and a plain mean teaches a network to predict no
+motion. Therefore the loss, in metres, is a sum of means over static points, points slower than 1
+m/s, and faster points (DeFlow, Zhang et al., ICRA 2024, eq. 5).
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ _SCALES = (0.95, 1.05)
 
 
 class Sample(NamedTuple):
-    """One pair of sweeps.
+    """One pair of sweeps to train on; the source has n points.
 
     Attributes:
-        sweeps: Source, target, and those before the source.
-        drawn: (d,) rows of the source for the objective.
-        drawn_target: (e,3) points of the target.
-        in_reach: (n,) mask of the source's points that count.
-        flow: (n,3) tensor, None without labels.
-        moving: (n,), None without labels.
+        sweeps: Source, target, and sweeps before the source; augmented coordinates.
+        drawn: (d,) rows of the source points that the objective uses.
+        drawn_target: (e,3) target points that the objective uses.
+        in_reach: (n,) mask of the source points within the network's grid, which count in the loss.
+        flow: (n,3) known flow to the target, m, without ego-motion; None without labels.
+        moving: (n,) bool tensor, None without labels.
     """
 
     sweeps: Sweeps
@@ -57,7 +57,7 @@ class Sample(NamedTuple):
 
 
 def on_device(value: Any, device: torch.device) -> Any:
-    """Return a tensor, or a tuple with tensors in it, on a device; other values as they are."""
+    """Move a tensor, or all tensors of a tuple, to a device; other values stay the same."""
     if isinstance(value, Tensor):
         return value.to(device)
     if isinstance(value, tuple):
@@ -70,6 +70,7 @@ def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
     """Yield samples without end.
 
     Args:
+        make: Maker of clips (short series of sweeps), called with 0, 1, 2 and so on.
         num_wanted: Number of sweeps that the network takes.
     """
     for group in count():
@@ -83,7 +84,7 @@ def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
 
 
 def _pairs(c: int, clip: Clip, rng: np.random.Generator) -> list[tuple[int, int, int]]:
-    """Return equally many (clip, source, target) of every clip, in rounds of all its pairs."""
+    """Return 48 triples (c, source, target) of a clip, in random rounds of all its pairs."""
     number = range(len(clip))
     found = [(c, i, j) for i in number for j in (i - 1, i + 1) if j in number]
     num_rounds = -(-_PAIRS_OF_CLIP // len(found))
@@ -98,10 +99,10 @@ def sample_of(
     num_wanted: int,
     rng: np.random.Generator | None = None,
 ) -> Sample:
-    """Return the sample of two neighbouring sweeps of a clip, by their numbers in it.
+    """Return the sample of two neighbouring sweeps of a clip, given by their indices.
 
     Args:
-        rng: Turns, mirrors, scales and draws at random. None leaves the clouds as they are and
+        rng: Generator that turns, mirrors, scales and draws at random. None changes nothing and
             draws evenly.
     """
     here, there = clip[source], clip[target]
@@ -136,7 +137,7 @@ def _random_change(rng: np.random.Generator) -> Float32:
 
 
 def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
-    """Return at most `NUM_DRAWN` rows of a mask, at random or evenly spaced."""
+    """Return at most `NUM_DRAWN` rows where the mask is True, at random or (without rng) evenly."""
     rows = np.flatnonzero(within)
     if len(rows) > NUM_DRAWN:
         every = np.arange(NUM_DRAWN) * len(rows) // NUM_DRAWN
@@ -152,7 +153,7 @@ FAST_M_S = 1.0
 
 
 def objective_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the published objective of a sample's drawn points, m² per point."""
+    """Return the published objective for the drawn points of a sample, m² per point, 0-d."""
     source: Tensor = sample.sweeps[0].points[sample.drawn]  # type: ignore[union-attr]
     graph = knn_graph(source.detach().cpu().double().numpy(), NUM_NEIGHBORS)
     flow = predict(sample.sweeps)[sample.drawn]
@@ -161,7 +162,7 @@ def objective_loss(predict: Predict, sample: Sample) -> Tensor:
 
 
 def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the sum of the mean errors over static, slow and fast points, metres."""
+    """Return the sum of the mean errors over static, slow and fast points, metres, 0-d."""
     flow, true, moving, counted = (
         predict(sample.sweeps),
         sample.flow,

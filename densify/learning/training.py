@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Train a network: samples, the loss of a teacher, Adam.
+"""Train a network on drawn samples with the loss of a teacher, by Adam.
 
 The same seed gives the same weights, byte for byte, on CPUs of one kind. Every sample follows from
 the seed and its number, and torch computes on one thread.
@@ -32,8 +32,10 @@ class Training:
     """The settings of a training.
 
     Attributes:
-        data: Specs of recordings.
-        steps: Number of pairs of sweeps.
+        data: Specifications of recordings.
+        steps: Number of training steps, each with one pair of sweeps.
+        teacher: Source of supervision: "objective", "engine" or "truth".
+        device: Device to train on, "auto", "cpu" or "cuda".
     """
 
     data: tuple[str, ...]
@@ -44,7 +46,7 @@ class Training:
 
 
 def train(training: Training, out: Path, progress: Progress | None = None) -> float:
-    """Train a network, write the model, and return the mean loss of the last 50 steps.
+    """Train a network, write the model to ``out``, and return the mean loss of the last 50 steps.
 
     Raises:
         InputError: A setting or a recording cannot be used.
@@ -83,10 +85,10 @@ def train(training: Training, out: Path, progress: Progress | None = None) -> fl
 
 
 def chosen_device(name: str) -> torch.device:
-    """Return the device to train on. ``auto`` is CUDA if there is one.
+    """Return the torch device for "cpu", "cuda", or "auto" (CUDA if available).
 
     Raises:
-        InputError: CUDA is asked for, and there is none.
+        InputError: CUDA is requested, but torch finds no CUDA device.
     """
     has_cuda = torch.cuda.is_available()
     if name == "cuda" and not has_cuda:
@@ -95,7 +97,7 @@ def chosen_device(name: str) -> torch.device:
 
 
 def _learning_rate(done: float) -> float:
-    """Return the rate at a share of the training: it rises, stays, and falls as half a cosine."""
+    """Return the learning rate at a share of the training: a rise, a plateau, half a cosine."""
     rate = min(1.0, (done + 0.002) / _WARM_UP)
     if done > 1 - _COOL_DOWN:
         rate = 0.5 + 0.5 * np.cos(np.pi * (done - 1 + _COOL_DOWN) / _COOL_DOWN)

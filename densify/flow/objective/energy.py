@@ -22,12 +22,12 @@ from densify.flow.objective.graph import checked_cloud
 
 
 class Energy(NamedTuple):
-    """Terms of the objective, 0-d tensors that carry the gradient.
+    """Terms of the objective E, 0-d tensors that carry the gradient.
 
     Attributes:
-        total: ``data + alpha * smoothness``.
-        data: E_d in m².
-        smoothness: tr(FᵀLF) in m².
+        total: ``data + alpha * smoothness``, m².
+        data: Data term E_d, m².
+        smoothness: Smoothness term tr(FᵀLF), m².
     """
 
     total: Tensor
@@ -49,14 +49,14 @@ def energy(
     gradient is exact wherever no two neighbours tie. The energy is a sum over points, not a mean.
 
     Args:
-        flow: (n,3) metres.
-        source: (n,3) P.
-        target: (m,3) Q.
-        laplacian: (n,n) of `densify.flow.objective.graph.laplacian`.
-        alpha: A smaller one leaves each point freer.
+        flow: (n,3) metres, F.
+        source: (n,3) metres, points p.
+        target: (m,3) metres, points q, in the frame of the source.
+        laplacian: (n,n) L of `densify.flow.objective.graph.laplacian`.
+        alpha: Weight of the smoothness term; a smaller weight leaves each point freer.
 
     Raises:
-        InputError: The shapes are wrong, there are no points, or there is a NaN.
+        InputError: A shape is wrong, a cloud is empty, or a value is NaN.
     """
     if flow.shape != source.shape:
         raise InputError(
@@ -81,7 +81,7 @@ def energy(
 
 @contextmanager
 def on_one_thread() -> Iterator[None]:
-    """Let torch work on one thread inside the block. With more threads its sums differ."""
+    """Run torch on one thread inside the block: its sums depend on the thread count."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -91,7 +91,7 @@ def on_one_thread() -> Iterator[None]:
 
 
 class _QuadraticForm(torch.autograd.Function):
-    """tr(FᵀLF) for a symmetric sparse L; one product serves value and gradient."""
+    """Function tr(FᵀLF) for a symmetric sparse L; one matrix product serves value and gradient."""
 
     @staticmethod
     def forward(ctx: Any, flow: Tensor, laplacian: csr_array) -> Tensor:
@@ -107,5 +107,5 @@ class _QuadraticForm(torch.autograd.Function):
 
 
 def _values(tensor: Tensor) -> Any:
-    """Return the numbers of a tensor as a float64 array."""
+    """Return the values of a tensor as a float64 array."""
     return tensor.detach().cpu().double().numpy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Use the published objective as an engine: between neighbouring sweeps, above the ground."""
+"""Engine ``paper``: solve the published objective between neighbouring sweeps, above the ground."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
 
 
 def _step(scene: Scene, here: int, there: int, settings: Config) -> FlowField:
-    """Return the flow of one sweep's points above the ground to another's time, by number."""
+    """Return the flow of sweep index ``here`` to ``there``, in its lidar frame; 0 on the ground."""
     clouds = [
         poses.transform(s.T_world_lidar, s.sweep.points)
         for s in (scene.stretch.sweeps[here], scene.stretch.sweeps[there])

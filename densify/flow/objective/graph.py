@@ -20,8 +20,7 @@ def checked_cloud(values: ArrayLike, name: str) -> Float:
     """Return a copy of a cloud as (n,3) float64 metres.
 
     Raises:
-        InputError: There are no points, the shape is another one, or coordinates are not
-            finite.
+        InputError: There are no points, the shape is not (n,3), or a coordinate is not finite.
     """
     try:
         points = np.array(values, dtype=np.float64, order="C")
@@ -48,11 +47,11 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
 
     Args:
         points: (n,3) metres.
-        num_neighbors: k without the point itself, cut to n - 1. With a larger k the flow of a
-            point pulls on points farther away.
+        num_neighbors: Number k of neighbours without the point itself, at most n - 1. A larger k
+            couples the flow of points farther apart.
 
     Raises:
-        InputError: There are no points, a NaN, or k < 1.
+        InputError: There are no points, a coordinate is NaN, or k < 1.
     """
     if num_neighbors < 1:
         raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
@@ -72,13 +71,14 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
 
 
 def laplacian(weights: csr_array) -> csr_array:
-    """Return ``L = D^-1/2 (D - W) D^-1/2``, (n,n) symmetric, positive semi-definite, float64.
+    """Return the graph Laplacian ``L = D^-1/2 (D - W) D^-1/2``.
 
-    The degree D holds the row sums of W with the self-weight ``W_ii = 1``, as in the paper. The
-    null space of L is ``D^1/2 · 1``: a constant flow costs energy where the density changes.
+    L is (n,n), symmetric, positive semi-definite, float64. The degree D holds the row sums of W
+    with the self-weight ``W_ii = 1``, as in the paper. The null space of L is ``D^1/2 · 1``: a
+    constant flow costs energy where the density changes.
 
     Args:
-        weights: W of `knn_graph`.
+        weights: (n,n) W of `knn_graph`.
     """
     degree = weights.sum(axis=1)
     scale = diags_array(1.0 / np.sqrt(degree))

@@ -37,13 +37,14 @@ _MAX_PRODUCTS, _RESIDUAL_DROP = (
 class SolverSettings:
     """The settings of a solver. The defaults are the paper's except for the solver.
 
-    A value out of range raises InputError.
-
     Attributes:
-        solver: "pcg" or "adam".
-        alpha: Weight of smoothness, at least 0. A larger one moves neighbours more alike.
-        num_neighbors: k of the graph. A larger one is stiffer and slower.
-        adam_num_steps: The lowest energy is usually reached within 200 steps.
+        solver: Name of the solver, "pcg" or "adam".
+        alpha: Weight of smoothness, at least 0. A larger weight moves neighbours more alike.
+        num_neighbors: Number k of neighbours in the graph. A larger k is stiffer and slower.
+        adam_num_steps: Number of steps of Adam. 200 usually reach the lowest energy.
+
+    Raises:
+        InputError: A value is out of range.
     """
 
     solver: str = "pcg"
@@ -66,11 +67,11 @@ class Solution:
     """A flow and its energy at the requested alpha.
 
     Attributes:
-        flow: (n,3) float64 metres.
-        energy: ``data + alpha * smoothness``, m².
-        energies: The energy before each step and after the last. A step is one of Adam's, or
-            one alternation of pcg. Adam's energy rises at times, and its minimum is ``energy``.
-            That of pcg never rises on the last level.
+        flow: (n,3) float64 metres, in the frame of the clouds.
+        energy: Value of the objective ``data + alpha * smoothness``, m².
+        energies: Energy before each step and after the last step. A step is an Adam step or an
+            alternation of pcg. Adam's energy may rise; its minimum is ``energy``. Pcg's never rises
+            on the last level.
     """
 
     flow: Float
@@ -86,17 +87,15 @@ def solve(
     settings: SolverSettings | None = None,
     initial: ArrayLike | None = None,
 ) -> Solution:
-    """Return the flow that moves ``source`` onto ``target`` smoothly, a minimum of the objective.
+    """Return the smooth flow that moves ``source`` onto ``target``, a minimum of the objective.
 
-    The same input gives the same bytes on the same CPU. Everything is computed in float64 about the
-    mean of the source.
+    The same input gives the same bytes on the same CPU. All is computed in float64.
 
     Args:
         source: (n,3) metres.
         target: (m,3) metres, in the same frame.
-        settings: None for the defaults.
-        initial: (n,3) flow to start from, otherwise 0. pcg then works at the final alpha at
-            once.
+        settings: Settings of the solver; None for the defaults.
+        initial: (n,3) flow to start from, None for 0. With it, pcg uses the final alpha at once.
 
     Raises:
         InputError: There are no points, wrong shapes, or NaN.
@@ -118,7 +117,7 @@ def solve(
 def _adam(
     source: Float, target: Float, smooth: csr_array, start: Float, settings: SolverSettings
 ) -> Solution:
-    """Return the solution of the published protocol, but keep the best flow of all steps."""
+    """Return the solution by Adam, the published protocol, keeping the best flow of all steps."""
     import torch
 
     from densify.flow.objective.energy import energy, on_one_thread
@@ -142,10 +141,11 @@ def _adam(
 
 
 class _Value:
-    """The energy of a flow, with the matches and the negative half of its gradient's data part.
+    """The energy of a flow, with the matches that give its gradient.
 
-    data, smoothness: E_d and tr(FᵀLF). total: at the requested alpha. pull: (n,3) from each moved
-    point to its matches, summed. num_matches: (n,) matches of each point, both ways.
+    data, smoothness: terms E_d and tr(FᵀLF). total: energy at the requested alpha. bent: (n,3) L F.
+    pull: (n,3) sum of the vectors from each moved point to its matches, minus half the gradient of
+    E_d. num_matches: (n,) number of matches of each point, both ways.
     """
 
     def __init__(self, problem: _Problem, flow: Float) -> None:
@@ -168,7 +168,7 @@ class _Value:
 
 
 class _Problem:
-    """One pair of clouds about the mean of the source."""
+    """A pair of clouds relative to the mean of the source, with the Laplacian and alpha."""
 
     def __init__(self, source: Float, target: Float, smooth: csr_array, alpha: float) -> None:
         self.source, self.target = source, target
@@ -178,11 +178,11 @@ class _Problem:
 
 
 def _pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
-    """Return the solution by majorisation and minimisation.
+    """Return the solution by majorisation and minimisation, over levels of descending alpha.
 
-    With fixed matches the energy is a quadratic that touches it from above. A step that lowers the
-    quadratic lowers the energy. At large alphas whole surfaces slide. From a small alpha the points
-    would stick to their first neighbours.
+    With fixed matches the energy becomes a quadratic upper bound that is tight at the current flow.
+    A step that lowers the quadratic lowers the energy. At large alphas whole surfaces slide. If
+    alpha started small, the points would stick to their first neighbours.
     """
     value = _Value(problem, start)
     energies = [value.total]
@@ -198,9 +198,9 @@ def _pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
 
 
 def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
-    """Return the (n,3) step that roughly minimises the quadratic, by conjugate gradients.
+    """Return the (n,3) step of the flow that roughly minimises the quadratic.
 
-    It solves ``(diag(num_matches) + alpha L) X = -gradient / 2`` with Jacobi's preconditioner.
+    Conjugate gradients solve ``(diag(num_matches) + alpha L) X = -gradient / 2`` (Jacobi).
     """
     shape = problem.source.shape
     diagonal = value.num_matches[:, None]

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Estimate scene flow between any two clouds in one frame.
 
-It is that of rigid groups that certainly move, or of the published objective.
+Either rigid groups that certainly move have flow, or all points have the flow of the published
+objective.
 """
 
 from __future__ import annotations
@@ -53,32 +54,33 @@ def estimate_flow(
 ) -> FlowField:
     """Estimate the scene flow between two clouds in one coordinate frame.
 
+    The flow excludes ego-motion, provided that the common frame does not move with the vehicle.
     Groups of points move only if their motion explains, in both clouds, differences that a static
     group leaves unexplained. The flow of all other points is exactly 0, also farther than 400 m
     from the middle. Without ``objective.static_prior`` every point takes the flow of the published
-    objective; with ``flow.engine=paper`` the moving groups take it.
+    objective. With ``flow.engine=paper`` the moving groups take it.
 
     Args:
         source: (N,3) metres, z up, with or without the ground.
-        target: (M,3) metres.
+        target: (M,3) metres, in the same frame.
         config: Settings; the sections ``flow`` and ``objective`` are used.
         initial: (N,3) flow to start from. It is needed only for objects faster than the search
             covers: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
-        source_offset_ns: (N,) time of each point. Give both clouds' times or neither. They are
-            on one clock, or each counts from its own sweep's reference time; then the target is
-            taken for the next revolution. Without times, an object that the scanner meets earlier
-            or later in the second sweep comes out too slow or too fast.
+        source_offset_ns: (N,) time of each point. Give the times of both clouds, or no times. Both
+            clouds use one clock, or each counts from its own sweep's reference time; in the second
+            case the target is taken for the next revolution. Without times, the flow is too slow or
+            too fast for an object that the scanner meets earlier or later in the second sweep.
         target_offset_ns: (M,) time of each point.
-        source_lidar: (N,) number of the scanner that measured each point. Give both or neither.
-            Each scanner's points are compared with its own; with times, with the others' too.
+        source_lidar: (N,) number of the scanner that measured each point. Give both clouds' numbers
+            or none. Without times, points are compared within a scanner only.
         target_lidar: (M,) number of the scanner that measured each point.
 
     Returns:
-        The flow from the middle of the source's times to that of the target's. With times,
-            ``to_reference`` is the motion from a point's own time to the source's middle.
+        Flow from the middle of the source's times to the target's middle, in the common frame. With
+            times, ``to_reference`` is the motion from a point's own time to the source's middle.
 
     Raises:
-        InputError: No points, wrong shapes, NaN, or an engine that needs a recording.
+        InputError: No points, a wrong shape, NaN, or an engine that needs a recording.
     """
     settings = resolve(config)
     if settings.flow.engine not in ("groups", "paper"):
@@ -107,9 +109,9 @@ def flow_between(
     settings: ObjectiveSettings,
     initial: ArrayLike | None = None,
 ) -> FlowField:
-    """Return the flow of the published objective; arguments and errors as in `estimate_flow`.
+    """Return the flow by the published objective, in the frame of the clouds.
 
-    With ``static_prior`` only groups that certainly move have it.
+    With ``static_prior`` only groups that certainly move have flow. See `estimate_flow`.
     """
     objective = SolverSettings(
         solver=settings.solver,
@@ -162,7 +164,7 @@ def _flow_of_groups(
 
 
 def _attach_below(points: Float, field: FlowField, low: Int) -> None:
-    """Assign the points just below a moving group to it: wheels and feet."""
+    """Assign points just below a moving group (wheels, feet) to the group, in place."""
     members = np.flatnonzero(field.instance >= 0)
     if len(members) and len(low):
         _, row = nearest(tree_of(points[members, :2]), points[low, :2], _BELOW_M)
@@ -170,11 +172,11 @@ def _attach_below(points: Float, field: FlowField, low: Int) -> None:
 
 
 def _tell_scanners(clouds: tuple[Float, Float], lag: tuple[Float, Float]) -> tuple[Int, Int] | None:
-    """Return (N,) and (M,) 0 or 1 for two scanners that spin half a turn apart, else None.
+    """Return (N,) and (M,) scanner numbers 0 or 1 for two scanners half a turn apart, else None.
 
-    Time plus or minus azimuth is one number for all points of a spinning scanner, its phase. If the
-    phases of two scanners are half a turn apart, only the doubled phases agree. lag: of the points,
-    as a share of the time between the clouds, a whole number of turns.
+    A spinning scanner has a phase: time plus or minus azimuth is constant over its points. If the
+    phases of two scanners are half a turn apart, only the doubled phases agree. ``lag`` is the
+    firing times as a share of the time between the clouds (whole turns).
     """
     both = np.concatenate(clouds)
     far = np.hypot(both[:, 0], both[:, 1]) > _MIDDLE_M
@@ -195,9 +197,9 @@ def _tell_scanners(clouds: tuple[Float, Float], lag: tuple[Float, Float]) -> tup
 def _columns(
     source: ArrayLike | None, target: ArrayLike | None, clouds: tuple[Float, Float], name: str
 ) -> tuple[Int, Int] | None:
-    """Return (N,), (M,) int64 columns beside the points of the clouds, None if not given.
+    """Return (N,) and (M,) values of two clouds' points as int64, None if not given.
 
-    Raises InputError for wrong ones.
+    Raises InputError if only one cloud has values, or their shape or type is wrong.
     """
     if source is None and target is None:
         return None
@@ -218,10 +220,10 @@ def _columns(
 
 
 class _Times(NamedTuple):
-    """The times of two clouds.
+    """The firing times of two clouds.
 
-    apart_s: from the middle of one cloud's times to that of the other's. lag: (N,), (M,) of the
-    points after the middle of their cloud's times, as a share of that.
+    lag: (N,) and (M,) times after the middle of the own cloud's times, as a share of ``apart_s``.
+    apart_s: Time from the middle of one cloud's times to the middle of the other cloud's times.
     """
 
     lag: tuple[Float, Float]
@@ -229,7 +231,7 @@ class _Times(NamedTuple):
 
 
 def _times(times_ns: tuple[Int, Int] | None) -> _Times | None:
-    """Return the times of two clouds, None if they are unknown or equal."""
+    """Return the times of two clouds from (N,) and (M,) ns, None if unknown or equal."""
     if times_ns is None:
         return None
     low, high = (np.array([int(of(times)) for times in times_ns]) for of in (np.min, np.max))
@@ -244,7 +246,7 @@ def _times(times_ns: tuple[Int, Int] | None) -> _Times | None:
 
 
 def _only_proven(source: Float, target: Float, flow: Float) -> FlowField:
-    """Keep the flow of groups that fits better than "did not move" in both directions."""
+    """Keep the flow (N,3) of groups that fit the target better than if static, both ways."""
     field = FlowField.zero(len(source))
     moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > _LEAST_MOTION_M)
     num_groups, group = link(source[moved], _LINK_M)
@@ -267,7 +269,7 @@ def _beats_standing_still(
 ) -> bool:
     """Return True if the group's common translation fits the target better than no motion.
 
-    The free flow cannot decide this, because it always comes closer to the target.
+    The free flow of each point cannot decide this, because it always comes closer to the target.
     """
     source_tree, target_tree = trees
     arrived = group + np.median(flow, axis=0)
@@ -301,7 +303,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
 
 
 def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowField:
-    """Return the flow of one sweep's points to another's reference time; sweeps by number."""
+    """Return the flow of sweep ``here`` to the reference time of ``there``, lidar frame."""
     pair = [stretch.sweeps[i] for i in (here, there)]
     sweeps = [s.sweep for s in pair]
     if min(map(len, sweeps)) == 0:
@@ -322,7 +324,7 @@ def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowFiel
 
 
 def _offsets_ns(source: Sweep, target: Sweep) -> tuple[Int | None, Int | None]:
-    """Return the times of the points, since the source's reference time."""
+    """Return firing times (N,) and (M,) since the source's reference time, None if unknown."""
     if source.offset_ns is None or target.offset_ns is None:
         return None, None
     return source.offset_ns, target.offset_ns + (target.stamp_ns - source.stamp_ns)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Propose motions of groups of points between two clouds, and align them.
+"""Propose motions of groups of points between two clouds, and align the groups there.
 
-A group starts at the few displacements that most of its points vote for (Hough 1962). It is aligned
-there with the surfaces of the other cloud (Segal et al., "Generalized-ICP", RSS 2009, with yaw as
-the only rotation). All groups are aligned at once.
+A group starts at the few displacements that most of its points vote for (Hough 1962). From there it
+is aligned with the surfaces of the other cloud (Segal et al., "Generalized-ICP", RSS 2009, with yaw
+as the only rotation). All groups are aligned at once.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ class PairCloud:
 
     Attributes:
         points: (N,3) metres.
-        lag: (N,) firing time after the cloud's reference time, as a share of the time between
-            the two clouds; zeros if unknown.
-        lidar: (N,) number of the scanner; None for a single one.
+        lag: (N,) firing time after the cloud's reference time, as a share of the time between the
+            clouds; 0 if unknown.
+        lidar: (N,) number of the scanner of each point; None for a single scanner.
     """
 
     points: Float
@@ -57,19 +57,23 @@ class PairCloud:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """The tree of the points."""
+        """Search tree of `places` of the points."""
         return tree_of(self.places(self.points, np.arange(len(self.points))))
 
     @cached_property
     def even_tree(self) -> cKDTree:
-        """The tree of one point per voxel, because points are denser along scan lines."""
+        """Search tree of one point per 0.06 m voxel: points are denser along scan lines."""
         places = self.places(self.points, np.arange(len(self.points)))
         return tree_of(places[one_per_voxel(places, _EVEN_M)])
 
     def places(self, points: Float, rows: Int) -> Float:
-        """Return coordinates in which points of different scanners are far from each other.
+        """Return search coordinates (N,3) or (N,4) that keep different scanners far apart.
 
         Each scanner measures an object at another time.
+
+        Args:
+            points: (N,3) metres, for example moved points of the cloud.
+            rows: (N,) rows of these points in the cloud, which tell their scanners.
         """
         if self.lidar is None:
             return points
@@ -78,10 +82,12 @@ class PairCloud:
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """The motion of an object from one cloud's reference time to the other's.
+    """The motion of an object from the source's reference time to the target's.
 
-    It is a displacement x y z (m) and yaw (rad) about ``centre``. ``seen_share`` of it is between
-    its measurements.
+    Attributes:
+        state: (4,) displacement x, y, z (m) and yaw (rad) about ``centre``.
+        centre: (3,) centre of the rotation, in the frame of the clouds.
+        seen_share: Share of the motion between the measurements in source and target, about 1.
     """
 
     state: Float
@@ -89,16 +95,16 @@ class RigidMotion:
     seen_share: float
 
     def seen(self, points: Float) -> Float:
-        """Return (N,3) points, moved from their measurement in the source to that in the target."""
+        """Return (N,3) points, moved from their measured position in the source to the target's."""
         return self.carry(points, self.seen_share)
 
     def carry(self, points: Float, share: float | Float) -> Float:
-        """Return (N,3) points of the object, moved by a share of the motion or by shares (N,)."""
+        """Return (N,3) points of the object, moved by a share of the motion or by (N,) shares."""
         return apply(self.state * np.reshape(share, (-1, 1)), points, self.centre)
 
 
 class Surface:
-    """Points of the target, each with the inverse covariance of the surface around it."""
+    """M points of the target, with the inverse covariance (M,3,3) of the surface around each."""
 
     def __init__(self, target: PairCloud, rows: Int) -> None:
         self.points, self.lag = target.points[rows], target.lag[rows]
@@ -110,15 +116,15 @@ class Surface:
 
 @dataclass
 class Hypotheses:
-    """Motions to try, H of them over P points in all.
+    """Motions to try: H hypotheses with P sample points in all.
 
     Attributes:
-        group: (H,) number of the group.
-        state: (H,4), see `RigidMotion`.
-        centre: (H,3), see `RigidMotion`.
-        row: (P,) of the source, a sample of the group.
-        of_point: (P,) number of the hypothesis.
-        share: (H,) of the motion between the measurements of the group in source and target.
+        group: (H,) index of the group that moves.
+        state: (H,4) displacement and yaw, see `RigidMotion`.
+        centre: (H,3) centre of the rotation, see `RigidMotion`.
+        row: (P,) rows of the sample points in the source.
+        of_point: (P,) index of the hypothesis of each sample point.
+        share: (H,) share of the motion between the group's measurements in source and target.
     """
 
     source: PairCloud
@@ -139,11 +145,14 @@ class Hypotheses:
         apart_s: float | None,
         ground: HeightMap,
     ) -> Hypotheses:
-        """Return every group at its voted positions, at rest, and at the position of ``initial``.
+        """Return every group's hypotheses: at voted displacements, at rest, at ``initial``.
 
-        The height above the ground stays.
+        All displacements follow the slope of the ground.
 
         Args:
+            groups: Rows in ``source`` of each group.
+            candidates: Rows in ``target`` of points that may be moving.
+            initial: (N,3) flow of the source points, at whose median a group also starts, or None.
             apart_s: Time between the clouds, None if unknown.
         """
         group, state, centre, row = [], [], [], []
@@ -173,14 +182,14 @@ class Hypotheses:
         )
 
     def seen(self, share: Float) -> Float:
-        """Return (P,3) the points after a share (P,) of their motions."""
+        """Return the (P,3) sample points, moved by a share (P,) of their hypothesis."""
         state = self.state[self.of_point] * share[:, None]
         return apply(state, self.source.points[self.row], self.centre[self.of_point])
 
     def align(self, surface: Surface) -> None:
-        """Align all states at once by Gauss-Newton steps.
+        """Align all hypotheses by Gauss-Newton steps, changing state and share in place.
 
-        A match spans the time from the measurement of the source point to that of the target point.
+        A match spans the time from its measurement in the source to the one in the target.
         """
         start = self.state.copy()
         lag = self.source.lag[self.row]
@@ -212,9 +221,10 @@ class Hypotheses:
 def _step(
     residual: Float, arm: Float, share: Float, information: Float, of_point: Int, prior: Float
 ) -> Float:
-    """Return (H,4) Gauss-Newton steps of all hypotheses.
+    """Return the (H,4) Gauss-Newton steps of all hypotheses, to be subtracted from the states.
 
-    prior: (H,4) gradient of the prior.
+    K matches have residual and arm (K,3), share (K,) of the motion, and information (K,3,3).
+    ``of_point`` (K,) is a match's hypothesis, ``prior`` (H,4) the gradient of the prior.
     """
     J = np.zeros((len(arm), 3, 4))
     J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = 1.0
@@ -229,15 +239,15 @@ def _step(
 
 
 def _num_vote_steps(apart_s: float | None) -> int:
-    """Return the number of steps that the fastest object may travel."""
+    """Return the number of vote steps (0.2 m) that the fastest object may travel."""
     apart_s = _USUAL_S if apart_s is None else min(apart_s, _LONGEST_S)
     return max(1, round(_MAX_SPEED_M_S * apart_s / _VOTE_STEP_M))
 
 
 def _vote(points: Float, there: Float, n: int) -> Float:
-    """Return (S,3) displacements, zero first, at which most (N,3) points meet another cloud.
+    """Return (S,3) displacements, zero first, that bring most points close to the other cloud.
 
-    Each point votes once for a displacement of fewer than n steps.
+    Each point has one vote for each displacement of up to n steps of 0.2 m along x and y.
     """
     zero = np.zeros((1, 3))
     span_m = np.array([n * _VOTE_STEP_M, n * _VOTE_STEP_M, _VOTE_SLACK_M])
@@ -269,9 +279,9 @@ def _vote(points: Float, there: Float, n: int) -> Float:
 
 
 def slope_of(ground: HeightMap, place: Float) -> Float:
-    """Return (2,) the slope of the ground around a place along x and y.
+    """Return the slope (2,) of the ground along x and y, around a position (3,).
 
-    It is 0 where the map is not plane, because clouds may come without their ground.
+    It is 0 where the height map is not plane, because clouds may come without ground points.
     """
     steps = np.arange(-_SLOPE_STEPS, _SLOPE_STEPS + 1) * _SLOPE_STEP_M
     arm = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -282,12 +292,12 @@ def slope_of(ground: HeightMap, place: Float) -> Float:
 
 
 def one_per_voxel(places: Float, side_m: float) -> Int:
-    """Return the rows of the first of the (N,3) or (N,4) `PairCloud.places` in each cube."""
+    """Return the rows of the first point in each cube, given its `PairCloud.places`."""
     voxel = np.floor(places / side_m).astype(np.int64)
     key = voxel @ np.array([1, 1 << 20, 1 << 40, 7][: voxel.shape[1]])
     return np.sort(np.unique(key, return_index=True)[1])
 
 
 def thinned(rows: Int, num: int) -> Int:
-    """Return about ``num`` of the rows, evenly spaced."""
+    """Return at most ``num`` of the rows, evenly spaced."""
     return rows[:: (len(rows) - 1) // num + 1] if len(rows) else rows

@@ -3,8 +3,8 @@
 
 A point is unexplained if the other cloud has no counterpart at its position. Connected groups with
 many unexplained points are aligned with the other cloud at several candidate positions
-(`densify.flow.pairs.hypotheses`). A group moves if its motion explains, in both clouds, the points
-that are unexplained if it is static.
+(`densify.flow.pairs.hypotheses`). A group moves if its motion explains points, in both clouds, that
+stay unexplained if the group is static.
 """
 
 from __future__ import annotations
@@ -40,11 +40,10 @@ def find_movers(
     initial: Float | None = None,
     apart_s: float | None = None,
 ) -> tuple[list[RigidMotion], Int]:
-    """Return the motions, and (N,) the motion of each source point, -1 for none.
+    """Return the motions of the moving groups, and (N,) each source point's motion, -1 for static.
 
     Args:
-        ground: Under both clouds.
-        initial: (N,3) flow. A group is also tried at the median flow of its members.
+        initial: (N,3) flow. A group also starts at the median flow of its members.
         apart_s: Time between the clouds, None if unknown. The search covers up to 38 m/s.
     """
     with ThreadPoolExecutor(2) as pool:
@@ -79,7 +78,10 @@ def find_movers(
 def _choose(
     trials: list[Trial], groups: list[Int], ours: Unexplained, theirs: Unexplained
 ) -> tuple[list[RigidMotion], Int]:
-    """Return at most one motion per group, with each target explained once."""
+    """Return at most one motion per group, and (N,) the index of each source point's motion.
+
+    Each target point is explained by at most one motion.
+    """
     free = np.ones(len(theirs.unexplained), bool)
     trials = _thinnest([t for t in trials if t.proves(free)])
     assigned = _assigned(trials, theirs.group)
@@ -96,9 +98,9 @@ def _choose(
 
 
 def _thinnest(trials: list[Trial]) -> list[Trial]:
-    """Drop trials with thicker surfaces than another motion close by.
+    """Drop trials whose surfaces are thicker than with another motion of the group within 1 m.
 
-    Nearest points cannot decide, because they fit any ring.
+    Nearest points cannot decide, because a moved object fits them ring to ring.
     """
     kept = []
     for trial in trials:
@@ -115,10 +117,10 @@ def _thinnest(trials: list[Trial]) -> list[Trial]:
 
 
 def _assigned(trials: list[Trial], target_group: Int) -> list[Trial]:
-    """Return groups assigned to groups of the target with the greatest total gain.
+    """Return the trials of an assignment of source groups to target groups with the greatest gain.
 
-    In a row of similar cars, each could take the place of the next, but the last would find none. A
-    group that is only a part of an object may stay unassigned, for its own gain.
+    In a row of similar cars, each could take the place of the next car, but the last would find no
+    place. A group that is only a part of an object may stay unassigned and counts its own gain.
     """
     best: dict[tuple[int, int], Trial] = {}
     for trial in trials:
@@ -140,9 +142,9 @@ def _assigned(trials: list[Trial], target_group: Int) -> list[Trial]:
 def _attach(
     motions: list[RigidMotion], instance: Int, ours: Unexplained, theirs: Unexplained
 ) -> None:
-    """Give points close to a moving group its motion if that explains them.
+    """Give points close to a moving group its motion, in place, if it explains them.
 
-    Unexplained points may be farther away.
+    Unexplained points may be up to 1 m away, others 0.3 m.
     """
     points = ours.cloud.points
     members, others = np.flatnonzero(instance >= 0), np.flatnonzero(instance < 0)

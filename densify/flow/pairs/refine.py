@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Refine motions until the surfaces of an object, moved to one time, are thin.
+"""Refine motions until the surfaces of an object, accumulated at one time, are thin.
 
-The rings of a scanner are elsewhere on an object that has moved. Nearest points fit any ring.
-Therefore they hold the motion back. If two scanners share a sweep, an object appears twice, half of
+After an object has moved, the rings of a scanner hit other parts of it. Nearest points match ring
+to ring and hold the motion back. If two scanners share a sweep, an object appears twice, half of
 the motion apart. Planes through several rings let a surface slide along itself, and the other
 surfaces fix the slide (as in Stückler, Behnke, "Multi-Resolution Surfel Maps", JVCI 2014). Here the
 planes are fitted again in every step, from all other points of the object, each at its own time.
@@ -51,9 +51,11 @@ _ARRIVED_POINTS = 300
 
 
 class Refined(NamedTuple):
-    """A motion with the thickness of the object's surfaces (m), and its ratio to that at rest.
+    """A motion, and how thin the object's surfaces become when its points are moved by it.
 
-    They are None if too few points are on surfaces.
+    Attributes:
+        thickness_m: Mean distance of points from their surface; None for too few surface points.
+        of_standing: Ratio of the thickness to the thickness without motion; None likewise.
     """
 
     motion: RigidMotion
@@ -70,15 +72,13 @@ def refined(
     ground: HeightMap,
     timed: bool,
 ) -> Refined:
-    """Return the refined motion of the source's ``members``.
-
-    If the surfaces are thinner with the motion as it is, that is returned.
+    """Return the refined motion of a group, or the given motion if its surfaces are thinner.
 
     Args:
-        candidates: Rows of the target that may be the object's.
-        timed: Lags are known, and every scanner's points are compared with those of all others,
-            each at its own time. Otherwise they are compared with the other cloud, by the same
-            scanner if that is known.
+        members: Rows of the group in ``source``.
+        candidates: Rows in ``target`` of points that may belong to the object.
+        timed: True if firing times are known. Then points of all scanners are compared, each at its
+            own time. Otherwise points are compared with the other cloud, scanner by scanner.
     """
     if len(members) < _MIN_POINTS:
         return Refined(motion)
@@ -107,7 +107,7 @@ def refined(
 
 
 def _starts(motion: RigidMotion, slope: Float, source: PairCloud, timed: bool) -> list[Float]:
-    """Return starts on the ground: the motion, and others at which it may be held back."""
+    """Return states (4,) to start from: the motion's own, and shorter and longer displacements."""
     way = motion.state[:2]
     length_m = np.linalg.norm(way)
     factors = (1.0, *(1 + shift / length_m for shift in _SHIFTS_M if length_m + shift > 0))
@@ -125,7 +125,7 @@ def _arrivals(
     target: PairCloud,
     candidates: Int,
 ) -> Int:
-    """Return the target's candidates near the members after one of the motions."""
+    """Return the rows among ``candidates`` close to the members after any of the motions."""
     points = source.points[thinned(members, _ARRIVED_POINTS)]
     arrived = np.concatenate([motion.seen(points) for motion in motions])
     low, high = arrived.min(0) - _NEAR_M, arrived.max(0) + _NEAR_M
@@ -138,7 +138,16 @@ def _arrivals(
 
 @dataclass(frozen=True)
 class _Surfaces:
-    """The points of an object in both clouds, see `_settle`."""
+    """The n points of an object in both clouds.
+
+    Attributes:
+        points: (n,3) measured positions.
+        share: (n,) share of the motion at the time of each measurement.
+        sampling: (n,) index of the point's combination of cloud and scanner.
+        judges: (samplings, samplings) bool, True if the second defines surfaces for the first.
+        centre: (3,) centre of the rotation.
+        reach_m: Radius of the neighbourhood that defines a plane.
+    """
 
     points: Float
     share: Float
@@ -171,9 +180,10 @@ class _Surfaces:
         )
 
     def settled(self, start: Float, gates_m: Float) -> tuple[Float, float, float]:
-        """Return the state after a step for each gate, and the quality of the surfaces.
+        """Return the state after a step for each gate, the mean thickness (m), and the plane share.
 
-        The quality is their thickness (m) and the share of points on a surface.
+        The plane share counts points with a plane. A gate is a distance: points beyond it have no
+        weight.
         """
         state, told = start.copy(), np.empty(2)
         _settle(
@@ -192,7 +202,7 @@ class _Surfaces:
 
 
 def _evenly(cloud: PairCloud, rows: Int) -> Int:
-    """Return the rows with one point of each scanner per voxel, few enough in all."""
+    """Return the rows thinned to one point of each scanner per voxel, at most 600 in all."""
     side_m = _SIDE_M
     while True:
         first = one_per_voxel(cloud.places(cloud.points[rows], rows), side_m)
@@ -214,13 +224,11 @@ def _settle(
     state: Float,
     told: Float,
 ) -> None:
-    """Move ``state`` (4,), in place, until the surfaces are thin, by Gauss-Newton steps.
+    """Move ``state`` (4,), in place, by Gauss-Newton steps until the surfaces are thin.
 
-    The points (n,3) are as measured after their ``share`` (n,) of the motion. The distance of a
-    point is that from the plane of the points within ``reach_m`` whose sampling judges its own:
-    sampling (n,) and judges (samplings, samplings). gates_m: for each step the distance from which
-    on a point has no weight. told: (2,) filled with the mean distance, at most ``_LIMIT_M``, and
-    with the share of points with a plane.
+    A step for each of ``gates_m`` gives no weight to points farther from their plane. The prior at
+    the start has the weight ``precision`` (4,), 1/m² and 1/rad². ``told`` (2,) is filled with the
+    mean distance, at most ``_LIMIT_M``, and the share of points with a plane.
     """
     H, g = np.empty((4, 4)), np.empty(4)
     start, at = state.copy(), np.empty_like(points)
@@ -241,7 +249,7 @@ def _settle(
 
 @inlined
 def _bring_back(points, share, centre, state, at):  # type: ignore[no-untyped-def]
-    """Fill ``at`` with the positions of the points at time 0."""
+    """Fill ``at`` (n,3) with the positions of the points at the source's reference time."""
     for i in range(len(points)):
         yaw = share[i] * state[3]
         c, s = np.cos(yaw), np.sin(yaw)
@@ -263,7 +271,7 @@ def _add(H, g, J, weight, off_m):  # type: ignore[no-untyped-def]
 
 @inlined
 def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told):  # type: ignore[no-untyped-def]
-    """Fill the normal equations, by Tukey's weights, and ``told``; return the sum of weights."""
+    """Fill the normal equations H, g and ``told``; return the sum of Tukey weights."""
     H[:], g[:] = 0.0, 0.0
     total, distance_m, num_planes, first = 0.0, 0.0, 0, 0
     squared_reach = reach_m * reach_m

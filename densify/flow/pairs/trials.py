@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Test the motion of a group between two clouds: does it explain the differences?.
+"""Test whether the motion of a group explains the differences between two clouds.
 
-Nearest points alone cannot decide. The rings of a scanner are elsewhere on an object that has
-moved. Each promising motion is refined until the object's surfaces are thin
+Nearest points alone cannot decide, because the rings of a scanner hit other parts of an object
+after it has moved. Each promising motion is refined until the object's surfaces are thin
 (`densify.flow.pairs.refine`). It is judged by the points that it explains, and by the thickness of
-the surfaces relative to that at rest.
+the surfaces relative to their thickness without motion.
 """
 
 from __future__ import annotations
@@ -38,20 +38,23 @@ _MAX_OF_STANDING = 0.82  # if much stays unexplained
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """The evidence for a motion of a group, in the group and around its position in the target.
+    """The evidence for a motion of a group, in the source and around its position in the target.
+
+    A point is unexplained if the other cloud has no counterpart (see `Unexplained`).
 
     Attributes:
-        group: Number of the group.
-        still: Number of unexplained source points at rest, in a sample.
-        left: Number of unexplained source points with the motion, in the same sample.
+        group: Index of the group.
+        refined: Motion with the thickness of its surfaces.
+        still: Number of source points, in a sample, unexplained if the group is static.
+        firmly: Number of source points, of the whole group, that no scanner explains if static.
+        left: Number of source points, in the same sample, unexplained if the group moves.
         misfit: Mean distance to the target with the motion, as a share of the tolerance.
-        still_there: Number of unexplained targets at rest.
-        firmly: Number of source points, of all, that no scanner explains.
-        firmly_there: Number of targets, of all, that no scanner explains.
-        around: Targets nearby.
-        explained: Targets nearby that the motion explains.
-        own_gain_m: Decrease of all distances from the group to the target.
-        gain_m: The same, with those from the target around.
+        still_there: Number of target points unexplained if the group is static.
+        firmly_there: Number of target points that no scanner explains if the group is static.
+        around: Rows of the target points close to the moved group.
+        explained: Rows of ``around`` that the motion explains.
+        own_gain_m: Decrease of the sum of distances from the group's points to the target.
+        gain_m: ``own_gain_m`` plus the decrease for the target points around.
     """
 
     group: int
@@ -71,7 +74,7 @@ class Trial:
     def of(
         group: int, members: Int, refined: Refined, ours: Unexplained, theirs: Unexplained
     ) -> Trial:
-        """Return the evidence for the motion of the source's ``members`` by nearest points."""
+        """Return the evidence for the motion of the source's ``members``, by nearest points."""
         sample = thinned(members, _LOOK_POINTS)
         place = ours.cloud.places(refined.motion.seen(ours.cloud.points[sample]), sample)
         far, tolerance_m = distances_m(place, theirs.cloud.tree), ours.tolerance_m(sample)
@@ -93,19 +96,19 @@ class Trial:
         )
 
     def after(self, found: Refined, settled: Trial) -> Trial:
-        """Return the trial of the refined motion.
+        """Return the trial of the refined motion ``found``.
 
-        It is judged by nearest points before or after the refinement, whichever fits better. Rings
-        that are aligned with each other fit, but hold the motion back.
+        Its evidence is taken before refinement (``self``) or after it (``settled``), whichever fits
+        better. Rings aligned with each other fit well, but hold the motion back.
         """
         here, there = (t._off(len(t.around) - len(t.explained)) for t in (self, settled))
         return replace(self, refined=found) if here < there else settled
 
     def left_there(self, free: Bool) -> int:
-        """Return the number of targets that stay unexplained.
+        """Return the number of target points around that stay unexplained.
 
         Args:
-            free: (M,) those that no other motion explains.
+            free: (M,) True for target points that no other motion explains.
         """
         return len(self.around) - int(free[self.explained].sum())
 
@@ -123,8 +126,11 @@ class Trial:
     def proves(self, free: Bool) -> bool:
         """Return True if the motion is confirmed.
 
-        With thin surfaces less must be explained. If they are as thin at rest, nearly all must be
-        explained.
+        Thin surfaces lower the share of points that must be explained. If the surfaces are as thin
+        without motion, nearly all points must be explained.
+
+        Args:
+            free: (M,) True for target points that no other motion explains.
         """
         left_there = self.left_there(free)
         off = self._off(left_there)
@@ -154,9 +160,9 @@ class Trial:
 def promising(
     hypotheses: Hypotheses, ours: Unexplained, theirs: Unexplained
 ) -> list[tuple[int, RigidMotion]]:
-    """Return groups and motions that pass a first test, in the source alone.
+    """Return (group index, motion) for the hypotheses that pass a first test, in the source alone.
 
-    Of several equal motions the one that leaves least is taken.
+    Among nearly equal motions of a group, the motion with the smallest misfit is taken.
     """
     num = len(hypotheses.state)
     row, of_point, state = hypotheses.row, hypotheses.of_point, hypotheses.state
@@ -186,9 +192,9 @@ def promising(
 
 
 def _ambiguous(points: Float, way: Float) -> bool:
-    """Return True if the group could be another part of the same surface.
+    """Return True if the group, moved by ``way`` (3,), could be another part of the same surface.
 
-    A flat group that moves along itself may be a part of a wall, observed through a gap. A level
+    A flat group that moves along itself may be a part of a wall, observed through a hole. A level
     bar may be any part of a rail, unless it moves across itself and has the size of a far car's
     back.
     """
@@ -207,7 +213,9 @@ def _looked_back(
 ) -> tuple[Int, Int, float]:
     """Return the evidence in the target at the position of the moved group.
 
-    It has `Trial`'s around and explained, and the decrease of the distances (m).
+    Returns:
+        ``around`` and ``explained`` of `Trial`, and the decrease (m) of the sum of distances from
+            points around.
     """
     sample = thinned(members, _JUDGE_POINTS)
     arrived = motion.seen(ours.cloud.points[sample])

@@ -27,13 +27,13 @@ _MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # above the ground, of its lowest and highes
 
 
 class Unexplained:
-    """The points of a cloud that the other one does not explain, and their groups.
+    """The points of a cloud without a counterpart in the other cloud, and the groups around them.
 
     Attributes:
-        distance_m: (N,) to the other cloud, at most 0.6 m.
-        unexplained: (N,) bool.
-        firmly: (N,) unexplained by the other scanners too: two scanners measure the posts of a
-            rail by different rings.
+        distance_m: (N,) distance to the other cloud, at most 0.6 m.
+        unexplained: (N,) bool, True without a counterpart of the same scanner within the tolerance.
+        firmly: (N,) bool, True if no scanner of the other cloud has a counterpart. Two scanners may
+            measure the posts of a rail with different rings.
         candidates: (C,) rows that belong to a group.
         group: (N,) label of the group, -1 for none.
     """
@@ -49,7 +49,7 @@ class Unexplained:
 
     @staticmethod
     def of(cloud: PairCloud, other: PairCloud) -> Unexplained:
-        """Return the unexplained points of a cloud."""
+        """Return the points of ``cloud`` that ``other`` does not explain."""
         rows = np.arange(len(cloud.points))
         own_m = distances_m(cloud.places(cloud.points, rows), other.tree)
         alone = own_m > EXPLAINED_M
@@ -59,9 +59,9 @@ class Unexplained:
         return Unexplained(cloud, own_m, alone)
 
     def tolerance_m(self, rows: Int) -> Float:
-        """Return the distance of each point within which a counterpart counts.
+        """Return for each row the greatest distance (m) at which another point is a counterpart.
 
-        It is larger in sparse parts, which are sparse in both clouds.
+        It is larger in sparse regions, which are sparse in both clouds.
         """
         k = min(_NUM_SPACING + 1, self.cloud.even_tree.n)
         place = self.cloud.places(self.cloud.points[rows], rows)
@@ -69,7 +69,7 @@ class Unexplained:
         return np.clip(spacing_m, EXPLAINED_M, _MAX_EXPLAINED_M)
 
     def groups(self, ground: HeightMap) -> list[Int]:
-        """Return the rows of each group that may be a road user, without tree crowns and walls."""
+        """Return the rows of each group that may be a road user, without crowns and walls."""
         order = self.candidates[np.argsort(self.group[self.candidates], kind="stable")]
         parts = np.split(order, np.flatnonzero(np.diff(self.group[order])) + 1)
         return [
@@ -81,10 +81,10 @@ class Unexplained:
         ]
 
     def _grouped(self) -> Int:
-        """Return (N,) labels of groups.
+        """Return (N,) group labels, -1 for none.
 
-        Connected points are one group if it is no longer than a vehicle and much of it is
-        unexplained. Elsewhere only the points close to unexplained ones are one.
+        Connected points form one group if it is no longer than a vehicle and at least 10 % of it is
+        unexplained. Elsewhere only the points close to unexplained points form groups.
         """
         points = self.cloud.points
         num, label = link(points, _LINK_M)
@@ -100,7 +100,7 @@ class Unexplained:
 
 
 def _extents_m(points: Float, label: Int, num: int) -> Float:
-    """Return (num,) the diagonals of the groups' bounding boxes from above."""
+    """Return (num,) horizontal diagonals of the groups' bounding boxes; ``label`` is (N,)."""
     low, high = np.full((num, 2), np.inf), np.full((num, 2), -np.inf)
     np.minimum.at(low, label, points[:, :2])
     np.maximum.at(high, label, points[:, :2])
@@ -108,7 +108,7 @@ def _extents_m(points: Float, label: Int, num: int) -> Float:
 
 
 def _may_drive(height_m: Float32) -> bool:
-    """Return True if a group with those heights above the ground may be a road user."""
+    """Return True if a group with these heights above the ground may be a road user."""
     low_m, high_m = np.percentile(height_m, (5, 95))
     return bool(low_m <= _MAX_LOW_M and high_m <= _MAX_HIGH_M)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The extent of tracked objects: which points of each sweep belong to which object."""
+"""Decide which points of each sweep belong to which tracked object."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ _PREDICTED_S = 0.2  # before the first and after the last observation
 
 @dataclass(frozen=True)
 class SweepPoints:
-    """The N points of a sweep, or of a batch, that may belong to an object.
+    """The N points of a sweep, or of a batch of sweeps, that may belong to an object.
 
     Attributes:
-        row: (N,) in the sweep.
+        row: (N,) index into the sweep's points.
         points: (N,3) world.
-        time_s: (N,) firing time.
-        height_m: (N,) above the ground.
-        gap_m: (N,) between neighbouring rings there.
-        reach_m: (N,) greatest distance from an object's shape.
+        time_s: (N,) firing time since the first sweep's reference time.
+        height_m: (N,) height above the ground.
+        gap_m: (N,) distance between neighbouring rings at the point.
+        reach_m: (N,) greatest distance from the shape of an object that may own the point.
     """
 
     row: Int
@@ -60,7 +60,7 @@ class SweepPoints:
     def of(
         stretch: Stretch, i: int, ground: HeightMap, obstacles: Obstacles, sensors: Sensors
     ) -> SweepPoints:
-        """Return the points of sweep i that are not too low."""
+        """Return the points of sweep i more than 0.08 m above the ground."""
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
@@ -74,22 +74,23 @@ class SweepPoints:
 
     @staticmethod
     def together(parts: Sequence[SweepPoints]) -> SweepPoints:
-        """Return the points of the sweeps of one batch, sweep by sweep."""
+        """Concatenate the points of the sweeps of one batch, in the order of the sweeps."""
         columns = (np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SweepPoints))
         return SweepPoints(*columns)
 
     @cached_property
     def strips(self) -> Strips:
-        """Return the points, ready to be searched."""
+        """Index of the points for box queries."""
         return Strips(self.points)
 
 
 def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Shape:
-    """Return the shape of all points of a track; those of a walker without their surroundings.
+    """Return the accumulated shape of a track; shapes of walkers exclude their surroundings.
 
-    Echoes that merged with those of a wall occur in even or in odd sweeps only. The points of a
-    bush are static, or lie among static points. Hardly any sweep sees through a wall itself, but
-    slow cars have such sides too: only objects shorter than 1.5 m are cut.
+    Objects faster than 2 m/s keep all points. Otherwise three kinds of points are dropped. Echoes
+    merged with the echoes of a wall occur only in even or only in odd sweeps. Points of a bush are
+    static or lie among static points. Points of a wall are hardly ever seen through. The same holds
+    for sides of slow cars: this cut applies only if the rest is shorter than 1.5 m.
     """
     sweeps = sorted(track.claimed)
     parts = {j: track.points_in(obstacles, [j]) for j in sweeps}
@@ -116,16 +117,14 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
 def _is_static(
     track: Track, obstacles: Sequence[Obstacles], parts: dict[int, Float], of: Int, reach_m: float
 ) -> Bool:
-    """Return (N,) True for points whose measured positions are more often occupied than moved ones.
+    """Return (N,) True for points that other sweeps confirm as static.
 
-    Other sweeps decide: at a static point they have more returns at its measured position than at
-    the position that it would have moved to.
+    More of the other sweeps have a return at the measured position of such a point than at its
+    position moved along with the object.
 
     Args:
-        track: The object.
-        obstacles: Of all sweeps.
-        parts: By sweep, in the object's own frame, N points in all.
-        of: (N,) number of the point's sweep.
+        parts: Points of the object by sweep index, in the object's frame, N in all.
+        of: (N,) position of the point's sweep in ``parts``.
         reach_m: Greatest distance from a position to a return that occupies it.
     """
     in_object = np.concatenate(list(parts.values()))
@@ -149,10 +148,10 @@ def assign_points(
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
 ) -> list[Instance]:
-    """Return for each sweep of a batch (N,) the object of each of its points, -1 for none.
+    """Return for each sweep of a batch (N,) the index of each point's object, -1 for none.
 
     Args:
-        obstacles: Of all sweeps of the stretch.
+        obstacles: Points above the ground of each sweep of the stretch.
     """
     parts = [SweepPoints.of(stretch, i, ground, obstacles[i], space.sensors) for i in batch]
     attached = []
@@ -171,10 +170,10 @@ def assign_points(
 
 
 def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock) -> Instance:
-    """Return (N,) the object of each point of sweep i, -1 for none.
+    """Return (N,) the index of the object of each point of sweep i, -1 for none.
 
-    A point belongs to an object if it is close to the object's accumulated points, or lies within
-    their outline. The ground below a walker does not.
+    A point belongs to an object if it is close to the object's accumulated points or within their
+    outline. The ground below a walker does not belong to the walker.
     """
     instance = np.full(len(seen.points), -1, np.int32)
     least_m = np.full(len(seen.points), np.inf)
@@ -202,9 +201,12 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
 def leave_out_isolated(
     instance: Instance, seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock
 ) -> None:
-    """Take isolated points from the objects, in place, where they are low or the object walks.
+    """Detach isolated points that are low or belong to a slow object (``instance`` = -1).
 
-    They are echoes merged with those of a wall, or the road behind an edge.
+    They are echoes merged with the echoes of a wall, or the road behind an edge.
+
+    Args:
+        instance: (N,) index of each point's object, -1 for none; changed in place.
     """
     low = seen.height_m < _AS_LOW_AS_ROAD_M
     for k in np.unique(instance[instance >= 0]):
@@ -225,10 +227,14 @@ def lengthen(
     objects: Sequence[MovingObject],
     space: FreeSpace,
 ) -> None:
-    """Extend vehicles along their heading, as wide and as high as they are, without a gap.
+    """Extend vehicles along their heading, as wide and as high as they are.
 
-    No sweep sees through the middle of a long side that slides along itself. The extension ends
-    where another sweep sees through the moved points.
+    The middle of a long side that slides along itself is never seen through, and lacks candidates.
+    The extension ends at a hole, or where another sweep sees through the moved points.
+
+    Args:
+        instance: (N,) index of each point's object, -1 for none; changed in place.
+        i: First sweep of the batch.
     """
     for k, (track, shape) in enumerate(objects):
         mine = np.flatnonzero(instance == k)
@@ -253,12 +259,12 @@ def lengthen(
 
 
 def columns_apart_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
-    """Return the distance along a side between the columns of rays that hit it.
+    """Return the distance along a side between neighbouring columns of rays that hit it.
 
     Args:
-        place: (3,) on the side, world.
-        ahead: (2,) unit vector along it.
-        T_lidar_world: (4,4).
+        place: (3,) position on the side, world.
+        ahead: (2,) unit vector along the side, world.
+        T_lidar_world: (4,4) pose of the world in the lidar frame.
     """
     in_lidar = poses.transform(T_lidar_world, place[None])[0, :2]
     x, y = T_lidar_world[:2, :2] @ ahead
@@ -268,7 +274,7 @@ def columns_apart_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: S
 
 
 def _is_linked(along: Float, own: Float, hole_m: float) -> Bool:
-    """Return (N,) True for the positions that reach (M,) ``own`` by steps of up to ``hole_m``."""
+    """Return (N,) True for positions connected to any of ``own`` (M,) by steps up to ``hole_m``."""
     everything = np.concatenate([along, own])
     order = np.argsort(everything, kind="stable")
     run = np.zeros(len(everything), np.int64)
@@ -279,17 +285,13 @@ def _is_linked(along: Float, own: Float, hole_m: float) -> Bool:
 def _is_free_of_violations(
     track: Track, seen: SweepPoints, rows: Int, along: Float, i: int, space: FreeSpace
 ) -> Bool:
-    """Return (N,) True for the points that no other sweep contradicts, from the middle outwards.
+    """Return (N,) True for extension points up to the first violations, ahead and behind.
 
-    Ahead and behind, the points end where another sweep sees through too many of the moved points.
+    The extension ends where another sweep sees through more than 5 % of the moved points so far.
 
     Args:
-        track: The object.
-        seen: Points of the batch.
-        rows: (N,) of ``seen``.
-        along: (N,) metres ahead of the middle.
-        i: Sweep of the points.
-        space: The free space that the sweeps observed.
+        rows: (N,) rows in ``seen`` of the extension.
+        along: (N,) metres ahead of the object's middle, negative behind.
     """
     step = np.floor(np.abs(along) / LINK_M).astype(np.int64)
     num_steps = int(step.max(initial=0)) + 1
@@ -308,11 +310,11 @@ def _is_free_of_violations(
 
 
 def is_known_at(track: Track, i: int, clock: Clock) -> bool:
-    """Return True if sweep i is among those that observed the object, or at most 0.2 s away."""
+    """Return True if sweep i lies within the track's sweeps or at most 0.2 s outside."""
     first, last = min(track.claimed), max(track.claimed)
     return first <= i <= last or any(clock.near(i, end, _PREDICTED_S) for end in (first, last))
 
 
 def _speed_m_s(track: Track, i: int, clock: Clock) -> float:
-    """Return the speed at sweep i."""
+    """Return the horizontal speed of the object at sweep i."""
     return float(np.linalg.norm(track.path.rate(track.seen_at(clock.time_ns[i]))[:2]))

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Non-rigid motion: how a tracked object bends about its rigid motion.
+"""Estimate non-rigid motion: how a tracked object bends relative to its rigid motion.
 
 The smoothness term is the graph Laplacian of Pontes, Hays, Lucey, "Scene Flow from Point Clouds
 with or without Learning" (3DV 2020, section 3). Infinite stiffness gives a rigid object. Their data
 term, nearest points, pulls points onto the scan lines of the other sweep. Here blurred surfaces are
 compared: a point moves by the mean of the target around it minus the mean of its own sweep around
 it. The first mean is a soft correspondence (Granger, Pennec, "Multi-scale EM-ICP", ECCV 2002). The
-second removes the effect of the blur itself at edges and in gaps.
+second removes the effect of the blur itself at edges and in holes.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Part:
     """The points of an object in one sweep.
 
     Attributes:
-        points: (n,3) metres, n >= 1, in the object's own frame.
-        time_s: When they were measured.
+        points: (n,3) metres, n >= 1, in the object's own frame (rigid motion removed).
+        time_s: Mean firing time of the points.
     """
 
     points: Float
@@ -54,15 +54,16 @@ class Part:
 
 @dataclass(frozen=True)
 class Softened:
-    """How an object bends from part to part.
+    """How an object bends from part (the object's points in one sweep) to part.
 
     Attributes:
-        to_next, to_previous: For each part (n,3) metres by which its points leave the rigid
-            motion until the next and the previous part; 0 where there is none, and for a rigid
+        to_next: For each part (n,3) metres, displacement of its points to the time of the next part
+            relative to the rigid motion, object's frame. It is 0 for the last part and for a rigid
             object.
-        alpha: The stiffness that held-out parts confirmed, inf for rigid.
-        held_out_m: For each alpha tried, inf first, the root mean square distance of held-out
-            parts from their prediction; empty where nothing was tried.
+        to_previous: The same to the previous part; 0 for the first part.
+        alpha: Stiffness that held-out parts confirmed, inf for rigid.
+        held_out_m: Root mean square distance of held-out parts from their prediction, by the alpha
+            tried, inf first; empty if nothing was tried.
     """
 
     parts: tuple[Part, ...]
@@ -72,7 +73,10 @@ class Softened:
     held_out_m: dict[float, float]
 
     def velocity_m_s(self, i: int) -> Float:
-        """Return (n,3) of part i's points about the rigid motion: the mean of before and after."""
+        """Return (n,3) velocities of part i's points relative to the rigid motion, object's frame.
+
+        They are the mean of the velocities to the next and from the previous part.
+        """
         velocities = [np.zeros_like(self.parts[i].points)]
         for j, moved in ((i + 1, self.to_next[i]), (i - 1, self.to_previous[i])):
             if 0 <= j < len(self.parts):
@@ -80,9 +84,9 @@ class Softened:
         return np.asarray(np.mean(velocities[1:] or velocities, axis=0))
 
     def carry(self, i: int, j: int) -> Float:
-        """Return (n,3) the points of part i at part j's time.
+        """Return the (n,3) points of part i at the time of part j, object's frame.
 
-        At each part between, a point goes on as the nearest points do that came the same way.
+        At each part in between, a point continues like nearby points that came the same way.
         """
         at, step = self.parts[i].points, 1 if j > i else -1
         if i == j or np.isinf(self.alpha):
@@ -102,9 +106,9 @@ def soften(parts: Sequence[Part]) -> Softened:
 
     The stiffness is lowered while held-out parts confirm it: every second part is left out, and
     predicted from the bending between its neighbours. The softest stiffness is taken that predicts
-    clearly better than the rigid object, in most parts. Otherwise the object stays rigid. So do
-    objects longer than 3 m, or in fewer than 5 sweeps, less than 0.35 s, or with a median of fewer
-    than 20 points.
+    clearly better than the rigid object, in most parts. Otherwise the object stays rigid. Objects
+    also stay rigid if they are longer than 3 m, or observed in fewer than 5 sweeps, for less than
+    0.35 s, or with a median of fewer than 20 points.
     """
     parts = tuple(parts)
     still = tuple(np.zeros_like(part.points) for part in parts)
@@ -127,7 +131,7 @@ def soften(parts: Sequence[Part]) -> Softened:
 
 
 def _may_bend(parts: tuple[Part, ...]) -> bool:
-    """Return False for vehicles, and for what was observed too little to tell."""
+    """Return True if the object is shorter than 3 m and was observed often enough."""
     if len(parts) < _MIN_PARTS or parts[-1].time_s - parts[0].time_s < _MIN_SEEN_S:
         return False
     if np.median([len(p.points) for p in parts]) < _MIN_POINTS:
@@ -137,9 +141,10 @@ def _may_bend(parts: tuple[Part, ...]) -> bool:
 
 
 def _held_out(parts: tuple[Part, ...]) -> Float:
-    """Return (held-out parts, 1 + levels) mean squared distances, those of the rigid object first.
+    """Return the mean squared distance (m²) of each held-out part from its prediction.
 
-    Concretely, ``[i, k]`` is about part i + 1 at stiffness k - 1. Targets are the neighbours alone.
+    The array is (held-out parts, 1 + stiffness levels). Element ``[i, k]`` is about part i + 1 at
+    level k - 1; k = 0 is the rigid object. A part is predicted from its two neighbours alone.
     """
     errors = np.zeros((len(parts) - 2, 1 + len(_ALPHAS)))
     for first in (0, 1):
@@ -155,7 +160,7 @@ def _held_out(parts: tuple[Part, ...]) -> Float:
 
 
 def _squared_distance(a: Float, b: Float) -> float:
-    """Return the mean of the squared, capped distances to the other cloud's nearest points."""
+    """Return the mean squared, capped distance (m²) of nearest points, both ways."""
     there = np.minimum(nearest(tree_of(b), a)[0], _CAP_M)
     back = np.minimum(nearest(tree_of(a), b)[0], _CAP_M)
     return float((there**2).mean() + (back**2).mean()) / 2
@@ -164,11 +169,12 @@ def _squared_distance(a: Float, b: Float) -> float:
 class _Bending:
     """Bends all parts at once, each to the next and to the previous one.
 
-    A hop leads from one part to a neighbour. The nodes of all hops lie side by side in one cloud,
-    so that one system of equations serves all. ``refine`` holds the targets and minimises
-    ``Σ w |f - target|² + Σ a |f|² + steady + alpha tr(Fᵀ L F)`` over the flow F. The weight w fades
-    with the distance to the target, a holds a point to its rigid position until it has clearly left
-    it (Geman, McClure 1987), and steady punishes a change of velocity from hop to hop.
+    A hop leads from one part to a neighbouring part. The nodes (thinned points) of all hops lie
+    side by side in one cloud, so that one system of equations serves all hops. ``refine`` holds the
+    targets and minimises ``Σ w |f - target|² + Σ a |f|² + steady + alpha tr(Fᵀ L F)`` over the flow
+    F. The weight w fades with the distance to the target. The weight a holds a point to its rigid
+    position until it has clearly left (Geman, McClure 1987). The term steady keeps velocities
+    equal.
     """
 
     def __init__(self, parts: tuple[Part, ...]) -> None:
@@ -187,7 +193,7 @@ class _Bending:
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
 
     def refine(self, level: int) -> None:
-        """Find the targets anew and solve, at the stiffness of a level."""
+        """Find all targets again and solve for the flow, at the stiffness of a level."""
         moved = self._source + self._flow
         near = nearest_k(tree_of(self._target), moved, _NUM_BLURRED)[1]
         there, distance_m = _blurred(self._target, near, moved, _BLURS_M[level])
@@ -205,10 +211,7 @@ class _Bending:
             )
 
     def bring_beyond(self) -> None:
-        """Add to each hop's target the part after it, moved there by the flow so far.
-
-        It fills the gaps and edges of the target.
-        """
+        """Fill holes of each hop's target by the part beyond it, moved by the flow."""
         flows = self._by_hop()
         targets = []
         for a, b in self._hops:
@@ -218,7 +221,7 @@ class _Bending:
         self._target = self._side_by_side(targets)
 
     def between(self, i: int, time_s: float) -> Float:
-        """Return (N,3) the nodes of part i and of the next one at a time between them."""
+        """Return the (N,3) nodes of parts i and i + 1, both moved to a time between them."""
         flows = self._by_hop()
         start_s, end_s = self._parts[i].time_s, self._parts[i + 1].time_s
         share = (time_s - start_s) / (end_s - start_s)
@@ -226,7 +229,7 @@ class _Bending:
         return np.concatenate([forth, self._nodes[i + 1] + (1 - share) * flows[i + 1, i]])
 
     def at_points(self) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-        """Return the flow of each part (n,3) to the next and to the previous one."""
+        """Return the flow (n,3) of each part's points to the next and to the previous part."""
         to_next = [np.zeros_like(p.points) for p in self._parts]
         to_previous = [np.zeros_like(p.points) for p in self._parts]
         for (a, b), flow in self._by_hop().items():
@@ -242,7 +245,7 @@ class _Bending:
         return np.concatenate([c + [k * self._apart_m, 0.0, 0.0] for k, c in enumerate(clouds)])
 
     def _steadiness(self) -> csr_array:
-        """Return the matrix of ``|f_next / dt_next + f_previous / dt_previous|²``.
+        """Return the (nodes, nodes) matrix of ``|f_next / dt_next + f_previous / dt_previous|²``.
 
         It is scaled to a weight of 1 for equal intervals.
         """
@@ -268,7 +271,7 @@ def _laplacian(points: Float) -> csr_array:
     """Return the (n,n) Laplacian ``(D - W) / mean(D)`` of the neighbour graph of (n,3) points.
 
     ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is among the 6 nearest of the other,
-    within 0.5 m; 1 on the diagonal.
+    within 0.5 m. The diagonal of W is 1. D holds the row sums of W.
     """
     n = len(points)
     distance_m, near = nearest_k(tree_of(points), points, _NUM_NEIGHBORS + 1)
@@ -284,7 +287,7 @@ def _laplacian(points: Float) -> csr_array:
 def _averaged(
     parts: tuple[Part, ...], to_next: tuple[Float, ...], to_previous: tuple[Float, ...]
 ) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-    """Average the flow to a neighbour with its flow back from where a point arrives."""
+    """Average the flows to next and previous with the reverse flows where points arrive."""
 
     def mean(a: int, b: int, onward: Float, back: Float) -> Float:
         arrived = parts[a].points + onward
@@ -297,17 +300,16 @@ def _averaged(
 
 
 def _one_per_voxel(points: Float) -> Int:
-    """Return the ascending rows of the first point in each voxel."""
+    """Return the ascending rows of the first point in each voxel of 0.07 m."""
     voxel = np.floor((points - points.min(axis=0)) / _NODE_M).astype(np.int64)
     return np.sort(np.unique(voxel, axis=0, return_index=True)[1]).astype(np.int64)
 
 
 def _blurred(points: Float, near: Int, at: Float, blur_m: float) -> tuple[Float, Float]:
-    """Return the Gaussian-weighted means around positions, and the distances to the nearest points.
+    """Return (N,3) Gaussian-weighted means around positions ``at``, and distances to the nearest.
 
-    Returns:
-        (N,3) mean of ``points[near]`` around each position, and (N,) distance to the nearest of
-        them.
+    The mean of position i is over ``points[near[i]]``, with the standard deviation ``blur_m``. The
+    (N,) distances are to the nearest of these points.
     """
     around = points[near]
     away = around - at[:, None]
@@ -319,11 +321,11 @@ def _blurred(points: Float, near: Int, at: Float, blur_m: float) -> tuple[Float,
 
 
 def _look_up(at: Float, came: Float, points: Float, known_came: Float, values: Float) -> Float:
-    """Interpolate the values of the points nearest in position and in the way they came.
+    """Interpolate the values (M,3) of known points with similar position and last displacement.
 
     Args:
-        at, came: (N,3).
-        points, known_came, values: (M,3). Legs that cross differ in the way they came.
+        at, came: (N,3) positions, and the displacements by which they were reached.
+        points, known_came: (M,3) the same of the known points. Crossing legs differ in ``came``.
     """
     known, asked = np.hstack([points, known_came]), np.hstack([at, came])
     near = nearest_k(tree_of(known), asked, _NUM_LOOKED_UP)[1]
