@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Measure tables: depth and scene flow of this package beside other methods and exact truth."""
+"""Measure tables: depth and scene flow of this package and other methods against ground truth."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Compare depth maps of several settings against every truth there is: ``densify bench depth``.
+"""Compare the depth maps of several settings with every ground truth: ``densify bench depth``.
 
-``truth``: exact depth of a simulated recording within a scanner's reach, that is below its top ring
-and within 80 m. ``key held out``: the key sweep's returns, for the map made from the other sweeps.
-``scanner``: the returns of one of several scanners, none of which is used for the maps.
+Ground truths by name. ``truth``: exact depth of a simulated recording below the scanner's top ring
+and within 80 m. ``key held out``: returns of the key sweep, for a map made from the other sweeps.
+``scanner``: returns of one of several scanners, which the maps do not use.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PRODUCTS = ("measured", "filled")
 _PARTS = ("all", "moving")
 _REACH_M = 80.0
 _TOP_QUANTILE = 0.999
-_HIDING_PX = 11  # returns of a second scanner behind a near one may be occluded
+_HIDING_PX = 11  # a return of the other scanner behind a nearer return may be occluded
 _HIDING_FRACTION, _HIDING_M = 0.03, 0.2
 _WRONG_M, _WRONG_FRACTION = 0.3, 0.05
 
@@ -41,10 +41,10 @@ class TruthMap(NamedTuple):
     """True depth of an image.
 
     Attributes:
-        depth_m: (H,W), 0 none.
-        moving: (H,W) of moving objects.
-        by_disparity: Outliers are those of KITTI's rule (more than 3 px of disparity and 5 %).
-            Else they are off by more than 0.3 m and 5 %.
+        depth_m: (H,W) true depth in metres, 0 for no depth.
+        moving: (H,W) bool, True at pixels of moving objects.
+        by_disparity: True to count outliers by KITTI's rule (error above 3 px of disparity and 5
+            %). False to count errors above 0.3 m and 5 %.
     """
 
     depth_m: Float32
@@ -62,17 +62,19 @@ def bench_depth(
     method: str = "flow",
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Make the keys with each variant, and score the pixels of all keys and cameras together.
+    """Densify the key sweeps with each variant, and pool the scores over key sweeps and cameras.
 
     Args:
-        variants: Settings by name.
-        scanner: Number of the scanner whose returns are the truth. The other arguments as in
-            `densify.pipeline.run.run`.
+        keys: Frame numbers of the key sweeps.
+        variants: Name -> settings to compare.
+        scanner: Index of the scanner whose returns are the ground truth, None for none. Other
+            arguments as in `densify.pipeline.run.run`.
 
     Returns:
-        Plain numbers, by variant: ``density`` (mean share of the image) of each product,
-            ``seconds`` a key of the stages after the cloud, and ``scores`` by truth, product and
-            part: num_pixels, coverage, outliers.
+        Plain numbers under ``variants``, by name of the variant: ``density`` (mean share of the
+            image's pixels) of measured and filled map, ``seconds`` per key sweep for projection,
+            and ``scores`` by ground truth, map (measured, filled) and pixels (all, moving):
+            num_pixels, coverage, outliers.
 
     Raises:
         InputError: An argument cannot be used.
@@ -105,7 +107,7 @@ def bench_depth(
 
 
 class _Without:
-    """A sequence without the returns of one scanner."""
+    """A recording without the returns of one scanner."""
 
     def __init__(self, sequence: LidarSequence, scanner: int) -> None:
         self._sequence, self._scanner = sequence, scanner
@@ -126,7 +128,7 @@ def _returns_of(
     shots: Mapping[str, Shot],
     config: Config,
 ) -> dict[str, TruthMap]:
-    """Return the depth that one scanner of the key sweep measured, by map."""
+    """Return the depth measured by one scanner in the key sweep, by name of the map."""
     recording = Recording(sequence, config, window, [key], looks_around=True)
     cloud = recording.moment(key, all_sweeps=True, engine="").cloud
     cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
@@ -152,7 +154,7 @@ def _returns_of(
 def _exact_truth(
     sequence: LidarSequence, key_sweep: Sweep, shots: Mapping[str, Shot], config: Config
 ) -> dict[str, TruthMap]:
-    """Return the exact depth within a scanner's reach by map, none of a real recording."""
+    """Return the exact depth within range and view of the scanner, {} for a real recording."""
     maps: dict[str, TruthMap] = {}
     if sequence.truth is None:
         return maps
@@ -180,9 +182,9 @@ def _exact_truth(
 
 
 class _Sums:
-    """Numbers of pixels over keys and cameras, by truth, product and part.
+    """Counts of pixels over key sweeps and cameras, by ground truth, map and kind of pixels.
 
-    They count those with a true depth, those compared, and the outliers.
+    The three counts are pixels with a true depth, pixels that also have a depth, and outliers.
     """
 
     def __init__(self) -> None:
@@ -196,7 +198,7 @@ class _Sums:
         truths: Mapping[str, Mapping[str, TruthMap]],
         cameras: Mapping[str, Camera],
     ) -> None:
-        """Add one result."""
+        """Add the maps of a result. ``truths``: name of the ground truth -> map -> true depth."""
         self._seconds += sum(cost.seconds for cost in made.costs if cost.name == "project")
         for name, maps in made.depth.items():
             focal_px = cameras[maps.camera].focal_px
@@ -214,7 +216,7 @@ class _Sums:
                     self._counts["key held out", product, part] += counts
 
     def numbers(self, num_keys: int) -> dict[str, Any]:
-        """Return the scores."""
+        """Return density, seconds and scores of a variant, see `bench_depth`."""
         scores: dict[str, Any] = {}
         for (source, product, part), (num, compared, outliers) in self._counts.items():
             scores.setdefault(source, {}).setdefault(product, {})[part] = {
@@ -229,7 +231,7 @@ class _Sums:
 def _counted(
     depth_m: Float32, truth: TruthMap, focal_px: float
 ) -> Iterator[tuple[str, tuple[int, int, int]]]:
-    """Yield each part with its counts, see `_Sums`."""
+    """Yield "all" and "moving" pixels, each with its three counts of `_Sums`."""
     for part in _PARTS:
         known = (truth.depth_m > 0) & (truth.moving if part == "moving" else True)
         both = known & (depth_m > 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Measure how often the doctor finds wrong calibrations, poses and clocks."""
+"""Measure how often ``densify doctor`` detects errors of calibrations, poses and clocks."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ _AXES = ("pitch", "yaw", "roll")
 def bench_doctor(
     sequences: Sequence[LidarSequence], config: Config, progress: Progress | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Return the verdicts of the doctor on cameras and poses with an error that is made on purpose.
+    """Give recordings artificial errors of camera or poses, and count the doctor's verdicts.
 
-    Each error is made in both directions, on each camera and recording as it is.
+    Each error is applied in both directions to each camera or recording. The unchanged recordings
+    are counted too.
 
     Returns:
-        For each error the number of cameras or recordings (``of``) and the shares that are called
-            fine, unknown, suspicious and wrong by the check that is meant.
+        Name of the error -> number of cases (``of``), and share of the verdicts fine, unknown,
+            suspicious and wrong from the check for this kind of error.
     """
     counts: dict[str, Counter[Verdict]] = {}
     for number, sequence in enumerate(sequences):
@@ -61,6 +62,7 @@ def _cameras(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
 
 
 def _put_out(camera: Camera, views: list[View]) -> Iterator[tuple[str, Camera, list[View]]]:
+    """Yield the name of an error, and the camera and views that have this error."""
     yield "cameras as they are", camera, views
     yield "camera's clock as it is", camera, views
     for size in _TURNS_DEG:
@@ -79,7 +81,7 @@ def _put_out(camera: Camera, views: list[View]) -> Iterator[tuple[str, Camera, l
 
 
 class _OtherPoses:
-    """A recording with other poses."""
+    """A recording whose recorded poses are replaced."""
 
     def __init__(self, sequence: LidarSequence, T_world_lidar: Callable[[int], Float]) -> None:
         self._sequence, self.T_world_lidar = sequence, T_world_lidar
@@ -89,11 +91,12 @@ class _OtherPoses:
 
 
 def _poses(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
+    """Yield the name of an error and the findings about poses that have this error."""
     sequence = sample.sequence
     stamp_ns, at = sample.timeline.stamp_ns, {f: i for i, f in enumerate(sample.timeline.frames)}
     try:
         T_world_lidar = np.stack([sequence.T_world_lidar(f) for f in sample.timeline.frames])
-    except InputError:  # it has none
+    except InputError:  # the recording has no poses
         return
     track = PoseTrack(sequence.name, stamp_ns, T_world_lidar)
 

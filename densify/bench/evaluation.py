@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Score depth maps on disk against true ones, and average the scores."""
+"""Score depth maps on disk against ground truth, and average the scores over images."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from densify.scores.depth_metrics import (
 )
 
 SCHEMA_VERSION = 1
-"""Version of `evaluate`'s dictionary; grows when a key changes its meaning or goes."""
+"""Version of `evaluate`'s dictionary. It grows when an entry changes its meaning or is removed."""
 
 KITTI_FOCAL_PX = 721.5377
-"""fx of KITTI's rectified cameras on 2011_09_26; on its other days 707 to 719."""
+"""Focal length of KITTI's rectified cameras on 2011_09_26. On other days it is 707 to 719 px."""
 
 
 def evaluate(
@@ -34,22 +34,22 @@ def evaluate(
     baseline_m: float = KITTI_BASELINE_M,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Return the mean over images of the value of each image, as in KITTI's kit.
+    """Return the scores of depth maps, averaged over images as in KITTI's development kit.
 
     The result has plain numbers ready for JSON, None if undefined::
 
         schema_version, focal_px, baseline_m, num_images
         density      predicted, truth: mean share of all the pixels that have a depth
-        parts        of `errors_by_part`: num_images and `mean_errors`
-        images       of each pair: predicted, truth, mask (paths or None), density, `DepthErrors`
-        without_truth, without_prediction, without_mask   paths
+        parts        name of `errors_by_part` -> num_images and the values of `mean_errors`
+        images       for each pair: predicted, truth, mask (paths or None), density, `DepthErrors`
+        without_truth, without_prediction, without_mask   paths of files without a partner
 
     Args:
-        pairs: The files.
-        focal_px: With the baseline, turns depth into the disparity that defines outliers and
-            depth discontinuities.
-        baseline_m: Stereo baseline.
-        progress: Is called with (stage, done, total).
+        pairs: The files of predicted and true depth, and of masks.
+        focal_px: Focal length in pixels. Disparity, which defines outliers and depth
+            discontinuities, is focal length times baseline over depth.
+        baseline_m: Stereo baseline in metres.
+        progress: Function called with (stage, done, total).
 
     Raises:
         InputError: A file is no depth map or mask, or the sizes of a pair differ.
@@ -87,6 +87,7 @@ def evaluate(
 
 
 def _read(pair: DepthPair) -> tuple[Float32, Float32, Bool | None]:
+    """Return (H,W) predicted metres, (H,W) true metres, and an (H,W) mask of moving pixels."""
     predicted_m, truth_m = read_depth_png(pair.predicted), read_depth_png(pair.truth)
     moving = None if pair.mask is None else read_mask_png(pair.mask)
     for path, image in ((pair.predicted, predicted_m), (pair.mask, moving)):

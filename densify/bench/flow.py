@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Compare engines of scene flow on the same windows: ``densify bench flow``.
+"""Compare methods of scene flow on the same window of sweeps: ``densify bench flow``.
 
-Errors are over the points above the ground of all sweeps of the window together, each with the flow
-to its neighbour towards the key. Seconds are per pair of sweeps, from the ground to the flow to the
-key. Registration does not count, nor the compilation at the first use. Scores are against the truth
-if there is one, and without.
+Errors are pooled over the points above the ground in all sweeps of the window. A point has the flow
+to the neighbouring sweep towards the key sweep. Seconds per pair of sweeps cover ground estimation,
+this flow and the flow to the key sweep, without registration and compilation. Some scores need
+ground truth.
 """
 
 from __future__ import annotations
@@ -39,11 +39,12 @@ _LEAST_MOTION_M = 0.5
 
 @dataclass(frozen=True)
 class Window:
-    """Consecutive registered sweeps around a key.
+    """Consecutive registered sweeps around a key sweep.
 
     Attributes:
-        around: Sweeps from which our engine takes the motion.
-        above: By frame (N,), above the ground.
+        key: Frame number of the key sweep.
+        around: Sweeps from which the configured method estimates motion.
+        above: Frame number -> (N,) mask of points above the ground.
     """
 
     stretch: Stretch
@@ -53,27 +54,30 @@ class Window:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """The frame numbers, ascending."""
+        """The frame numbers of the window, ascending."""
         return self.stretch.frames
 
     def hops(self, frame: int) -> int:
-        """Return the number of sweeps from the frame to the key, negative for frames after it."""
+        """Return the number of sweeps from ``frame`` to the key sweep, negative for later ones."""
         return self.frames.index(self.key) - self.frames.index(frame)
 
     def towards_key(self, frame: int) -> int:
-        """Return the neighbour on the way to the key. For the key it is the key itself."""
+        """Return the next frame number towards the key sweep, or the key sweep's own."""
         return self.frames[self.frames.index(frame) + int(np.sign(self.hops(frame)))]
 
 
 class SweepTruth(NamedTuple):
-    """The truth of the N points of one sweep, in its own lidar frame.
+    """The ground truth of the N points of a sweep: scene flow in metres without ego-motion.
+
+    Flow starts at the sweep's reference time and is in the lidar frame of that time.
 
     Attributes:
-        step: (N,3) flow to the neighbour towards the key.
-        to_key: (N,3) flow to the key.
-        moving: (N,) moves now.
-        foreground: (N,) belongs to an object.
-        certain: (N,) moves, at least 0.5 m over the window, on an object of 30 returns.
+        step: (N,3) flow to the neighbouring sweep towards the key sweep.
+        to_key: (N,3) flow to the key sweep.
+        moving: (N,) bool, True for points that move at the reference time.
+        foreground: (N,) bool, True for points of objects, moving or not.
+        certain: (N,) bool, True for moving points that travel at least 0.5 m over the window and
+            belong to an object with 30 returns or more.
     """
 
     step: Float
@@ -84,7 +88,7 @@ class SweepTruth(NamedTuple):
 
     @staticmethod
     def of(truth: Truth, window: Window, frame: int) -> SweepTruth:
-        """Return the truth of a sweep of the window."""
+        """Return the ground truth of a sweep of the window, by its frame number."""
         rows = window.stretch[frame].sweep.row
         targets = window.towards_key(frame), window.key, window.frames[0], window.frames[-1]
         step, to_key, first, last = (truth.displacement(frame, t)[rows] for t in targets)
@@ -100,12 +104,12 @@ class SweepTruth(NamedTuple):
 class Scorer:
     """The scores of methods on one window.
 
-    Errors are over the points above the ground, because no method moves the ground.
+    Most errors are over points above the ground, because no method moves the ground.
 
     Attributes:
-        sources: Frames whose step is scored.
-        truths: By frame, None without exact truth.
-        labels: Of the steps of the sources, none without truth.
+        sources: Frame numbers of the sweeps whose flow to a neighbour is scored.
+        truths: Frame number -> exact ground truth, None for a real recording.
+        labels: Frame number -> labelled flow to the neighbour, {} without ground truth.
     """
 
     window: Window
@@ -120,8 +124,8 @@ class Scorer:
         """Return the scorer of a window.
 
         Args:
-            place: Folder of true flow, see `densify.readers.flow_files`; None for the exact
-                truth of the sequence, if it has one.
+            place: Folder of true flow, see `densify.readers.flow_files`. None for the exact ground
+                truth of the recording, if available.
         """
         truths, labels = None, {}
         if sequence.truth is not None:
@@ -135,9 +139,10 @@ class Scorer:
         return Scorer(window, sources, truths, labels)
 
     def challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
-        """Return the scores of the Argoverse 2 challenges, all pairs together, None without truth.
+        """Return the pooled scores of the Argoverse 2 challenges (`densify.scores.challenge`).
 
-        They are of the flow to the next sweep, see `densify.scores.challenge`.
+        ``steps`` is frame number -> flow to the neighbour towards the key sweep. The result has
+        ``three_way`` and ``bucketed`` errors and ``num_points``, and is None without ground truth.
         """
         if not self.labels:
             return None
@@ -156,11 +161,13 @@ class Scorer:
         }
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the scores of the flow to the next sweep, all pairs together.
+        """Return the scores of the flow to the neighbouring sweep, pooled over the sources.
 
-        found: share of the certain moving points above the ground that are called moving (recall).
-        found_movers_m: error of the moving points that are called moving. falsely_moving: share of
-        false positives among all static points, ground included.
+        ``found`` is the recall: the share of ``certain`` moving points that are called moving.
+        ``falsely_moving`` is the share of static points, ground included, that are called moving.
+        End-point errors in metres are ``movers_m`` of moving points, ``found_movers_m`` of moving
+        points called moving. Without ground truth the only score is ``called_moving``, the share of
+        all points called moving.
         """
         truths = self.truths
         if truths is None:
@@ -184,10 +191,11 @@ class Scorer:
         return {"num_movers": int(moving.sum()), **_plainly(scores)}
 
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the scores of the flow to the key: ghosts, and with truth errors of moving points.
+        """Return the scores of the flow to the key sweep: ghost rate and errors of moving points.
 
-        The errors are of points above the ground, by the number of sweeps to the key, of all and of
-        those called moving.
+        Errors need ground truth. They are end-point errors in metres of points above the ground, by
+        the number of sweeps to the key sweep. ``movers_m_by_hops`` has all moving points,
+        ``found_movers_m_by_hops`` the moving points called moving.
         """
         stretch, key = self.window.stretch, self.window.key
         cloud = accumulate(stretch, [to_key[f] for f in stretch.frames], key, drop_lost=True)
@@ -209,11 +217,12 @@ class Scorer:
         return scores
 
     def _above(self, column: Callable[[int], Any]) -> Any:
+        """Return a column's values for the points above the ground, joined over the sources."""
         return np.concatenate([column(f)[self.window.above[f]] for f in self.sources])
 
 
 def _plainly(values: Mapping[str, float]) -> dict[str, float | None]:
-    """Return the values as JSON has them, None for not a number."""
+    """Return the values with None instead of NaN, for JSON."""
     return {name: None if math.isnan(value) else value for name, value in values.items()}
 
 
@@ -225,7 +234,7 @@ METHODS: Mapping[str, tuple[str, ...] | None] = {
     "paper-adam": (*_PAPER, "objective.solver=adam"),
     "rigid": None,
 }
-"""Changes of the configuration; None: nothing moves."""
+"""Name of a method -> changes of the configuration. None: all points are static."""
 DEFAULT_METHODS = tuple(name for name in METHODS if name != "paper-adam")
 
 
@@ -238,17 +247,18 @@ def bench_flow(
     progress: Progress | None = None,
     truth: Path | None = None,
 ) -> dict[str, Any]:
-    """Run and measure methods. The result has plain numbers, None if unknown.
+    """Run and measure methods of scene flow. The result has plain numbers, None if unknown.
 
     Args:
-        window: Number of sweeps on each side of the key.
-        methods: Of `METHODS`; ``ours`` is the configured engine.
-        truth: Folder of true flow (`densify.readers.flow_files`), to score only the pairs
-            before the key; None for the sequence's own.
+        key: Frame number of the key sweep.
+        window: Number of sweeps on each side of the key sweep.
+        methods: Names in `METHODS`. ``ours`` is the configured engine.
+        truth: Folder of true flow (`densify.readers.flow_files`), which scores only the sweeps
+            before the key sweep. None for the exact ground truth of the recording.
 
     Returns:
-        ``methods`` by name, each with ``seconds_per_pair`` and the scores ``step``,
-            ``challenge``, ``window`` of `Scorer`.
+        ``data``, ``key``, ``frames``, ``num_pairs``, and ``methods``: name -> ``seconds_per_pair``
+            and the scores ``step``, ``challenge``, ``window`` of `Scorer`.
 
     Raises:
         InputError: A method is unknown, the window has no neighbours, or a frame is missing.
@@ -282,10 +292,10 @@ def bench_flow(
 
 
 def open_window(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
-    """Return the registered window of a key.
+    """Return the registered window of a key sweep, with ``size`` sweeps on each side.
 
     Raises:
-        InputError: The key does not exist.
+        InputError: The frame number does not exist.
         ComputationError: Registration fails.
     """
     recording = Recording(sequence, config, size, [key], looks_around=True)
@@ -301,13 +311,16 @@ def open_window(sequence: LidarSequence, key: int, size: int, config: Config) ->
 def _flows(
     method: str, window: Window, config: Config
 ) -> tuple[dict[int, FlowField], dict[int, FlowField], float]:
-    """Return the flow to the neighbour and to the key, by frame, and the seconds."""
+    """Return flow to the neighbour towards the key sweep, flow to the key sweep, and seconds.
+
+    Both kinds of flow are by frame number.
+    """
     changes, frames = METHODS[method], window.frames
     if changes is None:
         still = {f: FlowField.zero(len(window.stretch[f].sweep)) for f in frames}
         return still, still, 0.0
     config = resolve(as_mapping(config), changes)
-    if method == "ours":  # compilation must not count
+    if method == "ours":  # compile before the clock starts
         here = frames.index(window.key)
         _motion(Stretch(window.stretch.sweeps[max(0, here - 1) : here + 2]), config)
     start = time.perf_counter()

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Make the tables of the paper again: ``densify bench paper``.
+"""Make the tables of the scene flow paper again: ``densify bench paper``.
 
 Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020.
 
-Methods get 2,048 points drawn from each cloud within 35 m, as in the paper. This package and
-trained networks get all points, and are scored at the drawn ones. Scores are the paper's: mean
-end-point error; share of points within 5 cm or 5 %, within 10 cm or 10 %; mean angle to the true
-flow where that is not 0. They are means over pairs.
+Methods get 2,048 points drawn from each cloud within 35 m, as in the paper. ``ours`` and trained
+networks get all points, and are scored at the drawn points. Scores are the paper's: mean end-point
+error; share of points with an error below 5 cm or 5 %, and below 10 cm or 10 %; mean angle to the
+true flow at points with true flow. Scores are averaged over pairs of clouds.
 
-Other sets are folders of .npz files as FlowNet3D's authors made them (Liu et al., CVPR 2019):
+Other data sets are folders of .npz files as FlowNet3D's authors made them (Liu et al., CVPR 2019):
 ``points1``, ``points2``, ``flow`` and ``valid_mask1`` (FlyingThings3D; camera axes, z forward), or
 ``pos1``, ``pos2`` and ``gt`` (KITTI without ground; z up).
 """
@@ -42,19 +42,19 @@ _NAMES = (
     ("pos1", "pos2", "gt", ""),
 )
 _R_FLU_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-"""Turns axes right, down, forward into forward, left, up."""
+"""Rotation from axes right, down, forward to axes forward, left, up."""
 
 
 @dataclass(frozen=True)
 class PaperPair:
-    """Two clouds and the true flow between them.
+    """Two clouds in one frame, without ground, and the true flow from the first to the second.
 
     Attributes:
-        source: (n,3) metres, z up.
-        target: (m,3) metres, z up.
-        flow: (n,3) metres.
-        moving: (n,), None if unknown.
-        sweeps: Input of networks.
+        source: (n,3) points of the first cloud in metres, z up.
+        target: (m,3) points of the second cloud in metres, z up.
+        flow: (n,3) true flow of the source points in metres.
+        moving: (n,) bool, True for moving points. None if unknown.
+        sweeps: Input of trained networks.
     """
 
     name: str
@@ -70,15 +70,19 @@ PUBLISHED: Mapping[str, Mapping[str, float]] = {
     "flyingthings": {"epe_m": 0.259, "within_5": 0.163, "within_10": 0.416, "angle_rad": 0.369},
     "kitti": {"epe_m": 0.093, "within_5": 0.648, "within_10": 0.821, "angle_rad": 0.137},
 }
-"""The paper's row without learning, by set."""
+"""The paper's published scores without learning, by data set."""
 
 _SEED = 0
 
 Flow = Callable[[Float, Float, PaperPair], Float]
-"""Drawn source and target, and the whole pair -> flow of the drawn source, or of the whole one."""
+"""Function of drawn source points, drawn target points and the whole pair.
+
+It returns the flow of the drawn source points, or of all source points."""
 
 
 def _objective(solver: str, **settings: Any) -> Flow:
+    """Return a method that minimizes the paper's loss with a solver and its settings."""
+
     def flow(source: Float, target: Float, pair: PaperPair) -> Float:
         return solve(source, target, SolverSettings(solver=solver, **settings)).flow
 
@@ -96,8 +100,9 @@ METHODS: dict[str, Flow] = {
     "no-laplacian": _objective("pcg", alpha=0.0),
     "ours": _ours,
 }
-"""rest: nothing moves. paper-adam: the objective as published, Adam, 1,500 steps. paper: by this
-package's solver. no-laplacian: the paper's Table 2. ours: this package on two whole clouds."""
+"""Methods by name. rest: zero flow. paper-adam: the published loss, minimized by Adam in 1,500
+steps. paper: the same loss with this package's solver. no-laplacian: the loss without its graph
+Laplacian (Table 2 of the paper). ours: this package on two whole clouds."""
 DEFAULT_METHODS = tuple(name for name in METHODS if name != "paper-adam")
 
 
@@ -108,9 +113,10 @@ def bench_paper(
     num_points: int = NUM_POINTS,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure methods and trained models on pairs.
+    """Measure methods of `METHODS` and files of trained networks on pairs of clouds.
 
-    The result has ``num_pairs``, ``num_points`` and ``methods``, rows by name, as plain numbers.
+    Return ``num_pairs``, ``num_points`` (drawn from each cloud) and ``methods``: name -> mean
+    scores.
 
     Raises:
         InputError: A method is unknown, there are no pairs, or a file is no model.
@@ -168,12 +174,13 @@ def _measured(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float
 
 
 def _drawn(points: Float, count: int, rng: np.random.Generator) -> Int:
+    """Return at most ``count`` ascending indices of random points within 35 m."""
     near = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < FARTHEST_M)
     return np.sort(rng.permutation(near)[:count])
 
 
 def _mean(measured: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Return the means over the pairs with a number."""
+    """Return the mean of each score over the pairs where it is finite, None if none is."""
     means: dict[str, float | None] = {}
     for name in measured[0]:
         values = np.array([m[name] for m in measured if name in m])
@@ -183,17 +190,17 @@ def _mean(measured: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
 
 
 def has_truth(spec: str) -> bool:
-    """Return True if a recording has exact truth."""
+    """Return True if a recording has exact ground truth."""
     return open_sequence(spec).truth is not None
 
 
 def pair_of_recording(spec: str, key: int) -> PaperPair:
-    """Return a sweep and its next one, without ground and ego-motion.
+    """Return key sweep number ``key`` and the next sweep, without ground and ego-motion.
 
-    Without truth in the recording, the flow is that of this package's engine.
+    The flow is the exact ground truth. For a real recording it is estimated by this package.
 
     Raises:
-        InputError: The key has no next sweep.
+        InputError: The key sweep has no next sweep.
         ComputationError: A sweep cannot be registered.
     """
     sequence = open_sequence(spec)
@@ -211,10 +218,10 @@ def pair_of_recording(spec: str, key: int) -> PaperPair:
 
 
 def pairs_of_files(folder: Path, most: int) -> Iterator[PaperPair]:
-    """Yield the first ``most`` files of a folder, by name; 0 for all.
+    """Yield the pairs in the first ``most`` files of a folder, by file name. 0 means all files.
 
     Raises:
-        InputError: The folder has no files, or a file has another form.
+        InputError: The folder has no files, or a file has another format.
     """
     paths = sorted(folder.glob("*.npz"))
     if not paths:
@@ -224,7 +231,7 @@ def pairs_of_files(folder: Path, most: int) -> Iterator[PaperPair]:
 
 
 def read_pair(path: Path) -> PaperPair:
-    """Return the pair of one file, without points farther than 35 m ahead."""
+    """Return the pair in an .npz file, without points farther than 35 m ahead."""
     arrays = read_arrays(path)
     found = next((names for names in _NAMES if all(n in arrays for n in names[:3])), None)
     if found is None:

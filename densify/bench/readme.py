@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Make the tables of docs/results.md again, as Markdown: ``densify bench readme``.
 
-Each table is a list of recordings and keys, and one function that measures a row. Rows of real
-recordings need their folders.
+A table is a list of recordings with key frame numbers, and a function that measures a row. Rows of
+real recordings need the folders of the recordings.
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ from densify.readers import open_sequence
 
 
 class Scene(NamedTuple):
-    """A recording and its keys.
+    """A recording and the settings of a row.
 
     Attributes:
-        window: Number of sweeps on each side.
-        scanner: Scanner whose returns are the truth, None for exact truth or the key held out.
+        keys: Frame numbers of the key sweeps.
+        window: Number of sweeps on each side of a key sweep.
+        scanner: Index of the scanner whose returns are the ground truth. None for exact ground
+            truth or the held-out key sweep.
     """
 
     data: str
@@ -44,7 +46,7 @@ class Scene(NamedTuple):
 
 
 def _streets(text: str) -> tuple[Scene, ...]:
-    """Return the scenes of a text of ``SPEC@KEY``."""
+    """Return the scenes in a text of ``SPEC@KEY`` words, where KEY is a frame number."""
     parts = [word.rpartition("@") for word in text.split()]
     return tuple(Scene(spec, (int(key),)) for spec, _, key in parts)
 
@@ -74,7 +76,7 @@ _REGISTERED = _streets("""
 class _Table(NamedTuple):
     """A table of results.
 
-    row: returns the cells of a scene. real: has rows of real recordings.
+    ``row`` returns the cells of a scene. ``real`` is True if rows of real recordings can be added.
     """
 
     about: str
@@ -90,11 +92,12 @@ def tables(
     pandaset: Path | None = None,
     progress: Progress | None = None,
 ) -> Iterator[str]:
-    """Make the tables of these names, all of `TABLES` if none, and yield each line when measured.
+    """Measure tables and yield each Markdown line as soon as it is known.
 
     Args:
-        kitti: Folder of drive 2011_09_26_drive_0013_sync.
-        pandaset: Folder of sequence 002.
+        names: Names in `TABLES`, empty for all.
+        kitti: Folder of KITTI drive 2011_09_26_drive_0013_sync, None to skip its rows.
+        pandaset: Folder of PandaSet sequence 002, None to skip its rows.
 
     Raises:
         InputError: A name is unknown.
@@ -137,7 +140,7 @@ def _times_100(value: float | None, digits: int, unit: str) -> str:
 
 
 def _row_of_depth(scene: Scene) -> list[str]:
-    """Return the scores against the best truth there is."""
+    """Return the scores against exact ground truth, else a scanner, else the held-out key sweep."""
     sequence, config = open_sequence(scene.data), {"": resolve(None)}
     cameras, scanner = [scene.camera], scene.scanner
     measured = bench_depth(sequence, scene.keys, scene.window, config, cameras, scanner)
@@ -152,6 +155,7 @@ def _row_of_depth(scene: Scene) -> list[str]:
 
 
 def _row_of_flow(scene: Scene) -> list[str]:
+    """Return recall, errors, false positives and ghosts of scene flow on one window."""
     sequence, key = open_sequence(scene.data), scene.keys[0]
     ours = bench_flow(sequence, key, scene.window, resolve(None), ["ours"])["methods"]["ours"]
     step, window = ours["step"], ours["window"]
@@ -172,7 +176,7 @@ def _row_of_flow(scene: Scene) -> list[str]:
 
 
 def _row_of_registration(scene: Scene) -> list[str]:
-    """Return the root mean square errors of the window's poses relative to that of the key."""
+    """Return root mean square errors of the window's poses relative to the key sweep's pose."""
     sequence, key = open_sequence(scene.data), scene.keys[0]
     stretch = Recording(sequence, resolve(None), scene.window, [key]).window(key)
     T_true_world = poses.inverse(sequence.T_world_lidar(key))

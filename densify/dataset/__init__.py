@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Make a training set of every key of whole recordings."""
+"""Make a training set of depth maps from whole recordings, one key sweep after another."""

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Do calls in this process, in several processes of this machine, or on a Dask scheduler.
+"""Run calls in this process, in several processes of this machine, or on a Dask scheduler.
 
-This module imports nothing heavy: a worker process loads it before it knows its number of threads.
+The module imports no heavy package, because a worker imports it before its number of threads is
+set.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from densify.pipeline.heap import keep_freed_memory
 Item = TypeVar("Item")
 _CONNECT_S = 10
 _Workers = AbstractContextManager[tuple[Executor, Callable[[], int]]]
-"""An open executor, and the number of calls that it can do at once."""
+"""An open executor, and a function that returns how many calls it can run at once."""
 _DEATH = (
     "a worker process died of it twice (killed, or out of memory?); fewer --workers or a smaller "
     "--window take less memory"
@@ -47,23 +48,23 @@ def call_all(
     log: Path | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[Item, Any]]:
-    """Call ``call(item)`` for every item, and yield each item with its outcome when it is done.
+    """Call ``call(item)`` for every item, and yield pairs (item, outcome) as calls finish.
 
-    An item whose process dies is tried once more, alone. Then its outcome is a ComputationError.
-    InputError and ComputationError of ``call`` are raised. Any other error becomes the outcome of
-    the item, as a ComputationError.
+    An item whose process dies is tried a second time, alone. If the process dies again, the outcome
+    is a ComputationError. InputError and ComputationError of ``call`` are raised. Any other error
+    becomes the outcome of the item, as a ComputationError.
 
     Args:
         call: A function of a module.
-        groups: None empty, of hashable and picklable items. The first item of a group is done
-            before the others begin, which then find shared results in the cache.
-        num_workers: Number of processes; 1 is this one.
-        log: The file to which other processes append their log.
-        scheduler: Address of a Dask scheduler whose workers are used instead.
+        groups: Non-empty groups of hashable, picklable items. The first item of a group is finished
+            before the others begin, so they find shared results in the cache.
+        num_workers: Number of processes. 1 uses this process.
+        log: File to which worker processes append their log.
+        scheduler: Address of a Dask scheduler whose workers replace local processes.
 
     Raises:
         ComputationError: The workers cannot begin, or the scheduler is lost.
-        InputError: The scheduler is not reached.
+        InputError: The scheduler cannot be reached.
     """
     if num_workers == 1 and scheduler is None:
         for group in groups:
@@ -72,7 +73,7 @@ def call_all(
         return
     ready = deque(group[0] for group in groups)
     others = {group[0]: group[1:] for group in groups}
-    suspects: deque[Item] = deque()  # at work when a process died
+    suspects: deque[Item] = deque()  # items that were running when a process died
     while ready or suspects:
         alone = bool(suspects)
         waiting, most = (suspects, 1) if alone else (ready, num_workers)
@@ -89,10 +90,14 @@ def call_all(
 
 @contextmanager
 def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
-    """Append the log below ``densify`` of this process, or of one thread of it, to a file.
+    """Append log messages of ``densify`` in this process to a file within the block.
+
+    Args:
+        path: The log file.
+        thread: Identifier of the only thread to log, None for all threads.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     try:
         handler = logging.FileHandler(path, encoding="utf-8")
@@ -113,7 +118,7 @@ def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
 
 
 def share_of_cores(num_workers: int) -> dict[str, str]:
-    """Return the environment that limits the threads of a worker's libraries to its share."""
+    """Return environment variables that limit the threads of a worker to its share of the cores."""
     share = str(max(1, len(os.sched_getaffinity(0)) // num_workers))
     return {f"{library}_NUM_THREADS": share for library in ("NUMBA", "OMP", "OPENBLAS", "MKL")} | {
         "OPENCV_FOR_THREADS_NUM": share
@@ -129,9 +134,10 @@ def _call_logged(call: Callable[[Item], Any], log: Path | None, item: Item) -> A
 def _until_a_death(
     call: Callable[[Item], Any], waiting: deque[Item], workers: _Workers
 ) -> Iterator[tuple[Item, Any]]:
-    """Call the waiting items until none is left or a process dies.
+    """Yield (item, outcome) until all waiting items are done or a process dies.
 
-    A death costs all items at work: their outcome is a BrokenExecutor.
+    Started items are removed from ``waiting`` in place. A death stops all running calls, whose
+    outcome is then a BrokenExecutor.
     """
     running: dict[Future[Any], Item] = {}
     with workers as (executor, num_at_once):
@@ -151,7 +157,7 @@ def _until_a_death(
 
 
 def _outcome(result: Callable[[], Any]) -> Any:
-    """Return the value of a call, the BrokenExecutor, or an error of this item alone."""
+    """Return the value of a call, the BrokenExecutor, or an error that concerns this item only."""
     try:
         return result()
     except BrokenExecutor as error:
@@ -164,7 +170,7 @@ def _outcome(result: Callable[[], Any]) -> Any:
 
 @contextmanager
 def _open_pool(num_workers: int) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """Open processes of this machine, which end with the block, finished or not."""
+    """Open a pool of processes. They end with the block, even with unfinished calls."""
     spawn, before = multiprocessing.get_context("spawn"), multiprocessing.active_children()
     environment = share_of_cores(num_workers)
     with ProcessPoolExecutor(num_workers, spawn, _begin, (environment,)) as pool:
@@ -184,18 +190,18 @@ def _open_pool(num_workers: int) -> Iterator[tuple[Executor, Callable[[], int]]]
 
 @contextmanager
 def _open_dask(scheduler: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """Open a client of the scheduler, whose workers may come and go."""
+    """Open a client of a Dask scheduler. Its workers may join and leave."""
     try:
         from distributed import Client
 
-        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # of no use to users
+        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # no help to users
         client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except ImportError as error:
         raise InputError(
             f"--scheduler {scheduler}: needs Dask, which is not installed; "
             f"{how_to_install('cluster')}"
         ) from error
-    except Exception as error:  # of many types
+    except Exception as error:  # the client raises many types
         raise InputError(
             f"--scheduler {scheduler}: not reached within {_CONNECT_S} s ({error}), expected the "
             f"address of a running Dask scheduler, such as tcp://host:8786; tls:// needs "
@@ -203,7 +209,7 @@ def _open_dask(scheduler: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
         ) from error
     with client:
         try:
-            # pure: two equal calls would be one.
+            # With pure=True, Dask would run two equal calls only once.
             yield client.get_executor(pure=False), lambda: max(1, sum(client.nthreads().values()))
         except (OSError, RuntimeError, CancelledError) as error:
             told = "the Dask scheduler was lost; run the same command again to go on"
@@ -211,10 +217,10 @@ def _open_dask(scheduler: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
 
 
 def _begin(environment: dict[str, str]) -> None:
-    """Set up a worker process."""
+    """Set up a worker process with its environment variables."""
     os.environ.update(environment)
     keep_freed_memory()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the command ends its workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the command ends its workers itself
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make one key of a training set in any process, write it, and describe it by its record."""
+"""Densify one key sweep of a training set in any process, write its files and return its record."""
 
 from __future__ import annotations
 
@@ -32,14 +32,17 @@ _log = logging.getLogger("densify")
 
 @dataclass(frozen=True)
 class Job:
-    """A recording of a set, as every process opens it.
+    """A recording of a training set, as every process opens it.
 
     Attributes:
-        drive: As in `densify.dataset.plan.Drive`; data, folder and cameras too.
-        out: Folder of the set.
-        run: Another text for each run, because files may change between runs while workers live
-            on.
-        version: Version of the densify that gives the job.
+        drive: Name of the recording's folder.
+        data: Text of ``--data``, with an absolute path.
+        folder: Folder of the recording's files, relative to ``out``.
+        cameras: Names of the wanted cameras.
+        out: Folder of the training set.
+        run: Unique text of the command's run, because long-lived workers must reopen the recording
+            in each run.
+        version: Version of densify that made the job.
     """
 
     drive: str
@@ -53,7 +56,10 @@ class Job:
 
 
 def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
-    """Make and write one key. Raise OutputError, which stops the set, if it cannot be written."""
+    """Densify and write one key sweep of a job, and return its record.
+
+    An error becomes a record with status ``failed``, except OutputError, which is raised.
+    """
     job, key = job_and_key
     start_s = time.perf_counter()
     try:
@@ -62,7 +68,7 @@ def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
         raise
     except (InputError, ComputationError) as error:
         record = KeyRecord(job.drive, key, "failed", str(error))
-    except Exception as error:  # the other keys may go well
+    except Exception as error:  # other key sweeps may succeed
         _log.debug("key %d of %s: %s", key, job.drive, traceback.format_exc())
         told = f"{type(error).__name__}: {error}"
         if is_out_of_memory(error):
@@ -77,7 +83,7 @@ def _made(job: Job, key: int) -> KeyRecord:
     recipe = job.recipe
     recording, cache = _opened(job)
     is_tree = recipe.layout == "kitti-depth"
-    # The tree's sparse input is the key sweep alone.
+    # The sparse input in the tree is the depth of the single key sweep.
     methods = ["none", recipe.method] if is_tree else methods_of_run(recipe.method, recipe.config)
     results = pipeline.densify(
         recording, key, tuple(dict.fromkeys(methods)), job.cameras, with_images=not is_tree
@@ -99,10 +105,10 @@ def _made(job: Job, key: int) -> KeyRecord:
 
 
 def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scores of a manifest.
+    """Return the scores for a manifest line from the metrics of a result.
 
-    They are ``num_points``, ``num_moving``, ``ghost``, and by camera ``density``,
-    ``density_filled``, ``outliers`` and ``mae_m`` of the key held out.
+    The scores are ``num_points``, ``num_moving`` and ``ghost``. By camera there are ``density``,
+    ``density_filled``, and ``outliers`` and ``mae_m`` against the held-out key sweep.
     """
     held_out = metrics["held_out"] or {}
     errors = {name: scores["measured"]["all"] for name, scores in held_out.items()}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Read a training set of `densify dataset --layout kitti-depth` as a torch dataset.
 
-Images come from the recordings of the set.
+The images are read from the recordings.
 """
 
 from __future__ import annotations
@@ -27,20 +27,22 @@ from densify.readers import open_sequence
 
 
 class DepthDataset(Dataset[dict[str, Any]]):
-    """One sample for each finished key and camera, ordered by drive, camera and frame.
+    """A dataset with a sample for each finished key sweep and camera.
 
-    A sample is a dict of float32 tensors and their names; H and W as cropped::
+    Samples are ordered by drive, camera and frame number. A sample is a dict of float32 tensors and
+    names. H and W are the size after cropping::
 
         image           (3,H,W) RGB, 0 to 1
-        sparse_depth_m  (1,H,W) camera z of the key sweep alone, metres, 0 none
-        dense_depth_m   (1,H,W) of the accumulated sweeps, metres, 0 none
-        confidence      (1,H,W) of the dense depth, 1 most certain; 0 where there is none
-        intrinsics      (3,3) K in pixels, of the image as it is here; integers at pixel centres
-        frame           int, absolute; drive, camera: str
+        sparse_depth_m  (1,H,W) camera z in metres from the key sweep alone, 0 for no depth
+        dense_depth_m   (1,H,W) camera z in metres from all sweeps of the window, 0 for no depth
+        confidence      (1,H,W) of the dense depth, 1 most certain; 0 at pixels without a depth
+        intrinsics      (3,3) K in pixels of the cropped, flipped image; integers at pixel centres
+        frame           int, frame number in the recording; drive, camera: str
 
-    A flipped sample is a mirrored world: camera x becomes -x, the focal lengths stay positive. Of a
-    recording that is not rectified, ``intrinsics`` leave the lens's distortion out. Crops and flips
-    are drawn by torch's generator: `torch.manual_seed` repeats them, in a DataLoader's workers too.
+    A flipped sample shows a mirrored world: camera x becomes -x, and focal lengths stay positive.
+    If the camera has lens distortion, ``intrinsics`` ignore the distortion. Crops and flips are
+    drawn by torch's generator. `torch.manual_seed` repeats them, also in the workers of a
+    DataLoader.
     """
 
     def __init__(
@@ -53,22 +55,23 @@ class DepthDataset(Dataset[dict[str, Any]]):
         data: Mapping[str, str | Path] | None = None,
         split: Literal["train", "val"] | None = None,
     ) -> None:
-        """Find the finished keys of a set.
+        """Find the finished key sweeps of a training set.
 
         Args:
-            root: ``--out`` of `densify dataset`.
-            cameras: Names; None for all.
-            filled: Take the filled map as dense depth.
-            crop: (height_px, width_px), cut out at the bottom of the image, where the depth is, and
-                at a random place from left to right.
-            flip: Mirror every other sample, at random.
-            data: Drive -> where its recording is now, for `densify.open_sequence`. It is needed for
-                those that have moved since the set was made.
-            split: ``train`` or ``val``, KITTI's; None for both.
+            root: Folder of the training set, ``--out`` of `densify dataset`.
+            cameras: Names of the cameras, None for all.
+            filled: Use the filled map (measured and interpolated pixels) as dense depth.
+            crop: (height_px, width_px) of a cutout. It lies at the bottom of the image, where depth
+                is, and at a random column.
+            flip: Mirror each sample with probability 0.5.
+            data: Drive -> new path of its recording, for `densify.open_sequence`. Only recordings
+                that have moved since the set was made need an entry.
+            split: KITTI's split, ``train`` or ``val``, None for both.
 
         Raises:
-            InputError: There is no set of this layout, or no finished key in it. Loading raises it
-                for a crop larger than an image, and for files that are missing or damaged.
+            InputError: The folder holds no training set of this layout, or no finished key sweep.
+                Loading a sample raises it for a crop larger than an image, and for missing or
+                damaged files.
         """
         self._root, self._crop, self._flip = Path(root), crop, flip
         self._dense = "groundtruth_filled" if filled else "groundtruth"
@@ -96,10 +99,10 @@ class DepthDataset(Dataset[dict[str, Any]]):
         return len(self._samples)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """Return a sample, see the class.
+        """Return a sample, a dict as described in the class.
 
         Raises:
-            InputError: A file is missing or damaged.
+            InputError: A file is missing or damaged, or the crop is larger than the image.
         """
         name, camera_name, frame = self._samples[index]
         drive = self._drives[name]
@@ -121,7 +124,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
             "image": self._image(name, camera, frame).transpose(2, 0, 1) / np.float32(255),
             "sparse_depth_m": read("velodyne_raw", read_depth_png),
             "dense_depth_m": dense_m,
-            # 1 to 255, as `densify.outputs.depth_png.stored_confidence` gives
+            # Stored levels are 1 to 255, see `densify.outputs.depth_png.stored_confidence`.
             "confidence": np.where(dense_m > 0, (levels - np.float32(1)) / 254, 0).clip(0),
         }
         size_px = camera.height_px, camera.width_px
@@ -144,7 +147,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
         }
 
     def _image(self, drive: str, camera: Camera, frame: int) -> NDArray[np.uint8]:
-        """Return the image, (H,W,3)."""
+        """Return the (H,W,3) RGB image of a camera at a key sweep."""
         spec = self._specs[drive]
         try:
             recording = _open(spec, os.getpid())
@@ -162,7 +165,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
 
 @cache
 def _open(spec: str, process: int) -> LidarSequence:
-    """Open a recording; a forked process opens its own."""
+    """Open a recording once per process, because forked processes must not share open files."""
     return open_sequence(spec)
 
 
@@ -176,12 +179,12 @@ def _read_drives(root: Path) -> dict[str, Drive]:
 
 
 def _map_path(drive: Drive, kind: str, camera: str, frame: int) -> str:
-    """Return the map's path in the set, as the manifest names it."""
+    """Return the path of a map relative to the training set, as named in the manifest."""
     return f"{drive.folder}/proj_depth/{kind}/{camera}/{frame:010d}.png"
 
 
 def _of_size(camera: Camera, where: str, image: NDArray[Any]) -> NDArray[Any]:
-    """Return the image. Raise InputError if its size is not that of the camera."""
+    """Return the image. Raise InputError if its size differs from the camera's."""
     height_px, width_px = image.shape[:2]
     if (height_px, width_px) != (camera.height_px, camera.width_px):
         raise InputError(

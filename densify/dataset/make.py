@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make a training set: plan it, find the finished keys, make the others, record every key."""
+"""Make a training set: plan it, skip finished key sweeps, densify and record the others."""
 
 from __future__ import annotations
 
@@ -42,20 +42,21 @@ from densify.outputs.atomic import LEFT_AFTER_S, clear_leftovers
 from densify.outputs.kitti_tree import write_readme
 
 _log = logging.getLogger("densify")
-_LEAST_KEYS = 8  # of a process; fewer are made before another one has begun
-_BASE_BYTES, _SWEEP_BYTES = 1.5e9, 0.15e9  # of a process, and of a sweep of a 64-ring scanner
+_LEAST_KEYS = 8  # key sweeps per process; fewer are done before another process has started
+_BASE_BYTES, _SWEEP_BYTES = 1.5e9, 0.15e9  # memory per process, and per sweep of 64 rings
 Block = tuple[Drive, tuple[int, ...]]
-"""A recording and the keys of one of its blocks."""
+"""A recording, and the key frame numbers of one of its blocks."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """The state of a set, or of the part of a shard.
+    """The progress of a training set, or of one shard.
 
     Attributes:
-        records: Of keys that were ever tried.
-        num_keys: Number of wanted keys.
-        num_made: Number of keys made in this run, within ``seconds``.
+        records: Records of the key sweeps tried so far, by drive and frame number.
+        num_keys: Number of wanted key sweeps.
+        num_made: Number of key sweeps made in this run.
+        seconds: Duration of this run.
     """
 
     records: Mapping[Key, KeyRecord]
@@ -64,16 +65,16 @@ class Summary:
     seconds: float = 0.0
 
     def count(self, status: str) -> int:
-        """Return the number of keys of this status."""
+        """Return the number of key sweeps with this status: done, aside or failed."""
         return sum(record.status == status for record in self.records.values())
 
     @property
     def num_left(self) -> int:
-        """The number of keys that are still to be made."""
+        """The number of wanted key sweeps without a record."""
         return self.num_keys - len(self.records)
 
     def mean(self, score: str) -> float | None:
-        """Return the mean of a score over the finished keys and their cameras."""
+        """Return a score's mean over finished key sweeps and their cameras, None if unknown."""
         values: list[Any] = []
         for record in self.records.values():
             value = record.scores.get(score) if record.status == "done" else None
@@ -94,33 +95,33 @@ def make_dataset(
     verify: bool = False,
     report: Callable[[Summary], None] | None = None,
 ) -> Summary:
-    """Make every key of whole recordings, as a training set.
+    """Make a training set from the key sweeps of whole recordings.
 
-    Run again, it continues: finished keys are kept, and failed ones are tried again.
-    The files do not depend on the number of processes, on shards or on interruptions. The manifest
-    says what became of every key.
+    A repeated call continues the set: finished key sweeps are kept and failed key sweeps are tried
+    again. The files do not depend on the number of processes, shards or interruptions. The manifest
+    records the outcome of every key sweep.
 
     Args:
         data: Recordings, as `densify.open_sequence` takes them.
-        out: The folder of the set.
-        keys: The existing frames ``start`` to ``stop`` - 1 by ``step``; None for all.
-        recipe: Window, method, cameras, limits of the scores and settings; None for the usual ones.
-        num_workers: Number of processes. 1 works in this one. None takes as many as cores, free
-            memory and keys allow. A script that starts several needs
-            ``if __name__ == "__main__"``.
-        scheduler: Address of a Dask scheduler whose workers are used instead. They need the same
-            files at the same paths. ``tcp://`` trusts everybody on that network.
-        shard: (i, n), the i-th of n parts of the work, from 1. Parts may run at the same time on
-            machines that share ``out``.
-        verify: Compare finished files with their recorded hashes, and make damaged ones again.
-        report: Is called before the first key and after every one.
+        out: Folder of the training set.
+        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``, None for all.
+        recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
+        num_workers: Number of processes. 1 uses this process. None uses as many as cores, free
+            memory and key sweeps allow. A script that starts several needs ``if __name__ ==
+            "__main__"``.
+        scheduler: Address of a Dask scheduler whose workers replace local processes. They need the
+            same files at the same paths. ``tcp://`` trusts everybody on that network.
+        shard: (i, n) for the i-th of n parts of the work, from 1. Machines that share ``out`` may
+            work on different parts at the same time.
+        verify: Compare finished files with their recorded hashes, and make damaged files again.
+        report: Function called with the progress, before the first and after every key sweep.
 
     Returns:
-        How far the set is.
+        The final progress.
 
     Raises:
-        InputError: Something cannot be used, or another run works on the same part.
-        ComputationError: The disk is full or the workers are lost. What is finished is kept.
+        InputError: An argument cannot be used, or another run works on the same part.
+        ComputationError: The disk is full or the workers are lost. Finished key sweeps are kept.
     """
     if isinstance(data, str) or not data:
         raise InputError(f"data: got {data!r}, expected a list of recordings, such as ['street']")
@@ -128,7 +129,7 @@ def make_dataset(
     check_engine(recipe.config.flow.engine)
     drives = plan(data, keys, recipe)
     check_place(out)
-    Cache()  # refuses a folder that others can write to
+    Cache()  # raises InputError if other users can write to the cache folder
     num_workers = _num_processes(num_workers, recipe, drives)
     leftover_age_s = 0.0 if shard is None else LEFT_AFTER_S
     with Manifest(out, shard) as manifest:
@@ -155,15 +156,15 @@ def make_dataset(
             left = _jobs(blocks, records.keys(), recipe, out, num_workers)
             made = call_all(make_key, left, num_workers, log, scheduler)
             summary = _record(made, manifest, records, len(wanted), report)
-            clear_leftovers(out, leftover_age_s)  # of workers that were killed
+            clear_leftovers(out, leftover_age_s)  # hidden folders of killed workers
     return summary
 
 
 def status(out: Path) -> Summary:
-    """Return how far a set is, finished or not.
+    """Return the progress of a training set from its files.
 
     Raises:
-        InputError: ``out`` holds none.
+        InputError: The folder holds no training set.
     """
     table = read_plan(out)
     if table is None:
@@ -174,16 +175,16 @@ def status(out: Path) -> Summary:
 
 
 def damaged(out: Path) -> list[str]:
-    """Return the files of finished keys, relative to ``out``, that are missing or changed.
+    """Return the missing or changed files of finished key sweeps, as paths relative to ``out``.
 
-    A file is changed if its hash is not that of the manifest.
+    A file is changed if its hash differs from the hash in the manifest.
     """
     records = read_manifests(out).values()
     return [name for r in records if r.status != "failed" for name in damaged_files(r, out)]
 
 
 def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[Drive]) -> int:
-    """Return the wanted number; for None as many as cores, free memory and keys allow."""
+    """Return the wanted number, or as many as cores, free memory and key sweeps allow."""
     if wanted is not None:
         if wanted < 1:
             raise InputError(f"--workers {wanted}: expected 1 or more processes")
@@ -195,7 +196,7 @@ def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[Drive]) 
 
 
 def _free_bytes() -> float:
-    """Return the free memory of the system, or the limit of a container if that is less."""
+    """Return the free memory of the system, or a container's lower limit."""
     found = []
     with suppress(OSError, ValueError, TypeError):
         table = Path("/proc/meminfo").read_text()
@@ -205,7 +206,7 @@ def _free_bytes() -> float:
 
 
 def _blocks(drives: Sequence[Drive], shard: tuple[int, int] | None) -> list[Block]:
-    """Return the blocks of all drives, or the consecutive ones of a shard."""
+    """Return the blocks of all drives, or the consecutive blocks of one shard."""
     i, n = shard or (1, 1)
     blocks = [(drive, keys) for drive in drives for keys in drive.blocks]
     return blocks[len(blocks) * (i - 1) // n : len(blocks) * i // n]
@@ -214,14 +215,17 @@ def _blocks(drives: Sequence[Drive], shard: tuple[int, int] | None) -> list[Bloc
 def _jobs(
     blocks: Sequence[Block], done: Collection[Key], recipe: Recipe, out: Path, num_workers: int
 ) -> list[list[tuple[Job, int]]]:
-    """Return the keys to make, in groups. The first key of a block makes what all of them share."""
+    """Return the key sweeps to make, in a group for each block.
+
+    The first key sweep of a group computes the results that the group shares.
+    """
     run, groups = uuid4().hex, []
     for drive, keys in blocks:
         cameras, place = tuple(drive.cameras), out.absolute()
         job = Job(drive.name, drive.data, drive.folder, cameras, recipe, place, run)
         if group := [(job, key) for key in keys if (drive.name, key) not in done]:
             groups.append(group)
-    # Workers begin far from each other, because neighbouring blocks share steps too.
+    # Workers begin at distant blocks, because neighbouring blocks share results too.
     step = math.ceil(len(groups) / num_workers)
     return [group for start in range(step) for group in groups[start::step]]
 
@@ -233,10 +237,11 @@ def _record(
     num_keys: int,
     report: Callable[[Summary], None] | None,
 ) -> Summary:
-    """Record and report every key.
+    """Record and report every key sweep, and return the final progress.
 
-    If it ends early, it says what is kept; a full disk is a ComputationError. made: of `call_all`.
-    records: earlier ones, to which the new ones are added.
+    ``made`` has the items and outcomes of `call_all`. New records are added to ``records`` in
+    place. On an error the number of finished key sweeps is logged. A full disk is a
+    ComputationError.
     """
     start_s = time.monotonic()
     summary = Summary(records, num_keys)

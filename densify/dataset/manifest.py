@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Record the keys of a set, one JSON line for each.
+"""Record the key sweeps of a training set in a manifest, one JSON line for each.
 
-The file is ``OUT/manifest.jsonl``, or ``OUT/manifest-2of4.jsonl`` of the second of four shards::
+The file is ``OUT/manifest.jsonl``, or ``OUT/manifest-2of4.jsonl`` for the second of four shards::
 
     drive, key       the recording's name and the frame number
-    status, reason   done, aside (made, but not good enough to be in the set) or failed, and why
-    frames           of the sweeps it was made of
+    status, reason   done, aside (made, but beyond a limit of the scores and not written) or
+                     failed; the reason is null for done
+    frames           frame numbers of the sweeps in the window
     files            path relative to OUT, with slashes -> bytes, sha256
     scores           numbers; null if unknown
-    seconds          of computing
+    seconds          computing time
     warnings         sentences about assumptions and suspicions
 
-A line is on the disk before the next one begins. A killed writer damages at most the last line,
-whose key is made again. A later line of a key replaces an earlier one.
+Each line is on the disk before the next line begins. A killed process can damage only the last
+line, and its key sweep is made again. A later line of a key sweep replaces an earlier line.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from densify.outputs.kitti_tree import FileRecord
 
 Status = Literal["done", "aside", "failed"]
 Key = tuple[str, int]
-"""A recording's name and a frame number."""
-_STATUSES: tuple[Status, ...] = ("failed", "aside", "done")  # the better, the later
+"""The name of a recording and the frame number of a key sweep."""
+_STATUSES: tuple[Status, ...] = ("failed", "aside", "done")  # from worst to best
 _log = logging.getLogger("densify")
 
 
 @dataclass(frozen=True)
 class KeyRecord:
-    """The outcome of one key; the fields are those of a manifest line."""
+    """The outcome of one key sweep, with the fields of a manifest line."""
 
     drive: str
     key: int
@@ -55,11 +56,11 @@ class KeyRecord:
 
     @property
     def name(self) -> Key:
-        """The drive and the key."""
+        """The drive and the frame number."""
         return self.drive, self.key
 
     def to_line(self) -> bytes:
-        """Return one line of JSON with its end. The same record gives the same bytes."""
+        """Return the record as a line of JSON with its newline. Equal records give equal bytes."""
         files = {
             name: {"bytes": file.num_bytes, "sha256": file.sha256}
             for name, file in sorted(self.files.items())
@@ -69,7 +70,7 @@ class KeyRecord:
 
     @staticmethod
     def from_line(line: bytes) -> KeyRecord:
-        """Return the record of a line, without later fields. Raise ValueError for damage."""
+        """Return the record in a manifest line. Raise ValueError if the line is damaged."""
         try:
             fields = parse_json(line, "a line")
             files = fields["files"].items()
@@ -89,10 +90,11 @@ class KeyRecord:
 
 
 def read_manifests(root: Path) -> dict[Key, KeyRecord]:
-    """Return the records of all manifests in a folder, ordered by drive and key.
+    """Return the records of all manifests in a folder, ordered by drive and frame number.
 
-    Of several lines of a key in one file the last one counts. Of several shards a finished one
-    counts, else one put aside. Damaged lines before the last give a warning.
+    If a file has several lines for a key sweep, the last line counts. If several shards have a
+    record, "done" counts before "aside" and "failed". Damaged lines before the last line give a
+    warning.
 
     Raises:
         InputError: A manifest cannot be read.
@@ -107,10 +109,10 @@ def read_manifests(root: Path) -> dict[Key, KeyRecord]:
 
 
 def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> list[str]:
-    """Return the record's files, relative to ``root``, that are missing or changed.
+    """Return the missing or changed files of a record, as paths relative to ``root``.
 
     Args:
-        by_content: Compare the hashes too, else the sizes alone.
+        by_content: Compare sizes and hashes instead of sizes alone.
     """
     damaged = []
     for name, file in record.files.items():
@@ -126,10 +128,12 @@ def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> lis
 
 
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
-    """Return the keys that need not be made again: done or put aside, with all their files.
+    """Return (drive, frame number) of the key sweeps that need no further work.
+
+    Their status is done or aside, and all their files exist.
 
     Args:
-        verify: Compare the hashes of files too, else only their sizes.
+        verify: Compare sizes and hashes of the files instead of sizes alone.
     """
     return {
         r.name
@@ -140,22 +144,22 @@ def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> 
 
 
 class Manifest:
-    """The manifest of one run, or of one shard, while it is written; a context manager.
+    """The manifest file of a run or shard, open for writing. Use it as a context manager.
 
-    One process at a time has it open, by a hidden lock file that stays. On opening and closing the
-    lines are put in order: one per key, by drive and key.
+    A hidden lock file, which stays, lets only one process open the manifest. Opening and closing
+    sort the file: one line per key sweep, by drive and frame number.
     """
 
     def __init__(self, root: Path, shard: tuple[int, int] | None = None) -> None:
-        """Prepare a manifest.
+        """Open a manifest, with the folder made if needed.
 
         Args:
-            root: Folder of the set, made if needed.
-            shard: (k, n) for the k-th of n, from 1.
+            root: Folder of the training set.
+            shard: (k, n) for the k-th of n shards, from 1. None for a run without shards.
 
         Raises:
-            InputError: Another process has it open, or it cannot be read.
-            OutputError: It cannot be written.
+            InputError: Another process has the manifest open, or it cannot be read.
+            OutputError: The file cannot be written.
         """
         stem = "manifest" if shard is None else f"manifest-{shard[0]}of{shard[1]}"
         self.path = root / f"{stem}.jsonl"
@@ -175,15 +179,15 @@ class Manifest:
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        with suppress(OSError, OutputError):  # the file keeps all records without the order
+        with suppress(OSError, OutputError):  # an unsorted file still has all records
             self._put_in_order()
         os.close(self._lock)
 
     def append(self, record: KeyRecord) -> None:
-        """Add or replace the record of a key. It is on the disk when this returns.
+        """Add or replace the record of a key sweep. The record is on the disk at return.
 
         Raises:
-            OutputError: It cannot be written.
+            OutputError: The file cannot be written.
         """
         try:
             with self.path.open("ab") as file:
@@ -206,7 +210,7 @@ class Manifest:
 
 
 def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
-    """Return the last record of each key with its line, {} without a file."""
+    """Return the last record of each key sweep with its line, {} if the file does not exist."""
     lines = read_bytes(path).split(b"\n") if path.exists() else [b""]
     records, damaged = {}, []
     for number, line in enumerate(lines, start=1):
@@ -215,7 +219,7 @@ def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
             records[record.name] = (record, line + b"\n")
         except ValueError:
             damaged.append(number)
-    if damaged[-1:] == [len(lines)]:  # the end: nothing, or what a killed writer left
+    if damaged[-1:] == [len(lines)]:  # the last line is empty, or cut by a killed process
         del damaged[-1]
     if damaged:
         _log.warning(
@@ -229,7 +233,7 @@ def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
 
 
 def _lock(lock: int, root: Path) -> None:
-    """Take the lock, which ends with the process in any case."""
+    """Take the lock, which is released when the process ends, even by a crash."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Plan a training set: the keys of the recordings, and how they are made.
+"""Plan a training set: the key sweeps of the recordings, and how their maps are made.
 
-``OUT/dataset.json`` holds the plan, with which a later run continues the set:
+``OUT/dataset.json`` holds the plan, with which a later run continues the set::
 
     schema_version, densify (version)
-    layout, method, window, cameras, gate, config    of every key
-    drives    name -> data (text of ``--data``), folder (of the tree, in OUT), frames (planned
-              keys, as [first, last] runs), cameras (name -> width_px, height_px, K, T_cam_lidar,
-              distortion, model, max_angle_deg, row_time_s, column_time_s)
+    layout, method, window, cameras, gate, config    settings for every key sweep, see `Recipe`
+    drives    name -> data (text of ``--data``), folder (relative to OUT), frames (planned key
+              frame numbers, as [first, last] runs), cameras (name -> width_px, height_px, K,
+              T_cam_lidar, distortion, model, max_angle_deg, row_time_s, column_time_s)
 """
 
 from __future__ import annotations
@@ -41,22 +41,23 @@ _KNOWN = {
 _FILE = "dataset.json"
 _MOST_FRAMES = 10_000_000
 _SAME = ("densify", "layout", "method", "window", "cameras", "gate", "config")
-"""Entries of dataset.json in which all runs of a set must agree."""
+"""Entries of dataset.json that must be equal in all runs for a training set."""
 _CAMERA = [f.name for f in fields(Camera) if f.name != "name"]
 
 
 @dataclass(frozen=True)
 class Gate(Section):
-    """Limits of the scores beyond which a key is put aside: ``--set dataset.NAME=VALUE``.
+    """Limits of the scores, set by ``--set dataset.NAME=VALUE``. None means no limit.
 
-    None is no limit. The scores need no ground truth.
+    A key sweep beyond a limit is not written. The scores need no ground truth.
 
     Attributes:
-        max_ghost: Share of the accumulated points that the key sweep saw through.
-        min_density: Share of the image's pixels with a measured depth, in every camera.
-        max_outliers: Share of outliers among the key's returns, held out, in every camera.
-        min_sweeps: Number of sweeps in the window, which ends and gaps of the recording cut.
-        split: ``train`` or ``val``, the split of the tree; ``kitti`` for KITTI's official one.
+        max_ghost: Greatest share of accumulated points at positions that the key sweep saw through.
+        min_density: Least share of the image's pixels with a measured depth, in every camera.
+        max_outliers: Greatest share of outliers against the held-out key sweep, in every camera.
+        min_sweeps: Least number of sweeps in the window, which may be cut at ends and holes in
+            time.
+        split: Split of the tree, ``train`` or ``val``; ``kitti`` takes KITTI's official split.
     """
 
     max_ghost: float | None = within(None, 0, 1)
@@ -66,7 +67,7 @@ class Gate(Section):
     split: str = one_of("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
-        """Return why a key with these `scores` is put aside, None for a good key."""
+        """Return why a key sweep with these scores of a manifest line is not written, else None."""
         ghost, outliers = scores["ghost"], scores["outliers"]
         if self.min_sweeps is not None and num_sweeps < self.min_sweeps:
             return f"{num_sweeps} sweeps, expected at least {self.min_sweeps}"
@@ -83,15 +84,16 @@ class Gate(Section):
 
 @dataclass(frozen=True)
 class Recipe:
-    """How every key of a training set is made.
+    """Settings for all key sweeps of a training set.
 
     Attributes:
-        window: Number of sweeps on each side of a key.
-        method: ``flow``, ``icp`` or ``none``.
-        layout: ``kitti-depth``, KITTI's depth tree, or ``densify``, what ``densify run`` writes.
-        cameras: Names; None for all.
+        window: Number of sweeps on each side of a key sweep.
+        method: ``flow``, ``icp`` or ``none``: scene flow, rigid accumulation or single sweep.
+        layout: ``kitti-depth`` for KITTI's depth tree, ``densify`` for the files of ``densify
+            run``.
+        cameras: Names of the cameras, None for all.
         gate: Limits of the scores, and the split of the tree.
-        config: Settings, from `densify.config.resolve`; scored if the gate limits outliers.
+        config: Settings from `densify.config.resolve`. A limit of outliers turns scoring on.
     """
 
     window: int = 5
@@ -118,14 +120,14 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Drive:
-    """A recording of a set.
+    """A recording of a training set.
 
     Attributes:
-        name: Name of its folder.
+        name: Name of the recording's folder.
         data: Text of ``--data``, with an absolute path.
-        folder: Folder of its files, relative to the set.
-        cameras: The wanted cameras.
-        blocks: Its keys, ascending. Keys of a block share steps of the pipeline.
+        folder: Folder of the recording's files, relative to the training set.
+        cameras: The wanted cameras, by name.
+        blocks: Key frame numbers, ascending. The key sweeps of a block share pipeline stages.
     """
 
     name: str
@@ -136,22 +138,22 @@ class Drive:
 
     @property
     def keys(self) -> tuple[int, ...]:
-        """All keys, ascending."""
+        """The frame numbers of all key sweeps, ascending."""
         return tuple(chain.from_iterable(self.blocks))
 
 
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]:
-    """Open every recording and choose its keys.
+    """Open every recording and choose its key sweeps.
 
     Args:
         data: Recordings, as ``--data`` takes them.
-        keys: None for all, else the existing frames ``start`` to ``stop`` - 1 by ``step``, of
-            every recording.
-        recipe: How keys are made.
+        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step`` in every recording,
+            None for all.
+        recipe: Settings of the training set.
 
     Raises:
-        InputError: A recording cannot be opened, two have equal names, or there is no such
-            camera or key.
+        InputError: A recording cannot be opened, two have equal names, or a camera or frame is
+            unknown.
     """
     drives: dict[str, Drive] = {}
     for spec in data:
@@ -192,19 +194,19 @@ def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, 
 
 
 def check_place(out: Path) -> None:
-    """Raise InputError if the folder holds anything but a set, or the beginning of one."""
-    begun = (".", "manifest")  # files of a run before there is a dataset.json
+    """Raise InputError if the folder holds files other than a finished or begun training set."""
+    begun = (".", "manifest")  # a run makes these files before dataset.json
     names = [path.name for path in out.iterdir()] if out.is_dir() else []
     if read_plan(out) is None and not all(name.startswith(begun) for name in names):
         raise InputError(f"--out {out}: not empty, and no dataset.json in it; choose another")
 
 
 def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
-    """Begin a set, or extend one that is made the same way.
+    """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe.
 
     Raises:
-        InputError: Another set is there.
-        OutputError: It cannot be written.
+        InputError: The folder holds a different training set.
+        OutputError: The file cannot be written.
     """
     table = _table(recipe, drives)
     before = read_plan(out)
@@ -217,10 +219,10 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
-    """Return dataset.json, None if there is none.
+    """Return the content of dataset.json, None if the file does not exist.
 
     Raises:
-        InputError: It is damaged.
+        InputError: The file is damaged or of another version.
     """
     path = out / _FILE
     if not path.is_file():
@@ -242,7 +244,7 @@ def read_plan(out: Path) -> dict[str, Any] | None:
 
 
 def drives_of(table: Mapping[str, Any]) -> dict[str, Drive]:
-    """Return the recordings in the result of `read_plan`, by name, each as one block."""
+    """Return the recordings in the result of `read_plan`, by name, each with a single block."""
     found = {}
     for name, drive in table["drives"].items():
         cameras = {n: _camera(n, camera) for n, camera in drive["cameras"].items()}
@@ -252,7 +254,7 @@ def drives_of(table: Mapping[str, Any]) -> dict[str, Drive]:
 
 
 def planned_keys(table: Mapping[str, Any]) -> set[tuple[str, int]]:
-    """Return (drive, frame) of every key in a dataset.json."""
+    """Return (drive, frame number) of every key sweep in the result of `read_plan`."""
     return {(name, key) for name, drive in drives_of(table).items() for key in drive.keys}
 
 
@@ -291,7 +293,7 @@ def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) ->
 
 
 def _flat(name: str, value: Any) -> dict[str, Any]:
-    """Return the values of nested mappings by dotted names."""
+    """Return the values of nested mappings by their dotted names, such as ``gate.max_ghost``."""
     if not isinstance(value, dict):
         return {name: value}
     return {n: v for key, part in value.items() for n, v in _flat(f"{name}.{key}", part).items()}

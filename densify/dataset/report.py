@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Write pages: ``report.html`` of a run or a training set, ``compare.html`` of a comparison.
+"""Write HTML pages: ``report.html`` of a run or training set, ``compare.html`` of a comparison.
 
-The page of a training set is one table.
+The page of a training set is a table of its key sweeps.
 """
 
 from __future__ import annotations
@@ -37,23 +37,24 @@ tr:nth-child(even) {{background: #eee}}</style>
 
 
 def write_comparison_page(folder: Path) -> Path:
-    """Write ``compare.html`` of a key's folder."""
+    """Write ``compare.html`` into the folder of a key sweep and return its path."""
     page = folder / "compare.html"
     write_file(page, key_page(KeyFiles.of_comparison(folder), ""))
     return page
 
 
 def write_report(place: Path, overwrite: bool = False) -> list[Path]:
-    """Make the pages of a folder and return them.
+    """Write the HTML pages of a folder and return their paths.
 
-    They are ``report.html`` of a run or a set, and ``compare.html`` of a comparison, beside their
-    files.
+    The page is ``report.html`` for a run or a training set, and ``compare.html`` for a comparison.
 
     Args:
-        place: Folder of a key, the folder above it if it holds no other, or a training set.
+        place: Folder of a key sweep, its parent folder if it holds no other, or a training set.
+        overwrite: Replace existing pages.
 
     Raises:
-        InputError: The folder is none of these, its main files are damaged, or a page exists.
+        InputError: The folder has no run, comparison or training set, its main files are damaged,
+            or a page exists.
         OutputError: A page cannot be written.
     """
     pages = _pages(place)
@@ -66,7 +67,7 @@ def write_report(place: Path, overwrite: bool = False) -> list[Path]:
 
 
 def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
-    """Return path -> function that makes the page."""
+    """Return the path of each page -> function that returns its bytes."""
     if not place.is_dir():
         raise InputError(
             f"{place}: no such folder; expected what densify run, compare or dataset wrote"
@@ -92,9 +93,9 @@ def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
 
 
 def _set_page(root: Path) -> bytes:
-    """Return the page of a training set.
+    """Return the bytes of a training set's page.
 
-    Its first keys are the failed ones and those with the highest ghost rate.
+    The table starts with failed key sweeps and those with the highest ghost rate.
     """
     table, records = read_plan(root) or {}, read_manifests(root)
     counts = Counter[str](record.status for record in records.values())
@@ -112,14 +113,14 @@ def _set_page(root: Path) -> bytes:
 
 
 def _badness(record: KeyRecord) -> tuple[Any, ...]:
-    """Return the sort key of a record."""
+    """Return a sort key: failed first, then aside, then the highest ghost rate."""
     ghost = record.scores.get("ghost")
     share = ghost if isinstance(ghost, int | float) else 0.0
     return _STATUSES.index(record.status), -share, record.name
 
 
 def _row(record: KeyRecord) -> dict[str, Any]:
-    """Return the cells of a key by the heads of their columns."""
+    """Return column title -> cell for the row of a key sweep."""
     row = {
         "recording": record.drive,
         "key": record.key,
@@ -135,7 +136,7 @@ def _row(record: KeyRecord) -> dict[str, Any]:
 
 
 def _rows(rows: Iterable[Iterable[Any]]) -> str:
-    """Return rows of a table in HTML."""
+    """Return the rows of a table as HTML."""
     cells = ("".join(f"<td>{html.escape(_text(value))}</td>" for value in row) for row in rows)
     return "\n".join(f"<tr>{row}</tr>" for row in cells)
 

@@ -94,7 +94,6 @@ def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
 
 @contextmanager
 def _hidden_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside ``path``. Raise OutputError if writing fails."""
     prefix = f".{path.name[:100]}."
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

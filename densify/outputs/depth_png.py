@@ -167,7 +167,6 @@ def read_mask_png(path: Path) -> Bool:
 
 
 def _quantised(depth_m: Float32) -> NDArray[np.uint16]:
-    """Return depths in steps of 1/256 m, 0 for depths beyond 256 m."""
     if not (np.isfinite(depth_m) & (depth_m >= 0)).all():
         raise ValueError("depth_m: expected finite depths, 0 or more")
     steps = np.rint(_STEPS_PER_M * depth_m.astype(np.float64))

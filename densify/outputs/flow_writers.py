@@ -209,7 +209,6 @@ def flow_writer(
 
 
 def _place(form: str, out: Path, name: str) -> Path:
-    """Return the folder that the user is told for a format."""
     return out / name if form in ("av2", "doc-depth") else out
 
 
@@ -260,7 +259,6 @@ def _write_paths(folder: Path, sequence: LidarSequence, T_world_lidar: dict[int,
 
 
 def _save_path(path: Path, track: PoseTrack, stamps_ns: Int, numbers: Sequence[int]) -> None:
-    """Write the poses of a track at (n,) times as a PLY file, with an index for each pose."""
     T = np.stack([track.at(int(ns)) for ns in stamps_ns]) if len(stamps_ns) else np.zeros((0, 4, 4))
     turns = Rotation.from_matrix(T[:, :3, :3]).as_quat().T if len(T) else np.zeros((4, 0))
     columns = dict(zip("xyz", T[:, :3, 3].T, strict=True))

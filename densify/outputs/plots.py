@@ -83,11 +83,7 @@ def _image(result: Result, camera: str) -> Picture:
 
 
 def _error(result: Result, camera: str, product: str) -> str:
-    """Return text with the share of outliers, "" if it is unknown.
-
-    The share is against ground truth if available, else against the returns of the held-out key
-    sweep.
-    """
+    """Return text with the share of outliers against ground truth, else the held-out key sweep."""
     for source, against in (("depth", "truth"), ("held_out", "key held out")):
         scores = (result.metrics.get(source) or {}).get(camera, {}).get(product)
         if scores and scores["all"]["outliers"] is not None:

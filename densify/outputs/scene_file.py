@@ -78,7 +78,6 @@ def damage_named(path: Path) -> Iterator[None]:
 
 
 def _view(view: Mapping[str, Any]) -> CameraView:
-    """Return the camera and pose in an entry of scene.json. Raise an error for bad values."""
     own = {f.name: view[f.name] for f in fields(Camera)}
     own |= {
         "K": _array(view["K"], 3, 3),

@@ -71,14 +71,12 @@ def write_street(
 
     Args:
         format: Name of a format in `FORMATS`.
-        out: Folder above the recording.
         frames: Frame numbers to write.
         cameras: Names of the cameras to write, None for all.
         overwrite: Replace an existing recording.
 
     Raises:
-        InputError: The format, a frame or a camera is unknown or does not fit, or the recording
-            exists.
+        InputError: The format, a frame or a camera is unknown or unfit, or the recording exists.
     """
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
@@ -177,7 +175,6 @@ def put(path: Path, data: bytes | str) -> None:
 
 
 def _numbered(frames: Sequence[int], progress: Progress) -> Iterator[tuple[int, int]]:
-    """Yield the index and frame number of each frame, and report progress."""
     for number, frame in enumerate(frames):
         progress("simulate", number, len(frames))
         yield number, frame

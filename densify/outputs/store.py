@@ -77,7 +77,6 @@ def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) ->
 
 
 def _check_place(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> None:
-    """Raise InputError unless ``folder`` can be made or updated, as in `writing`."""
     place = folder
     while not os.path.lexists(place):
         place = place.parent

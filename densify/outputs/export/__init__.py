@@ -107,6 +107,5 @@ def facts(export: Export) -> dict[str, Any]:
 
 
 def _total(runs: Sequence[FinishedRun]) -> Kept | None:
-    """Return the number of points of all runs, None if no cloud was read."""
     known = [run.num_points for run in runs if run.num_points is not None]
     return Kept(sum(k.before for k in known), sum(k.after for k in known)) if known else None

@@ -121,7 +121,6 @@ def _write_depths(pictures: Sequence[Picture], folder: Path) -> None:
 
 
 def _write_movers(run: FinishedRun, folder: Path) -> None:
-    """Write the points of each moving object in its own frame, and those without a track."""
     whole = run.cloud()
     moving = [whole.select(whole.moving), *run.mover_clouds()]
     points, rgb, instance = (
@@ -293,7 +292,6 @@ def _write_model(
 
 
 def _model(camera: Camera) -> tuple[str, list[float]]:
-    """Return COLMAP's name of the camera model and its parameters."""
     params = list(intrinsics(camera).values())
     if camera.model == "fisheye":
         return "OPENCV_FISHEYE", params

@@ -179,7 +179,6 @@ class FinishedRun:
         return [self._select(read_cloud(path)) for path in paths]
 
     def _select(self, cloud: StoredCloud) -> StoredCloud:
-        """Return the points within the thresholds and add their number to ``num_points``."""
         age = stored_age(1e-9 * np.abs(cloud.stamp_ns - self.stamp_ns))
         keep = (stored_confidence(cloud.confidence) >= self._min_confidence) & (
             age <= self._max_age
@@ -309,7 +308,7 @@ def colours(cloud: StoredCloud) -> NDArray[np.uint8]:
 
 
 def _relative_pose(run: FinishedRun, other: FinishedRun) -> Float:
-    """Return the (4,4) pose of the other run's key sweep in the run's key sweep."""
+    """Return the (4,4) pose T_run_other from ``other``'s key sweep to ``run``'s key sweep."""
     if other.key in run.scene.T_key_lidar:
         return run.scene.T_key_lidar[other.key]
     if run.key in other.scene.T_key_lidar:

@@ -54,7 +54,6 @@ def write_exr(run: FinishedRun, folder: Path) -> None:
 def _write_maps(
     run: FinishedRun, folder: Path, suffix: str, save: Callable[[Path, str, Float32], None]
 ) -> None:
-    """Write each map by ``save``, a function of path, kind and (H,W) float32 values."""
     for camera in run.cameras:
         maps = run.maps(camera)
         levels = np.maximum(maps["confidence"].astype(np.float32) - 1, 0)

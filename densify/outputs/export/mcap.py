@@ -68,7 +68,6 @@ def _messages(m: Any, timeline: Timeline) -> Iterator[tuple[str, int, Any]]:
 
 
 def _of_shot(m: Any, shot: Shot) -> Iterator[tuple[str, Any]]:
-    """Yield the kind and the message of an image, its calibration and its depth maps."""
     about = {"timestamp": _stamp(m, shot.stamp_ns), "frame_id": shot.name}
     if shot.jpeg is not None:
         yield "image", m.CompressedImage(**about, data=shot.jpeg, format="jpeg")
@@ -97,7 +96,6 @@ def _lens(camera: Camera) -> tuple[str, list[float]] | None:
 
 
 def _cloud(m: Any, stamp_ns: int, points: Any, rgb: Any, beside: dict[str, NDArray[Any]]) -> Any:
-    """Return a PointCloud message of points (N,3) in the key sweep's lidar frame."""
     values = [*points.T.astype(np.float32), *rgb.T]
     columns = dict(zip(("x", "y", "z", "red", "green", "blue"), values, strict=True))
     rows = table(columns | {"alpha": np.full(len(points), 255, np.uint8), **beside})

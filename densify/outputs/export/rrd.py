@@ -108,7 +108,6 @@ def _of_shot(shot: Shot) -> Iterator[tuple[str, Any]]:
 
 
 def _boxes(tracks: Sequence[ObjectTrack], frame: int) -> Any:
-    """Return the boxes of the objects that have a pose at sweep ``frame``."""
     import rerun as rr
 
     seen = [(t, t.frames.index(frame)) for t in tracks if frame in t.frames]

@@ -186,7 +186,6 @@ def key_page(files: KeyFiles, folder: str) -> bytes:
 
 
 def _mover(track: ObjectTrack, key: Any) -> dict[str, Any]:
-    """Return the page's entry of a moving object, with metres in the key sweep's lidar frame."""
     at = track.frames.index(key)
     places_m = track.T_key_object[:, :3, 3]
     path = zip(track.frames, places_m, strict=True)
