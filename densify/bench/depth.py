@@ -71,10 +71,10 @@ def bench_depth(
             arguments as in `densify.pipeline.run.run`.
 
     Returns:
-        Plain numbers under ``variants``, by name of the variant: ``density`` (mean share of the
-            image's pixels) of measured and filled map, ``seconds`` per key sweep for projection,
-            and ``scores`` by ground truth, map (measured, filled) and pixels (all, moving):
-            num_pixels, coverage, outliers.
+        Plain numbers, under ``variants`` by name of the variant. ``density`` is the mean share of
+            pixels with a depth in the measured and the filled map. ``seconds`` per key sweep are
+            for projection. ``scores`` (num_pixels, coverage, outliers) are by ground truth, map
+            (measured, filled) and pixels (all, moving).
 
     Raises:
         InputError: An argument cannot be used.

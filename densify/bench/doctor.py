@@ -34,8 +34,8 @@ def bench_doctor(
     are counted too.
 
     Returns:
-        Name of the error -> number of cases (``of``), and share of the verdicts fine, unknown,
-            suspicious and wrong from the check for this kind of error.
+        Name of the error -> number of cases ``of``, and share of cases by verdict. The verdict is
+            from the check for this kind of error: fine, unknown, suspicious or wrong.
     """
     counts: dict[str, Counter[Verdict]] = {}
     for number, sequence in enumerate(sequences):

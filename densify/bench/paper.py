@@ -4,13 +4,14 @@
 Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020.
 
 Methods get 2,048 points drawn from each cloud within 35 m, as in the paper. ``ours`` and trained
-networks get all points, and are scored at the drawn points. Scores are the paper's: mean end-point
-error; share of points with an error below 5 cm or 5 %, and below 10 cm or 10 %; mean angle to the
-true flow at points with true flow. Scores are averaged over pairs of clouds.
+networks get all points, and are scored at the drawn points. Scores are the paper's, averaged over
+pairs of clouds: mean end-point error, accuracy, mean angle to the true flow. Accuracy is the share
+of points with an error below 5 cm or 5 %, and below 10 cm or 10 %. The angle is over points with
+true flow.
 
-Other data sets are folders of .npz files as FlowNet3D's authors made them (Liu et al., CVPR 2019):
-``points1``, ``points2``, ``flow`` and ``valid_mask1`` (FlyingThings3D; camera axes, z forward), or
-``pos1``, ``pos2`` and ``gt`` (KITTI without ground; z up).
+Other data sets are folders of .npz files by FlowNet3D's authors (Liu et al., CVPR 2019).
+FlyingThings3D has ``points1``, ``points2``, ``flow`` and ``valid_mask1`` in camera axes, z forward.
+KITTI without ground has ``pos1``, ``pos2`` and ``gt``, z up.
 """
 
 from __future__ import annotations

@@ -163,7 +163,7 @@ def _outcome(result: Callable[[], Any]) -> Any:
     except BrokenExecutor as error:
         return error
     except (InputError, ComputationError, CancelledError):
-        raise  # a Dask client that loses its scheduler cancels all
+        raise  # CancelledError: a Dask client that loses its scheduler cancels all calls
     except Exception as error:
         return ComputationError(f"{type(error).__name__}: {error}")
 

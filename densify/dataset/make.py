@@ -201,7 +201,7 @@ def _free_bytes() -> float:
     with suppress(OSError, ValueError, TypeError):
         table = Path("/proc/meminfo").read_text()
         found.append(1024.0 * int(re.findall(r"MemAvailable:\s+(\d+)", table)[0]))
-        found.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))  # or the word max
+        found.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))  # may be "max"
     return min(found, default=float("inf"))
 
 

@@ -85,7 +85,7 @@ class KeyRecord:
                 seconds=float(fields["seconds"]),
                 warnings=tuple(map(str, fields.get("warnings", ()))),
             )
-        except Exception as error:  # damaged text raises anything
+        except Exception as error:  # damaged text raises errors of any type
             raise ValueError(f"no record of a key: {error!r}") from error
 
 

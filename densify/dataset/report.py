@@ -95,7 +95,7 @@ def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
 def _set_page(root: Path) -> bytes:
     """Return the bytes of a training set's page.
 
-    The table starts with failed key sweeps and those with the highest ghost rate.
+    The table starts with the failed key sweeps, then has the highest ghost rates first.
     """
     table, records = read_plan(root) or {}, read_manifests(root)
     counts = Counter[str](record.status for record in records.values())

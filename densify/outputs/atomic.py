@@ -84,7 +84,7 @@ def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
 
     Folders younger than ``age_s`` seconds are kept, because another process may be writing there.
     """
-    for folder, names, _ in os.walk(root):  # skips files that others remove meanwhile
+    for folder, names, _ in os.walk(root):  # skips entries that other processes remove meanwhile
         for name in names:
             hidden = Path(folder, name)
             with suppress(OSError):

@@ -305,7 +305,7 @@ def projections(key: str) -> str:
     A line is K [I | t], with t in metres from the rectified camera 0.
     """
     lines = ""
-    for number in range(4):  # 0 and 1 are the gray cameras beside them
+    for number in range(4):  # gray cameras 0 and 1 share the poses of colour cameras 2 and 3
         camera = CAMERAS[f"image_0{2 + number % 2}"]
         away = (camera.T_cam_lidar - T_RECTIFIED_LIDAR)[:3, 3]
         lines += f"{key.format(number)}: {numbers(camera.K @ np.column_stack([np.eye(3), away]))}\n"

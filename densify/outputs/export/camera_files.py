@@ -34,7 +34,7 @@ from densify.readers.decoded_files import decode_image
 
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
-_INVERSE_STEPS = 65536  # of 16 bits, as that training divides them
+_INVERSE_STEPS = 65536  # the training of Gaussian splatting divides by this number
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -286,7 +286,7 @@ def _write_model(
     sparse = folder / "sparse" / "0"
     write_file(sparse / "cameras.txt", cameras.encode())
     write_file(sparse / "images.txt", images.encode())
-    # Each: number, position, colour, reprojection error
+    # A row has the point's number, position, colour and reprojection error.
     rows = np.column_stack([np.arange(1, len(cloud.points) + 1), cloud.points, cloud.rgb])
     np.savetxt(sparse / "points3D.txt", rows, fmt="%d %.3f %.3f %.3f %d %d %d 0")
 

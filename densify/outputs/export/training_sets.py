@@ -19,7 +19,7 @@ from densify.outputs.export.camera_files import Picture, intrinsics, pictures_of
 from densify.outputs.export.finished_run import FinishedRun
 from densify.outputs.kitti_tree import drive_folder
 
-_LOG_STEPS = 65533  # of 16 bits, as MoGe divides them
+_LOG_STEPS = 65533  # MoGe divides by this number
 
 
 def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:

@@ -41,7 +41,7 @@ _TRIAL_LEVEL, _LEVEL = 1, 7
 _LEVELS = 65535
 _MOST_POINTS = 500_000
 _CONFIDENCE_STEPS = 31
-_GRAY = 50, 190  # reflectance 0 and 1, where no camera observed the point
+_GRAY = 50, 190  # gray of reflectance 0 and 1, for points without colour
 _NEAR_M, _MOVING_WEIGHT = 4.0, 100.0
 
 
