@@ -50,7 +50,7 @@ _MOVED = (
 
 
 def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
-    """Return the layers with those boundary pixels (``rim_m``) accepted that the image confirms.
+    """Return the layers with the boundary pixels (``rim_m``) accepted that the image confirms.
 
     A pixel is accepted if 97 % of the votes are for its depth. Boundary pixels vote too, with half
     the weight, and in a second round by their own share of votes. Their ``confidence`` becomes 0 to

@@ -95,7 +95,7 @@ def key_shots(
 
 
 def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str, NDArray[np.uint8]]:
-    """Return the (H,W,3) RGB image of each shot that has one, by the name of the map."""
+    """Return the (H,W,3) RGB images of the shots that show an image, by the name of the map."""
     images = {n: (s.camera.name, s.number) for n, s in shots.items() if s.number is not None}
     if hasattr(sequence, "prepare"):
         sequence.prepare((), list(images.values()))
@@ -179,8 +179,8 @@ class Exposure:
     ) -> Exposure:
         """Return the exposure of a shot for the key sweep with frame number ``key``.
 
-        The camera pose is extrapolated from the key sweep with the vehicle's twist. A recorded pose
-        of the image is used instead if there is one.
+        The camera pose is extrapolated from the key sweep with the vehicle's twist. If the
+        recording has a pose of the image, the recorded pose is used instead.
         """
         others: dict[str, Exposure] = {}
         if settings.output.optical_flow and shot.number is not None:
@@ -206,8 +206,8 @@ class Exposure:
         """Project points (N,3) with velocities (N,3), given in the key sweep's lidar frame.
 
         The points are at the reference time of that sweep. Moving points advance by their velocity
-        to the exposure. With a rolling shutter the exposure is that of each point's own row or
-        column. Points beside or behind a wide lens have no z and are not inside.
+        to the exposure. With a rolling shutter each row or column of the image has its own exposure
+        time. Points beside or behind a wide lens have no z and are not inside.
         """
         late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)

@@ -53,9 +53,9 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
     """Return for each sweep (N,) True where another sweep along the road saw through the point.
 
     Some sweeps, 5 m of travel apart, test the points of the others. Points ahead of a sweep are
-    tested by the next of them at least 3.5 m farther, points behind it by the previous. By then
-    even a vehicle that drives along has left most of its place. At the ends of the road it is the
-    last testing sweep, 2 m away or more, or the one on the other side.
+    tested by the next testing sweep at least 3.5 m farther, points behind it by the previous one.
+    By then even a vehicle that drives along has left most of its place. At the ends of the road the
+    last testing sweep is taken, if 2 m away or more, or the testing sweep on the other side.
 
     Args:
         sweeps: Deskewed sweeps in the order of the road.
@@ -230,7 +230,7 @@ def far_cloud(
 def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
     """Return the row numbers, ascending, of the points (N,3), world frame, that a camera needs.
 
-    It needs one in every pixel and step of depth, from sweeps in mixed order.
+    A camera needs one point in every pixel and step of depth, from sweeps in mixed order.
     """
     T_cam_world = exposure.T_cam_key @ T_key_world
     near = np.flatnonzero(may_see(exposure.camera, T_cam_world, points, _SLACK_M))

@@ -118,14 +118,14 @@ def fill_between(
 ) -> tuple[Float32, Float32, Float32]:
     """Interpolate empty pixels that have measured pixels on both sides.
 
-    The window of an empty pixel must hold measured pixels in a column to the left, in a column to
-    the right, in a row above and in a row below. No depth discontinuity may run through them. There
-    is a discontinuity if deviations from a plane differ by more than 0.2 m and 5 % of the nearest
-    depth. With fewer than six pixels the depths themselves are compared.
+    The window around an empty pixel must hold measured pixels to its left, to its right, above and
+    below. No depth discontinuity may run through them. There is a discontinuity if deviations from
+    a plane differ by more than 0.2 m and 5 % of the nearest depth. With fewer than six pixels the
+    depths themselves are compared.
 
     The pixel gets the depth of the plane, limited to the range of depths in the window: nothing is
     extrapolated. Weights fall to zero just outside the window. The window grows in thirds of the
-    ray spacing, then to ``reach`` spacings, and the smallest sufficient one is taken.
+    ray spacing, then to ``reach`` spacings. The smallest sufficient window is taken.
 
     Args:
         depth_m: (H,W) measured depth in metres, 0 none.
@@ -270,8 +270,8 @@ def fill_stars(layers: Layers) -> Layers:
 
     A hole is filled if at least eight directions have a known pixel within a spacing of rays, and
     at most seven neighbouring directions have none. The surface of each known pixel is extended to
-    the hole. These predictions must agree to 10 % of inverse depth, and eight tenths of the votes
-    must confirm their mean, weighted by one over the steps. In an empty strip of up to six rows
+    the hole. These predictions must agree to 10 % of inverse depth. Their mean, weighted by the
+    reciprocal of the steps, needs eight tenths of the votes. In an empty strip of up to six rows
     along the image's lower border two directions fewer are enough. The confidence is half the least
     of the known pixels.
     """

@@ -142,7 +142,7 @@ def _sums(
 ) -> Float:
     """Return (29,29) the sums of colour changes at E shifted pixels along a direction.
 
-    row and column: (E,) of the pixels, in steps. right and down: (E,) direction, or one for all.
+    row and column: (E,) of the pixels, in steps. right and down: (E,) or common direction.
     """
     width, (x, y) = changes.shape[2], changes.reshape(2, -1)
     offsets = np.arange(-_REACH, _REACH + 1)

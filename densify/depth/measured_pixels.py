@@ -277,11 +277,11 @@ def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, r
     """Compare the points around pixel (v0, u0) with the tangent plane of point i.
 
     The plane has inverse depth ``centre`` in the pixel, and points within ``agree`` of it agree.
-    witness_ns: greatest age of a point behind the plane that shows a discontinuity; `_NEVER_NS` for
+    witness_ns: greatest age of a point behind the plane that shows a discontinuity, `_NEVER_NS` for
     static points. The moments m (9,) of the fit and the extent of the surface, reach (8,), are
-    filled in. Return a bit for each sweep that agrees, the age of the youngest, the number of
-    points in the fit, their weighted sum of squares, True if a point is close behind, and for a
-    moving point the number of agreeing returns of the key sweep.
+    filled in. Return a bit for each sweep that agrees, the age of the youngest of these sweeps, and
+    the number of points in the fit. Return also their weighted sum of squares, True if a point is
+    close behind, and for a moving point the number of agreeing returns of the key sweep.
     """
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns

@@ -120,7 +120,7 @@ def _corners(points: Float) -> Float:
 
 
 class _Met(NamedTuple):
-    """Rays that meet a hull; the columns are those of `MovingBody`."""
+    """Rays that meet a hull, with columns as in `MovingBody`."""
 
     entries: Float
     ends: Bool
@@ -343,7 +343,7 @@ def _surface(layers: Layers, rows: Int, front: _Front) -> Float:
 def _shown(
     layers: Layers, cloud: Cloud, surface: Float, agree_m: Float32, share: Float
 ) -> tuple[Bool, Bool]:
-    """Return (h,w) the pixels that show a body, and (h,w) those where its returns count.
+    """Return (h,w) the pixels that show a body, and (h,w) the pixels where its returns count.
 
     Other content inside its outline is removed from ``layers``. surface: (h,w) inverse depth of the
     body, 1/m. agree_m: (h,w) tolerance of depth behind it. share: (h,w) share of the rays that end

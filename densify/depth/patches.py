@@ -191,8 +191,8 @@ def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
 def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
     """Return the slope of inverse range per radian from its slopes on both sides (NaN: unknown).
 
-    If both sides are on one surface it is their mean. Otherwise it is the lesser one, or 0 if that
-    is a step in depth. step: usual angle in rad.
+    If both sides are on the same surface it is their mean. Otherwise it is the lesser slope, or 0
+    if that is a step in depth. step: usual angle in rad.
     """
     metres = step * range_m * range_m  # of range per step, by a unit of slope
     if abs(one - other) * metres <= _BEND_M + _BEND * abs(one + other) * metres:
@@ -266,8 +266,8 @@ def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, s
 def _tangents_anywhere(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
     """Fill normal and spacing of points of a scanner without rings, as `_tangents_on_rings` does.
 
-    A plane is fitted by least squares to the points around, then to those points that it fits. If
-    the plane does not fit half of them, the patch faces the scanner.
+    A plane is fitted by least squares to the points around, then to the points close to this plane.
+    If the plane does not fit half of them, the patch faces the scanner.
     """
     num_rows, num_columns = cells.shape
     for k in range(first, last):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Complete depth from a depth image of the user, such as one of a monocular network.
+"""Complete depth from a depth image of the user (the prior), such as one of a monocular network.
 
 A curve, fitted by robust least squares, converts the values of the prior to metres. The remaining
-error differs from place to place. A correction of the logarithm of depth is spread over the image
-as a membrane. It is tied to the known pixels and torn at the prior's own depth discontinuities
-(random walks, Grady, "Random walks for image segmentation", PAMI 2006).
+error differs over the image. It is corrected by a membrane in the logarithm of depth, tied to the
+known pixels and torn at the prior's own depth discontinuities (random walks, Grady, "Random walks
+for image segmentation", PAMI 2006).
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from densify.depth.boundary_pixels import MOST_CONFIDENCE
 from densify.geometry.types import Bool, DepthMap, Float, Float32, FullDepth, Int, Prior, PriorFit
 
 FAR_M = 120.0
-"""Farther values of a prior count as sky."""
+"""Depth beyond which pixels of a prior count as sky."""
 MAX_WRONG = 0.2
-"""A prior is not used if its best fit is off by more than 25 % at a larger share of the measured
-pixels, each step of depth counted alike. Good ones had up to 0.11, those of other images 0.25 to
+"""Greatest share of measured pixels, each step of depth counted alike, at which the best fit of a
+used prior is off by more than 25 %. Good priors had up to 0.11, priors of other images 0.25 to
 0.6."""
 _FORMS = {"auto": ("depth", "log", "inverse"), "depth": ("depth", "log"), "inverse": ("inverse",)}
 _MIN_FITTED = 100
@@ -37,17 +37,17 @@ _EMPTY = 2 * np.log(FAR_M)  # logarithm of a depth beyond all others
 
 
 def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
-    """Return a depth map with pixels of the prior where it has neither measured nor filled ones.
+    """Return the depth map with pixels of the prior where it has no measured or filled depth.
 
-    Pixels stay empty without a value, in the sky of the mask, beyond ``FAR_M``, at the prior's own
-    far limit, and between two surfaces, as blurred priors have them. A prior that does not fit is
-    not used. Confidences are a ranking: a pixel of the prior has at most 0.2, less the more the
-    prior deviates from known pixels nearby and the steeper it is. All known pixels have more.
+    A pixel stays empty if the prior has no value, shows sky by the mask, or is beyond ``FAR_M`` or
+    at its far limit. Pixels on the blurred transition between two surfaces stay empty too. A prior
+    that does not fit is not used. Confidences are a ranking. A pixel of the prior has at most 0.2,
+    less where the prior is steep or deviates from known pixels nearby. All known pixels have more.
 
     Args:
-        maps: None of its pixels is changed.
-        prior: Of the same shape, with the same measure of depth.
-        kind: Of its values, ``depth``, ``inverse`` or ``auto``.
+        maps: Depth map, whose pixels keep their depth.
+        prior: Depth image of the same shape, with the same measure of depth.
+        kind: Kind of the prior's values, ``depth``, ``inverse`` or ``auto``.
     """
     known = (prior.value > 0) & ~prior.sky
     above = MOST_CONFIDENCE + (1 - MOST_CONFIDENCE) * maps.confidence
@@ -83,9 +83,9 @@ def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
     A curve that turns near into far is rejected.
 
     Args:
-        value: (N,) above 0.
-        depth_m: (N,) above 0, of measured pixels.
-        kind: As in `complete`.
+        value: (N,) values of the prior, above 0.
+        depth_m: (N,) measured depths of the same pixels, above 0.
+        kind: Kind of the values, as in `complete`.
     """
     p, z = value.astype(np.float64), depth_m.astype(np.float64)
     fits = [_fitted(form, p, z) for form in _FORMS[kind]]
@@ -93,9 +93,9 @@ def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
 
 
 def _fitted(form: str, p: Float, z: Float) -> PriorFit:
-    """Fit one form through the medians of the values in steps of depth.
+    """Fit one form of curve to values p (N,) and depths z (N,) by their medians in steps of depth.
 
-    Measured depth is exact and values are not. A tenth of outliers moves no median.
+    Measured depth counts as exact, the prior's values do not. Medians tolerate a tenth of outliers.
     """
     if len(z) < _MIN_FITTED:
         return PriorFit(form, 0.0, 0.0, np.inf, 1.0, False)
@@ -112,10 +112,10 @@ def _fitted(form: str, p: Float, z: Float) -> PriorFit:
 
 
 def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
-    """Return scale and shift.
+    """Return scale and shift of the curve of one form through values p and depths z.
 
-    The form is linear in both, and convex. Its weights make residuals about those of the logarithm
-    of depth.
+    The form is linear in both. Its weights make residuals close to residuals of the logarithm of
+    depth.
     """
     unit, one = float(np.median(p)), np.ones(len(z))
     if form == "log":
@@ -135,7 +135,7 @@ def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
 
 
 def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
-    """Return the logarithm of depth in metres by the curve alone, far beyond its end."""
+    """Return the logarithm of depth in metres by the curve, whose values are kept above 0."""
     value = value.astype(np.float64)
     if fit.kind == "log":
         return fit.scale * np.log(np.maximum(value, np.finfo(np.float64).tiny)) + fit.shift
@@ -151,10 +151,10 @@ def _at_far_limit(value: Float32, known: Bool, fit: PriorFit) -> Bool:
 
 
 class _Cells(NamedTuple):
-    """The image in squares of ``size`` pixels.
+    """The image in square cells of ``size`` pixels, R rows and C columns.
 
-    guide: (R,C) logarithm of depth of their central pixels. of: (H,W) number of each pixel's cell,
-    row by row.
+    guide: (R,C) logarithm of depth at the central pixel of each cell. of: (H,W) number of each
+    pixel's cell, row by row.
     """
 
     size: int
@@ -175,7 +175,7 @@ class _Cells(NamedTuple):
     def membrane(self) -> sparse.csr_array:
         """Return the (RC,RC) matrix of the squared differences between neighbouring cells.
 
-        A difference counts less the more the guides differ.
+        A difference counts less the more the guides of both cells differ.
         """
         number = np.arange(self.guide.size).reshape(self.guide.shape)
         first = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
@@ -189,7 +189,7 @@ class _Cells(NamedTuple):
     def at_pixels(self, values: Float, guide: Float32) -> Float:
         """Return (K,H,W) values (K,RC) of cells, interpolated between four cells.
 
-        Cells with the guide of another surface hardly count.
+        Cells on another surface, by their guide, hardly count.
         """
         grid = values.reshape(-1, *self.guide.shape)
         down, right = ((np.arange(length) - self.size // 2) / self.size for length in guide.shape)
@@ -205,7 +205,7 @@ class _Cells(NamedTuple):
 
 
 def _both_ways(place: Float, num: int) -> list[tuple[Int, Float]]:
-    """Return the cells before and after fractional positions, and their weights."""
+    """Return the cells before and after fractional positions, each with its weights."""
     before = np.clip(np.floor(place), 0, num - 1).astype(np.int64)
     share = np.clip(place - before, 0, 1)
     return [(before, 1 - share), (np.minimum(before + 1, num - 1), share)]
@@ -214,10 +214,10 @@ def _both_ways(place: Float, num: int) -> list[tuple[Int, Float]]:
 def _correction(
     filled_m: Float32, log_depth: Float, guide: Float32, steepness: Float32, usable: Bool
 ) -> tuple[Float, Float]:
-    """Return (H,W) the correction of the logarithm of depth, and its remaining error.
+    """Return (H,W) the correction of the logarithm of depth, and (H,W) its remaining error.
 
-    The error is that of known pixels nearby on the same surface. Without any, there is no
-    correction and the usual error.
+    The error is the mean error of known pixels nearby on the same surface. Far from known pixels
+    there is no correction, and the error is the mean over the image.
     """
     cells = _Cells.over(guide)
     area, num = cells.size**2, cells.guide.size
@@ -227,7 +227,7 @@ def _correction(
     membrane = cells.membrane()
 
     def at_rest(trust: Float, values: Float, elsewhere: float) -> Float:
-        """Return (RC,) the membrane at rest if known pixels pull it to their values."""
+        """Return the (RC,) membrane at rest, pulled by known pixels to their values."""
         tied = np.bincount(cell, trust, num) / area + _TOWARDS_NONE
         pulled = np.bincount(cell, trust * values, num) / area + _TOWARDS_NONE * elsewhere
         system = (membrane + sparse.diags_array(tied)).tocsc()
@@ -235,7 +235,7 @@ def _correction(
         return rest
 
     def trusted(off: Float | Float32) -> Float:
-        """Return (N,) weight of known pixels at these deviations."""
+        """Return the (N,) weight of known pixels at these deviations."""
         weight: Float = 1 / (1 + (off.astype(np.float64) / (2 * _USUAL)) ** 2)
         return weight
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make one depth map from the accumulated cloud, step by step.
+"""Make one depth map from the accumulated cloud, stage by stage.
 
 The order of the points has no effect. Planes are fitted in inverse depth, or in inverse range if
 depth is the range.
@@ -48,17 +48,16 @@ def project(
     """Return the depth map of a cloud in the view of a camera.
 
     Args:
-        cloud: At the key's reference time.
-        exposure: Of the camera. Moving objects are shown at their position then.
-        settings: Section ``project``. Without ``visibility`` the nearest point of each pixel is
-            taken as it is.
-        patches: Of the cloud.
+        cloud: M accumulated points at the key sweep's reference time.
+        exposure: Camera and time of the map. Moving objects are shown at their position then.
+        settings: Section ``project``. Without ``visibility`` each pixel takes its nearest point.
+        patches: Surface patches of the cloud.
         filled: False leaves out the fill.
-        lab: (H,W,3) the image in L*a*b*. Without it no boundary pixel is accepted.
-        rays: Of the window. Without them no pixel is rejected as seen through.
-        share_lost: Of `densify.depth.car_windows.share_lost`. Without it no car window is
-            closed.
-        bodies: Of moving objects, by instance.
+        lab: (H,W,3) image in L*a*b*. If None, no boundary pixel is accepted.
+        rays: Rays of the window. If None, no pixel is rejected as seen through.
+        share_lost: Function of `densify.depth.car_windows.share_lost`. If None, car windows stay
+            open.
+        bodies: Bodies of moving objects by instance number.
     """
     view, camera, visible = exposure.sees(cloud), exposure.camera, settings.visibility
     points = points_in_image(cloud, view, patches, vetoed=visible)
@@ -98,7 +97,7 @@ def project(
 def _layers_of(
     pixels: MeasuredPixels, points: PointsInImage, camera: Camera, lab: Float32 | None
 ) -> Layers:
-    """Return measured pixels as layers, those close to a depth discontinuity as boundary pixels."""
+    """Return measured pixels as layers; pixels near a depth discontinuity are boundary pixels."""
     shape = (camera.height_px, camera.width_px)
     known, inside = pixels.winner >= 0, pixels.inside
     winner = pixels.winner[known]
@@ -127,11 +126,11 @@ def _layers_of(
 
 
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
-    """Return (H,W,2) the spacing of rays across and down, the mean over blocks of pixels.
+    """Return the (H,W,2) spacing of rays across and down, the mean over blocks of pixels.
 
-    Blocks without points take the nearest block's spacing. Down, a block takes that of the block
-    above or below if it is far larger, because the gap below the last of a scanner's denser rings
-    is as wide.
+    Blocks without points take the spacing of the nearest block. A block takes the downward spacing
+    of the block above or below if that is far larger, because the hole below the last of a
+    scanner's denser rings is as wide.
     """
     height, width = (-(-size // _BLOCK_PX) for size in shape)
     column, row = np.rint(points.uv).astype(np.int64).T // _BLOCK_PX
@@ -152,7 +151,7 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
 
 
 def _set_reasons(layers: Layers, reason: NDArray[np.uint8]) -> None:
-    """Set the ``reason`` of points in the map, and of those removed from it."""
+    """Set the ``reason`` (M,) in place for points in the map and points removed from it."""
     reason[layers.point[(layers.rim_m > 0) & ~layers.behind_patch]] = Reason.EDGE
     reason[layers.point[layers.depth_m > 0]] = Reason.KEPT
     if layers.glass is not None:

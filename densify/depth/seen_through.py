@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Reject pixels through whose surface too many rays passed, such as the gaps of a fence.
+"""Reject pixels through whose surface too many rays passed, such as pixels in the gaps of a fence.
 
-The image cannot decide this, because the background that a scanner measured from elsewhere is
-behind the car in the image too. Every ray is followed to its crossing with the map's own surface,
-and counts there (free-space evidence as in occupancy grids: Thrun et al., "Probabilistic Robotics",
-2005, ch. 9).
+The image cannot decide this: a background measured from elsewhere lies behind the car in the image
+too. Every ray is followed to its crossing with the map's own surface, and counts there (free-space
+evidence as in occupancy grids: Thrun et al., "Probabilistic Robotics", 2005, ch. 9).
 """
 
 from __future__ import annotations
@@ -23,21 +22,25 @@ from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
 from densify.geometry import poses
 from densify.geometry.types import Bool, Cloud, Float, Float32, Reason, Stretch
 
-_SHARE = 0.25  # share of rays that pass through a pixel which is rejected
+_SHARE = 0.25  # share of passing rays above which a pixel is rejected
 RAY_BLUR = 0.35
-"""Standard deviation of the place at which a ray counts, in gaps between rays."""
+"""Standard deviation of the position where a ray counts, in spacings of neighbouring rays."""
 _NUM_STEPS = 6
 
 
 @dataclass(frozen=True)
 class Rays:
-    """The rays of the sweeps of a window, for a key of it."""
+    """The rays of the sweeps of a window, in the lidar frame of the key sweep.
+
+    Attributes:
+        key: Frame number of the key sweep.
+    """
 
     stretch: Stretch
     key: int
 
     def starts(self, cloud: Cloud) -> Float:
-        """Return (M,3) key-frame origins of the rays of the points, at their firing times."""
+        """Return the (M,3) origins of the rays of a cloud's M points, at their firing times."""
         starts = np.empty((len(cloud), 3))
         for frame in np.unique(cloud.frame).tolist():
             mine, registered = np.flatnonzero(cloud.frame == frame), self.stretch[frame]
@@ -61,15 +64,15 @@ def without_seen_through(
 ) -> Layers:
     """Return the layers without the pixels that rays passed through.
 
-    A ray of an occluded point passed through where it crosses the surface of the map, clearly
-    before its end. A ray of another point ended in its pixel. Both are blurred by about a third of
-    the gap between rays. A pixel is rejected if a quarter of the rays passed through. Closed car
-    windows and moving bodies stay. So do pixels within a gap of surfaces that only the key sweep
-    measured, because an object that moves unnoticed was elsewhere at other times.
+    The ray of an occluded static point passed through where it crosses the surface of the map,
+    clearly before its end. The ray of any other point ended in its pixel. Both are blurred by a
+    third of the ray spacing. A pixel is rejected if more than a quarter of the rays passed through.
+    Closed car windows and moving bodies stay. Pixels within a ray spacing of surfaces that only the
+    key sweep measured stay too, because an undetected moving object was elsewhere at other times.
 
     Args:
-        view: Of the cloud.
-        reason: (M,) `Reason` of each point so far.
+        view: Points of the cloud in the image.
+        reason: (M,) `Reason` of each point of the cloud so far.
     """
     counts = np.isin(cloud.frame, rays.stretch.frames)
     counts &= (reason != Reason.OUTSIDE) & (reason != Reason.VETOED)
@@ -78,7 +81,7 @@ def without_seen_through(
     gap_px, shape = float(np.median(layers.gap_px)), layers.filled_m.shape
 
     def through(hits: Bool) -> Float:
-        """Return (K,2) px of the crossings of rays of these points (M,) with the map."""
+        """Return the (K,2) px where rays of the points ``hits`` (M,) cross the map."""
         if not hits.any():
             return np.zeros((0, 2))
         ends = cloud.select(hits)
@@ -107,14 +110,15 @@ def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
 
 
 def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Exposure) -> Float:
-    """Return (P,2) px where rays cross the surface (H,W) clearly before they end.
+    """Return the (P,2) px where rays cross the surface of a map clearly before they end.
 
-    The search starts at the end of the ray. At the depth of the surface in its pixel the ray is in
-    another pixel, and so on until the depth stays the same.
+    The search starts at the end of the ray. It goes to the point of the ray at the surface's depth
+    in the present pixel, and repeats this until the depth stays the same.
 
     Args:
-        from_key: (K,3) origins of the rays, key frame.
-        to_key: (K,3) ends of the rays, key frame.
+        surface_m: (H,W) depth of the surface in metres, 0 none.
+        from_key: (K,3) origins of the rays, key sweep's lidar frame.
+        to_key: (K,3) ends of the rays, key sweep's lidar frame.
     """
     start = poses.transform(exposure.T_cam_key, from_key)
     end = poses.transform(exposure.T_cam_key, to_key)
@@ -139,9 +143,9 @@ def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Expo
 
 
 def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
-    """Return (P,) the share of the path at this depth, NaN for none.
+    """Return the (P,) share of the path from start to end at this depth, NaN if it is not reached.
 
-    The path is from ``start`` to ``end``, (P,3) in the camera frame.
+    start and end: (P,3) camera frame. depth_m: (P,) depth in ``measure``.
     """
     way = end - start
     with np.errstate(divide="ignore", invalid="ignore"):

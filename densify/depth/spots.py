@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Count as measured the pixels that a laser's spot covers, beside the one at its centre.
+"""Count as measured all pixels that a laser's spot covers, not only the pixel at its centre.
 
-A camera with a long focal length has several pixels to a beam. A return measures all of them.
+With a long focal length several pixels fall into the spot of one beam. A return measures all of
+them.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ _MOST_PX = 4  # greatest half width
 
 
 def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
-    """Count filled pixels as measured if the spot of a measured return covers them.
+    """Count filled pixels as measured if the laser spot of a measured return covers them.
 
-    The ``point`` of the nearest return is taken. The fill must lie on the surface of the return.
-    Depth and confidence remain those of the fill. Pixels without fill stay empty.
+    The fill must lie on the surface of the return. A covered pixel takes the ``point`` of the
+    nearest return, and keeps its filled depth and confidence. Pixels without fill stay empty.
     """
     shape = layers.depth_m.shape
     measured = np.flatnonzero(layers.depth_m > 0)
@@ -44,12 +45,12 @@ def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
 
 @Kernel
 def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, found, nearest):  # type: ignore[no-untyped-def]
-    """Find the measured pixel whose spot covers a filled one, nearest in the image.
+    """Find for each filled pixel the measured pixel, nearest in the image, whose spot covers it.
 
-    pixel and radius_px: (P,) of the measured ones. uv: (P,2) px of their returns. depth_m: (H,W).
-    tilt: (H,W,2) slope of inverse depth, 1/m per px. filled_m: (H,W) of the pixels that may be
-    covered, 0 elsewhere. found: (H,W) int64, set to the measured pixel. nearest: (H,W) inf, squared
-    distance to its spot.
+    pixel and radius_px: (P,) index and spot radius of the measured pixels. uv: (P,2) px of their
+    returns. tilt: (H,W,2) slope of inverse depth, 1/m per px. filled_m: (H,W) depth of pixels that
+    may be covered, 0 elsewhere. found: (H,W) int64 output, index of the measured pixel. nearest:
+    (H,W) squared distance to its spot, inf at first.
     """
     height, width = filled_m.shape
     for i in range(len(pixel)):

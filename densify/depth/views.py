@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make all depth maps of a key: the accumulated cloud in the view of each camera."""
+"""Make all depth maps of a key sweep: the accumulated cloud in the view of each camera."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ from densify.scores import depth_metrics
 
 
 class SeenCloud(NamedTuple):
-    """A cloud with its patches, and the bodies of its moving objects, by instance."""
+    """A cloud, its surface patches, and the bodies of its moving objects by instance number."""
 
     cloud: Cloud
     patches: Patches
     bodies: Mapping[int, MovingBody] = {}
 
     def joined(self, far: SeenCloud | None) -> SeenCloud:
-        """Return the cloud with the points of sweeps beyond the window."""
+        """Return the cloud with the points of sweeps beyond the window appended."""
         if far is None or not len(far.cloud):
             return self
         return self._replace(
@@ -68,14 +68,14 @@ class SeenCloud(NamedTuple):
 
 @dataclass(frozen=True)
 class Views:
-    """The viewpoints of the depth maps of a key, by their names.
+    """The cameras and times of the depth maps of a key sweep; mappings are by name of the map.
 
     Attributes:
+        key: Frame number of the key sweep.
         key_image: Range image of the key sweep.
-        sensors: The scanners.
-        origins: (S,3) of the scanners in each sweep, key frame, by frame.
-        rays: Of the window.
-        lab: (H,W,3) L*a*b* of the maps that show an image.
+        origins: (S,3) of the scanners, key sweep's lidar frame, by frame number of the sweep.
+        rays: Rays of the window's sweeps.
+        lab: (H,W,3) L*a*b* images of the maps that show an image.
     """
 
     key: int
@@ -97,7 +97,7 @@ class Views:
         images: Mapping[str, NDArray[np.uint8]],
         settings: Config,
     ) -> Views:
-        """Return the views of a key."""
+        """Return the views of the key sweep with frame number ``key``."""
         sensors = Sensors.of(stretch.sweeps)
         return Views(
             key=key,
@@ -117,7 +117,7 @@ class Views:
         )
 
     def see(self, cloud: Cloud, visible: bool = True) -> SeenCloud:
-        """Return a cloud with its patches; ``visible`` marks points the key sweep saw through."""
+        """Return a cloud with patches; if ``visible`` they mark what the key sweep saw through."""
         key_image = self.key_image if visible else None
         wanted = np.zeros(len(cloud), bool)
         for exposure in self.exposures.values():
@@ -127,7 +127,7 @@ class Views:
         )
 
     def bodies(self, cloud: Cloud) -> dict[int, MovingBody]:
-        """Return the bodies of moving objects by instance, of all points of the window."""
+        """Return the bodies of moving objects by instance number, from all points of the window."""
         return moving_bodies(cloud, self.rays)
 
     def far(
@@ -136,7 +136,7 @@ class Views:
         """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`.
 
         Args:
-            standing_only: For maps with visibility.
+            standing_only: True for maps with visibility.
         """
         cloud, surface = far_cloud(
             found, T_key_found, stretch, self.key, self.exposures, standing_only
@@ -149,11 +149,11 @@ class Views:
     def depth(
         self, seen: SeenCloud, visible: bool = True, filled: bool = True
     ) -> dict[str, DepthMap]:
-        """Return depth maps by name.
+        """Return the depth map of each view by name.
 
         Args:
-            visible: Without occluded, seen-through and unsupported points.
-            filled: With the fill.
+            visible: True leaves out occluded, seen-through and unsupported points.
+            filled: True interpolates between measured pixels.
         """
         settings = replace(self.settings, visibility=visible)
         lost = None if self.key_image is None else share_lost(self.key_image)
@@ -178,13 +178,13 @@ class Views:
         depth: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
-        """Return the cloud with the colours of the images that observe it.
+        """Return the cloud with the colours of the (H,W,3) images that observe its points.
 
         A point is observed unless it is clearly behind the depth of its pixel. Pixels without depth
-        colour nothing.
+        give no colour.
 
         Args:
-            depth: The maps made of the cloud.
+            depth: Maps made of the cloud, by name.
         """
         rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
@@ -197,7 +197,7 @@ class Views:
         return replace(seen.cloud, rgb=rgb)
 
     def truth(self, truth: Truth) -> dict[str, tuple[Float32, Bool]]:
-        """Return the true depth and (H,W) the moving pixels of the maps that show an image."""
+        """Return the true depth (H,W) and moving pixels (H,W) of each map that shows an image."""
         known = {}
         for name, e in self.exposures.items():
             if e.number is not None:
@@ -207,7 +207,7 @@ class Views:
         return known
 
     def cameras(self) -> dict[str, CameraView]:
-        """Return the viewpoint of each map."""
+        """Return the viewpoint of each map by name."""
         return {
             name: CameraView(e.camera, e.T_cam_key, e.late_s, e.number)
             for name, e in self.exposures.items()
@@ -216,7 +216,7 @@ class Views:
     def optical_flow(
         self, cloud: Cloud, depth: Mapping[str, DepthMap]
     ) -> dict[str, dict[str, Float32]]:
-        """Return (H,W,2) pixels by name, to the "previous" and to the "next" image."""
+        """Return the (H,W,2) `optical_flow` to the "previous" and "next" image, by map name."""
         return {
             name: {
                 which: optical_flow(cloud, depth[name], exposure, other)
@@ -226,9 +226,9 @@ class Views:
         }
 
     def rejected(self, cloud: Cloud, depth: Mapping[str, DepthMap]) -> dict[str, NDArray[np.uint8]]:
-        """Return (H,W) by name: the `Reason` of the nearest rejected point of a pixel, 0 none.
+        """Return for each map (H,W) the `Reason` of a pixel's nearest rejected point, 0 none.
 
-        Points that lost their pixel to another one do not count.
+        Points that lost their pixel to another point do not count.
         """
         maps = {}
         for name, e in self.exposures.items():
@@ -249,7 +249,7 @@ class Views:
         bodies: Mapping[int, MovingBody],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> dict[int, Mover]:
-        """Return every moving object alone, and as -1 all moving points without an object."""
+        """Return every moving object alone by instance number, points without an object as -1."""
         movers = {}
         for instance in np.unique(cloud.instance[cloud.moving]).tolist():
             part = self.see(cloud.select(cloud.moving & (cloud.instance == instance)), visible)
@@ -260,14 +260,14 @@ class Views:
 
 
 def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, other: Exposure) -> Float32:
-    """Return (H,W,2) pixels to the right and down from one exposure to another, NaN if unknown.
+    """Return the (H,W,2) flow in pixels, right and down, between two exposures; NaN if unknown.
 
-    Moving objects continue at their velocity. Measured pixels are known; those that only spots
-    cover move with the nearest one.
+    The flow includes ego-motion, and moving objects continue at their velocity. Pixels that only a
+    laser spot covers take the flow of the nearest measured pixel. Other filled pixels have none.
 
     Args:
-        cloud: At the key's reference time.
-        depth: The map made of it.
+        cloud: Points at the key sweep's reference time.
+        depth: Map made of the cloud.
     """
     chosen = np.flatnonzero(depth.reason == Reason.KEPT)
     points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
@@ -290,8 +290,8 @@ def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: f
     A filled pixel has the age of the nearest measured pixel in the image.
 
     Args:
-        stamps_ns: Reference times of the sweeps, by frame.
-        late_s: From the key's reference time to that of the map.
+        stamps_ns: Reference times of the sweeps by frame number.
+        late_s: Seconds from the key sweep's reference time to the time of the map.
     """
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
     age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
@@ -310,12 +310,12 @@ def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: f
 
 @dataclass(frozen=True)
 class HeldOut:
-    """The key sweep's own returns as the truth for the key densified from its neighbours alone.
+    """The key sweep's returns as ground truth for maps made from its neighbouring sweeps alone.
 
     Attributes:
-        key_alone: Maps of the key sweep, without boundary pixels.
-        moving: (H,W) its moving returns.
-        gap_rad: Usual angle between its rings.
+        key_alone: Depth maps of the key sweep by name, without boundary pixels.
+        moving: (H,W) True at moving returns of the key sweep, by name of the map.
+        gap_rad: Usual angle between neighbouring rings of the key sweep.
     """
 
     views: Views
@@ -325,10 +325,10 @@ class HeldOut:
 
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
-        """Return the truth of a key.
+        """Return the ground truth of a key sweep.
 
         Args:
-            cloud: Has the moving points of the key sweep and their velocities.
+            cloud: Cloud with the key sweep's moving points and their velocities.
         """
         views = replace(views, key_image=None)  # the held-out sweep must not help
         settings = replace(views.settings, rims="strict", visibility=True)
@@ -352,7 +352,7 @@ class HeldOut:
         return HeldOut(views, key_alone, moving, float(np.median(known)) if len(known) else 0.0)
 
     def without_key(self, seen: SeenCloud) -> SeenCloud:
-        """Return the cloud without the key sweep and its evidence about free space and bodies."""
+        """Return the cloud without the key sweep and its evidence on free space and bodies."""
         others = seen.cloud.frame != self.views.key
         surface = seen.patches.select(others)
         surface = replace(surface, free=np.zeros(len(surface.free), bool))
@@ -360,12 +360,12 @@ class HeldOut:
         return SeenCloud(cloud, surface, without_sweep(seen.bodies, cloud, self.views.key))
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
-        """Return scores by name, None for a cloud of the key sweep alone.
+        """Return the scores of each map made without the key sweep, None if no points remain.
 
-        They have the ``curve`` of precision over density, ``reliability``, and the share of filled
-        pixels ``unjudged`` for lack of a return of the key sweep within a gap between rays. Returns
-        from far inside a moving body are no truth: the key sweep measured them through its windows,
-        and the map shows the glass.
+        Besides `depth_metrics.depth_scores` each has the ``curve`` of precision over density,
+        ``reliability``, and the share ``unjudged`` of filled pixels without a return of the key
+        sweep within a ray spacing. Returns from far inside a moving body are no ground truth: they
+        passed its windows, but the map shows the glass.
         """
         others = self.without_key(seen)
         if not len(others.cloud):

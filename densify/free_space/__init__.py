@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Find free space: range images, the scanner's rays, the space that they passed, and the ground."""
+"""Find free space: range images, the scanners' rays, the space that they passed, the ground."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Estimate the height of the ground, and the mount of the lidar above it."""
+"""Estimate the height of the ground, and the rotation that makes the lidar level."""
 
 from __future__ import annotations
 
@@ -14,27 +14,28 @@ from densify.geometry import poses
 from densify.geometry.types import Float, Float32, Int, Stretch, Sweep
 
 ABOVE_GROUND_M = 0.2
-"""Points lower than this above the ground are part of it: they start no motion."""
+"""Height above the ground below which points are part of it and never start a moving object."""
 CELL_M = 1.0  # smaller cells follow kerbs, larger ones bridge holes
 MAX_SLOPE = 0.15  # rise per metre; steeper surfaces are objects
 _WINDOW = 7  # cells; a narrower hump or pit is not ground
 
 _NUM_POINTS, _NUM_TRIES = 2000, 200
-_LEAST_SHARE = 0.1  # share of points on a ground plane, less those below it
+_LEAST_SHARE = 0.1  # share of points on a ground plane minus share of points below it
 
 
 def ground(stretch: Stretch) -> HeightMap:
-    """Return the ground height under all sweeps, in the world frame with z up."""
+    """Return the ground height under all sweeps of a window, in the world frame with z up."""
     return HeightMap.of([poses.transform(s.T_world_lidar, s.sweep.points) for s in stretch.sweeps])
 
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Ground heights on a grid.
+    """Ground heights on a grid of square cells.
 
     Attributes:
-        heights_m: (X,Y) at the centres of the cells.
-        low_m: (2,) lower corner of the grid.
+        heights_m: (X,Y) ground height at the centres of the cells.
+        low_m: (2,) x and y of the grid's lower corner.
+        cell_m: Side of a cell.
     """
 
     heights_m: Float
@@ -43,15 +44,15 @@ class HeightMap:
 
     @staticmethod
     def of(clouds: Sequence[Float]) -> HeightMap:
-        """Return the ground under point clouds.
+        """Return the ground height under point clouds.
 
         The second lowest point of a cell is its ground, because the lowest may be a stray
-        reflection. A cell below all slopes from the median around it is repaired. The slope limit
-        then removes cars and walls, and humps are removed. The points near this lower hull are
-        averaged.
+        reflection. A cell far below the median of its surroundings is repaired. A limit on the
+        slope then removes cars and walls, and narrow humps are removed. The points near the
+        resulting lower hull are averaged.
 
         Args:
-            clouds: (N,3) each, metres, z up, at least one point in all.
+            clouds: Clouds of (N,3) points in metres, z up, with at least one point in all.
         """
         low, shape = _grid(clouds)
         lowest, second = np.full((2, *shape), np.inf)
@@ -76,7 +77,7 @@ class HeightMap:
     def under(self, points: Float) -> Float:
         """Return the (N,) ground height in metres at points (N,2) or (N,3).
 
-        Beyond the grid the height is that of the nearest edge.
+        Beyond the grid it is the height at the nearest edge.
         """
         x, y = ((points[:, :2] - self.low_m) / self.cell_m - 0.5).T
         ground_m: Float = ndimage.map_coordinates(self.heights_m, (x, y), order=1, mode="nearest")
@@ -89,7 +90,7 @@ class HeightMap:
 
 
 def _grid(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
-    """Return the (2,) lower corner of a grid that holds all points, and its numbers of cells."""
+    """Return the (2,) lower corner of a grid around all points, and its numbers of cells."""
     low = np.min([p[:, :2].min(axis=0, initial=np.inf) for p in clouds], axis=0)
     high = np.max([p[:, :2].max(axis=0, initial=-np.inf) for p in clouds], axis=0)
     low = np.floor(low / CELL_M) * CELL_M
@@ -98,16 +99,16 @@ def _grid(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
 
 
 def _cells(points: Float, low_m: Float) -> tuple[Int, Int]:
-    """Return the row and the column (N,) of the grid cell of each point."""
+    """Return the (N,) row and the (N,) column of each point's grid cell."""
     x, y = ((points[:, :2] - low_m) / CELL_M).astype(np.int64).T
     return x, y
 
 
 def _averaged(hull: HeightMap, clouds: Sequence[Float]) -> Float:
-    """Return the (X,Y) mean height of the points close to the hull, around each cell.
+    """Return the (X,Y) mean height of the points close to the hull around each cell.
 
-    The hull itself is lower where more points were measured. An object that drives from one of
-    these places to another must not climb.
+    The hull itself is lower where more points were measured, and an object driving there would seem
+    to climb.
     """
     total, number = np.zeros((2, *hull.heights_m.shape))
     for points in clouds:
@@ -122,7 +123,7 @@ def _averaged(hull: HeightMap, clouds: Sequence[Float]) -> Float:
 
 
 def _without_humps(heights: Float) -> Float:
-    """Remove narrow humps, such as a vehicle that never left its place. Slopes and kerbs stay.
+    """Remove narrow humps, such as a vehicle that is always parked. Slopes and kerbs stay.
 
     Morphological opening: Zhang et al., "A Progressive Morphological Filter for Removing Nonground
     Measurements from Airborne LIDAR Data", TGRS 2003.
@@ -142,12 +143,12 @@ def _slope_limited(heights: Float, rise: float) -> Float:
 
 
 def find_upright(sweeps: Sequence[Sweep]) -> Float:
-    """Return (3,3) ``R_level_lidar``, which turns the axes of the lidar until z is up.
+    """Return the (3,3) rotation ``R_level_lidar`` from the lidar frame to level axes, z up.
 
-    The ground plane is found by RANSAC (Fischler, Bolles, "Random sample consensus", 1981): most
-    points are on it, few below it, and the lidar is above it. A lidar is upside down if the ground
-    is found only in that way. Without a ground, and for half the slope that a height map follows,
-    the identity is returned.
+    The ground plane is found by RANSAC (Fischler, Bolles, "Random sample consensus", 1981). Most
+    points are on it, few below it, and the lidar is above it. The lidar is upside down if the
+    ground is found only after turning it over. Without a ground plane the result is the identity.
+    Slopes below 0.075 are not levelled.
     """
     num = sum(map(len, sweeps)) // _NUM_POINTS + 1
     points = np.concatenate([s.points[::num] for s in sweeps])
@@ -167,7 +168,7 @@ def _level(up: Float) -> Float:
 
 
 def _ground_normal(points: Float) -> Float | None:
-    """Return the (3,) unit normal of the ground plane, upwards, None without a ground."""
+    """Return the (3,) unit normal of the ground plane, pointing up, None if there is no ground."""
     if len(points) < 3:
         return None
     rng = np.random.default_rng(0)

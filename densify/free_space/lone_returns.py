@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Returns without others around them: snow, rain and dust.
+"""Remove returns without other returns around them: snow, rain and dust.
 
-As in Charron et al., "De-noising of Lidar Point Clouds Corrupted by Snowfall", CRV 2018, the space
-around a return grows with its range. Here it is a cell of direction and of the logarithm of range,
-so that no neighbours have to be searched.
+As in Charron et al., "De-noising of Lidar Point Clouds Corrupted by Snowfall", CRV 2018, the volume
+searched around a return grows with its range. Here it is a cell of direction and logarithm of
+range, and no neighbour search is needed.
 """
 
 from __future__ import annotations
@@ -16,13 +16,16 @@ from densify.geometry.types import Int, Sweep
 
 _CELL_RAD, _OF_POINTS = np.deg2rad(2.0), 120_000  # some 50 rays of a sweep of so many points
 _CELL_DEPTH = 0.08  # of the range
-_LEAST = 1000  # returns of a sweep that tell
-_FEW = 5  # returns that are no surface
+_LEAST = 1000  # least number of returns of a tested sweep
+_FEW = 5  # greatest number of returns in the cell of a lone return
 _MANY = 0.007  # returns alone in a cell; real sweeps in good weather had up to 0.004
 
 
 def without_lone(sweep: Sweep) -> Sweep:
-    """Return the sweep without its lone returns if it has as many as in snow, rain or dust."""
+    """Return the sweep without its lone returns if their number suggests snow, rain or dust.
+
+    The removed returns are counted in ``num_lone``.
+    """
     if len(sweep) < _LEAST:
         return sweep
     num = count_around(sweep)
@@ -34,9 +37,10 @@ def without_lone(sweep: Sweep) -> Sweep:
 
 
 def count_around(sweep: Sweep) -> Int:
-    """Return (N,) the number of returns around each return, with itself.
+    """Return the (N,) number of returns around each return, itself included.
 
-    Two grids, half a cell apart, are looked at, because a surface may lie on the border of a cell.
+    It is the larger count of two grids, half a cell apart, because a surface may lie on a cell
+    border.
     """
     around = np.zeros(len(sweep), np.int64)
     for lidar in np.unique(sweep.lidar).tolist():

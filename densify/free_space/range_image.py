@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Build range images: the measurements of a sweep by direction, and its free space.
 
-A range image is built in the scanner's frame at the firing time of each ray, where the rays form a
-regular grid. Its cells follow the sensor: rows are its rings, columns its azimuth step, both
-measured in the returns (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for free space).
+A range image is in the scanner's frame at the firing time of each ray, where the rays form a
+regular grid. Its rows are the scanner's rings, its columns the azimuth steps, both measured in the
+returns (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for free space).
 
-A scanner without a firing order by azimuth (solid state, rosettes) faces a cell at several times of
-a sweep. Each cell then keeps the middle of these times and their spread, which widens the margin.
-Its rays have no single density. Therefore images of several cell sizes are made, each twice as
-coarse as the previous one, and each is used where enough of its cells are filled.
+A scanner that does not fire in order of azimuth (solid state, rosettes) faces a cell at several
+times of a sweep. Each cell then keeps the middle of these times and their spread, which widens the
+margin. The density of such rays varies over the view. Therefore several images are made, each with
+cells twice as large, and each is used where enough of its cells are filled.
 """
 
 from __future__ import annotations
@@ -27,37 +27,36 @@ from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
 _CELLS_PER_LINE = 1.14  # the even step of lines is 1 % longer than the usual one
 _MIN_ROW_RAD = np.deg2rad(0.45)
-# Closer rings always share a row. Other rings have rows of their own from the range at
-# which three of them span more than the error of registration.
+# Closer rings always share a row. Other rings have their own rows from the range at
+# which three rings span more than the error of registration.
 _MIN_FAR_ROW_RAD, _SLACK_M = np.deg2rad(0.15), 0.1
-# A ring this far from all others observes free space at its rays. Three full cells are enough.
+# A ring this far from all others observes free space only at its rays. Three full cells suffice.
 _LONE_RAD, _ON_RING_RAD, _OF_ONE_RING = np.deg2rad(1.0), np.deg2rad(0.15), 2
 _SETTLED = 0.1  # share of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
 _DENSEST = 10  # percent of the returns of an unordered scanner that set its finest cells
-MIN_FILLED = 6  # of the 3 x 3 cells around a direction
+MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
 _VOUCHED, _MAX_SIZES = 0.8, 5  # share of returns with enough filled cells; number of cell sizes
 _PI = np.float32(np.pi)
 
 
 class ScannerImage(NamedTuple):
-    """The range image of one scanner. Columns start at azimuth -pi and wrap around.
+    """The range image of one scanner, R rows by C columns. Columns start at azimuth -pi and wrap.
 
     Attributes:
-        offset_s: (1,C) or (R,C) float32, middle of the times at which the scanner faced the
-            column or cell.
-        spread_s: The same shape, greatest difference from that time.
-        settled_s: If a column has one time, the greatest difference between two guesses of the
-            time at which a point is faced. A larger one is at the seam of the turn.
-        nearest_m: (R,C) float32, nearest return in the 3 x 3 cells around each cell, inf if
-            none.
-        num_filled: (R,C) uint8, number of these nine cells with a return.
-        row_edges_rad: (R+1,) float32 ascending elevations.
-        origin_m: (3,) float32 of the scanner in the lidar frame.
-        axes: (3,3) float32 to its own axes.
-        twists: (2,6) float32 of the lidar before and after the reference time.
-        from_m: Least range at which it is used.
-        to_m: Greatest range at which it is used.
+        offset_s: (1,C) or (R,C) float32 seconds after the reference time at which the scanner faced
+            the column or cell, middle of all such times.
+        spread_s: Greatest difference from that time in seconds, same shape.
+        settled_s: Greatest difference between two estimates of the time at which a point is faced,
+            if each column has one time. A larger difference is at the seam between two turns.
+        nearest_m: (R,C) float32 nearest return in the 3 x 3 cells around each cell, inf if none.
+        num_filled: (R,C) uint8 number of these nine cells with a return.
+        row_edges_rad: (R+1,) float32 elevations of the row borders, ascending.
+        origin_m: (3,) float32 position of the scanner in the lidar frame.
+        axes: (3,3) float32 rotation from the lidar frame to the scanner's axes.
+        twists: (2,6) float32 twist of the lidar before and after the reference time.
+        from_m: Least range at which the image is used.
+        to_m: Greatest range at which the image is used.
     """
 
     offset_s: Float32
@@ -73,7 +72,7 @@ class ScannerImage(NamedTuple):
     to_m: float
 
     def in_range(self, points: Float32) -> Bool:
-        """Return (N,) True for points (N,3), lidar frame, at which the image is used."""
+        """Return (N,) True for points (N,3), lidar frame, at whose range the image is used."""
         if self.from_m == 0 and self.to_m == np.inf:
             return np.ones(len(points), bool)
         away = points - self.origin_m
@@ -83,19 +82,20 @@ class ScannerImage(NamedTuple):
 
 @dataclass(frozen=True)
 class RangeImage:
-    """The range images of a sweep, one or more for each scanner."""
+    """The range images of a sweep, at least one for each scanner."""
 
     scanners: tuple[ScannerImage, ...]
 
     @staticmethod
     def of(registered: RegisteredSweep, num_together: int = 1, by_ring: bool = False) -> RangeImage:
-        """Return the images of a deskewed sweep.
+        """Return the range images of a deskewed sweep.
 
         Args:
-            num_together: Number of sweeps that are tested together. The columns are finer by
-                this factor.
-            by_ring: Use rings one by one too: dense rings for far points, where an error of
-                registration is smaller than their distance, and single rings right at their rays.
+            num_together: Number of sweeps whose counts are added up. The columns are finer by this
+                factor.
+            by_ring: True also uses single rings: dense rings for far points, where an error of
+                registration is smaller than the spacing of rings, and isolated rings right at their
+                rays.
         """
         scanners: list[ScannerImage] = []
         for lidar in np.unique(registered.sweep.lidar).tolist():
@@ -110,16 +110,17 @@ class RangeImage:
         min_filled: int = MIN_FILLED,
         velocity_m_s: Float | Float32 | None = None,
     ) -> Bool:
-        """Return (N,) True where the space at points (N,3) is certainly free.
+        """Return (N,) True where the space at points is certainly free.
 
-        Of the 3 x 3 cells around the direction of the point, at least ``min_filled`` must hold a
-        return. Every return in them must be farther than the point by more than ``max(margin_m,
-        margin_fraction * range)``. A larger margin tolerates errors of registration and misses
+        At least ``min_filled`` of the 3 x 3 cells around a point's direction must hold a return.
+        Every return in them must be farther than the point by more than ``max(margin_m,
+        margin_fraction * range)``. A larger margin tolerates errors of registration, but misses
         moving objects close to a background.
 
         Args:
-            points: Lidar frame at the reference time.
-            velocity_m_s: (N,3) of moving points.
+            points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
+            velocity_m_s: (N,3) velocities in the lidar frame without ego-motion, None for static
+                points.
         """
         beyond = self.num_beyond(points, (margin_m, margin_fraction), min_filled, velocity_m_s)
         return np.asarray((beyond >= min_filled).any(axis=0))
@@ -131,10 +132,13 @@ class RangeImage:
         least: int = 1,
         velocity_m_s: Float | Float32 | None = None,
     ) -> NDArray[np.int16]:
-        """Return (S,N) for each image the filled cells around each point, if all are farther.
+        """Return (S,N) for each of S images the filled cells around N points, if all are beyond.
 
-        The number is far below 0 if a return is not farther (see `sees_through`), and 0 if fewer
-        than ``least`` cells are filled. The numbers of several sweeps may be added.
+        The count is far below 0 if a return is not beyond the point (see `sees_through`), and 0 if
+        fewer than ``least`` cells are filled. The counts of several sweeps may be added.
+
+        Args:
+            margins_m: Least distance of a return beyond a point: metres, and share of the range.
         """
         points32 = np.ascontiguousarray(points, np.float32)
         velocity = np.zeros((0, 3), np.float32)
@@ -156,8 +160,8 @@ class RangeImage:
 class _Cells(NamedTuple):
     """The cells of one image: edges of the rows (R+1,), and the range in which it is used.
 
-    lone: every other row is a single ring, the others are between. coarser: used only where the
-    previous image has too many empty cells.
+    lone: True if every other row is a single ring, and the rows between hold no ring. coarser: True
+    if used only where the previous image has too many empty cells.
     """
 
     row_edges_rad: Float32
@@ -182,7 +186,7 @@ def _images(
 
 
 def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) -> ScannerImage:
-    """Put one scanner's rays into cells."""
+    """Make the range image of one scanner from its rays."""
     sweep, shape = registered.sweep, (len(cells.row_edges_rad) - 1, cells.num_columns)
     row, column = _cell_of(rays, cells.row_edges_rad, cells.num_columns)
     inside = np.flatnonzero(row >= 0)
@@ -222,7 +226,7 @@ def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) 
 
 
 def _cell_of(rays: Aimed, row_edges_rad: Float32, num_columns: int) -> tuple[Int, Int]:
-    """Return the row, -1 outside, and the column of each ray."""
+    """Return the row (-1 outside) and the column of each ray, (N,) each."""
     row = np.searchsorted(row_edges_rad, rays.elevation, side="right") - 1
     row[row == len(row_edges_rad) - 1] = -1
     column = ((rays.azimuth + _PI) * (np.float32(num_columns) / (_PI + _PI))).astype(np.int64)
@@ -237,7 +241,7 @@ def _over_3x3(join: Callable[..., Any], cells: NDArray[Any], empty: float) -> ND
 
 
 def _offset_per_column(column: Int, offset_s: Float32, num_columns: int) -> Float32:
-    """Return the (C,) mean firing time of each column. An empty one has that of its neighbours."""
+    """Return the (C,) mean firing time of each column, interpolated in columns without rays."""
     num_rays, sum_s = np.bincount(column), np.bincount(column, offset_s)
     filled = np.flatnonzero(num_rays)
     if not len(filled):
@@ -273,7 +277,10 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
 
 
 def _cells_of_rings(rings: Float, step: float, by_ring: bool) -> list[_Cells]:
-    """Return cells that reach half way to the next ring, and as far outwards at the outermost."""
+    """Return cells whose rows reach half way to the neighbouring rings.
+
+    The outermost rows reach as far outwards as inwards.
+    """
     middle = 0.5 * (rings[1:] + rings[:-1])
     outer: Float = 2 * rings[[0, -1]] - middle[[0, -1]]
     edges: Float = np.concatenate([outer[:1], middle, outer[1:]])
@@ -295,10 +302,9 @@ def _grid(edges: NDArray[np.floating], step: float) -> _Cells:
 
 
 def _no_closer(edges: Float, distance: float) -> Float:
-    """Drop edges until rows are at least this high. The first and the last edge stay.
+    """Drop edges until rows have at least this height. The first and the last edge stay.
 
-    Rows of dense rings are joined, because with a slight error of registration points leave their
-    cells.
+    Dense rings share a row, because a slight error of registration moves points to another ring.
     """
     kept = [edges[0]]
     for edge in edges[1:]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Move rays back to their firing times, and look up points in range images; compiled loops."""
+"""Move rays back to their firing times, and look points up in range images, in compiled loops."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from densify.geometry.compiled import Kernel, inlined
 
 HIDES = 1000
-"""More than the number of cells of all images that are asked together."""
+"""Penalty of a hiding return, above the number of cells of all images whose counts are added."""
 _BLOCK = 128
 _PI = np.float32(np.pi)
 _HALF_PI = np.float32(0.5 * np.pi)
@@ -23,7 +23,7 @@ _A1, _A3, _A5, _A7, _A9 = (
 
 @inlined
 def _azimuth(x, y):  # type: ignore[no-untyped-def]
-    """Return radians, left positive.
+    """Return the azimuth of (x, y) in radians, positive to the left.
 
     The series is faster than the system's arctan2, and the same with every version of it.
     """
@@ -41,7 +41,7 @@ def _azimuth(x, y):  # type: ignore[no-untyped-def]
 
 @inlined
 def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
-    """Return the column. Columns start behind, and a point without a direction is in the first."""
+    """Return the column of an azimuth, 0 for NaN. Columns start behind the scanner."""
     if not abs(azimuth) <= _PI:
         return np.int32(0)
     # 32 bits, because more of them fit into a vector instruction.
@@ -53,7 +53,7 @@ def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
 def _rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
     """Fill ``row`` with the interval of the ascending edges of each elevation, -1 outside.
 
-    A binary search with the steps outside and the elevations inside, many at once.
+    This is a binary search of many elevations at once, with the steps as the outer loop.
     """
     last, step = np.int32(len(edges) - 1), np.int32(1)
     row[:size] = 0
@@ -104,15 +104,14 @@ def _from_scanner(x, y, z, size, origin, R):  # type: ignore[no-untyped-def]
 def aim(begin, end, points, offset_s, origin, axes, twists, rays):  # type: ignore[no-untyped-def]
     """Fill ``rays`` (3,N) with azimuth and elevation (rad) and range (m) of a scanner's points.
 
-    The points are deskewed. Each is taken in the scanner's frame at its firing time. All arrays are
-    float32.
+    Each deskewed point is moved to the scanner's frame at its firing time. All arrays are float32.
 
     Args:
-        points: (N,3) lidar frame at the reference time.
-        offset_s: (N,) firing times.
-        origin: (3,) of the scanner.
-        axes: (3,3) from the axes of the lidar frame to the scanner's.
-        twists: (2,6) before and after the reference time.
+        points: (N,3) positions in metres, lidar frame at the reference time.
+        offset_s: (N,) firing times in seconds after the reference time.
+        origin: (3,) position of the scanner in the lidar frame.
+        axes: (3,3) rotation from the lidar frame to the scanner's axes.
+        twists: (2,6) twist of the lidar before and after the reference time.
     """
     x, y, z = np.empty((3, 1), np.float32)
     for i in range(begin, end):
@@ -174,18 +173,17 @@ def _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row,
 
 @Kernel
 def see_beyond(begin, end, points, velocity, image, margins, least, beyond):  # type: ignore[no-untyped-def]
-    """Count the returns of one scanner that are beyond points.
+    """Add to ``beyond`` (N,) int16 the number of returns of one scanner beyond each point.
 
-    ``beyond`` (N,) int16 is increased by the number of the 3 x 3 cells around each point with a
-    return, or decreased by `HIDES` if one of these returns is not beyond it. All other arrays are
-    float32.
+    Counted are the filled cells among the 3 x 3 cells around a point. If any of their returns is
+    not beyond the point, `HIDES` is subtracted instead. All other arrays are float32.
 
     Args:
-        points: (N,3) lidar frame at the reference time.
-        velocity: (N,3) m/s, or (0,3) if none moves.
-        image: `densify.free_space.range_image.ScannerImage`.
-        margins: (2,) metres and share of the range.
-        least: Fewer filled cells are no evidence.
+        points: (N,3) positions in metres, lidar frame at the reference time.
+        velocity: (N,3) velocities in m/s, or (0,3) if all points are static.
+        image: Range image, `densify.free_space.range_image.ScannerImage`.
+        margins: (2,) least distance of a return beyond a point: metres and share of the range.
+        least: Least number of filled cells that is evidence.
     """
     moving, by_azimuth = len(velocity) > 0, len(image.offset_s) == 1
     settled_s = np.float32(image.settled_s)

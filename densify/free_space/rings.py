@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Measure the rays of one scanner, and how it samples directions: rings, lines, or neither.
+"""Measure the rays of a scanner, and how they sample directions: in rings, lines, or unordered.
 
-Every return is moved back to its firing time and to the frame of its scanner at that time. Only
-there are the returns of a spinning scanner on rings. Angles are in radians.
+Every return is moved back to its firing time and to the scanner's frame at that time. Only in this
+frame do the returns of a spinning scanner form rings. Angles are in radians.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ class Aimed(NamedTuple):
     """The N rays of one scanner at their firing times, in its frame; (N,) float32 each.
 
     Attributes:
-        offset_s: Seconds after the reference time of the sweep.
+        azimuth: Azimuth in radians, positive to the left.
+        elevation: Elevation in radians, positive upwards.
+        offset_s: Firing time in seconds after the reference time of the sweep.
     """
 
     azimuth: Float32
@@ -77,15 +79,14 @@ def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
 
 
 class RayTable(NamedTuple):
-    """Angles between neighbouring rays, by direction.
+    """Angles between neighbouring rays in B bins of elevation by C bins of azimuth, radians.
 
     Attributes:
-        across: (B,C) float32 along the azimuth.
-        along: (B,C) float32 along the elevation.
-        low_rad: Row b is for elevations from ``low_rad + b * bin_rad``. The outermost rows are
-            for all beyond.
-        bin_rad: Height of a row. Column c is for azimuths from ``-pi + c * 2 pi / C``; C is 1
-            if they do not matter.
+        low_rad: Lowest elevation of bin 0. The outermost bins also stand for all elevations beyond.
+        bin_rad: Height of a bin of elevation.
+        across: (B,C) float32 angle between rays along the azimuth.
+        along: (B,C) float32 angle between rays along the elevation. Bins of azimuth start at -pi; C
+            is 1 if the azimuth does not matter.
     """
 
     low_rad: float
@@ -94,7 +95,7 @@ class RayTable(NamedTuple):
     along: Float32
 
     def at(self, azimuth: NDArray[np.floating], elevation: NDArray[np.floating]) -> Float:
-        """Return (N,2) across and along in these directions."""
+        """Return the (N,2) angles across and along at N directions."""
         rows, columns = self.along.shape
         row = np.clip((elevation - self.low_rad) / self.bin_rad, 0, rows - 1).astype(np.int64)
         column = ((azimuth + np.pi) * (columns / (2 * np.pi))).astype(np.int64) % columns
@@ -103,15 +104,14 @@ class RayTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """The sampling of directions by a scanner.
+    """The pattern in which a scanner samples directions.
 
     Attributes:
         rings_rad: (K,) elevation of every ring, ascending; None if there are no distinct rings.
-        unordered: There are no lines either, or the firing time does not follow the azimuth
-            (solid state, rosettes).
-        azimuth_step_rad: Angle between rays of a ring or line; the usual spacing of an
-            unordered scanner.
-        table: The spacings.
+        unordered: True if there are no lines either, or if the firing time does not follow the
+            azimuth (solid state, rosettes).
+        azimuth_step_rad: Angle between rays of a ring or line, usual spacing if unordered.
+        table: Angles between neighbouring rays by direction.
     """
 
     rings_rad: Float | None
@@ -123,8 +123,8 @@ class Layout:
 def measure(sweeps: Sequence[Aimed]) -> Layout:
     """Return the layout of a scanner, measured by its rays in a few sweeps.
 
-    The returns of lasers that do not share an origin smear over those of other rings at close
-    range, as for KITTI's HDL-64E. They still follow at even steps along the azimuth: lines.
+    Lasers that do not share an origin, as in KITTI's HDL-64E, mix their rings at close range. Their
+    returns still follow at even steps along the azimuth: such a scanner samples in lines.
     """
     if sum(len(rays.azimuth) for rays in sweeps) < FEW_POINTS:
         step, along = _DEFAULT_RAD
@@ -145,11 +145,11 @@ def measure(sweeps: Sequence[Aimed]) -> Layout:
 
 
 def find_rings(elevation: Float32) -> Float | None:
-    """Return (K,) ascending elevations of the beams, None if the returns are not on rings.
+    """Return the (K,) ascending elevations of the rings, None if the returns are not on rings.
 
-    There are no rings for several scanners taken for one, processed clouds, scanners without rings,
-    and lasers that do not share an origin. The rings are the peaks of a fine histogram, if they are
-    separate and hold nearly all returns. Each is then the mean of the returns close to it.
+    Merged scanners, processed clouds, and lasers that do not share an origin have no rings. The
+    rings are the peaks of a fine histogram, if these are separate and hold nearly all returns. Each
+    ring is then the mean elevation of the returns close to it. elevation: (N,).
     """
     of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
     returns = np.bincount(of_return, minlength=int(np.pi / _RING_BIN_RAD) + 2).astype(float)
@@ -168,9 +168,9 @@ def find_rings(elevation: Float32) -> Float | None:
 
 
 def fires_by_azimuth(rays: Aimed) -> bool:
-    """Return True if all returns of a column are fired at nearly the same time.
+    """Return True if all rays of the same azimuth are fired at nearly the same time.
 
-    Without times the result is True.
+    The result is True if the rays have no times.
     """
     duration_s = float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
     if duration_s == 0.0:
@@ -184,7 +184,7 @@ def fires_by_azimuth(rays: Aimed) -> bool:
 
 
 def _some_sectors(rays: Aimed) -> Aimed:
-    """Return every fourth sector of a view all round, which is enough evidence."""
+    """Return every fourth sector of an all-round view, which is enough evidence."""
     if len(rays.azimuth) > _MANY_POINTS:
         some = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
         if some.mean() > 0.1:
@@ -193,9 +193,9 @@ def _some_sectors(rays: Aimed) -> Aimed:
 
 
 def _gaps(group: NDArray[Any], angle: Float32) -> Float:
-    """Return the gaps between neighbouring angles of the same group.
+    """Return the differences between neighbouring angles of the same group.
 
-    group: (N,) whole numbers.
+    group: (N,) whole number of each angle's group.
     """
     apart = 4 * np.pi  # more than the greatest difference within a group
     found: Float = np.diff(np.sort(group * apart + angle.astype(np.float64)))
@@ -203,17 +203,17 @@ def _gaps(group: NDArray[Any], angle: Float32) -> Float:
 
 
 def _step_along(azimuth: Float32, ring: NDArray[Any]) -> float:
-    """Return the median azimuth between neighbours on a ring."""
+    """Return the median azimuth difference between neighbours on a ring."""
     along = _gaps(ring, azimuth)
     along = along[along > _LEAST_STEP_RAD]
     return float(np.median(along)) if len(along) else _DEFAULT_RAD[0]
 
 
 def _even_step(rays: Aimed) -> tuple[float, float]:
-    """Return the usual azimuth between consecutive returns of about the same elevation.
+    """Return the usual azimuth difference between consecutive returns of about equal elevation.
 
-    Also return the share of returns at that distance. It is more than half for a spinning scanner,
-    and a fifth for scattered returns.
+    Also return the share of returns at this difference. It is more than half for a spinning
+    scanner, and a fifth for scattered returns.
     """
     gap = _gaps(np.floor(rays.elevation / _BAND_RAD), rays.azimuth)
     gap = gap[gap > _LEAST_GAP_RAD]
@@ -224,7 +224,7 @@ def _even_step(rays: Aimed) -> tuple[float, float]:
 
 
 def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
-    """Return spacings: at a ring the mean of the gaps to both its neighbours."""
+    """Return the table whose spacing at a ring is the mean distance to both neighbouring rings."""
     low = float(rings[0]) - _BEYOND_RAD
     num_bins = int((float(rings[-1]) + _BEYOND_RAD - low) / _RING_BIN_RAD) + 1
     elevation = low + (np.arange(num_bins) + 0.5) * _RING_BIN_RAD
@@ -233,9 +233,9 @@ def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
 
 
 def _table_of_lines(sweeps: Sequence[Aimed], step_rad: float) -> RayTable:
-    """Return medians by elevation of the gaps within sectors of 1 degree.
+    """Return the table of median elevation differences within sectors of 1 degree, by elevation.
 
-    Gaps within one line and those over missing returns are left out.
+    Differences within one line and across missing returns are left out.
     """
     gaps, middles = [], []
     for rays in sweeps:
@@ -266,7 +266,7 @@ def _table(low: float, bin_rad: float, across: Float, along: Float) -> RayTable:
 
 
 def _table_of_density(sweeps: Sequence[Aimed]) -> RayTable:
-    """Return the side of the square that each return of a sweep has to itself, by direction.
+    """Return the table of the side of the square around a return that holds no other, by direction.
 
     Returns are counted in the smallest window around each cell of a degree that holds enough.
     """
@@ -293,6 +293,6 @@ def _table_of_density(sweeps: Sequence[Aimed]) -> RayTable:
 
 
 def _in_windows(values: Float, cells: int) -> Float:
-    """Return the sums over square windows. The azimuth wraps around."""
+    """Return the sums of values (R,C) over square windows. The azimuth wraps around."""
     mean: Float = ndimage.uniform_filter(values, cells, mode=("constant", "wrap"))
     return mean * cells**2

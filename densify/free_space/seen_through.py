@@ -17,9 +17,9 @@ from densify.geometry.clock import Clock, num_in_batch
 from densify.geometry.types import Bool, Float, RegisteredSweep, Stretch
 
 REACH_S = 1.0
-"""Sweeps up to this long before and after a sweep are tested against its points."""
-_MOST_TESTED = 10  # sweeps on each side; a larger number costs more and finds the same
-_MARGIN_M, _MARGIN_FRACTION = 0.4, 0.015  # the larger one; tolerates errors of registration
+"""Greatest time between a sweep and the sweeps that are tested against its points."""
+_MOST_TESTED = 10  # number of sweeps on each side; more sweeps cost time and find nothing more
+_MARGIN_M, _MARGIN_FRACTION = 0.4, 0.015  # the larger applies; tolerates registration errors
 
 
 def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
@@ -35,14 +35,14 @@ def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[R
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """The free space that each of W sweeps observed.
+    """The free space that each of the W sweeps of a window observed.
 
     Attributes:
-        images: (W,).
-        T_lidar_world: (W,) of (4,4).
-        clock: Of the sweeps.
-        sensors: Angles between rays.
-        batches: Sweeps that are tested together, see `Clock.batches`.
+        images: W range images.
+        T_lidar_world: W transforms (4,4) from the world to the lidar at the reference time.
+        clock: Reference times of the sweeps.
+        sensors: Scanners, with the angles between their rays.
+        batches: Indices of sweeps that are tested together, see `Clock.batches`.
     """
 
     images: tuple[RangeImage, ...]
@@ -53,10 +53,10 @@ class FreeSpace:
 
     @staticmethod
     def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
-        """Return the free space of a stretch.
+        """Return the free space of a window of sweeps.
 
         Args:
-            images: Of the sweeps, as in `range_images`; None makes them.
+            images: Range images of the sweeps, as from `range_images`; None makes them.
         """
         clock = Clock.of(stretch)
         if images is None:
@@ -70,12 +70,12 @@ class FreeSpace:
         )
 
     def gap_m(self, place: Float, i: int) -> float:
-        """Return the metres between neighbouring rings of sweep i at a (3,) position, world."""
+        """Return the metres between neighbouring rings of sweep i at a (3,) world position."""
         in_lidar = poses.transform(self.T_lidar_world[i], place[None])
         return float(self.sensors.finest_gap_m(in_lidar)[0])
 
     def others(self, i: int) -> list[int]:
-        """Return the first sweeps of the other batches that are tested against sweep i."""
+        """Return the first sweep of each other batch that is tested against sweep i, by index."""
         around = self.clock.around(i, REACH_S, _MOST_TESTED * max(map(len, self.batches)))
         return sorted({self._batch_of[j][0] for j in around} - {self._batch_of[i][0]})
 
@@ -86,12 +86,13 @@ class FreeSpace:
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
         """Return (N,) True where the batch of sweep j certainly observed free space.
 
-        No sweep of the batch may have a return near the direction of the point that is not clearly
-        farther away, and all together must have enough returns there.
+        Every return near the direction of the point must be clearly farther away, in all sweeps of
+        the batch. Together the sweeps must have enough returns there.
 
         Args:
-            points: (N,3) world, at the reference time of sweep j.
-            velocity_m_s: (N,3) of moving points, world.
+            points: (N,3) positions in the world frame at the reference time of sweep j.
+            j: Index of the sweep.
+            velocity_m_s: (N,3) velocities in the world frame, None for static points.
         """
         batch, num_beyond = self._batch_of[j], []
         for k in batch:

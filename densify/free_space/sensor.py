@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Measure the scanners of a recording in its own sweeps: position, field of view, ray spacing."""
+"""Measure the scanners of a recording in its sweeps: position, field of view, ray spacing."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from densify.geometry.types import RegisteredSweep
 
 _NUM_SWEEPS = 3  # number of sweeps in which a scanner is measured
 _BEAM_RAD = np.deg2rad(1 / 6)  # 3 mrad, the width of most beams
-_HOLE_RAD = np.deg2rad(45.0)  # width of a gap that a building can cause
+_HOLE_RAD = np.deg2rad(45.0)  # widest range of azimuth without returns that a building can cause
 
 
 class RayGrid(NamedTuple):
-    """Cells of about one ray of a sweep each.
+    """A grid of directions whose cells hold about one ray of a sweep each.
 
-    Columns go left from azimuth -pi, all round.
+    Columns go left from azimuth -pi, all round. Rows go up.
 
     Attributes:
-        low_rad: Elevation of the first bin.
-        bin_rad: Height of a bin.
-        row_of: (B+1,) number of rows, which go up, below each bin; may be a fraction.
+        low_rad: Lowest elevation of the first bin.
+        bin_rad: Height of a bin of elevation.
+        row_of: (B+1,) number of rows below each border of a bin, may be a fraction.
     """
 
     low_rad: float
@@ -39,14 +39,15 @@ class RayGrid(NamedTuple):
 
 @dataclass(frozen=True)
 class SensorModel(Layout):
-    """One scanner.
+    """One scanner, with its pattern of rays.
 
     Attributes:
         origin_m: (3,) origin of its rays, lidar frame.
-        axes: (3,3) from the axes of the lidar frame to its own, in which its angles are.
-        elevation_rad: (2,) lowest and highest ray.
-        azimuth_rad: (2,) rightmost and leftmost ray; -pi and pi for a view all round, and right
-            > left if the view holds the backward direction.
+        axes: (3,3) rotation from the lidar frame to the scanner's axes, in which angles are
+            measured.
+        elevation_rad: (2,) elevations of the lowest and the highest ray.
+        azimuth_rad: (2,) azimuths of the rightmost and the leftmost ray: -pi and pi for an
+            all-round view, right > left if the view includes the backward direction.
     """
 
     origin_m: Float
@@ -56,7 +57,7 @@ class SensorModel(Layout):
 
     @staticmethod
     def of(sweeps: Sequence[RegisteredSweep], lidar: int) -> SensorModel:
-        """Return a scanner, measured in at most three deskewed sweeps with its returns."""
+        """Return the scanner with number ``lidar``, measured in up to three deskewed sweeps."""
         holding = [s for s in sweeps if (s.sweep.lidar == lidar).any()]
         middles = (np.arange(_NUM_SWEEPS) + 0.5) * len(holding) / _NUM_SWEEPS
         chosen = [holding[i] for i in np.unique(middles.astype(int))]
@@ -72,7 +73,7 @@ class SensorModel(Layout):
 
     @property
     def grid(self) -> RayGrid:
-        """The cells: a row for each ring; for an unordered scanner as small as its closest rays."""
+        """The grid: a row for each ring, or cells as small as the closest unordered rays."""
         low, bin_rad = self.table.low_rad, self.table.bin_rad
         if self.unordered:
             bin_rad = float(np.percentile(self.table.along, 5))
@@ -90,7 +91,7 @@ class SensorModel(Layout):
     def directions(self, points: Float) -> tuple[Float, Float, Float]:
         """Return azimuth, elevation (rad) and range (m), (N,) each, of points (N,3), lidar frame.
 
-        They are relative to the scanner.
+        They are as seen from the scanner, in its axes.
         """
         away = points - self.origin_m
         x, y, z = (away if np.array_equal(self.axes, np.eye(3)) else away @ self.axes.T).T
@@ -98,7 +99,7 @@ class SensorModel(Layout):
         return np.arctan2(y, x), np.arctan2(z, level), np.hypot(level, z)
 
     def sees(self, azimuth: Float, elevation: Float) -> Bool:
-        """Return (N,) True for the directions between its outermost rays."""
+        """Return (N,) True for directions, in radians, within the scanner's field of view."""
         right, left = self.azimuth_rad
         inside = (azimuth - right) % (2 * np.pi) <= (left - right) % (2 * np.pi)
         if left - right >= 2 * np.pi:
@@ -107,10 +108,10 @@ class SensorModel(Layout):
         return inside & (elevation >= low) & (elevation <= high)
 
     def gap_m(self, points: Float) -> tuple[Float, Bool]:
-        """Return (N,) metres from points (N,3), lidar frame, to the next ring, and (N,) in view.
+        """Return the (N,) distance in metres to the next ring, and (N,) True for points in view.
 
-        A scanner without rings has the distance to the next ray. The width of a beam is added,
-        because a return may be from anywhere in its spot.
+        For a scanner without rings it is the distance to the next ray. The width of a beam is
+        added, because a return may be from anywhere within the beam. points: (N,3) lidar frame.
         """
         azimuth, elevation, range_m = self.directions(points)
         gap_rad = self.table.at(azimuth, elevation)[:, 1]
@@ -125,20 +126,20 @@ class Sensors:
 
     @staticmethod
     def of(sweeps: Sequence[RegisteredSweep]) -> Sensors:
-        """Return every scanner of the deskewed sweeps, measured."""
+        """Return all scanners, measured in the deskewed sweeps."""
         numbers = {int(n) for s in sweeps for n in np.unique(s.sweep.lidar)}
         return Sensors({n: SensorModel.of(sweeps, n) for n in sorted(numbers)})
 
     @property
     def origins_m(self) -> Float:
-        """The (S,3) origins by number, lidar frame; zeros for numbers without a scanner."""
+        """The (S,3) origins by scanner number, lidar frame; zeros for numbers without a scanner."""
         origins_m = np.zeros((1 + max(self.models, default=0), 3))
         for number, model in self.models.items():
             origins_m[number] = model.origin_m
         return origins_m
 
     def gap_m(self, points: Float, lidar: NDArray[np.uint8]) -> Float:
-        """Return `SensorModel.gap_m` (N,) of the scanner (N,) that measured each point (N,3)."""
+        """Return `SensorModel.gap_m` (N,) at points (N,3) of the scanner ``lidar`` (N,) of each."""
         gap_m = np.zeros(len(points))
         for number, model in self.models.items():
             mine = np.flatnonzero(lidar == number)
@@ -146,9 +147,9 @@ class Sensors:
         return gap_m
 
     def finest_gap_m(self, points: Float) -> Float:
-        """Return the gap of the scanner with the finest view of each point.
+        """Return the (N,) ring spacing in metres of the scanner with the finest view of each point.
 
-        For a point out of all views it is that of the coarsest scanner.
+        Points out of all views take the spacing of the coarsest scanner.
         """
         gaps_m, sees = zip(*(m.gap_m(points) for m in self.models.values()), strict=True)
         finest = np.where(sees, gaps_m, np.inf).min(axis=0)
@@ -156,9 +157,9 @@ class Sensors:
 
 
 def _view(azimuth: Float32) -> tuple[float, float]:
-    """Return the ends of the widest gap without returns.
+    """Return the right and the left end of the field of view, radians.
 
-    The view is all round unless the gap is wider than a building can cause.
+    They bound the widest range of azimuth without returns, unless a building can cause that range.
     """
     angles = np.unique(azimuth).astype(np.float64)
     gap = np.diff(angles, append=angles[0] + 2 * np.pi)

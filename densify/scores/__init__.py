@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Score depth maps, scene flow and clouds, with and without truth."""
+"""Score depth maps, scene flow and clouds, with and without ground truth."""

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Score scene flow as the Argoverse 2 scene flow challenges do, over many pairs of sweeps.
 
-Within 35 m on each side of the vehicle and without the ground, flow from a sweep to the next,
-ego-motion removed:
+Scored is the flow from a sweep to the next, ego-motion removed, within 35 m on each side of the
+vehicle and without the ground:
 
-- three-way end-point error (Chodosh, Ramanan, Lucey, WACV 2024; the package av2): means over points
-  of objects that move by 0.05 m a sweep or more, of other objects, and of static background;
+- three-way end-point error (Chodosh, Ramanan, Lucey, WACV 2024; the package av2): mean errors over
+  points of objects that move by 0.05 m a sweep or more, of other objects, and of static background;
 - bucket normalised error (Khatri et al., "I Can't Believe It's Not Scene Flow!", ECCV 2024; the
-  package bucketed-scene-flow-eval): per class, points are sorted by the length of their true flow
-  into ``linspace(0, 2.0, 51)`` metres a sweep and one bucket beyond. The first is static: its mean
-  error, metres. In every other one the mean error is divided by the mean length of the true flow;
-  the quotients are averaged over the buckets that hold points, and over the classes.
+  package bucketed-scene-flow-eval): the points of each class are sorted by the length of their true
+  flow into ``linspace(0, 2.0, 51)`` metres a sweep and one bucket beyond. The first bucket is
+  static, scored by its mean error in metres. In every other bucket the mean error is divided by the
+  mean length of the true flow. These quotients are averaged over the buckets with points, and then
+  over the classes.
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ from densify.geometry.arrays import Float
 from densify.scores.flow_metrics import end_point_errors, mean_of
 
 CLASSES = ("BACKGROUND", "CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU", "OBJECT")
-"""A point's class is the index of its name here. OBJECT: of a kind that nobody named."""
+"""Names of the classes; a point's class is the index. OBJECT is an object of unknown kind."""
 IGNORED = 255
-"""The class of points that the challenge leaves out, such as signs."""
+"""Class number of points that the challenge leaves out, such as signs."""
 WITHIN_M = 35.0
 MOVES_M = 0.05
 EDGES_M = np.linspace(0, 2.0, 51)
 
 
 class ThreeWayError(NamedTuple):
-    """Mean errors in metres. ``mean_m`` is the mean of the three, NaN if one is."""
+    """Mean end-point errors in metres, and ``mean_m``, the mean of the three, NaN if any is NaN."""
 
     foreground_dynamic_m: float
     foreground_static_m: float
@@ -43,9 +44,12 @@ class ThreeWayError(NamedTuple):
 
 
 class BucketedError(NamedTuple):
-    """The error of the static bucket in metres, and that of the others as a share of the speed.
+    """The bucket normalised error of a class, or its mean over classes.
 
-    An estimate of zero flow has a dynamic error of 1.
+    Attributes:
+        static_m: Mean error in the static bucket, metres.
+        dynamic: Mean error in the other buckets as a share of the true flow, 1 for an estimate of
+            zero.
     """
 
     static_m: float
@@ -53,12 +57,12 @@ class BucketedError(NamedTuple):
 
 
 class ChallengeScores(NamedTuple):
-    """The scores of all pairs.
+    """The scores over all pairs of sweeps.
 
     Attributes:
-        three_way: Metres.
-        by_class: Of the classes with points.
-        mean: Over these classes.
+        three_way: Three-way end-point error in metres.
+        by_class: Bucketed error of each class with points, by name of the class.
+        mean: Bucketed error averaged over these classes.
         num_points: Number of scored points.
     """
 
@@ -69,7 +73,7 @@ class ChallengeScores(NamedTuple):
 
 
 class ChallengeScorer:
-    """Sums over pairs of sweeps."""
+    """Accumulator of the challenge's scores over pairs of sweeps."""
 
     def __init__(self, within_m: float = WITHIN_M) -> None:
         self._within_m = within_m
@@ -77,12 +81,12 @@ class ChallengeScorer:
         self._buckets = np.zeros((3, len(CLASSES), len(EDGES_M)))
 
     def add(self, points: Float, estimated: Float, true: Float, classes: NDArray[Any]) -> None:
-        """Add one pair, without unlabelled points and the ground.
+        """Add the flow of one pair of sweeps, without unlabelled points and the ground.
 
         Args:
-            points: (N,3) metres, vehicle frame.
-            estimated: (N,3) metres to the next sweep.
-            true: (N,3) metres to the next sweep.
+            points: (N,3) positions in metres, vehicle frame.
+            estimated: (N,3) estimated flow to the next sweep in metres, ego-motion removed.
+            true: (N,3) true flow to the next sweep in metres, ego-motion removed.
             classes: (N,) indices in `CLASSES`, or `IGNORED`.
         """
         counted = np.abs(points[:, :2]).max(axis=1, initial=0) < self._within_m
@@ -99,7 +103,7 @@ class ChallengeScorer:
             self._buckets[row] += sums.reshape(self._buckets[row].shape)
 
     def scores(self) -> ChallengeScores:
-        """Return the scores of all pairs together, NaN over no points."""
+        """Return the scores over all added pairs; a mean over no points is NaN."""
         dynamic_m, static_m, background_m = (_ratio(e, num) for e, num in self._three_way)
         mean_m = (dynamic_m + static_m + background_m) / 3
         three_way = ThreeWayError(dynamic_m, static_m, background_m, mean_m)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Score an accumulated cloud without truth, by its ghosts.
+"""Score an accumulated cloud by its ghosts, without ground truth.
 
 Every ``*_scores`` dictionary holds plain numbers ready for JSON. An undefined number is None.
 """
@@ -21,9 +21,13 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
     """Return (M,) True for ghosts, and (M,) True for points that the key sweep cannot judge.
 
     A ghost is a point of another sweep of the window at a position that the key sweep saw through.
-    It is in front of all that the key sweep measured in its direction and in the eight around, by
-    more than max(0.5 m, 2 % of its range). Of these nine directions six must have a return. Dark
-    paint and glass, which give none, hide ghosts.
+    All returns of the key sweep in its direction and the eight directions around are farther, by
+    more than max(0.5 m, 2 % of its range). At least six of the nine directions must have a return.
+    Dark paint and glass give no return and hide ghosts.
+
+    Args:
+        key_image: Range image of the key sweep.
+        key: Frame number of the key sweep.
     """
     ghost, unjudged = np.zeros((2, len(cloud)), bool)
     other = np.flatnonzero(_others(cloud, key))
@@ -42,11 +46,12 @@ def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
 
 
 def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
-    """Return the rate of `ghosts` among the ``num_points`` of other sweeps of the window.
+    """Return the shares of `ghosts` among the ``num_points`` points of the window's other sweeps.
 
-    It is given for ``all``, for ``moving`` and ``static`` points, by distance from the key in
-    frames (``by_distance["3"]``), and in seconds to 10 ms (``by_seconds["0.30"]``). ``unjudged`` is
-    the share of all, moving and static points for which the key sweep has no returns to compare.
+    The shares are for ``all``, ``moving`` and ``static`` points, by distance from the key sweep in
+    frames (``by_distance["3"]``), and by time from it, rounded to 10 ms (``by_seconds["0.30"]``).
+    ``unjudged`` is the share of all, moving and static points without returns of the key sweep to
+    compare.
     """
     other = np.flatnonzero(_others(cloud, key))
     ghost, unjudged = (found[other] for found in ghosts(cloud, key_image, key))
@@ -74,7 +79,7 @@ def _others(cloud: Cloud, key: int) -> Bool:
 
 
 def _rates(ghost: Bool, group: NDArray[np.integer]) -> dict[int, float]:
-    """Return the share of ghosts in every group (N,) with points, ascending."""
+    """Return the share of ghosts in each group number (N,) that has points, ascending."""
     num, num_ghosts = np.bincount(group), np.bincount(group, ghost)
     return {g: float(num_ghosts[g] / num[g]) for g in np.flatnonzero(num).tolist()}
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Compare depth with truth, as lists of pixels or whole maps.
+"""Compare depth with ground truth, as lists of pixels or whole maps.
 
-Definitions are those of KITTI's depth development kit (``evaluate_depth.cpp``; Uhrig et al.,
-"Sparsity Invariant CNNs", 3DV 2017), except that the kit fills holes of a prediction before it
-scores. Here a missing pixel lowers the coverage and is no error.
+The definitions are from KITTI's depth development kit (``evaluate_depth.cpp``; Uhrig et al.,
+"Sparsity Invariant CNNs", 3DV 2017). The kit fills the holes of a prediction before it scores. Here
+a missing pixel lowers the coverage and is no error.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ class DepthErrors:
     """Errors of depth z against the true depth t. An error over no pixels is None.
 
     Attributes:
-        num_pixels: Number of pixels with a truth.
-        num_compared: Number of those with a predicted depth; the errors are over these.
-        coverage: num_compared / num_pixels.
+        num_pixels: Number of pixels with a true depth.
+        num_compared: Number of pixels with both depths, over which the errors are taken.
+        coverage: Share of the true pixels with a depth, num_compared / num_pixels.
         mae_m: Mean of |z - t|.
         rmse_m: Root mean square of z - t.
         imae_per_km: Mean of |1/z - 1/t|.
         irmse_per_km: Root mean square of 1/z - 1/t.
         abs_rel: Mean of |z - t| / t.
         sq_rel: Mean of (z - t)² / t².
-        delta_1: Share with max(z/t, t/z) < 1.25 (Eigen et al., NIPS 2014).
-        delta_2: The same below 1.25².
-        delta_3: The same below 1.25³.
-        outliers: Share of outliers by the rule of KITTI's 2015 stereo benchmark (Menze and
-            Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015).
+        delta_1: Share of pixels with max(z/t, t/z) < 1.25 (Eigen et al., NIPS 2014).
+        delta_2: Share of pixels with that ratio below 1.25².
+        delta_3: Share of pixels with that ratio below 1.25³.
+        outliers: Share of outliers by the rule of KITTI's 2015 stereo benchmark (Menze and Geiger,
+            "Object Scene Flow for Autonomous Vehicles", CVPR 2015).
     """
 
     num_pixels: int
@@ -71,17 +71,17 @@ def depth_errors(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> DepthErrors:
-    """Return the errors of depths where truth exists and ``mask`` (all if None) is True.
+    """Return the errors of depths over the pixels with ground truth.
 
-    A depth is an outlier if its disparity focal_px · baseline_m / z is off by more than 3 px *and*
-    by more than 5 % of the true one.
+    A depth z is an outlier if its disparity focal_px · baseline_m / z is off by more than 3 px
+    *and* by more than 5 % of the true disparity.
 
     Args:
-        predicted_m: Camera z in metres, 0 none; a map (H,W) or a list of pixels (N,).
-        truth_m: The same of the truth.
-        mask: The pixels that count.
-        focal_px: The fx of the camera.
-        baseline_m: Stereo baseline.
+        predicted_m: Camera z in metres, 0 none; (H,W) map or (N,) list of pixels.
+        truth_m: True camera z in metres, 0 none, same shape.
+        mask: True at the pixels that count, same shape; None for all.
+        focal_px: Focal length fx of the camera.
+        baseline_m: Stereo baseline that turns depth into disparity.
     """
     known = truth_m > 0 if mask is None else (truth_m > 0) & mask
     compared = known & (predicted_m > 0)
@@ -110,10 +110,14 @@ def depth_errors(
 def precision_density(
     maps: DepthMap, truth_m: Float32, camera: Camera
 ) -> list[dict[str, float | None]]:
-    """Return density and outliers for each least confidence 0, 0.05, … 0.95.
+    """Return density and share of outliers for each least confidence 0, 0.05, … 0.95.
 
-    ``density`` is the share of all pixels that keep a depth, ``outliers`` the share of outliers
-    among those with a truth, for ``measured`` and ``filled`` depth.
+    The values are given for ``measured`` and ``filled`` depth. ``density_*`` is the share of all
+    pixels that keep a depth. ``outliers_*`` is the share of outliers among kept pixels with ground
+    truth.
+
+    Args:
+        truth_m: (H,W) true depth in metres, 0 none.
     """
     curve = []
     for least in _LEAST_CONFIDENCES:
@@ -136,11 +140,11 @@ def errors_by_part(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> dict[str, DepthErrors]:
-    """Return `depth_errors` of parts of the pixels.
+    """Return `depth_errors` of parts of the pixels, by name of the part.
 
-    The parts are ``all`` pixels, by true depth (``0-10 m`` … ``over 80 m``), on `depth_edges`
-    (``edge``) and off them (``not edge``), and, with a mask of moving pixels (H,W), ``moving`` and
-    ``static`` ones.
+    The parts are ``all`` pixels, ranges of true depth (``0-10 m`` … ``over 80 m``), `depth_edges`
+    (``edge``) and other pixels (``not edge``). With (H,W) ``moving`` pixels given, there are also
+    parts ``moving`` and ``static``. predicted_m and truth_m: (H,W) metres, 0 none.
     """
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]
@@ -159,13 +163,13 @@ def errors_by_part(
 
 
 def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_BASELINE_M) -> Bool:
-    """Return (H,W) True at depth discontinuities.
+    """Return (H,W) True at pixels of the true depth close to a depth discontinuity.
 
-    Within 3 px of such a pixel there is a true depth that would be an outlier here. The ground is
-    no discontinuity: at 1.65 m above it, its disparity grows by 0.54/1.65 px from row to row.
+    Within 3 px of such a pixel there is a true depth that would be an outlier here. Level ground is
+    no discontinuity: for a camera 1.65 m above it, disparity grows by 0.54/1.65 px per row.
 
     Args:
-        truth_m: (H,W) metres, 0 none.
+        truth_m: (H,W) true depth in metres, 0 none.
     """
     known = truth_m > 0
     disparity_px = np.zeros(truth_m.shape)
@@ -181,9 +185,9 @@ def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_
 
 
 def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
-    """Return the mean of the values of images, over the images where they are defined.
+    """Return the mean of each error over images, without images where it is undefined.
 
-    Counts are added up.
+    Counts of pixels are added up.
     """
     means: dict[str, Any] = {}
     for field in fields(DepthErrors):
@@ -194,7 +198,7 @@ def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
 
 
 def image_density(depth_m: Float32) -> float:
-    """Return the share (0 to 1) of the image's pixels with a depth."""
+    """Return the share (0 to 1) of the image's pixels that have a depth."""
     return float(np.mean(depth_m > 0)) if depth_m.size else 0.0
 
 
@@ -204,8 +208,8 @@ def depth_scores(
     """Return `depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``.
 
     Args:
-        truth_depth_m: (H,W) metres, 0 none.
-        moving_mask: (H,W) bool.
+        truth_depth_m: (H,W) true depth in metres, 0 none.
+        moving_mask: (H,W) True at pixels of moving objects.
     """
     return {
         product: scores_by_motion(image, truth_depth_m, moving_mask, camera)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Compute metrics of scene flow, each with its definition, unit and source.
 
-Flow is (N,3) metres from one time to another, ego-motion removed. A mean over nothing is NaN.
+Flow is (N,3) metres from one time to another, ego-motion removed. A mean over no points is NaN.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import numpy as np
 from densify.geometry.types import Bool, Float
 
 STRICT, RELAXED = 0.05, 0.1
-"""Metres, and parts of the true flow: the two limits of `accuracy`."""
+"""Limits of `accuracy`, both in metres and as a share of the true flow's length."""
 
 
 def end_point_errors(estimated: Float, true: Float) -> Float:
-    """Return (N,) metres, the length of the error at each point."""
+    """Return the (N,) end-point errors in metres, |estimated - true| of (N,3) flows."""
     return np.linalg.norm(np.asarray(estimated, np.float64) - np.asarray(true, np.float64), axis=1)
 
 
 def end_point_error(estimated: Float, true: Float, mask: Bool | None = None) -> float:
-    """Return EPE, metres: the mean of `end_point_errors`, over ``mask`` (N,) if given.
+    """Return the mean end-point error (EPE) in metres, over ``mask`` (N,) if given.
 
     Liu, Qi, Guibas, "FlowNet3D", CVPR 2019.
     """
@@ -29,20 +29,20 @@ def end_point_error(estimated: Float, true: Float, mask: Bool | None = None) -> 
 
 
 def accuracy(estimated: Float, true: Float, limit: float) -> float:
-    """Return the share (0 to 1) of the points with a small error.
+    """Return the share (0 to 1) of the points with a small end-point error.
 
     The error is below ``limit`` metres *or* below ``limit`` times the length of the true flow.
 
     Args:
-        limit: `STRICT` (0.05 m or 5 %) or `RELAXED` (0.1 m or 10 %), as in FlowNet3D (CVPR
-            2019) and Pontes et al. (3DV 2020).
+        limit: `STRICT` (0.05 m or 5 %) or `RELAXED` (0.1 m or 10 %), as in FlowNet3D (CVPR 2019)
+            and Pontes et al. (3DV 2020).
     """
     error_m = end_point_errors(estimated, true)
     return mean_of((error_m < limit) | (error_m < limit * np.linalg.norm(true, axis=1)))
 
 
 def angle_error_rad(estimated: Float, true: Float) -> float:
-    """Return the mean angle between the estimated and the true flow, radians.
+    """Return the mean angle in radians between the estimated and the true flow.
 
     It is taken over the points whose true flow is not 0 (Pontes et al., 3DV 2020). An estimate of 0
     counts as a right angle.
@@ -56,5 +56,5 @@ def angle_error_rad(estimated: Float, true: Float) -> float:
 
 
 def mean_of(values: Float | Bool) -> float:
-    """Return the mean, NaN over nothing."""
+    """Return the mean of the values, NaN if there are none."""
     return float(values.mean()) if len(values) else float("nan")
