@@ -17,7 +17,7 @@ from densify.geometry.cameras import image_points
 from densify.geometry.types import Bool, Boxes, BoxView, Float, FlowField, Int, RegisteredSweep
 
 MOVES_M_S = 0.5
-"""Slower boxes are static: boxes are not drawn to the centimetre (Chodosh et al., WACV 2024)."""
+"""Least speed of a moving box; box poses are not accurate (Chodosh et al., WACV 2024)."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Float, FlowField, Int, Stretch
 
 _NUM_NEIGHBORS = 3
-_LINE_M = 0.05  # points with less scatter about a line are on it
+_LINE_M = 0.05  # points with less scatter about a line count as on the line
 _MAX_GAP_M = 0.5
 
 

@@ -12,14 +12,14 @@ import numpy as np
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Int
 
-GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, step by step
-MAX_WEIGHT = 60.0  # of all matches; the errors of neighbours on a surface are not independent
+GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, for each step
+MAX_WEIGHT = 60.0  # greatest sum over matches; errors of neighbours on a surface are correlated
 NUM_NEAR = 12  # neighbours that span a surface
-MIN_FIT = 5  # matches
+MIN_FIT = 5  # least number of matches
 _SURFACE_M = 0.05  # noise of a surface point
-_RIDGE = 0.02  # of the mean variance, for points on a line
+_RIDGE = 0.02  # share of the mean variance that is added, for points on a line
 _MAX_MODEL_POINTS = 1500
-_LOOSE = 10.0  # of the covariance, because points of a surface must not stop a slide along it
+_LOOSE = 10.0  # factor of the covariance: surface points must not stop a slide along the surface
 
 
 def apply(state: Float, points: Float, centre: Float) -> Float:
@@ -110,7 +110,7 @@ class Model:
             row, arm = row[found], at_model[found] - centre
             weight = (1 - (distance_m[found] / gate_m) ** 2) ** 2
             cos, sin = np.cos(state[3]), np.sin(state[3])
-            J = np.zeros((len(found), 3, 3))  # of the model's point by x, y and yaw
+            J = np.zeros((len(found), 3, 3))  # derivative of the model's point by x, y and yaw
             J[:, 0, 0], J[:, 1, 0] = cos, -sin
             J[:, 0, 1], J[:, 1, 1] = sin, cos
             J[:, 0, 2], J[:, 1, 2] = -arm[:, 1], arm[:, 0]

@@ -23,7 +23,7 @@ from densify.readers import open_sequence
 from densify.readers.street import Street
 
 STREETS = "streets"
-"""Recording specification: a new street for every clip; a sensor may follow as of ``street``."""
+"""Recording specification: a new simulated street for every clip; options as of ``street``."""
 NUM_SWEEPS = 7
 _PRESETS, _SHARES = ("street", "crossing", "highway"), (0.5, 0.25, 0.25)
 _MOST_TRIES = 8

@@ -19,7 +19,7 @@ from densify.geometry.types import Float
 from densify.learning.network import NUM_SWEEPS, AboveGround, Model, order_for, read_model
 
 MOVES_M_S = 0.5
-"""Points that the network sees move more slowly start no track (Chodosh et al., WACV 2024)."""
+"""Least speed by the network of points that may start a track (Chodosh et al., WACV 2024)."""
 
 
 def check_argument(argument: str) -> None:

@@ -39,7 +39,7 @@ from densify.readers.decoded_files import read_arrays
 CELL_M = 0.4
 NUM_CELLS = 256
 REACH_M = CELL_M * NUM_CELLS / 2
-"""Points farther from the scanner along x or y have no flow."""
+"""Half side of the grid. Points farther from the scanner along x or y have no flow."""
 NUM_SWEEPS = 3
 _NUM_POINT_FEATURES = 6
 _WIDTH = 16
@@ -47,7 +47,7 @@ _WIDTHS = (32, 48, 64, 96)
 _LARGEST_HEIGHT_M = 4.0
 
 
-# Its input, the same in training and inference: points above the ground, ego-motion removed
+# The network's input, in training and inference: points above the ground, ego-motion removed
 
 
 class NetworkCloud(NamedTuple):
@@ -104,7 +104,7 @@ def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> lis
 
 
 Sweeps = Sequence[NetworkCloud | None]
-"""Source, target, and any number of sweeps before the source; None where there is none."""
+"""Source, target, and any number of sweeps before the source; None for a missing sweep."""
 
 
 class Voxels(nn.Module):
@@ -124,7 +124,7 @@ class Voxels(nn.Module):
             nn.Linear(widths[1] + _WIDTH + 3, 48), nn.ReLU(), nn.Linear(48, 32), nn.ReLU(),
             nn.Linear(32, 3),
         )  # fmt: skip
-        with torch.no_grad():  # little moves at first, as in the world
+        with torch.no_grad():  # start with small flow, because most points are static
             self.decode[-1].weight.mul_(0.1)  # type: ignore[operator, union-attr]
             self.decode[-1].bias.zero_()  # type: ignore[operator, union-attr]
 

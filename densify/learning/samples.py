@@ -29,8 +29,8 @@ from densify.learning.clips import Clip, ClipMaker
 from densify.learning.network import REACH_M, NetworkCloud, Sweeps, order_for
 
 NUM_DRAWN = 4096
-"""Points of source and target that the objective is computed for."""
-_NUM_MIXED = 4  # clips
+"""Greatest number of points of source, and of target, in the objective."""
+_NUM_MIXED = 4  # number of clips
 _PAIRS_OF_CLIP = 48
 _SCALES = (0.95, 1.05)
 
@@ -178,4 +178,4 @@ def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
 
 
 TEACHERS = {"objective": objective_loss, "engine": supervised_loss, "truth": supervised_loss}
-"""The loss of a network and a sample, a 0-d tensor."""
+"""Loss function by teacher; it takes a network and a sample and returns a 0-d tensor."""

@@ -23,8 +23,8 @@ from densify.learning.samples import TEACHERS, on_device, samples
 
 _LEARNING_RATE = 2e-3
 _LARGEST_GRADIENT = 1.0
-_WARM_UP, _COOL_DOWN = 0.05, 0.5  # shares of the training
-_NUM_AVERAGED = 50  # losses
+_WARM_UP, _COOL_DOWN = 0.05, 0.5  # shares of the training's steps
+_NUM_AVERAGED = 50  # number of losses
 
 
 @dataclass(frozen=True)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Minimise the published objective of Pontes, Hays, Lucey (3DV 2020)."""
+"""Minimise the published scene flow objective of Pontes, Hays, Lucey (3DV 2020)."""

@@ -13,7 +13,7 @@ from densify.geometry.types import FlowField, Motion
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """See `densify.flow.engines.EngineModule`; takes no argument."""
+    """Return the motion by the published objective, see `EngineModule`; takes no argument."""
 
     def step(here: int, there: int) -> FlowField:
         return _step(scene, here, there, settings)

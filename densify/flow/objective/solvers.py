@@ -2,7 +2,7 @@
 """Solve the scene flow objective of Pontes, Hays, Lucey (3DV 2020) in two ways.
 
 ``adam`` is the published protocol. ``pcg`` alternates nearest neighbours with preconditioned
-conjugate gradients. It reaches the same or a lower energy in a small part of the time.
+conjugate gradients. It reaches the same or a lower energy in a fraction of the time.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from densify.geometry.types import Float
 
 SOLVERS = ("pcg", "adam")
 _LEARNING_RATE_M = 0.1  # of Adam, as published
-_FIRST_ALPHA = 1000.0  # at which whole surfaces slide
+_FIRST_ALPHA = 1000.0  # whole surfaces slide at this alpha
 _LEVEL_FACTOR = 10 ** (2 / 3)  # greatest factor between the alphas of two levels
 _LEAST_ALPHA = 0.1  # last level for alpha = 0
-_LEVEL_TOLERANCE = 2e-3  # a level ends when an alternation lowers its energy by less, relatively
-_MAX_ALTERNATIONS, _MAX_LAST_ALTERNATIONS = 4, 100  # before the last level, and on it
+_LEVEL_TOLERANCE = 2e-3  # a level ends when an alternation lowers the energy by less (share)
+_MAX_ALTERNATIONS, _MAX_LAST_ALTERNATIONS = 4, 100  # per level before the last, on the last
 _MAX_PRODUCTS, _RESIDUAL_DROP = (
     20,
     0.2,

@@ -109,9 +109,9 @@ def flow_between(
     settings: ObjectiveSettings,
     initial: ArrayLike | None = None,
 ) -> FlowField:
-    """Return the flow by the published objective, in the frame of the clouds.
+    """Return the flow by the published objective (Pontes, Hays, Lucey, 3DV 2020).
 
-    With ``static_prior`` only groups that certainly move have flow. See `estimate_flow`.
+    With ``static_prior`` only groups that certainly move have flow. Arguments: `estimate_flow`.
     """
     objective = SolverSettings(
         solver=settings.solver,
@@ -286,7 +286,7 @@ def _beats_standing_still(
     return min(forward, backward) >= _MIN_GAIN_M
 
 
-# --- as an engine
+# --- The engine ``pairs``
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:

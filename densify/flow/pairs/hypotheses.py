@@ -27,16 +27,16 @@ from densify.geometry.types import Float, Int
 
 _EVEN_M = 0.06
 _MAX_SPEED_M_S = 38.0
-_USUAL_S, _LONGEST_S = 0.1, 0.4  # time between the clouds if unknown; greatest time
+_USUAL_S, _LONGEST_S = 0.1, 0.4  # assumed time between clouds if unknown; greatest time
 _VOTE_STEP_M = 0.2
-_VOTE_SLACK_M = 0.3  # vertical
+_VOTE_SLACK_M = 0.3  # vertical tolerance of a vote
 _VOTE_POINTS, _VOTE_TARGETS = 60, 800
 _NUM_VOTED = 5
 _APART_M = 0.5
 _ALIGN_POINTS = 150
-_PRECISION = 1 / np.array([1.0, 1.0, 0.01, 0.06]) ** 2  # per m from the start, per rad from zero
+_PRECISION = 1 / np.array([1.0, 1.0, 0.01, 0.06]) ** 2  # prior: m from the start state, rad from 0
 _FROM_START = np.array([1.0, 1.0, 1.0, 0.0])
-_SLOPE_STEP_M, _SLOPE_STEPS = 2.0, 4  # of a grid around a place
+_SLOPE_STEP_M, _SLOPE_STEPS = 2.0, 4  # of the grid that is fitted around a position
 _ROUGH_M = 0.1  # a ground rougher than this has no slope
 
 

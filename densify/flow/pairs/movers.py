@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find the rigid groups of one cloud that certainly moved to their place in another cloud.
+"""Find the rigid groups of one cloud that certainly moved to another position in another cloud.
 
 A point is unexplained if the other cloud has no counterpart at its position. Connected groups with
 many unexplained points are aligned with the other cloud at several candidate positions

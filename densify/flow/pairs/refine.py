@@ -28,25 +28,25 @@ from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _MIN_POINTS = 40  # fewer points have no surfaces
-_MAX_POINTS = 600  # of each cloud; with 400 the thickness depends on the axes
+_MAX_POINTS = 600  # of each cloud; with 400 points the thickness depends on the axes
 _SIDE_M = 0.06
 _REACH_M, _MAX_REACH_M, _WIDER = 0.4, 1.0, 1.5
-_MIN_PLANES = 0.6  # share of points that must have one
+_MIN_PLANES = 0.6  # least share of points with a plane
 _GATES_M, _LAST_GATES_M = np.array([0.3, 0.3, 0.3, 0.2, 0.2]), np.array([0.15, 0.15, 0.1, 0.1, 0.1])
 _NO_GATES = np.zeros(0)
 _STANDING = np.zeros(4)
 _LIMIT_M = 0.15
-_MAX_THICK_M = 0.09  # thicker ones are sparse or no surfaces, and no evidence
+_MAX_THICK_M = 0.09  # thicker surfaces are too sparse to be evidence
 _MAX_WEIGHT = 60.0
 _MIN_NEIGHBORS = 6
 _MIN_WIDTH_M2 = 0.05**2  # neighbours on one ring alone span no plane
 _SIGMA_M2 = 0.02**2  # noise of a surface point
-_PRECISION = np.array([1e3, 1e3, 3e5, 1e4])  # 1/m² from where it starts; 1/rad²
+_PRECISION = np.array([1e3, 1e3, 3e5, 1e4])  # of the start state as a prior: 1/m², 1/rad²
 _SHIFTS_M = (0.3, -0.3)
 _FACTORS = (2.0, 2 / 3)  # starts for two confused appearances of an object
-_CLEARLY = 0.9  # how much thinner another start must be,
-_SURELY = 0.95  # and the refined motion without known times
-_NEAR_M = 0.5  # of the positions at which the object may arrive
+_CLEARLY = 0.9  # relative thickness below which another start is taken,
+_SURELY = 0.95  # and below which a refined motion without known times is taken
+_NEAR_M = 0.5  # around the positions at which the object may arrive
 _ARRIVED_POINTS = 300
 
 
@@ -55,7 +55,7 @@ class Refined(NamedTuple):
 
     Attributes:
         thickness_m: Mean distance of points from their surface; None for too few surface points.
-        of_standing: Ratio of the thickness to the thickness without motion; None likewise.
+        of_standing: Ratio of the thickness to the thickness without motion; None in the same case.
     """
 
     motion: RigidMotion

@@ -19,21 +19,21 @@ from densify.flow.pairs.unexplained import EXPLAINED_M, MIN_UNEXPLAINED, Unexpla
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Bool, Float, Int
 
-_MIN_TOGETHER, _MIN_TOGETHER_PER_M = 10, 3.5  # with distance more positions fit by chance
+_MIN_TOGETHER, _MIN_TOGETHER_PER_M = 10, 3.5  # farther away, more positions fit by chance
 _MIN_MOTION_M = 0.1
-_MAX_RISE_M, _MAX_RISE = 0.12, 0.15  # and per metre
+_MAX_RISE_M, _MAX_RISE = 0.12, 0.15  # greatest rise, and per metre of motion
 _SAME_M, _SAME_RAD = 0.25, 0.06
 _LOOK_POINTS, _JUDGE_POINTS = 150, 2000
 _THIN_M, _ALONG = 0.05, 0.3
-_BAR_M, _LEVEL, _ACROSS = 0.12, 0.5, 0.2  # of a rail: its width (rms), its rise, its motion
-_MAX_BAR_M, _MAX_BAR_POINTS = 0.75, 60  # length (rms) of the back of a car, far away
+_BAR_M, _LEVEL, _ACROSS = 0.12, 0.5, 0.2  # a rail's width (rms), rise, motion across
+_MAX_BAR_M, _MAX_BAR_POINTS = 0.75, 60  # length (rms) and points of a far car's back
 _AROUND_M = 0.5
-_MAX_LEFT = 0.4  # share of the points unexplained at rest, in both clouds together
-_MAX_LEFT_EACH, _MAX_LEFT_START = 0.6, 0.75  # before a motion is refined
-_MAX_MISFIT = 0.82  # share left and mean distance in tolerances, together
-_MAX_MISFIT_THIN = 1.2  # for thin surfaces,
-_THIN_SURFACES_M, _THIN_OF_STANDING = 0.075, 0.65  # in metres, and relative to the object at rest
-_MAX_OF_STANDING = 0.82  # if much stays unexplained
+_MAX_LEFT = 0.4  # share of the points unexplained at rest that may stay so, both clouds
+_MAX_LEFT_EACH, _MAX_LEFT_START = 0.6, 0.75  # in each cloud; before a motion is refined
+_MAX_MISFIT = 0.82  # sum of the unexplained share and the mean distance in tolerances
+_MAX_MISFIT_THIN = 1.2  # for thin surfaces, which are
+_THIN_SURFACES_M, _THIN_OF_STANDING = 0.075, 0.65  # as thin as this, in m and relative to rest
+_MAX_OF_STANDING = 0.82  # relative thickness, if much stays unexplained
 
 
 @dataclass(frozen=True, eq=False)

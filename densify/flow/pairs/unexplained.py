@@ -14,16 +14,16 @@ from densify.geometry.types import Bool, Float, Float32, Int
 
 EXPLAINED_M = 0.1  # a nearer point is a counterpart,
 MIN_UNEXPLAINED = 5, 3  # in the source, in the target
-_REACH_M = 0.6  # a distance beyond it counts as this
+_REACH_M = 0.6  # greater distances count as this distance
 _MAX_EXPLAINED_M = 0.5
-_NUM_SPACING = 8  # or one within the radius of this number of neighbours
+_NUM_SPACING = 8  # or a point within the radius of this number of neighbours
 _LINK_M = 0.6
 _NEAR_M = 0.4
-_MIN_SHARE = 0.1  # unexplained share of a group that is taken as a whole
+_MIN_SHARE = 0.1  # least unexplained share of a group that is kept whole
 _MAX_EXTENT_M = 20.0
 _MIN_SEED_SHARE = 0.3
 _MIN_POINTS = 8
-_MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # above the ground, of its lowest and highest points
+_MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # greatest heights of a group's lowest and highest points
 
 
 class Unexplained:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The engine for whole recordings: what other sweeps saw through is followed as rigid objects."""
+"""Engine for whole recordings: track groups of seen-through points as rigid objects."""

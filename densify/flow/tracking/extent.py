@@ -23,17 +23,17 @@ from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 
 Instance = NDArray[np.int32]
 
-_REACH = 1.5  # of candidates, in distances up to which other points count as neighbours
+_REACH = 1.5  # of candidates to an object, in neighbour distances (`near_m`)
 _LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M, _AS_LOW_AS_ROAD_M = 0.08, 0.1, 0.15
 _WALKS_M_S = 2.0
 _LEAST_SEEDS, _WALKER_M = 0.1, 1.5
-_WIDER_M, _MOSTLY = 0.5, 0.5  # so many of the points so close must move too
+_WIDER_M, _MOSTLY = 0.5, 0.5  # least share of moving points within this distance
 _ALONE_GAPS, _NUM_BESIDE = 2.0, 2
 NUM_COLUMNS = 2.0
-"""Columns of rays in a gap along a side that falls away from the scanner."""
+"""Columns of rays that may be missing along a side that recedes from the scanner."""
 _LONGEST_HOLE_M = 2.0
 _MAX_VIOLATIONS = 0.05
-_PREDICTED_S = 0.2  # before the first and after the last observation
+_PREDICTED_S = 0.2  # an object is known so long before the first and after the last observation
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ def _is_free_of_violations(
     """
     step = np.floor(np.abs(along) / LINK_M).astype(np.int64)
     num_steps = int(step.max(initial=0)) + 1
-    step += num_steps * (along < 0)  # those ahead, then those behind
+    step += num_steps * (along < 0)  # steps ahead, then steps behind
 
     def up_to(steps: Int) -> Int:
         return np.bincount(steps, minlength=2 * num_steps).reshape(2, num_steps).cumsum(axis=1)

@@ -22,18 +22,18 @@ from densify.geometry.types import Bool, Float, Int
 
 MIN_POINTS = 8  # to start a track
 _MIN_SEED_SHARE = 0.4
-_AROUND_S = 0.5  # from both ends of the recording, any start is equally good
-_NEARER_END, _NEARER_END_S = 0.7, 0.1  # nearer to an end, it is worth 0.7 for each 0.1 s
+_AROUND_S = 0.5  # farther than this from both ends of the recording, starts are equally good
+_NEARER_END, _NEARER_END_S = 0.7, 0.1  # closer to an end, a start is worth 0.7 per 0.1 s
 _BESIDE_M = 1.0  # from a towing vehicle to what it tows
 FIT_M = 0.3
-"""From the object to its points."""
-_SHARE_UNSEEN = 0.5  # of the points that a batch usually has
-# m, m, rad: of a prediction over 0.25 s, and in proportion over longer times.
+"""Greatest distance of a point from the object that claims it."""
+_SHARE_UNSEEN = 0.5  # least share of the object's usual number of points
+# Standard deviation (m, m, rad) of a prediction over 0.25 s; it grows with longer times.
 _PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
-_RECENT_S = 0.4  # states that tell a rate
-# The given velocity counts as much as states with this sum of squared times; it tells no turning.
+_RECENT_S = 0.4  # age of the states that the rate is fitted to
+# The given velocity weighs as much as states with this sum of squared times; it has no turn rate.
 _GIVEN_S2 = np.array([0.02, 0.02, 0.02, 0.0])
-_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # turns level out
+_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # factor of the rate: turns level out
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
@@ -139,7 +139,7 @@ class Follower:
         inside = c.strips.rows_inside(expected.min(0) - slack_m, expected.max(0) + slack_m)
         inside = inside[batch.gather(self.free)[inside]]
         rows, enough = inside[c.cluster[inside] >= 0], float(MIN_FIT)
-        if len(rows) < MIN_FIT:  # no sweep saw through it, but it may be there
+        if len(rows) < MIN_FIT:  # no sweep saw through the object, but it may be there
             usual = float(np.median([track.num_points(m) for m in track.observations]))
             rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * usual)
         if len(rows) < enough:

@@ -26,11 +26,11 @@ from densify.free_space.seen_through import REACH_S, FreeSpace
 from densify.geometry.nearest import is_near, nearest, tree_of
 from densify.geometry.types import Float
 
-_NUM_STATES = 3  # fewer lie on a line anyway
-_NUM_ASKED = 60  # points of a batch
-_GIVEN = 5.0  # answers that are taken to be for either side, since few answers tell little
-_CLEARLY = 1.0  # by so much the log odds of two motions must differ, to be told from noise
-_ROUGH = 0.1  # of the distance between neighbours: no state is known better
+_NUM_STATES = 3  # fewer states always lie on a line
+_NUM_ASKED = 60  # number of tested points of a batch
+_GIVEN = 5.0  # observations added to both counts, because few observations are weak evidence
+_CLEARLY = 1.0  # difference of the log odds of two motions that exceeds noise
+_ROUGH = 0.1  # accuracy of a state, as a share of the neighbour distance
 
 _FILE = Path(__file__).with_name("likelihood.json")
 
@@ -99,7 +99,7 @@ class Evidence(NamedTuple):
             "travelled": float(np.log(self.travelled + _ROUGH)),
             "rough": float(np.log(self.rough + _ROUGH)),
             "taken": less,
-            "taken too": more,  # counts less: the rest of a long object may be there
+            "taken too": more,  # has less weight: the rest of a long object may be there
             "slender": float(np.log(self.slender) ** 2),
         }
 
@@ -162,7 +162,7 @@ def judge(
         track.path.residual_m / within_m,
         _slenderness(track, obstacles, within_m),
     )
-    # The places left cost most; where the rest tells enough, they are not looked at.
+    # Vacated positions cost most time. They are skipped if the other terms already reject.
     if judged is not None or found.log_odds(own_table()) > 0:
         before, after = find_places_left(track, obstacles, space, objects, within_m)
         found = found._replace(before=before, after=after)

@@ -20,13 +20,13 @@ from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _NEAR_M, _NEAR_GAPS = 0.2, 0.5
-_MANY_POINTS = 100  # more do not locate an object better
+_MANY_POINTS = 100  # more points do not locate an object better
 _BESIDE_M = 1.0
 _OUTLINE_M = 0.05
 LONG_M = 3.0
-"""Shorter objects may bend, and need not move where they point."""
+"""Objects shorter than this may bend, and need not move where they point."""
 LANE_M = 15.0
-"""So far ahead of and behind an object its parts are looked for."""
+"""Distance ahead of and behind an object within which its parts are searched."""
 _SIDE_M = 0.1
 _QUARTERS_RAD = np.arange(4) * np.pi / 2
 _SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05

@@ -23,17 +23,17 @@ from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Float, Int
 
 _ALPHAS = tuple(np.geomspace(100.0, 0.5, 7).tolist())  # from stiff to soft
-_REACHES_M = np.geomspace(0.5, 0.25, len(_ALPHAS))  # farther targets do not pull
+_REACHES_M = np.geomspace(0.5, 0.25, len(_ALPHAS))  # targets farther away do not pull
 _BLURS_M = np.geomspace(0.2, 0.08, len(_ALPHAS))
-_NODE_M = 0.07  # one node per voxel: dense parts are not stiffer than sparse ones
+_NODE_M = 0.07  # one node per voxel, so that dense regions are not stiffer than sparse regions
 _NUM_NEIGHBORS, _LINK_M = 6, 0.5
 _NUM_BLURRED = 8
 _STEADY = 1.0  # weight of equal velocities before and after
-_ANCHOR, _ANCHOR_M = 2.0, 0.02  # weight of the rigid position, and the distance that ends it
+_ANCHOR, _ANCHOR_M = 2.0, 0.02  # weight of the rigid position, and distance at which it fades
 _MAX_PRODUCTS, _RESIDUAL_DROP = 30, 0.02
 _NUM_LOOKED_UP = 3
 _MIN_PARTS, _MIN_SEEN_S, _MIN_POINTS = 5, 0.35, 20
-_CAP_M = 0.3  # a stray point counts no more than this
+_CAP_M = 0.3  # greatest distance that a stray point counts
 # On eight streets parts of vehicles gained up to 0.045 of the squared distance, walkers within
 # 20 m mostly 0.06 to 0.4.
 _MIN_GAIN, _MIN_SHARE_BETTER = 0.05, 0.75
@@ -60,7 +60,7 @@ class Softened:
         to_next: For each part (n,3) metres, displacement of its points to the time of the next part
             relative to the rigid motion, object's frame. It is 0 for the last part and for a rigid
             object.
-        to_previous: The same to the previous part; 0 for the first part.
+        to_previous: As ``to_next``, to the time of the previous part; 0 for the first part.
         alpha: Stiffness that held-out parts confirmed, inf for rigid.
         held_out_m: Root mean square distance of held-out parts from their prediction, by the alpha
             tried, inf first; empty if nothing was tried.
@@ -107,8 +107,8 @@ def soften(parts: Sequence[Part]) -> Softened:
     The stiffness is lowered while held-out parts confirm it: every second part is left out, and
     predicted from the bending between its neighbours. The softest stiffness is taken that predicts
     clearly better than the rigid object, in most parts. Otherwise the object stays rigid. Objects
-    also stay rigid if they are longer than 3 m, or observed in fewer than 5 sweeps, for less than
-    0.35 s, or with a median of fewer than 20 points.
+    longer than 3 m always stay rigid. Objects with fewer than 5 parts, less than 0.35 s, or a
+    median of fewer than 20 points per part stay rigid too.
     """
     parts = tuple(parts)
     still = tuple(np.zeros_like(part.points) for part in parts)
@@ -325,7 +325,7 @@ def _look_up(at: Float, came: Float, points: Float, known_came: Float, values: F
 
     Args:
         at, came: (N,3) positions, and the displacements by which they were reached.
-        points, known_came: (M,3) the same of the known points. Crossing legs differ in ``came``.
+        points, known_came: (M,3) positions and displacements of the known points.
     """
     known, asked = np.hstack([points, known_came]), np.hstack([at, came])
     near = nearest_k(tree_of(known), asked, _NUM_LOOKED_UP)[1]

@@ -36,10 +36,10 @@ from densify.geometry.linking import link
 from densify.geometry.types import Bool, Float, Int
 
 _NEAR_S = 0.3
-_REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: of the smooth motion
-_AS_WHOLE = 0.9  # of its points
+_REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: standard deviation of the smooth motion
+_AS_WHOLE = 0.9  # share of the known track's points that a better track must keep
 _GAPS_IN_LINE_M = (1.5, 4.0)
-_ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of one, in steps of rings and of columns
+_ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of a single ring or column, in steps
 
 
 def find_tracks(
@@ -89,7 +89,7 @@ class _Search:
         return [np.ones(len(c.points), bool) for c in self._obstacles]
 
     def tracks(self) -> list[Track]:
-        """Return the confirmed tracks, those with the best starts first.
+        """Return the confirmed tracks, tracks with the best starts first.
 
         Points of a rejected track start no track in the first pass. In the second pass they may.
         For example, two walkers that meet are one cluster for a moment, and its track claims both
@@ -233,7 +233,7 @@ class _Search:
 
 
 def _better(known: tuple[Track, Verdict], found: tuple[Track, Verdict]) -> tuple[Track, Verdict]:
-    """Return the found track and verdict if clearly more likely, otherwise the known ones."""
+    """Return the found track and verdict if clearly more likely, else the known track."""
     return found if known[1].is_clearly_below(found[1].log_odds) else known
 
 

@@ -19,11 +19,11 @@ from densify.geometry.types import Float, Int
 Bytes = NDArray[np.uint8]
 
 _MAX_SPEED_M_S = 38.0
-_NEAR_S = 0.1  # to the nearer batches; the farther ones are twice as far
-_STEP_M = 0.2  # of the grid
+_NEAR_S = 0.1  # time to the nearer batches; the others are twice as far
+_STEP_M = 0.2  # side of a voxel
 _FEW_POINTS, _MANY_POINTS = 60, 600
-_TIMES_ASKED = 3  # the firing time depends on the position
-_FINE_S, _FINE_M_S = 0.5, 0.2  # of the last vote: its time span and step
+_TIMES_ASKED = 3  # iterations, because the firing time depends on the position
+_FINE_S, _FINE_M_S = 0.5, 0.2  # time span and velocity step of the last vote
 
 
 @dataclass(frozen=True)
