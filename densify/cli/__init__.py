@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Run the command line, a thin shell over the Python API.
 
-Results and paths go to stdout, progress and log to stderr. Only this package prints. A verb imports
-numpy and heavier modules when it runs. Therefore help answers at once.
+Results and paths go to stdout, progress and log to stderr. No other package prints. Verbs import
+numpy and heavier modules only when they run, so help answers at once.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
-    0: done. 1: a ComputationError, or an unforeseen error, whose traceback is written to a file. 2:
-    an InputError, an error of the system, or (by argparse, which exits) a bad argument. 130:
+    0: success. 1: a ComputationError, or an unforeseen error, whose traceback is written to a file.
+    2: an InputError, a system error, or (by argparse, which exits) a bad argument. 130:
     interrupted.
     """
     with screen() as shown:
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def script() -> NoReturn:
-    """Run `main` as a process of its own: the console script and ``python -m densify``."""
+    """Run `main` as the process's entry point: the console script and ``python -m densify``."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(
@@ -101,7 +101,7 @@ def _run(arguments: Sequence[str] | None, shown: Screen) -> None:
 
 
 def _let_go_of(stream: TextIO) -> None:
-    """Redirect a broken stream, which the interpreter would flush once more."""
+    """Redirect a broken output stream, which the interpreter would flush at exit."""
     try:
         stream.flush()
     except OSError:
@@ -109,7 +109,7 @@ def _let_go_of(stream: TextIO) -> None:
 
 
 def _write_bug_report(error: BaseException) -> str:
-    """Write the versions, the command and the traceback to a temporary file; return its path."""
+    """Write versions, command and traceback to a temporary file, and return its path."""
     prefix = time.strftime("densify-bug-%Y%m%d-%H%M%S-")
     number, path = tempfile.mkstemp(".log", prefix)
     with open(number, "w", encoding="utf-8", errors="backslashreplace") as file:

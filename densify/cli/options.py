@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Define options of several verbs, and read their values."""
+"""Define the options that several verbs share, and read their values."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def add_verb(
     """Add a verb to the command line and return its parser.
 
     Args:
-        commands: The subparsers.
+        commands: Subparsers of argparse.
         name: Name of the verb.
-        verb: Is called with the options; None for a verb with verbs of its own.
-        about: A line for the front page.
-        epilog: More about it.
+        verb: Function called with the options; None for a verb that has verbs of its own.
+        about: One-line description.
+        epilog: Further help.
     """
     description = f"{about[0].upper()}{about[1:]}."
     parser: argparse.ArgumentParser = commands.add_parser(
@@ -55,8 +55,8 @@ def option(parser: argparse.ArgumentParser, usage: str, about: str, **more: Any)
     """Add an option.
 
     Args:
-        usage: ``--name METAVAR``, or ``--name`` alone for one without a value.
-        about: Help.
+        usage: ``--name METAVAR``, or ``--name`` for a flag without a value.
+        about: Help text.
     """
     name, _, metavar = usage.partition(" ")
     kind: dict[str, Any] = {"metavar": metavar} if metavar else {"action": "store_true"}
@@ -64,7 +64,7 @@ def option(parser: argparse.ArgumentParser, usage: str, about: str, **more: Any)
 
 
 def add_recording(parser: argparse.ArgumentParser, several: bool = False) -> None:
-    """Add the recording, as a positional argument and as ``--data``."""
+    """Add the argument for the recording, positional and as ``--data``."""
     parser.add_argument("recording", metavar="SPEC", nargs="*" if several else "?", help=_DATA)
     number = "+" if several else 1
     option(
@@ -78,9 +78,9 @@ def add_recording(parser: argparse.ArgumentParser, several: bool = False) -> Non
 
 
 def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add some of the options that several verbs have.
+    """Add some of the options that several verbs share.
 
-    Their names are window, method, camera, config (with ``--set``) and overwrite.
+    The names are window, method, camera, config (with ``--set``) and overwrite.
     """
     if "window" in names:
         about = (
@@ -109,7 +109,7 @@ def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
 def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
     """Return the specs of the recordings that a command names.
 
-    Without any, log that the simulator is used, and return ``default``.
+    If it names none, log that the simulator is used, and return ``default``.
     """
     given = options.recording or []
     specs = [*([given] if isinstance(given, str) else given), *options.data]
@@ -139,7 +139,7 @@ def config_of(options: argparse.Namespace) -> Config:
 
 
 def check_new_file(path: Path, overwrite: bool, suffix: str = "") -> None:
-    """Raise InputError, before the computation, if the file exists or cannot be made."""
+    """Raise InputError, before the computation, if a file exists or cannot be created."""
     if path.suffix != (suffix or path.suffix):
         raise InputError(f"--out {path}: expected a name that ends in {suffix}")
     if path.is_dir():
@@ -154,10 +154,10 @@ def check_new_file(path: Path, overwrite: bool, suffix: str = "") -> None:
 
 
 def sliced(sequence: LidarSequence, keys: range | None) -> list[int]:
-    """Return the frames of ``--keys``, all for None.
+    """Return the frame numbers selected by ``--keys``; all frames for None.
 
     Raises:
-        InputError: There is none.
+        InputError: No frame is selected.
     """
     from densify.readers.timeline import format_frames
 
@@ -171,14 +171,14 @@ def sliced(sequence: LidarSequence, keys: range | None) -> list[int]:
 
 
 def natural(text: str) -> int:
-    """Read a whole number from 0 up."""
+    """Parse a whole number of at least 0."""
     if not _are_digits(text):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
     return int(text)
 
 
 def positive(text: str) -> float:
-    """Read a number above 0."""
+    """Parse a number above 0."""
     try:
         number = float(text)
     except ValueError:
@@ -189,15 +189,15 @@ def positive(text: str) -> float:
 
 
 def words(text: str) -> list[str]:
-    """Read words separated by commas."""
+    """Parse words separated by commas."""
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def key_range(text: str, other: str = "") -> range:
-    """Read ``A:B[:S]``.
+    """Parse ``A:B[:S]`` as a range.
 
     Args:
-        other: Other accepted text, for the message.
+        other: Description of other accepted text, for the message.
     """
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
@@ -210,12 +210,12 @@ def key_range(text: str, other: str = "") -> range:
 
 
 def all_or_range(text: str) -> range | None:
-    """Read ``all`` as None, or ``A:B[:S]``."""
+    """Parse ``all`` as None, or ``A:B[:S]`` as a range."""
     return None if text == "all" else key_range(text, "all, or ")
 
 
 def shard(text: str) -> tuple[int, int]:
-    """Read ``i/n`` with i from 1 to n."""
+    """Parse ``i/n`` with i from 1 to n."""
     i, slash, n = text.partition("/")
     if slash and _are_digits(i, n) and 1 <= int(i) <= int(n):
         return int(i), int(n)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Summarise results, comparisons and exports, for people and (``*_facts``) for programs.
+"""Summarise results, comparisons and exports, as text and (``*_facts``) as numbers for programs.
 
-They read `Result.metrics`: ``density`` and ``ghosts``, ``held_out`` by camera (scores of the map
-made without the key sweep against its returns) and ``depth`` by camera (scores against exact
+The scores are in `Result.metrics`: ``density``, ``ghosts``, ``held_out`` by camera (scores of maps
+made without the key sweep against its returns) and ``depth`` by camera (scores against ground
 truth).
 """
 
@@ -43,7 +43,7 @@ _SCORES = (
 
 
 def summary(result: Result) -> str:
-    """Return a few lines about one densified key."""
+    """Return a few lines of text about one densified key."""
     cloud = result.cloud
     moving = f"{np.count_nonzero(cloud.moving):,} on moving objects"
     if result.movers:
@@ -81,7 +81,7 @@ def summary(result: Result) -> str:
 
 
 def _beside_icp(result: Result, *path: str) -> str:
-    """Return a share as text, with that of rigid accumulation in brackets; "" for none."""
+    """Return a share as text, followed by rigid accumulation's share in brackets; "" for none."""
     share = look_up(result.metrics, *path)
     rigid = result.baselines.get("icp")
     by_icp = look_up(rigid.metrics, *path) if rigid is not None else None
@@ -90,7 +90,7 @@ def _beside_icp(result: Result, *path: str) -> str:
 
 
 def key_facts(result: Result) -> dict[str, Any]:
-    """Return the numbers of one method's result."""
+    """Return the scores of one method's result, as numbers."""
     metrics = result.metrics
     facts = {
         "key": result.key,
@@ -112,7 +112,8 @@ def comparison(results: Mapping[str, Result]) -> str:
     """Return a table with one column per method.
 
     Rows: points, image density per camera, ghost rate, and coverage, MAE, RMSE and outliers of the
-    measured depth at all, moving and static pixels, with the key held out and against exact truth.
+    measured depth. These are given for all, moving and static pixels, against the held-out key
+    sweep and against ground truth.
     """
     cameras = list(next(iter(results.values())).depth)
     rows: list[tuple[str, tuple[str, ...], str]] = [("points", ("num_points",), ",d")]
@@ -135,7 +136,7 @@ def comparison(results: Mapping[str, Result]) -> str:
 
 
 def export_summary(exported: Export) -> str:
-    """Return a line for each camera, its density before and after, and one for the cloud."""
+    """Return a line per camera with its density before and after, and one line for the cloud."""
     lines = []
     for camera, products in exported.density.items():
         measured, filled = (

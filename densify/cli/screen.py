@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Print answers on stdout; log lines, the one error, and a progress bar on stderr.
+"""Print answers on stdout, and log lines, errors and a progress bar on stderr.
 
 The progress bar is shown only on a terminal.
 """
@@ -28,10 +28,10 @@ class Answer:
     """The answer of a verb.
 
     Attributes:
-        text: For people.
-        facts: For programs (``--json``). Lists of several answers are joined.
+        text: Text for people.
+        facts: Values for programs (``--json``). Lists of several answers are concatenated.
         files: Written files.
-        first: Files to open first, each with its content.
+        first: File that the user may open first -> its content.
     """
 
     text: str = ""
@@ -50,10 +50,10 @@ class Answer:
 
 
 def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> dict[Path, str]:
-    """Return the files to open first, at most one of each kind.
+    """Return the files to open first -> their content, at most one file of each kind.
 
     Args:
-        kinds: Pattern of the end of a path -> content. The first kinds come first.
+        kinds: Pattern of the end of a path -> content, most important first.
     """
     first: dict[Path, str] = {}
     for pattern, what in kinds.items():
@@ -64,7 +64,7 @@ def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> 
 
 
 def numbers_table(columns: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a table with a column for each mapping and a row for each number, by its path."""
+    """Return a text table with a column per mapping and a row per number, labelled by its path."""
     flat = {title: dict(_numbers(numbers, "")) for title, numbers in columns.items()}
     names = dict.fromkeys(name for numbers in flat.values() for name in numbers)
     body = [[name, *(_cell(column.get(name)) for column in flat.values())] for name in names]
@@ -84,7 +84,7 @@ def _numbers(values: Mapping[str, Any], path: str) -> Iterator[tuple[str, float]
 
 
 def aligned(rows: Sequence[Sequence[str]], side: str = ">") -> str:
-    """Return the rows as text, the first column to the left, the others to the right or left."""
+    """Return rows as text, the first column left-aligned, the others aligned to ``side``."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     sides = ["<", *(side * (len(widths) - 1))]
     lines = (
@@ -95,10 +95,10 @@ def aligned(rows: Sequence[Sequence[str]], side: str = ">") -> str:
 
 
 def written(value: float | None, form: str) -> str:
-    """Return the number as text, "-" for None.
+    """Return a number as text, "-" for None.
 
     Args:
-        form: A format, and after a blank a unit.
+        form: Format specification, optionally followed by a blank and a unit.
     """
     if value is None:
         return "-"
@@ -112,7 +112,7 @@ def percent(value: float | None, digits: int = 2) -> str:
 
 
 def look_up(metrics: Mapping[str, Any], *path: str) -> Any:
-    """Return ``metrics[a][b]...``, None if a step of the path is missing."""
+    """Return ``metrics[a][b]...``, None if a key of the path is missing."""
     value: Any = metrics
     for step in path:
         value = value.get(step) if isinstance(value, Mapping) else None
@@ -137,12 +137,12 @@ class Screen(logging.Handler):
         self._warnings: list[str] = []
 
     def heed(self, options: argparse.Namespace) -> None:
-        """Take ``--json`` of a command."""
+        """Read ``--json`` from the options of a command."""
         self._json = options.json
         self._facts = {"schema": _SCHEMA, "verb": options.name, "files": [], "open_first": []}
 
     def show(self, answer: Answer) -> None:
-        """Print the answer, or keep it for the end."""
+        """Print the answer, or keep it until the end for ``--json``."""
         if self._json:
             files = {"files": answer.files, "open_first": [*answer.first]}
             for name, value in {**answer.facts, **files}.items():
@@ -155,7 +155,7 @@ class Screen(logging.Handler):
             sys.stdout.flush()
 
     def end(self, exit_code: int, error: str | None = None) -> int:
-        """Print the error and the JSON object, if there are any, and return the exit code."""
+        """Print the error and the JSON object, if present, and return the exit code."""
         if error is not None:
             logging.getLogger("densify").error("%s", error)
         if self._json:
@@ -178,10 +178,10 @@ class Screen(logging.Handler):
 
 @contextmanager
 def screen() -> Iterator[Screen]:
-    """Send the package's log to a new screen.
+    """Send the package's log to a new screen within the ``with`` block.
 
     ``densify.progress`` is shown only on a terminal, unless its level is set. Warnings of numpy and
-    others, for developers, are debug messages.
+    other packages are shown as debug messages.
     """
     log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
     before, shown = (log.level, log.propagate, progress.level), Screen()
@@ -203,7 +203,7 @@ def screen() -> Iterator[Screen]:
 
 @contextmanager
 def progress_on_stderr() -> Iterator[Progress]:
-    """Yield a function that shows that ``done`` of ``total`` parts of a stage are done."""
+    """Yield a callback (stage, done, total) that shows progress on stderr."""
     from tqdm import tqdm
 
     hidden = not sys.stderr.isatty()
@@ -226,10 +226,10 @@ def _above_bars() -> AbstractContextManager[None]:
 
 
 def tell_doubts(doubts: Iterable[tuple[str, str, int]], most: int = 20) -> None:
-    """Log each warning once with its keys, the most frequent first.
+    """Log each distinct warning once with its keys, the most frequent first.
 
     Args:
-        doubts: (warning, recording or "", key).
+        doubts: Tuples of warning, recording (or ""), and key.
     """
     from densify.readers.timeline import format_frames
 

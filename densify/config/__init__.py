@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Hold the settings (`densify.config.sections`) and find their values (`.resolving`)."""
+"""Hold the settings (`densify.config.sections`) and resolve their values (`.resolving`)."""
 
 from densify.config.resolving import as_mapping as as_mapping
 from densify.config.resolving import presets as presets

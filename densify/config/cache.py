@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Cache results of pipeline steps on disk, by all inputs that they were made of.
+"""Cache results of pipeline steps on disk, addressed by a digest of all their inputs.
 
-An entry is an ``.npz`` file without pickles: the arrays, and the rest as JSON. A damaged entry is
-made again. The folder belongs to the user alone: nobody else can write there.
+An entry is an ``.npz`` file without pickles: the arrays, and everything else as JSON. A damaged
+entry is computed again. Only the user can write to the folder.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ _MOST_ENTRIES = 10_000
 
 
 class Cache:
-    """A folder of entries."""
+    """A folder of cached results."""
 
     def __init__(self, limit_bytes: int = 10 * 1024**3, folder: Path | None = None) -> None:
         """Open a cache.
 
         Args:
-            limit_bytes: Bound of its size, kept by `trim`.
-            folder: None for the user's own.
+            limit_bytes: Greatest total size, enforced by `trim`.
+            folder: Folder of the entries; None for the user's cache directory.
 
         Raises:
-            InputError: Others can write to the folder.
+            InputError: Other users can write to the folder.
         """
         self._folder, self._limit_bytes = folder or own_folder("steps"), limit_bytes
         try:
@@ -54,10 +54,12 @@ class Cache:
             _log.warning("%s: %s; nothing is kept for later", self._folder, error.strerror or error)
 
     def get(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
-        """Return the result of ``make``, computed now or cached.
+        """Return the cached result for these inputs, or else compute and cache it.
 
         Args:
-            inputs: All that the result depends on, as `digest` takes it.
+            step: Name of the pipeline step.
+            inputs: Everything the result depends on, as `digest` accepts.
+            make: Computes the result.
         """
         path = self._folder / f"{step}-{digest((__version__, _STEP_VERSIONS, inputs))}.npz"
         try:
@@ -78,7 +80,7 @@ class Cache:
         return value
 
     def trim(self) -> None:
-        """Delete the least recently used entries until the size is within the bound."""
+        """Delete the least recently used entries until the size is within the limit."""
         with suppress(OSError):  # another process deletes too
             entries = [(e.stat().st_mtime_ns, e, e.stat().st_size) for e in self._folder.iterdir()]
             left = sum(num_bytes for *_, num_bytes in entries)
@@ -89,12 +91,12 @@ class Cache:
 
 
 def kept(cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:
-    """Return the result of ``make``, by the cache if there is one."""
+    """Return the result from the cache if one is given, else from ``make``; see `Cache.get`."""
     return make() if cache is None else cache.get(step, inputs(), make)
 
 
 def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write an ``.npz`` file that appears when it is complete."""
+    """Write an ``.npz`` file atomically, through a temporary file in the same folder."""
     number, aside = tempfile.mkstemp(".tmp", dir=path.parent)
     try:
         with open(number, "wb") as file:
@@ -106,7 +108,7 @@ def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def digest(value: Any) -> str:
-    """Return a digest of arrays, numbers, text, dataclasses, sequences and mappings."""
+    """Return a hash of arrays, numbers, text, dataclasses, sequences and mappings."""
     text, arrays = _packed(value)
     state = hashlib.blake2b(text, digest_size=20)
     for array in arrays.values():
@@ -116,9 +118,9 @@ def digest(value: Any) -> str:
 
 
 def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
-    """Return the value as JSON, and its arrays by their names there.
+    """Return the value as JSON, and its arrays by the names used there.
 
-    Values that JSON lacks are ``{KIND: content}``. Raises TypeError for other parts.
+    Types that JSON lacks are written as ``{KIND: content}``. Raises TypeError for other types.
     """
     arrays: dict[str, np.ndarray] = {}
 
@@ -141,10 +143,10 @@ def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
 
 
 def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the value whose JSON and arrays `_packed` returned.
+    """Return the value that `_packed` converted.
 
-    Its classes are dataclasses and named tuples of already imported modules. They are filled
-    without calling their code.
+    Only dataclasses and named tuples of already imported modules are built, without calling their
+    code.
     """
     if isinstance(tree, list):
         return [_unpacked(part, arrays) for part in tree]
@@ -166,13 +168,13 @@ def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 
 def own_folder(name: str) -> Path:
-    """Return a folder of this name in the user's cache directory.
+    """Return the folder of this name in the user's cache directory.
 
-    The environment variable DENSIFY_CACHE_DIR names another directory. The folder is made with mode
-    0700 if possible.
+    The environment variable DENSIFY_CACHE_DIR replaces that directory. The folder is created with
+    mode 0700 if possible.
 
     Raises:
-        InputError: Others can write to it.
+        InputError: Other users can write to the folder.
     """
     named = os.environ.get("DENSIFY_CACHE_DIR")
     root = Path(named or platformdirs.user_cache_dir("densify"))
@@ -188,7 +190,7 @@ def own_folder(name: str) -> Path:
 
 
 def others_can_write(folder: Path) -> bool:
-    """Return True if anybody but this user and root can write to an existing folder."""
+    """Return True if users other than this user and root can write to an existing folder."""
     try:
         found = folder.stat()
     except OSError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Define the errors that are no bugs of densify, each with a one-line message.
+"""Define the errors that users can resolve, each with a one-line message.
 
 The message says what happened, where, what was expected, and what to do.
 """
@@ -16,7 +16,7 @@ _MOST_CHARACTERS = 1000
 
 
 def brief(message: str) -> str:
-    """Return the message on one line, with long values (quoted, or a long word) cut."""
+    """Return the message on one line, with long quoted values and long words shortened."""
     message = _LONG_VALUE.sub(lambda found: _cut(found[0], 200), _BREAK.sub(" ", message))
     return _cut(message, _MOST_CHARACTERS) if len(message) > _MOST_CHARACTERS else message
 
@@ -35,7 +35,7 @@ def how_to_install(extra: str) -> str:
 
 
 def did_you_mean(got: str, known: Iterable[str]) -> str:
-    """Return ``did you mean NAME? `` with the known name most like ``got``, "" if none is."""
+    """Return ``did you mean NAME? `` with the known name most similar to ``got``, else ""."""
     close = difflib.get_close_matches(got, list(known), n=1, cutoff=0.6)
     return f"did you mean {close[0]}? " if close else ""
 
@@ -46,7 +46,7 @@ class _ShortError(Exception):
 
 
 class InputError(_ShortError):
-    """Input, configuration or output place that cannot be used. Exit code 2."""
+    """Input, configuration or output path that cannot be used. Exit code 2."""
 
 
 class OutputError(InputError):
@@ -54,11 +54,11 @@ class OutputError(InputError):
 
 
 class ComputationError(_ShortError):
-    """A stage found that its result cannot be trusted. Exit code 1."""
+    """A result that a stage found to be unreliable. Exit code 1."""
 
 
 class SweepError(_ShortError):
-    """One sweep cannot be used; without sweep ``frame`` the others could be."""
+    """An error of one sweep; ``frame`` is its frame number. Other sweeps may still be used."""
 
     def __init__(self, message: str, frame: int) -> None:
         super().__init__(message, frame)
@@ -69,13 +69,13 @@ class SweepError(_ShortError):
 
 
 class UnfitSweepError(SweepError, InputError):
-    """A sweep has too few points, or its stamp cannot be right."""
+    """A sweep with too few points or an implausible stamp."""
 
 
 class UnplacedSweepError(SweepError, ComputationError):
-    """Registration does not find the pose of a sweep."""
+    """A sweep whose pose registration could not find."""
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Return True if the system had no memory left, also for the stack of one more thread."""
+    """Return True if the error means that memory ran out, also when starting a thread."""
     return isinstance(error, MemoryError) or str(error) == "can't start new thread"

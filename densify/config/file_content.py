@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Read files with bounds: bytes, text, JSON and YAML; and import optional packages.
+"""Read bytes, text, JSON and YAML with size limits, and import optional packages.
 
-Every error of a malformed description becomes one InputError.
+Every error of malformed content becomes one InputError.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def open_file(path: Path) -> BinaryIO:
     """Open a file for reading; the caller closes it.
 
     Raises:
-        InputError: At once, if it is missing, unreadable, a folder, pipe or device, or a pointer to
-            a file that Git LFS has not fetched.
+        InputError: The file is missing or unreadable, is a folder, pipe or device, or is a pointer
+            to a file that Git LFS has not fetched.
     """
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -51,7 +51,7 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     """Return the content of a file.
 
     Raises:
-        InputError: It is unreadable or larger than that.
+        InputError: The file is unreadable or larger than ``most_bytes``.
     """
     with open_file(path) as file:
         check_size(os.fstat(file.fileno()).st_size, path, most_bytes)
@@ -62,10 +62,14 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return unpacked gzip data.
+    """Return decompressed gzip data.
+
+    Args:
+        where: File, for the message.
+        most_bytes: Greatest size after decompression.
 
     Raises:
-        InputError: It is damaged or larger than that.
+        InputError: The data is damaged or too large.
     """
     unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
@@ -79,7 +83,7 @@ def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> b
 
 
 def check_size(num_bytes: int, where: Path | str, most_bytes: int = MOST_BYTES) -> None:
-    """Raise InputError for more bytes than that."""
+    """Raise InputError if ``num_bytes`` exceeds ``most_bytes``; ``where`` begins the message."""
     if num_bytes > most_bytes:
         raise InputError(
             f"{where}: holds {num_bytes:,} bytes or claims to, expected {most_bytes:,} at most"
@@ -93,10 +97,10 @@ def reason(error: BaseException) -> str:
 
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
-    """Return the text of a file.
+    """Return the text of a UTF-8 file.
 
     Raises:
-        InputError: It is unreadable, too large or no text.
+        InputError: The file is unreadable, too large or not UTF-8.
     """
     try:
         return read_bytes(path, most_bytes).decode("utf-8")
@@ -108,13 +112,13 @@ def read_json(path: Path) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        InputError: It is unreadable or broken.
+        InputError: The file is unreadable or not valid JSON.
     """
     return parse_json(read_bytes(path), path)
 
 
 def parse_json(data: bytes, where: Path | str) -> Any:
-    """Return the content of JSON text. Raise InputError, which begins with ``where``."""
+    """Return the content of JSON text; raise InputError, starting with ``where``, if invalid."""
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -124,16 +128,20 @@ def parse_json(data: bytes, where: Path | str) -> Any:
 
 
 def read_yaml(path: Path) -> tuple[Any, dict[str, int]]:
-    """Return `parse_yaml` of a file."""
+    """Return the values of `parse_yaml` for a file."""
     return parse_yaml(read_text(path, _MOST_YAML_BYTES), path)
 
 
 def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
-    """Return the content of YAML text, None if empty, and the line of each key by dotted name.
+    """Return the content of YAML text and its line numbers.
+
+    Returns:
+        content: Parsed content, None if empty.
+        lines: Dotted key, such as ``a.b`` -> line of that key.
 
     Raises:
-        InputError: The YAML is broken, has other tags than YAML's own, a key twice, or more
-            than 30 aliases. The message begins with ``where``.
+        InputError: The YAML is invalid, has custom tags, duplicate keys or more than 30 aliases.
+            The message begins with ``where``.
     """
     import yaml
 
@@ -165,15 +173,15 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
 
 
 def needed(module: str, extra: str, what: str) -> Any:
-    """Return the imported module.
+    """Import and return an optional module.
 
     Args:
         module: Import path.
-        extra: Extra of densify that installs it.
-        what: Things that need it, such as "Argoverse 2 recordings", for the message.
+        extra: Extra of densify that installs the module.
+        what: Features that need the module, such as "Argoverse 2 recordings", for the message.
 
     Raises:
-        InputError: It is not installed. The message has the command that installs it.
+        InputError: The module is not installed. The message has the command that installs it.
     """
     package = module.partition(".")[0]
     try:
@@ -191,9 +199,11 @@ def needed(module: str, extra: str, what: str) -> Any:
 
 @contextmanager
 def described_in(where: Path | str, expected: str) -> Iterator[None]:
-    """Raise InputError, which begins with ``where``, for an absent key or a wrong kind of value.
+    """Turn a missing key or a malformed value within the ``with`` block into an InputError.
 
-    It covers what is read within the block.
+    Args:
+        where: File or option; begins the message.
+        expected: Correct content, for the message.
     """
     try:
         yield

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""List the built-in readers and engines, and find those of other packages by entry points.
+"""List the built-in readers and engines, and find plug-ins of other packages by entry points.
 
-Rows name modules and import none. The name of an entry point is that of the plug-in, its value a
-module::
+The tables name modules without importing them. The name of an entry point is the name of the
+plug-in, and its value is a module::
 
     [project.entry-points."densify.readers"]
     npy = "densify_npy.reader"
@@ -25,20 +25,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Plugin:
-    """One plug-in.
+    """One reader or scene-flow engine.
 
-    A module of another package has the other fields as attributes, and ``holds`` as HOLDS.
+    A module of another package gives the other fields as attributes, ``holds`` as HOLDS and so on.
 
     Attributes:
-        name: As users write it.
+        name: Name that users write.
         module: Import path.
-        recognises: Of readers: returns True if an existing place holds such recordings, judged
-            by names alone.
-        holds: Of readers: what is there, for messages.
-        boxes: Of readers: where tracked boxes are, for messages.
-        scenes: Of readers: a place may hold several recordings, named by ``#SCENE``.
-        argument: Of engines: the text after the name and a colon.
-        shared: Of engines: the motion of a long stretch serves every key in it
+        recognises: Reader: function that returns True if a path holds its recordings, judged by
+            file names.
+        holds: Reader: kind of recording, for messages.
+        boxes: Reader: path of the annotated boxes, for messages.
+        scenes: Reader: a path may hold several recordings, selected by ``#SCENE``.
+        argument: Engine: name of the argument after the colon; empty for no argument.
+        shared: Engine: motion of a long stretch serves every key in it
             (`densify.flow.engines.SharedMotion`).
     """
 
@@ -53,11 +53,11 @@ class Plugin:
 
     @property
     def usage(self) -> str:
-        """The text that users write."""
+        """Name and argument as users write them."""
         return f"{self.name}:{self.argument}" if self.argument else self.name
 
     def work(self) -> Any:
-        """Import the module that does the work."""
+        """Import and return the plug-in's module."""
         return import_module(self.module)
 
 
@@ -66,9 +66,10 @@ class Table:
     """The plug-ins of one kind.
 
     Attributes:
-        kind: For messages.
-        group: Of the entry points.
-        members: Functions that the module of another package has.
+        kind: Name of the kind, for messages.
+        group: Entry-point group through which packages add plug-ins.
+        members: Names of functions that a plug-in's module must have.
+        built_in: Plug-ins of densify.
     """
 
     kind: str
@@ -77,14 +78,11 @@ class Table:
     built_in: tuple[Plugin, ...]
 
     def names(self) -> list[str]:
-        """Return the built-in names, then those of other packages."""
+        """Return the built-in names, then the names from other packages."""
         return [row.name for row in self.built_in] + sorted(self._added())
 
     def require(self, name: str, where: str) -> None:
-        """Raise InputError, which begins with ``where``, unless there is such a plug-in.
-
-        It imports none.
-        """
+        """Raise InputError, starting with ``where``, if no plug-in has this name; import none."""
         if name not in self.names():
             usages = [row.usage for row in self.built_in] + sorted(self._added())
             raise InputError(
@@ -93,26 +91,26 @@ class Table:
             )
 
     def row(self, name: str, where: str) -> Plugin:
-        """Return the row of that name. It imports the module of another package.
+        """Return the plug-in of this name; the module of another package is imported.
 
         Raises:
-            InputError: There is none, or the package is broken.
+            InputError: No plug-in has the name, or its package is broken.
         """
         self.require(name, where)
         rows = {row.name: row for row in self.built_in}
         return rows[name] if name in rows else self._load(self._added()[name])
 
     def __iter__(self) -> Iterator[Plugin]:
-        """Yield all rows, the most general built-in one last.
+        """Yield all plug-ins, the most general built-in one last.
 
-        Rows of other packages are imported one by one.
+        Modules of other packages are imported one by one.
         """
         yield from self.built_in[:-1]
         yield from (self._load(point) for _, point in sorted(self._added().items()))
         yield self.built_in[-1]
 
     def _added(self) -> dict[str, EntryPoint]:
-        """Return the entry points of other packages by name. None replaces a built-in one."""
+        """Return name -> entry point for other packages. Built-in names cannot be replaced."""
         from importlib.metadata import entry_points
 
         built_in = {row.name for row in self.built_in}
@@ -120,7 +118,7 @@ class Table:
         return {point.name: point for point in points if point.name not in built_in}
 
     def _load(self, point: EntryPoint) -> Plugin:
-        """Return the row of a plug-in, as its module describes it."""
+        """Import a plug-in of another package, and return its description."""
         what = f"{self.kind} {point.name} of the package {point.dist.name if point.dist else '?'}"
         try:
             module = point.load()
@@ -151,14 +149,14 @@ ENGINES = Table(
         Plugin("npz", "densify.readers.flow_files", argument="DIR"),
     ),
 )
-"""The module of each has the functions of `densify.flow.engines.EngineModule`."""
+"""Engines. Their modules have the functions of `densify.flow.engines.EngineModule`."""
 
 
 def check_engine_spec(spec: str) -> tuple[str, str]:
-    """Return name and argument of an engine's ``NAME[:ARGUMENT]``, without import.
+    """Return name and argument of an engine's ``NAME[:ARGUMENT]``, without importing it.
 
     Raises:
-        InputError: There is no such engine, or it has an argument too many or too few.
+        InputError: The engine does not exist, lacks its argument, or takes no argument.
     """
     name, _, argument = spec.partition(":")
     ENGINES.require(name, "flow.engine")
@@ -169,10 +167,10 @@ def check_engine_spec(spec: str) -> tuple[str, str]:
 
 
 def engine(spec: str) -> tuple[Plugin, str]:
-    """Return row and argument of ``NAME[:ARGUMENT]``.
+    """Return the plug-in and the argument of an engine's ``NAME[:ARGUMENT]``.
 
     Raises:
-        InputError: There is no such engine.
+        InputError: As in `check_engine_spec`.
     """
     name, argument = check_engine_spec(spec)
     return ENGINES.row(name, "flow.engine"), argument
@@ -205,9 +203,9 @@ _BESIDE = re.compile(r"\..*|(timestamps?|times|stamps|poses?|trajectory)\.\w+", 
 
 
 def _holds_sweeps(path: Path) -> bool:
-    """Return True if sweeps are in a folder, or up to two folders below.
+    """Return True if a folder has sweep files, at most two folders deep.
 
-    Tables of numbers count only if nothing else is beside them.
+    Tables of numbers count as sweeps only if the folder has no other files.
     """
     near = (found for pattern in ("*", "*/*", "*/*/*") for found in path.glob(pattern))
     if (path / "densify.yaml").is_file() or any(_SWEEP.fullmatch(found.name) for found in near):
@@ -257,16 +255,16 @@ READERS = Table(
                "a folder of numbered sweeps (000120.bin, .pcd, .ply, .npy, .csv, ...)"),
     ),
 )  # fmt: skip
-"""The module of each has the function of `densify.readers.ReaderModule`."""
+"""Readers. Their modules have the function of `densify.readers.ReaderModule`."""
 
 
 class Form(NamedTuple):
-    """A form of exports.
+    """An export format.
 
     Attributes:
-        module: In `densify.outputs.export`, with the function ``write_NAME``.
-        owned: Files and folders that it writes.
-        of_drive: It takes several keys of a drive.
+        module: Module of `densify.outputs.export` with the function ``write_NAME``.
+        owned: Files and folders that the format writes.
+        of_drive: True if an export can cover several keys of a drive.
     """
 
     module: str
@@ -294,4 +292,4 @@ EXPORTS = {
     "rrd": Form("rrd", ("recording.rrd",), of_drive=True),
     "mcap": Form("mcap", ("recording.mcap",), of_drive=True),
 }
-"""The forms of ``densify export``, by name."""
+"""Name of an export format of ``densify export`` -> its writer."""

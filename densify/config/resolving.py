@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make a checked `Config` of a preset, a file, a mapping and single settings."""
+"""Build a checked `Config` from a preset, a file, a mapping and single settings."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _SECTIONS: dict[str, Any] = {f.name: type(f.default) for f in dataclasses.fields
 def resolve(
     config: Config | str | Path | Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
 ) -> Config:
-    """Return the settings that ``config`` and the overrides name.
+    """Return the settings given by ``config``, then changed by the overrides.
 
     Args:
         config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a
-            YAML file of that form; or a str, the name of a preset or else a file. Only differences
-            from the defaults need to be named.
-        overrides: ``section.key=value`` each, values written as in YAML; later ones win.
+            YAML file of that form; or a str, the name of a preset or else of a file. Settings that
+            are not given have their defaults.
+        overrides: Texts ``section.key=value``, with values as in YAML; later overrides win.
 
     Raises:
-        InputError: A name is unknown (the message suggests the right one), or a value is of the
-            wrong type or out of range. The message names the file or ``--set`` that it comes from.
+        InputError: A name is unknown (the message suggests the right one), or a value has the wrong
+            type or is out of range. The message names the file or ``--set`` that gave it.
     """
     values = as_mapping(config if isinstance(config, Config) else Config())
     if isinstance(config, Mapping):
@@ -47,12 +47,12 @@ def resolve(
 
 
 def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
-    """Return ``{section: {key: value}}`` with every key. `resolve` makes the Config again."""
+    """Return ``{section: {key: value}}`` with every setting; `resolve` inverts it."""
     return dataclasses.asdict(config)
 
 
 def presets() -> dict[str, Path]:
-    """Return the YAML file of each preset by name."""
+    """Return preset name -> its YAML file."""
     package = Path(__file__).parents[1]
     inside = package / "configs"  # installed
     folder = inside if inside.is_dir() else package.parent / "configs"  # checkout
@@ -60,7 +60,7 @@ def presets() -> dict[str, Path]:
 
 
 def parse_override(override: str) -> dict[str, dict[str, Any]]:
-    """Return ``{section: {key: value}}`` of ``section.key=value``.
+    """Return ``{section: {key: value}}`` from the text ``section.key=value``.
 
     Raises:
         InputError: The text has another form.
@@ -89,10 +89,15 @@ def apply_changes(
     where: str,
     sections: Mapping[str, type[Section]] = _SECTIONS,
 ) -> None:
-    """Write ``{section: {key: value}}`` over values of that form.
+    """Overwrite settings in place with checked changes.
+
+    Args:
+        values: ``{section: {key: value}}`` with every setting; changed in place.
+        changes: ``{section: {key: value}}`` with some settings.
+        where: File or option that gave the changes; begins error messages.
 
     Raises:
-        InputError: As in `resolve`. The message begins with ``where``.
+        InputError: As in `resolve`.
     """
     for name, keys in _mapping(changes, where, "sections"):
         if name not in values:

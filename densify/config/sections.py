@@ -24,13 +24,13 @@ def within(default: float | None, low: float, high: float) -> Any:
 
 
 def one_of(*words: str) -> Any:
-    """Return a dataclass field for one of these words, the first by default."""
+    """Return a dataclass field for a choice of words, the first word by default."""
     return field(default=words[0], metadata={"words": words})
 
 
 @dataclass(frozen=True)
 class Section:
-    """The settings of one stage, checked whenever one is made."""
+    """The settings of one stage, checked on construction."""
 
     def __post_init__(self) -> None:
         for knob in fields(self):
@@ -39,13 +39,16 @@ class Section:
 
 
 def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
-    """Return the value as the type of its setting.
+    """Return a value converted to the type of its setting.
 
     Args:
-        where: File or option that the value comes from, for the message.
+        section: Section of the setting.
+        key: Name of the setting.
+        value: Value as given by the user.
+        where: File or option that gave the value; begins the message.
 
     Raises:
-        InputError: The type is another one, or the value is out of range.
+        InputError: The value has another type or is out of range.
     """
     knob = section.__dataclass_fields__[key]
     kind, _, optional = str(knob.type).partition(" | ")
@@ -73,7 +76,7 @@ def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
 
 @dataclass(frozen=True)
 class RegisterSettings(Section):
-    """The pose of the lidar at every sweep."""
+    """Settings for the pose of the lidar at every sweep."""
 
     source: str = one_of("kiss-icp", "dataset")
     voxel_size_m: float = within(0.5, 0.05, 10)
@@ -92,7 +95,7 @@ class RegisterSettings(Section):
 
 @dataclass(frozen=True)
 class FlowSettings(Section):
-    """The motion of points."""
+    """Settings for scene flow."""
 
     engine: str = "groups"
     look_around_s: float | None = within(None, 0, 5)
@@ -102,13 +105,14 @@ class FlowSettings(Section):
         check_engine_spec(self.engine)
 
     def around(self, points_per_s: float) -> tuple[float, float]:
-        """Return the time around the window, and the time between the sweeps to search there.
+        """Return how far around the window motion is searched, and at which spacing of sweeps.
 
-        With few points, a single sweep shows little of a moving object, and every sweep counts.
+        Sparse sweeps show little of a moving object, so every sweep is searched, farther around.
 
-        points_per_s: of the scanner.
+        points_per_s: point rate of the scanner.
 
-        Returns ``look_around_s``, where null as the scanner needs it; and seconds, 0 for all.
+        Returns seconds on each side of the window (``look_around_s`` unless null), and seconds
+        between the searched sweeps, 0 for every sweep.
         """
         few = points_per_s < _FEW_POINTS_PER_S
         needed_s, step_s = (_AROUND_FEW_S, 0.0) if few else (_AROUND_S, _AROUND_S)
@@ -117,7 +121,7 @@ class FlowSettings(Section):
 
 @dataclass(frozen=True)
 class ObjectiveSettings(Section):
-    """The published objective: engine paper, and the flow of two files without static_prior."""
+    """Settings of engine paper; all but static_prior also apply to the flow of two point files."""
 
     solver: str = one_of("pcg", "adam")
     alpha: float = within(10.0, 0, 1e6)
@@ -127,7 +131,7 @@ class ObjectiveSettings(Section):
 
 @dataclass(frozen=True)
 class AccumulateSettings(Section):
-    """The accumulated cloud at the key's time."""
+    """Settings for the accumulated cloud at the key's time."""
 
     unfollowed: str = one_of("drop", "rigid")
     far_m: float = within(40.0, 0, 500)
@@ -135,7 +139,7 @@ class AccumulateSettings(Section):
 
 @dataclass(frozen=True)
 class ProjectSettings(Section):
-    """Depth maps of the accumulated cloud."""
+    """Settings for depth maps of the accumulated cloud."""
 
     at: str = one_of("camera", "sweep")
     per: str = one_of("sweep", "image")
@@ -157,14 +161,14 @@ class ProjectSettings(Section):
 
 @dataclass(frozen=True)
 class PriorSettings(Section):
-    """Depth images that the user brings (--prior), for pixels without a measurement."""
+    """Settings for depth images from the user (--prior), which complete unmeasured pixels."""
 
     kind: str = one_of("auto", "depth", "inverse")
 
 
 @dataclass(frozen=True)
 class OutputSettings(Section):
-    """Files beside those that every run writes."""
+    """Settings for files in addition to the files that every run writes."""
 
     flow: str = one_of("none", "npz")
     optical_flow: bool = False
@@ -176,7 +180,7 @@ class OutputSettings(Section):
 
 @dataclass(frozen=True)
 class Config:
-    """The whole configuration; ``Config()`` is the default one. Sections mirror the stages."""
+    """The whole configuration, one section per stage; ``Config()`` has the defaults."""
 
     register: RegisterSettings = RegisterSettings()
     flow: FlowSettings = FlowSettings()
@@ -188,9 +192,9 @@ class Config:
 
     @property
     def is_scored(self) -> bool:
-        """Return True if results have baselines and are scored with the key held out."""
+        """True if results have baselines and are scored against the held-out key sweep."""
         return self.output.score or self.output.report
 
     def scored(self) -> Config:
-        """Return the configuration with ``output.score``."""
+        """Return this configuration with ``output.score`` set."""
         return replace(self, output=replace(self.output, score=True))

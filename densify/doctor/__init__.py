@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Examine a recording before it is densified: find what may be wrong, and how to mend it.
+"""Examine a recording before it is densified: find probable errors and their remedies.
 
-A check is a function of the `Sample` and one line in `CHECKS`. It measures, and compares the
-recording as given with the recording under the usual mistakes.
+A check is a function of the `Sample` and one entry in `CHECKS`. It compares the recording as given
+with the recording corrected for each common mistake.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FETCH = "fetch these files again; windows end before sweeps that cannot be read
 
 
 def check_sweep_files(sample: Sample) -> list[Finding]:
-    """Compare the sizes of the sweeps' files, and name sweeps that cannot be read."""
+    """Report empty or short sweep files, and sweeps that cannot be read."""
     findings = []
     if sample.unreadable:
         frame, reason = next(iter(sample.unreadable.items()))
@@ -88,8 +88,8 @@ class Diagnosis:
     """The findings about a recording.
 
     Attributes:
-        sample: The sweeps that were examined.
-        findings: In the order of `CHECKS`.
+        sample: Sweeps that were examined.
+        findings: Findings in the order of `CHECKS`.
     """
 
     sample: Sample
@@ -97,17 +97,17 @@ class Diagnosis:
 
     @property
     def worst(self) -> Verdict:
-        """The worst verdict."""
+        """The most severe verdict."""
         return max((finding.verdict for finding in self.findings), default=Verdict.FINE)
 
 
 def examine(sequence: LidarSequence, config: Config) -> Diagnosis:
-    """Check a recording.
+    """Run all checks on a recording.
 
-    At most fifteen of its sweeps and some forty images are read, whatever its length.
+    At most 15 sweeps and about 40 images are read, whatever the length of the recording.
 
     Raises:
-        InputError: None of these sweeps can be read.
+        InputError: No sweep of the sample can be read.
     """
     sample = Sample.of(sequence, config.register)
     return Diagnosis(sample, tuple(found for check in CHECKS for found in check(sample)))

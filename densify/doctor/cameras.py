@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check cameras: existing images, and whether depth discontinuities are on image edges."""
+"""Check cameras: missing images, and whether depth discontinuities coincide with image edges."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from densify.geometry.types import Camera, Float, RegisteredSweep
 from densify.readers.timeline import format_frames
 
 _NEAREST_M, _FARTHEST_M = 3.0, 100.0
-_MOST_IMAGES, _LEAST_IMAGES = 36, 4  # of all cameras; of one, to tell
+_MOST_IMAGES, _LEAST_IMAGES = 36, 4  # of all cameras; of one camera for a verdict
 _CLEARLY = 1.25
-_AS_MANY = 0.5  # share of the edges at the given calibration; one object may match by chance
+_AS_MANY = 0.5  # least share of the edges visible as given; one object may match by chance
 _OFF_DEG, _WRONG_DEG, _UNSURE_DEG = 0.5, 0.75, 0.25  # an offset of 1 degree is 4 standard errors
 _CLOCK_OFF_S, _CLOCK_WRONG_S = 0.02, 0.05
 _LEAST_SPEED_M_S = 3.0
@@ -76,10 +76,13 @@ def _check_images(sample: Sample, camera: Camera) -> Finding:
 def camera_views(
     sample: Sample, camera: Camera, silhouettes: dict[int, Silhouettes]
 ) -> tuple[list[View], str]:
-    """Return sweeps of all registered spots with the nearest image, and why one cannot be read.
+    """Return views (a sweep and its nearest image) from all registered spots of the sample.
 
     Args:
-        silhouettes: Of the sweeps by frame, completed here.
+        silhouettes: Frame number -> depth discontinuities of that sweep; missing ones are added.
+
+    Returns:
+        The views, and the error message if an image cannot be read, else "".
     """
     exposed_ns = sample.sequence.image_stamps_ns(camera.name)
     numbers, stamps_ns = list(exposed_ns), np.array([*exposed_ns.values()], np.int64)
@@ -108,7 +111,7 @@ def camera_views(
 
 
 def _silhouettes(registered: RegisteredSweep) -> Silhouettes:
-    """Return the depth discontinuities that each scanner observes, in the lidar frame."""
+    """Return the depth discontinuities of a sweep, found per scanner, in the lidar frame."""
     sweep, parts = registered.sweep, []
     for lidar in map(int, np.unique(sweep.lidar)):
         origin_m, axes = sweep.origin_m(lidar), sweep.axes(lidar)
@@ -120,7 +123,7 @@ def _silhouettes(registered: RegisteredSweep) -> Silhouettes:
 
 
 def alternatives(T: Float) -> dict[str, Float]:
-    """Return the name of each usual mistake and ``T_cam_lidar`` (4,4) without it."""
+    """Return the name of each common mistake -> the corrected ``T_cam_lidar`` (4,4)."""
     turned = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     return {
         "the inverse of the given pose (T_lidar_cam instead of T_cam_lidar)": poses.inverse(T),
@@ -131,7 +134,7 @@ def alternatives(T: Float) -> dict[str, Float]:
 
 
 def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
-    """Compare calibration and clock as given with the best around them and with usual mistakes."""
+    """Compare the score of the given calibration with nearby offsets and with common mistakes."""
     name, num = f"{camera.name}: calibration", len(views)
     if num < _LEAST_IMAGES:
         text = f"{num} images near registered sweeps, {_LEAST_IMAGES} are needed to tell"
@@ -170,7 +173,7 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
 
 
 def _described(camera: Camera, fit: Fit, verdict: Verdict, num: int) -> tuple[str, str]:
-    """Return by how much the calibration is off, and the corrected line."""
+    """Return a sentence with the error of the calibration, and the corrected line as remedy."""
     ways = (("higher", "lower"), ("farther right", "farther left"), ("clockwise", "anticlockwise"))
     turns = [
         f"{abs(turn):.2f} ± {error:.2f} deg {way[int(turn < 0)]}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check the stamps of sweeps and points: order, gaps, unit, span, and whether they deskew."""
+"""Check the stamps of sweeps and points: order, holes, unit, span, and effect on deskewing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 from densify.readers.timeline import format_frames
 
-_PERIODS_S = (0.015, 1.1)  # of scanners that are built: 50 Hz to 1 Hz
+_PERIODS_S = (0.015, 1.1)  # range of existing scanners, 50 Hz to 1 Hz
 _HOLE_PERIODS = 3.1
 _UNITS = {
     "seconds taken for nanoseconds": 1e9,
@@ -30,7 +30,7 @@ _LEAST_HEIGHT_M = 0.5
 _CLOSE_M = 1.0
 _LEAST_POINTS = 50
 _CLEARLY, _TOLD = 1.2, 1.05
-_WHOLE_SWEEP = (0.5, 1.5)  # of a period: from the first to the last point
+_WHOLE_SWEEP = (0.5, 1.5)  # plausible time from first to last point, in periods
 
 
 def check_stamps(sample: Sample) -> list[Finding]:
@@ -84,7 +84,7 @@ def _rate(period_s: float) -> Finding:
 
 
 def check_point_times(sample: Sample) -> list[Finding]:
-    """Check the share of a period that the firing times within a sweep span."""
+    """Check that the firing times within a sweep span about one period."""
     findings, sweeps = [], [spot.sweeps[spot.middle] for spot in sample.spots]
     period_s = sample.timeline.period_ns * 1e-9
     if len(sample.timeline.frames) < 2 or any(s.offset_ns is None for s in sweeps):
@@ -111,7 +111,7 @@ def check_point_times(sample: Sample) -> list[Finding]:
 
 
 def check_deskewing(sample: Sample) -> list[Finding]:
-    """Compare the alignment of sweeps with the point times given, reversed and left out."""
+    """Compare how well sweeps align with the point times as given, reversed, and left out."""
     spot = sample.fastest
     if spot is None or spot.sweeps[0].offset_ns is None:
         return []
@@ -142,9 +142,9 @@ def check_deskewing(sample: Sample) -> list[Finding]:
 
 
 def _apart_m(spot: Spot) -> float:
-    """Return the median distance (m) of near points above the ground between last and first sweep.
+    """Return the median distance (m) between the first and the last registered sweep of a spot.
 
-    It is 1 m if they cannot be registered.
+    Only near points above the ground count. It is 1 m if the sweeps cannot be registered.
     """
     if spot.trajectory is None:
         return _CLOSE_M

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Fit the direction and the clock of a camera: depth discontinuities of sweeps to edges of images.
+"""Fit the rotation and the clock of a camera: depth discontinuities of sweeps to image edges.
 
 Levinson and Thrun, "Automatic Online Calibration of Cameras and Lasers", RSS 2013, with two
-additions. Upright silhouettes are compared with changes of the image to the side, level ones with
-changes up and down, so pitch is observable as well as yaw. The error of the best fit is that of an
-M-estimator (Huber, "The behavior of maximum likelihood estimates under nonstandard conditions",
+additions. Vertical silhouettes are compared with horizontal image gradients, and level silhouettes
+with vertical gradients, so pitch is observable as well as yaw. The error of the best fit is that of
+an M-estimator (Huber, "The behavior of maximum likelihood estimates under nonstandard conditions",
 1967): the curvature of the score, and the spread of its slope over the images.
 """
 
@@ -25,8 +25,8 @@ from densify.geometry.types import Bool, Camera, Float, Float32
 _NEAREST_M, _FARTHEST_M = 3.0, 50.0
 _EDGE_M, _EDGE_SHARE = 0.6, 0.08
 _ROW_RAD = np.deg2rad(0.1)  # finer than any scanner's rings
-_APART_RAD = np.deg2rad(1.5)  # of neighbouring returns, at most, to tell the edge between them
-_FOCAL_PX = 700.0  # of images as they are compared
+_APART_RAD = np.deg2rad(1.5)  # greatest angle between neighbouring returns at an edge
+_FOCAL_PX = 700.0  # focal length to which images are resized
 _NOISE_PX, _BLUR_PX, _AROUND_PX = 0.8, 2.0, 25.0
 _MOST_STRENGTH = 4.0
 _REACH, _STEP = (2.7, 2.7, 2.0, 0.2), (0.3, 0.3, 1.0, 0.05)  # degrees and seconds of the grid
@@ -35,11 +35,12 @@ _NUM_ON_GRID, _NUM_STARTS, _NUM_HALVINGS = 4000, 4, 4
 
 
 class Silhouettes(NamedTuple):
-    """Depth discontinuities of a sweep.
+    """E depth discontinuities of a sweep.
 
     Attributes:
-        places: (E,3) metres, on the near surface, half way to the far one as the scanner sees it.
-        is_level: (E,) the far surface is above or below, else beside.
+        places: (E,3) metres, lidar frame: at the range of the near surface, in the direction
+            halfway between the near and the far return.
+        is_level: (E,) bool, True if the far surface is above or below, False if beside.
     """
 
     places: Float
@@ -47,14 +48,14 @@ class Silhouettes(NamedTuple):
 
 
 class View(NamedTuple):
-    """An image and the depth discontinuities of a sweep near it.
+    """An image and the depth discontinuities of a sweep near it in time.
 
     Attributes:
-        silhouettes: The depth discontinuities.
-        strength: (2,H,W) of image edges beyond the mean: changes to the side, then up and down.
-        scale: Of the image that is compared.
-        twist: (6,) of the lidar, per second.
-        exposed_s: Since the reference time of the sweep.
+        silhouettes: Depth discontinuities.
+        strength: (2,H,W) image gradient (horizontal, then vertical) minus its mean.
+        scale: Size of the resized image divided by the size of the original.
+        twist: (6,) velocity of the lidar (rad/s, m/s), lidar frame.
+        exposed_s: Stamp of the image minus the reference time of the sweep.
     """
 
     silhouettes: Silhouettes
@@ -65,15 +66,15 @@ class View(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """The offset of a camera with which its views fit best.
+    """The best-fitting offset of a camera's rotation and clock.
 
     Attributes:
         offset: (4,) degrees about the camera's x (pitch), y (yaw) and z (roll), and seconds from
             the stamps of the images to their exposure.
-        error: (4,) its standard error, infinite if the views do not determine it.
-        score: Sum of the image's edges on depth discontinuities there.
-        rival: Best score more than a degree or 0.1 s beside.
-        usual: Median score of all offsets.
+        error: (4,) standard error of the offset, infinite if the views do not determine it.
+        score: Sum of image gradients at the depth discontinuities with this offset.
+        rival: Best score with an offset more than 1 degree or 0.1 s away.
+        usual: Median score of all offsets on the grid.
     """
 
     offset: Float
@@ -84,15 +85,18 @@ class Fit(NamedTuple):
 
     @property
     def clearness(self) -> float:
-        """The height of the best score above the usual one, as a multiple of the rival's."""
+        """Height of the best score above the median, divided by the height of the rival."""
         return (self.score - self.usual) / max(self.rival - self.usual, 1e-9)
 
 
 def depth_edges(points: Float) -> Silhouettes:
-    """Return the depth discontinuities of one scanner's points (N,3), in its frame.
+    """Return the depth discontinuities of one scanner's points.
 
-    A point is on an edge if its inverse range is above the line through both neighbours'. Along a
-    plane inverse range is linear at any slant, so neither the far road nor a fence has edges.
+    A return is at an edge if its inverse range lies above the line through both neighbours. On a
+    plane inverse range is linear at any slant, so neither a distant road nor a fence gives edges.
+
+    Args:
+        points: (N,3) metres, in the scanner's own frame and axes.
     """
     x, y, z = points.T
     range_m = np.linalg.norm(points, axis=1)
@@ -122,7 +126,7 @@ def depth_edges(points: Float) -> Silhouettes:
 
 
 def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, float]:
-    """Return `View.strength` and `View.scale` of an image (H,W,3)."""
+    """Return `View.strength` and `View.scale` of an (H,W,3) RGB image."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     scale = _FOCAL_PX / focal_px
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -138,23 +142,23 @@ def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, flo
 
 
 def turned(camera: Camera, offset: Float) -> Camera:
-    """Return the camera with the turn of an offset (4,) put right."""
+    """Return the camera with its rotation corrected by an offset (4,), as in `Fit`."""
     turn = poses.exp(np.append(np.deg2rad(offset[:3]), np.zeros(3)))
     return replace(camera, T_cam_lidar=turn @ camera.T_cam_lidar)
 
 
 def score(camera: Camera, views: Sequence[View]) -> tuple[float, int]:
-    """Return the sum of image edges at depth discontinuities, and the number of those in view."""
+    """Return the sum of image gradients at depth discontinuities, and the number in view."""
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
     total = sum(float(line.scores(np.zeros((1, 4)))[0]) for line in lines)
     return total, sum(len(line.uv) for line in lines)
 
 
 def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
-    """Return the best fit of two or more views.
+    """Return the best fit of a camera to two or more views.
 
     Args:
-        with_clock: Else the delay is taken as 0.
+        with_clock: Fit the delay of the images too, else it is 0.
     """
     free = np.array([True, True, True, with_clock])
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
@@ -177,7 +181,7 @@ def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
 
 
 def _grid(free: Bool) -> Float:
-    """Return (M,4) all pitches and yaws with each roll, and with each delay."""
+    """Return (M,4) offsets: all pitches and yaws, combined with each roll, then with each delay."""
     axes = [np.arange(-r, r + s / 2, s) for r, s in zip(_REACH, _STEP, strict=True)]
     parts = []
     for axis in (2, 3):
@@ -188,13 +192,13 @@ def _grid(free: Bool) -> Float:
 
 
 class _Lines(NamedTuple):
-    """The depth discontinuities of a view in the image that is compared.
+    """The E depth discontinuities of a view, projected into the resized image.
 
     Attributes:
-        uv: (E,2) px.
-        slope: (E,2,4) px for a degree and a second.
-        is_level: (E,) as of `Silhouettes`.
-        strength: (2,H+2,W+2), 0 around.
+        uv: (E,2) pixels.
+        slope: (E,2,4) change of ``uv`` per degree and per second of the offset.
+        is_level: (E,) as in `Silhouettes`.
+        strength: (2,H+2,W+2) image gradient, padded with 0.
     """
 
     uv: Float
@@ -204,7 +208,7 @@ class _Lines(NamedTuple):
 
     @staticmethod
     def of(camera: Camera, view: View, offset: Float) -> _Lines:
-        """Return the edges in the image with an offset (4,)."""
+        """Return the discontinuities in view, projected with an offset (4,)."""
 
         def project(more: Float) -> tuple[Float, Bool]:
             seen_s = view.exposed_s + offset[3] + more[3]
@@ -228,11 +232,11 @@ class _Lines(NamedTuple):
         )
 
     def scores(self, offsets: Float, thin: int = 1) -> Float:
-        """Return (M,) the sum of image edges at the depth discontinuities moved by offsets.
+        """Return (M,) sums of image gradients at the discontinuities, for M offsets.
 
         Args:
-            offsets: (M,4) as of `Fit`.
-            thin: Every ``thin``-th discontinuity is used.
+            offsets: (M,4) as in `Fit`.
+            thin: Only every ``thin``-th discontinuity is used.
         """
         height, width = self.strength.shape[1:]
         uv, slope = self.uv[::thin], self.slope[::thin]
@@ -247,12 +251,12 @@ def _sum(lines: Sequence[_Lines], offset: Float) -> float:
 
 
 def _is_beside(offsets: Float, other: Float) -> Any:
-    """Return where offsets are more than a degree of pitch or yaw, or 0.1 s, from another one."""
+    """Return True for offsets more than 1 degree of pitch or yaw, or 0.1 s, from another offset."""
     return (np.abs(offsets - other)[..., [0, 1, 3]] > (1.0, 1.0, 0.1)).any(axis=-1)
 
 
 def _climbed(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
-    """Return the offset (4,) of the highest score near one."""
+    """Return the offset (4,) of the local maximum of the score near a start."""
     sides = np.concatenate([np.eye(4)[free], -np.eye(4)[free]])
     best = _sum(lines, offset)
     for halving in range(_NUM_HALVINGS):
@@ -266,7 +270,7 @@ def _climbed(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
 
 
 def _error(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
-    """Return (4,) the standard error of the best offset, 0 where nothing is free."""
+    """Return (4,) the standard error of the best offset, 0 for parameters that are not fitted."""
     axes = np.flatnonzero(free)
     steps = np.eye(4)[axes] * _BLURRED
     num, pairs = len(axes), [(i, j) for i in range(len(axes)) for j in range(i)]

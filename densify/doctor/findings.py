@@ -11,7 +11,7 @@ from enum import IntEnum
 class Verdict(IntEnum):
     """The severity of a finding.
 
-    UNKNOWN: the recording does not show it, for instance because the vehicle stands.
+    UNKNOWN: the recording allows no verdict, for instance because the vehicle is at rest.
     """
 
     FINE = 0
@@ -32,10 +32,11 @@ class Finding:
     """The result of one check.
 
     Attributes:
-        check: Subject, such as "stamps".
-        evidence: One sentence with the number that the verdict rests on.
-        remedy: The option or line that mends it; empty if nothing is wrong.
-        values: The numbers by name, with units in the names.
+        check: Name of the checked property, such as "stamps".
+        verdict: Severity.
+        evidence: Sentence with the number on which the verdict is based.
+        remedy: Option or line that corrects the error; empty if the verdict is FINE or UNKNOWN.
+        values: Name (with unit) -> measured number.
     """
 
     check: str
@@ -48,5 +49,5 @@ class Finding:
 def finding(
     check: str, verdict: Verdict, evidence: str, remedy: str = "", **values: Value
 ) -> Finding:
-    """Return a finding, without the remedy unless something may be wrong."""
+    """Return a finding, with the remedy only if the verdict is SUSPICIOUS or WRONG."""
     return Finding(check, verdict, evidence, remedy if verdict >= SUSPICIOUS else "", values)

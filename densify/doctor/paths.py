@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Compare the recording's poses with the path that odometry finds from the sweeps alone."""
+"""Compare the recording's poses with odometry from the sweeps."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 from densify.readers.recorded_poses import PoseTrack
 
-# Of registration over a spot of five sweeps; 1 % of the way doubles surfaces by 0.1 m in 10 m.
+# Tolerance over a spot of five sweeps; an error of 1 % shifts surfaces by 0.1 m over 10 m.
 _OFF_M, _OFF_PER_M, _OFF_DEG = 0.03, 0.01, 0.3
-_LEAST_WAY_M = 1.5  # 3 % of it are more than is allowed
-_WRONG = 4.0  # times what is allowed
+_LEAST_WAY_M = 1.5  # an error of 3 % of this distance exceeds the tolerance
+_WRONG = 4.0  # as a multiple of the tolerance
 _CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.3, 0.02, 0.04
-_CLOCK_TOLD_S = 0.1  # a period of most scanners; a wider interval tells nothing
+_CLOCK_TOLD_S = 0.1  # a period of most scanners; a wider interval gives no verdict
 _NOISE_M, _NOISE_RAD, _EVEN_COST = 0.05, 1.5e-3, 4.0
 _MUCH_BETTER = 0.4
 CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
@@ -30,7 +30,7 @@ CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
 def changed(
     rotation: Callable[[Float], Float] = np.copy, scale: float = 1.0
 ) -> Callable[[Float], Float]:
-    """Return a change of (4,4) poses: of their (3,3) rotations, and a scale of translations."""
+    """Return a function that maps the rotation and scales the translation of poses (4,4)."""
 
     def change(T: Float) -> Float:
         new = np.eye(4)
@@ -41,7 +41,7 @@ def changed(
 
 
 def _rolled(by: int) -> Callable[[Float], Float]:
-    """Return a change of rotations, as if their quaternions were read in another order."""
+    """Return a function on rotations (3,3) that shifts the order of their quaternion's elements."""
     return lambda R: Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), by)).as_matrix()
 
 
@@ -54,11 +54,11 @@ HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
     "their quaternions are w x y z, read as x y z w": changed(_rolled(1)),
     "their rotations are transposed": changed(np.transpose),
 }
-"""The usual mistakes of poses, each with the change (4,4) -> (4,4) that mends it."""
+"""Common mistake of poses -> the function (4,4) -> (4,4) that corrects it."""
 
 
 def check_poses(sample: Sample) -> list[Finding]:
-    """Compare the poses as given, and as under each of `HYPOTHESES`, with odometry."""
+    """Compare the poses as given, and corrected for each of `HYPOTHESES`, with odometry."""
     spots = sample.registered
     try:
         given = [[sample.sequence.T_world_lidar(end.frame) for end in _ends(s)] for s in spots]
@@ -93,7 +93,7 @@ def check_poses(sample: Sample) -> list[Finding]:
 
 
 def _described(given: list[Float], found: list[Float], spots: list[Spot]) -> tuple[str, str]:
-    """Return the main error of the poses over the spots, scale or drift, and its correction."""
+    """Return the main error of the poses, scale or drift, as text, and its correction."""
     given_m, found_m = (np.array([T[:3, 3] for T in steps]) for steps in (given, found))
     off_m, way_m = (given_m - found_m).mean(axis=0), found_m.mean(axis=0)
     if np.linalg.norm(off_m) < 0.5 * np.linalg.norm(given_m - found_m, axis=1).mean():
@@ -110,10 +110,10 @@ def _described(given: list[Float], found: list[Float], spots: list[Spot]) -> tup
 
 
 def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
-    """Measure the difference between the clocks of poses and sweeps.
+    """Measure the time shift between the poses and the sweeps.
 
-    It is the shift with which the poses agree best with odometry. It shows where the vehicle turns
-    or changes its speed.
+    It is the shift at which the poses agree best with odometry. It is observable only where the
+    vehicle turns or changes its speed.
     """
     late_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
     cost, num_used = np.zeros(len(late_s)), 0
@@ -145,7 +145,7 @@ def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
 
 
 def _track(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:
-    """Return the recording's poses around a spot, None at its ends, or if one is missing."""
+    """Return the recording's poses around a spot; None at its ends or if a pose is missing."""
     reach_ns = int(1e9 * _CLOCK_S)
     timeline = sample.timeline
     frames = timeline.within(first_ns - 2 * reach_ns, last_ns + 2 * reach_ns)
@@ -168,12 +168,13 @@ def _between(pair: list[Float]) -> Float:
 
 
 class _Off(NamedTuple):
-    """Errors of relative poses against those found.
+    """Errors of the given relative poses against odometry.
 
     Attributes:
-        m, deg: The median over the spots.
-        cost: Their larger share of the tolerance.
-        way_m: The longest way.
+        m: Median translation error over the spots.
+        deg: Median rotation error over the spots.
+        cost: The larger error, as a multiple of its tolerance.
+        way_m: Longest distance driven within a spot.
     """
 
     m: float

@@ -17,7 +17,7 @@ _MEDIAN_RANGE_M = (1.5, 60.0)
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
 _CELL_M, _CLOSE_M = 0.1, 6.0
 _LEAST_OWN = 20
-_LEAST_WITHOUT = 0.005  # of the rows
+_LEAST_WITHOUT = 0.005  # share of the rows
 _NEAR_M = 25.0
 _UP = {
     sign + axis: (-1.0 if sign else 1.0) * np.eye(3)["xyz".index(axis)]
@@ -30,13 +30,13 @@ _UP_MEANS = {
     "y": "y up",
 }
 _LAYER_M, _LEAST_LEVEL, _FEW_BELOW = 0.3, 0.08, 0.2
-_HIGHEST_M = 0.3  # where points are in a vehicle's frame the road is at 0
+_HIGHEST_M = 0.3  # in a vehicle frame the road is at height 0
 _CLEARLY = 1.5
-_FAR_OFF = 10.0  # times as far as the points are apart
+_FAR_OFF = 10.0  # distance from the origin, as a multiple of the spread of the points
 
 
 def check_units(sample: Sample) -> list[Finding]:
-    """Check that the points are in metres, and around the scanner."""
+    """Check that the points are in metres and that the scanner is at the origin."""
     name, (least_m, most_m) = "unit of points", _MEDIAN_RANGE_M
     middle = [spot.sweeps[spot.middle].points for spot in sample.spots]
     range_m = float(np.median([_median_range_m(points) for points in middle]))
@@ -64,9 +64,9 @@ def _median_range_m(points: Float) -> float:
 
 
 def check_axes(sample: Sample) -> list[Finding]:
-    """Check the axis that points up.
+    """Check that z points up.
 
-    A layer along it holds most returns, and hardly any are below the layer.
+    Along the vertical axis one layer, the ground, holds most returns and few returns are below it.
     """
     level = {name: _ground_share(sample, up) for name, up in _UP.items()}
     best = max(level, key=lambda name: level[name])
@@ -86,10 +86,10 @@ def check_axes(sample: Sample) -> list[Finding]:
 
 
 def _ground_share(sample: Sample, up: Float) -> float:
-    """Return the share of the near returns in the fullest layer with few returns below it.
+    """Return the share of near returns in the fullest layer with few returns below it.
 
-    The layer is not above the origin. Few means: relative to an even spread over all heights. The
-    result is the median over the spots.
+    The layer must not be above the origin. The share counts in excess of an even spread over all
+    heights. The result is the median over the spots.
     """
     shares = []
     for spot in sample.spots:
@@ -111,7 +111,7 @@ def _ground_share(sample: Sample, up: Float) -> float:
 def check_own_vehicle(sample: Sample) -> list[Finding]:
     """Check for returns of the vehicle that carries the scanner.
 
-    They are at the same place in sweeps far apart in time, while the vehicle drives.
+    While the vehicle drives, these returns stay at the same position in the lidar frame.
     """
     moving = [
         spot
@@ -134,9 +134,9 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
 
 
 def _own_returns(spots: list[Spot]) -> tuple[float, int]:
-    """Return the distance of these returns, and their number in a sweep.
+    """Return the range (m) of the farthest own-vehicle returns, and their number of 0.1 m cells.
 
-    Ground looks the same everywhere too. Therefore the lowest layer does not count.
+    The lowest layer is excluded, because ground is at the same position in all sweeps too.
     """
     cells = []
     for sweep in [s for spot in spots for s in (spot.sweeps[0], spot.sweeps[-1])]:
@@ -157,7 +157,7 @@ def _own_returns(spots: list[Spot]) -> tuple[float, int]:
 
 
 def check_intensity(sample: Sample) -> list[Finding]:
-    """Check that reflectances are from 0 to 1."""
+    """Check that intensities are between 0 and 1."""
     values = np.concatenate([spot.sweeps[spot.middle].intensity for spot in sample.spots])
     low, high = float(values.min()), float(values.max())
     text, is_fine = f"{low:g} to {high:g}", low >= 0 and high <= 1
@@ -169,7 +169,7 @@ def check_intensity(sample: Sample) -> list[Finding]:
 
 
 def check_sensors(sample: Sample) -> list[Finding]:
-    """Describe each scanner as the pipeline models it."""
+    """Describe each scanner as the pipeline models it: rings, field of view, number of returns."""
     spot = sample.fastest
     if spot is None:
         return []

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Check the rings of a spinning scanner.
 
-They are cones about its own axis only for points relative to its position at their firing.
+They are cones about its spin axis only if each point is given relative to the scanner's position
+at its firing.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ _REACH_M = np.array([3.0, 0.8, 2.4])
 _GRID_M = (0.5, 0.4, 0.05)
 _COARSE_FROM_M, _COARSE_POINTS, _COARSE_BINS, _NUM_STARTS = 18.0, 3000, 3, 8
 _FINER = ((0.1, 3), (0.05, 2), (0.02, 1))  # step in metres, bins
-# KITTI's HDL-64E, with two separate blocks of lasers, is sharpest 0.2 m higher.
+# The rings of KITTI's HDL-64E, with two separate blocks of lasers, are sharpest from 0.2 m above.
 _OFF_M = 0.3
 
 
 def check_rings(sample: Sample) -> list[Finding]:
-    """Check the position of each scanner, and that its sweeps are as they were fired."""
+    """Check the position of each scanner, and that its sweeps are not motion-compensated yet."""
     findings = []
     for lidar in sample.lidars:
         R = sample.spots[0].sweeps[0].axes(lidar)  # rings are level in the scanner's own axes
@@ -51,9 +52,9 @@ def check_rings(sample: Sample) -> list[Finding]:
 def _check_compensation(
     sample: Sample, lidar: int, R: Float, origins_m: tuple[Float, Float]
 ) -> Finding:
-    """Check that the motion within a sweep is not removed already.
+    """Check that the motion within a sweep is not compensated already.
 
-    R: into the scanner's axes. origins_m: possible positions of the scanner.
+    R: (3,3) from lidar to scanner axes. origins_m: candidate positions (3,) in scanner axes.
     """
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     spot = sample.fastest
@@ -100,7 +101,7 @@ def _check_compensation(
 
 
 def _still_points(sample: Sample, lidar: int) -> Float:
-    """Return (N,3) returns of one scanner from all spots."""
+    """Return (N,3) returns of one scanner, lidar frame, from the middle sweeps of all spots."""
     parts = []
     for spot in sample.spots:
         sweep = spot.sweeps[spot.middle]
@@ -110,9 +111,9 @@ def _still_points(sample: Sample, lidar: int) -> Float:
 
 
 def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: Float) -> Finding:
-    """Compare the given and the found position of a scanner.
+    """Compare the given with the found position of a scanner.
 
-    All are in the scanner's axes, into which R turns those of the lidar frame.
+    points, given_m and found_m are in the scanner's axes, to which R turns the lidar axes.
     """
     name = "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
     given, found = sharpness(points, given_m), sharpness(points, found_m)
@@ -138,10 +139,10 @@ def _text(place_m: Float) -> str:
 
 
 def found_origin(points: Float, start_m: Float) -> Float:
-    """Return (3,) the position with the sharpest rings.
+    """Return (3,) the position from which the rings are sharpest, in the axes of the points.
 
-    The search covers 3 m ahead and behind a position, 0.8 m aside, 2.4 m above and below. Heights
-    have fine steps, because they move every ring.
+    The search covers 3 m ahead and behind a start position, 0.8 m aside, 2.4 m above and below.
+    Heights have fine steps, because the height changes every ring.
     """
     axes = [np.arange(-r, r + 1e-9, step) for r, step in zip(_REACH_M, _GRID_M, strict=True)]
     grid = start_m + np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Select the sweeps to examine: few, from all over the recording, registered by odometry."""
+"""Select a few sweeps from the whole recording to examine, and register them by odometry."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ _STEP_S = 0.1
 
 @dataclass(frozen=True)
 class Spot:
-    """A few consecutive sweeps.
+    """A few consecutive sweeps at one position in the recording.
 
     Attributes:
-        sweeps: As read, own vehicle included.
-        trajectory: None if they cannot be registered, for the reason in ``failure``.
+        sweeps: Raw sweeps, own vehicle included.
+        trajectory: Poses by odometry; None if registration failed.
+        failure: Reason of the failure.
     """
 
     sweeps: tuple[Sweep, ...]
@@ -35,17 +36,17 @@ class Spot:
 
     @cached_property
     def stretch(self) -> Stretch:
-        """The sweeps deskewed, in the odometry's world; empty without registration."""
+        """The sweeps deskewed, in the world of odometry; empty if registration failed."""
         return Stretch(()) if self.trajectory is None else deskew(self.sweeps, self.trajectory)
 
     @property
     def middle(self) -> int:
-        """The row of the sweep in the middle."""
+        """Index of the middle sweep."""
         return len(self.sweeps) // 2
 
     @property
     def twist(self) -> Float:
-        """The (6,) rad/s and m/s in the middle, lidar frame; zeros if it is not registered."""
+        """(6,) velocity (rad/s, m/s) at the middle sweep, lidar frame; 0 if registration failed."""
         if self.trajectory is None:
             return np.zeros(6)
         sweep = self.stretch.sweeps[self.middle]
@@ -53,11 +54,11 @@ class Spot:
 
     @property
     def speed_m_s(self) -> float:
-        """The speed in the middle."""
+        """Speed at the middle sweep."""
         return float(np.linalg.norm(self.twist[3:]))
 
     def too_slow(self, least_m_s: float) -> str:
-        """Return a sentence that a check needs a faster vehicle."""
+        """Return the sentence that a check needs a faster vehicle."""
         return (
             f"the vehicle drives at {self.speed_m_s:.1f} m/s where it was looked at, "
             f"{least_m_s:g} are needed"
@@ -70,10 +71,10 @@ class Sample:
 
     Attributes:
         sequence: The recording.
-        timeline: Times of its sweeps.
-        spots: In order of time.
-        unreadable: Frame -> reason for which a chosen sweep could not be read.
-        settings: Of the registration.
+        timeline: Reference times of all its sweeps.
+        spots: Groups of consecutive sweeps, ascending in time.
+        unreadable: Frame number -> reason why a chosen sweep could not be read.
+        settings: Settings of registration.
     """
 
     sequence: LidarSequence
@@ -84,7 +85,7 @@ class Sample:
 
     @staticmethod
     def of(sequence: LidarSequence, settings: RegisterSettings) -> Sample:
-        """Read and register spots at the start, in the middle and at the end."""
+        """Read and register spots at the start, in the middle and at the end of the recording."""
         timeline = Timeline.of(sequence)
         unreadable: dict[int, str] = {}
         spots = []
@@ -104,22 +105,22 @@ class Sample:
 
     @property
     def lidars(self) -> list[int]:
-        """Return the numbers of the scanners."""
+        """Indices of the scanners."""
         return sorted({int(n) for s in self.spots for n in np.unique(s.sweeps[s.middle].lidar)})
 
     @property
     def registered(self) -> list[Spot]:
-        """Return the spots that could be registered."""
+        """Spots whose registration succeeded."""
         return [spot for spot in self.spots if spot.trajectory is not None]
 
     @property
     def fastest(self) -> Spot | None:
-        """The registered spot with the fastest vehicle."""
+        """Registered spot with the highest speed; None if there is none."""
         return max(self.registered, key=lambda spot: spot.speed_m_s, default=None)
 
 
 def _chosen(timeline: Timeline) -> list[list[int]]:
-    """Return the frames of each spot: sweeps about 0.1 s apart; none twice."""
+    """Return the frame numbers of each spot: disjoint groups of sweeps about 0.1 s apart."""
     frames = timeline.frames
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
     length = min(len(frames), stride * (_NUM_SWEEPS - 1) + 1)
@@ -129,7 +130,7 @@ def _chosen(timeline: Timeline) -> list[list[int]]:
 
 
 def spot_of(sweeps: tuple[Sweep, ...], settings: RegisterSettings) -> Spot:
-    """Return a spot of sweeps, registered by odometry if possible."""
+    """Return a spot of these sweeps, registered by odometry if possible."""
     if len(sweeps) < 2:
         return Spot(sweeps, None, "one sweep alone cannot be registered")
     try:

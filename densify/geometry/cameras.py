@@ -294,8 +294,8 @@ def _slopes(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float, Float]:
     """Return three (N,) partial derivatives of the distortion on the plane.
 
     Returns:
-        Derivative of the distorted x by x; of the distorted x by y, which equals that of the
-        distorted y by x; and of the distorted y by y.
+        Derivative of the distorted x by x, of the distorted x by y (equal to the derivative of
+        the distorted y by x), and of the distorted y by y.
     """
     s, n, d = x**2 + y**2, lens.numerator, lens.denominator
     factor = n(s) / d(s)

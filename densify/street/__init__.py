@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The built-in street: a lidar and camera simulator with exact truth, made from a seed."""
+"""The built-in street: a seeded lidar and camera simulator with exact ground truth."""

@@ -34,10 +34,11 @@ _PAINTS: tuple[Tint, ...] = (
 
 @dataclass(frozen=True)
 class Actor:
-    """An object of the street.
+    """An object of the street, such as a car or a pedestrian.
 
     Attributes:
-        bodies: Its rigid parts. The first `num_solid` of them count for collisions.
+        name: Kind of the object.
+        bodies: Rigid parts. Only the first `num_solid` parts are tested for collisions.
     """
 
     name: str
@@ -72,7 +73,7 @@ def _panels(low: Float, high: Float) -> Float:
 
 
 def _both_sides(left: Float, material: Material, tint: Tint = WHITE) -> Mesh:
-    """Return (2K,4,3) quads: those on the left, and their mirror images on the right."""
+    """Return a mesh of (K,4,3) quads on the left and their mirror images on the right."""
     right = left * [1.0, -1.0, 1.0]
     return Mesh.quads(np.concatenate([left, right]), material, tint)
 

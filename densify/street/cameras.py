@@ -39,11 +39,11 @@ T_FISHEYE_LIDAR = np.array(  # on the left of the roof, facing left
 
 
 class Shutter(NamedTuple):
-    """The times at which a camera exposes.
+    """The exposure times of a camera.
 
     Attributes:
-        delay_ns: Time of the first image after frame 0's reference time.
-        period_ns: Time from image to image; None for one image with each sweep.
+        delay_ns: Exposure of the first image minus frame 0's reference time.
+        period_ns: Time between images; None for one image per sweep.
     """
 
     delay_ns: int
@@ -86,14 +86,14 @@ USUAL = ("image_02", "image_03")
 
 
 def T_level_lidar(tilt_deg: float) -> Float:
-    """Return (4,4) the pose of the lidar frame of a tilted mount in that of a level mount."""
+    """Return the (4,4) pose of a lidar with a tilted mount in the frame of a level mount."""
     return inverse(T_ego_lidar()) @ T_ego_lidar(tilt_deg)
 
 
 def cameras_beside(tilt_deg: float, names: tuple[str, ...] = USUAL) -> dict[str, Camera]:
-    """Return the cameras in the lidar frame of a tilted mount.
+    """Return the cameras, with poses relative to the lidar frame of a tilted mount.
 
-    The cameras themselves stay where they are on the vehicle.
+    Tilting the lidar does not move the cameras on the vehicle.
     """
     T = T_level_lidar(tilt_deg)
     return {n: replace(CAMERAS[n], T_cam_lidar=CAMERAS[n].T_cam_lidar @ T) for n in names}
@@ -110,8 +110,8 @@ class Picture:
     Attributes:
         image: (H,W,3) uint8 RGB.
         depth_m: (H,W) float32 depth of the nearest surface, glass included, by the camera's
-            ``measure``. 0 where there is no surface within 120 m, or where the lens has no view.
-        body: (H,W) int32 index of the body in view, -1 for sky.
+            ``measure``. 0 for pixels without a surface within 120 m, or outside the lens's view.
+        body: (H,W) int32 index of the visible body, -1 for sky.
     """
 
     image: NDArray[np.uint8]
@@ -120,11 +120,11 @@ class Picture:
 
 
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
-    """Return the picture of a camera, each row exposed at its own time.
+    """Render the picture of a camera, each row exposed at its own time.
 
     Args:
-        camera: The camera in the lidar frame of a level mount.
-        time_s: Exposure of the middle row, in seconds from frame 0.
+        camera: Camera with its pose relative to the lidar frame of a level mount.
+        time_s: Exposure of the middle row, in seconds since frame 0.
     """
     h, w = camera.height_px, camera.width_px
     v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)
@@ -151,7 +151,7 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
 
 
 def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Float) -> Rays:
-    """Return rays in the world, each at the time of its row.
+    """Return rays in the world frame, each at the exposure time of its image row.
 
     Args:
         ray: (N,3) directions in the camera frame.
@@ -164,13 +164,13 @@ def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Floa
 
 
 def through_glass(world: World) -> Optics:
-    """Return how light meets surfaces: it passes the glass of vehicles and nothing else."""
+    """Return the optics of light: it passes vehicle glass and stops at all other surfaces."""
     is_glass = world.triangles.material == Material.GLASS
     return lambda met: np.where(is_glass[met.triangle], PASSES, STOPS)
 
 
 def _colours(world: World, rays: Rays, hits: Hits) -> Float:
-    """Return (N,3) linear light: sun with shadows, light of the sky, haze."""
+    """Return (N,3) linear RGB of the ray hits: sun with shadows, sky light and haze."""
     colour = _sky(rays.direction)
     rows = np.flatnonzero(hits.triangle >= 0)
     triangle, direction, normal = hits.triangle[rows], rays.direction[rows], hits.normal[rows]
@@ -200,7 +200,7 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
 
 
 def _sky(direction: Float) -> Float:
-    """Return (N,3) linear colours of the sky in (N,3) directions.
+    """Return (N,3) linear RGB of the sky in (N,3) directions.
 
     The sky is paler towards the horizon and has a few soft clouds.
     """

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Simulate one sweep: the returns of each ray, and the rays that pass or are lost.
+"""Simulate one sweep: the returns of each ray, and the rays that pass surfaces or are lost.
 
-Cars lose whole car windows and dark doors. The shares are those of 207 moving cars of KITTI's
-stereo benchmark (Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015) in
-sweeps of an HDL-64E. They depend on the angle of incidence, the brightness of the car and the part.
-The upper part of the source is the window band with its pillars and the roof. The tables here are
-of paint and glass alone. They are fitted such that cars in a sweep have the shares of the source
-(``tests/test_street_returns.py``). Fewer rays pass through doors than in the source, where they are
-errors of calibration.
+Many rays give no return from car windows and dark doors. The shares are taken from 207 moving cars
+of KITTI's stereo benchmark (Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR
+2015) in sweeps of an HDL-64E. They depend on the angle of incidence, the brightness of the car and
+the part. The source's upper part is the window band with pillars and roof, while the tables here
+are of paint and glass alone. They are fitted to give simulated cars the shares of the source
+(``tests/test_street_returns.py``). Fewer rays pass through doors than in the source, where such
+rays are errors of calibration.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _GOLDEN = 0.6180339887498949
 
 
 def laser(world: World, luck: Float) -> Optics:
-    """Return how rays of a lidar meet surfaces.
+    """Return the optics of lidar: each ray that meets a surface stops, passes or is absorbed.
 
     Args:
         luck: (N,) random number of each ray in [0, 1).
@@ -91,11 +91,11 @@ def laser(world: World, luck: Float) -> Optics:
 
 
 def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
-    """Return (N,) share of pulses that are lost, beside those that vehicles absorb.
+    """Return the (N,) share of pulses without a return, besides pulses that vehicles absorb.
 
     Args:
         material: (N,) materials.
-        tint: (N,3) factors on their colours.
+        tint: (N,3) factors on the colours of the materials.
         range_m: (N,) distances in metres.
     """
     ground, dark, other = (
@@ -110,11 +110,11 @@ def _of_vehicle(material: Int) -> Bool:
 
 
 def patches(place: Float, owner: Int) -> Float:
-    """Return (N,) numbers, evenly spread from 0 to 1, that vary smoothly over a surface.
+    """Return (N,) numbers, uniform in 0 to 1, that vary smoothly over a surface.
 
     Args:
         place: (N,3) positions in metres.
-        owner: (N,) objects. Each object has numbers of its own.
+        owner: (N,) object indices. Different objects have independent numbers.
     """
     cell = np.floor(place / _PATCH_M).astype(np.int64)
     share = place / _PATCH_M - cell
@@ -151,12 +151,12 @@ class Returns:
     """The N returns of a sweep in the order of time.
 
     Attributes:
-        points: (N,3) float32 metres, lidar axes, each at its own firing time.
-        intensity: (N,) 0 to 1.
-        offset_ns: (N,) int64 from the reference time.
-        lidar: (N,) number of the scanner.
-        body: (N,) index of the body hit.
-        instance: (N,) number of the object hit, -1 for none.
+        points: (N,3) float32 metres, in the lidar frame at each point's own firing time.
+        intensity: (N,) float32 of 0 to 1.
+        offset_ns: (N,) int64 firing time minus the reference time.
+        lidar: (N,) uint8 index of the scanner.
+        body: (N,) int32 index of the body hit.
+        instance: (N,) int32 number of the object hit, -1 for none.
     """
 
     points: Float32
@@ -168,10 +168,10 @@ class Returns:
 
 
 def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
-    """Return (4,4) the pose of the lidar frame, which is that of the mount, on the vehicle.
+    """Return the (4,4) pose of the lidar frame on the vehicle.
 
     Args:
-        tilt_deg: Pitch of the mount about the origin of the frame, nose down.
+        tilt_deg: Pitch of the mount about the origin of the lidar frame, positive nose down.
     """
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("y", tilt_deg, degrees=True).as_matrix()
@@ -183,11 +183,11 @@ def scan(
     world: World, ego: Driving, sensor: Sensor, time_s: float, rng: np.random.Generator,
     period_ns: int = 100_000_000, tilt_deg: float = 0.0,
 ) -> Returns:  # fmt: skip
-    """Return one sweep from a mount that is tilted as in `T_ego_lidar`.
+    """Simulate one sweep from a mount tilted as in `T_ego_lidar`.
 
     Args:
-        time_s: Reference time of the sweep, in seconds from frame 0.
-        period_ns: Time from sweep to sweep.
+        time_s: Reference time of the sweep, in seconds since frame 0.
+        period_ns: Duration of a sweep.
     """
     T = T_ego_lidar(tilt_deg)
     fired = firings(sensor, time_s, period_ns)
@@ -227,13 +227,13 @@ def scan(
 
 
 def at_offsets(time_s: float, offset_ns: Int) -> Float:
-    """Return (N,) seconds at these offsets in nanoseconds from a reference time."""
+    """Return (N,) times in seconds from (N,) offsets in ns and a reference time in seconds."""
     times: Float = np.asarray(time_s + offset_ns * 1e-9, dtype=np.float64)
     return times
 
 
 def _spot(direction: Float) -> list[Float]:
-    """Return five rays for each of (N,3) beams: the centre of its spot, then four around it."""
+    """Return five (N,3) ray directions for N beams: spot centre, then four around it."""
     level = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
     level /= lengths(level)
     upward = across(direction, level)
@@ -242,14 +242,17 @@ def _spot(direction: Float) -> list[Float]:
 
 
 def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Hits, Bool]:
-    """Return the echo of each spot: range (N,), the surface that it is from, and edges (N,).
+    """Return the echo of each laser spot.
 
-    On one plane the centre ray counts. At an edge each part of the spot is equally likely to be the
-    strongest echo. Two echoes close together sometimes merge into one between them.
+    On one plane the centre ray counts. At an edge each ray of the spot is equally likely to be the
+    strongest echo. Two echoes close together sometimes merge into one at a range in between.
 
     Args:
         echoes: Hits of the rays of all spots.
         spot: (N,S,3) directions of the rays, the centre first.
+
+    Returns:
+        (N,) range in metres, hit surface of each spot, and (N,) True for spots at an edge.
     """
     n, num = spot.shape[:2]
     rows = np.arange(n)

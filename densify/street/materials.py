@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Define the materials of surfaces: colour, texture, reflectivity, and how often rays pass."""
+"""Define the materials of surfaces: colour, texture, reflectivity, and reflection of the sky."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ COLOUR, (REFLECTIVITY, GLOSS) = _ROWS[:, :3], _ROWS[:, 3:].T
 
 
 def noise(i: Int, j: Int) -> Float:
-    """Return (N,) repeatable random numbers in [0, 1), a number for each (N,) integers."""
+    """Return (N,) repeatable random numbers in [0, 1), a hash of two (N,) integer arrays."""
     h = i.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     h ^= j.astype(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F)
     h ^= h >> np.uint64(29)
@@ -63,7 +63,7 @@ def noise(i: Int, j: Int) -> Float:
 
 
 def smooth_noise(uv: Float, cell_m: float) -> Float:
-    """Return (N,) numbers in [0, 1) at (N,2) positions, smooth over cells of that size."""
+    """Return (N,) numbers in [0, 1) at (N,2) positions, smooth over cells of ``cell_m``."""
     x, y = uv.T / cell_m
     i, j = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     x, y = x - i, y - j
@@ -121,9 +121,9 @@ _TEXTURES = {
 
 
 def shade_factor(material: Int, uv: Float) -> Float:
-    """Return (N,) brightness of the texture, around 1.
+    """Return the (N,) brightness of the texture, around 1.
 
-    Textures stick to their body, because uv are coordinates on its surface.
+    Textures move with their body, because uv are coordinates on its surface.
 
     Args:
         material: (N,) materials.

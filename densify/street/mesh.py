@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Build triangle meshes, with a material for each triangle, from simple solids."""
+"""Build triangle meshes from simple solids, with a material for each triangle."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class Mesh:
 
     Attributes:
         vertices: (V,3) metres.
-        triangles: (T,3) indices of vertices.
-        uv: (V,2) metres on the surface.
+        triangles: (T,3) vertex indices.
+        uv: (V,2) texture coordinates, metres on the surface.
         material: (T,) materials.
         tint: (T,3) factors on the colour of the material.
-        instance: (T,) int32 numbers of objects, -1 for none.
+        instance: (T,) int32 object numbers, -1 for none.
     """
 
     vertices: Float
@@ -51,7 +51,7 @@ class Mesh:
 
     @staticmethod
     def join(meshes: Sequence[Mesh]) -> Mesh:
-        """Return one mesh of several."""
+        """Return the union of several meshes."""
         meshes = [m for m in meshes if len(m.triangles)]
         starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
         columns = {
@@ -65,8 +65,8 @@ class Mesh:
         """Return a mesh of (K,4,3) quads.
 
         Args:
-            corners: In order around each quad. uv are metres along the first side and away from
-                it.
+            corners: (K,4,3) metres, in order around each quad. Texture coordinates run along the
+                first side and away from it.
         """
         k = len(corners)
         side, away = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
@@ -83,11 +83,11 @@ class Mesh:
         )
 
     def posed(self, T_a_mesh: Float) -> Mesh:
-        """Return the mesh moved by the (4,4) rigid motion."""
+        """Return the mesh moved by a (4,4) rigid motion."""
         return replace(self, vertices=self.vertices @ T_a_mesh[:3, :3].T + T_a_mesh[:3, 3])
 
     def of_instance(self, instance: int) -> Mesh:
-        """Return the mesh with another number of its object."""
+        """Return the mesh with all triangles assigned to this object number."""
         return replace(self, instance=np.full(len(self.triangles), instance, np.int32))
 
     @cached_property

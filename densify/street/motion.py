@@ -20,7 +20,7 @@ class Poses(NamedTuple):
     """N poses ``T_world_body``.
 
     Attributes:
-        rotation: (N,3,3).
+        rotation: (N,3,3) rotation matrices.
         position: (N,3) metres.
     """
 
@@ -44,18 +44,18 @@ class Poses(NamedTuple):
         return np.einsum("nji,nj->ni", self.rotation, directions)
 
     def rows(self, rows: Int) -> Poses:
-        """Return the poses of these rows, in the order of the index."""
+        """Return the poses at these indices."""
         return Poses(self.rotation[rows], self.position[rows])
 
     def matrix(self, row: int = 0) -> Float:
-        """Return the (4,4) ``T_world_body`` of one row."""
+        """Return the (4,4) matrix ``T_world_body`` of one pose."""
         T_world_body = np.eye(4)
         T_world_body[:3, :3], T_world_body[:3, 3] = self.rotation[row], self.position[row]
         return T_world_body
 
 
 def upright(xyz: Sequence[float], heading: float) -> Poses:
-    """Return one pose at a (3,) position, turned about z by ``heading`` in rad."""
+    """Return one pose at a (3,) position, rotated about z by ``heading`` in rad."""
     turn = Rotation.from_euler("z", heading).as_matrix()
     return Poses(turn[None], np.asarray(xyz, float)[None])
 
@@ -64,7 +64,7 @@ class Trajectory(Protocol):
     """The pose of a body at any time."""
 
     def poses(self, times_s: Float) -> Poses:
-        """Return N poses at (N,) seconds since the time zero of the sequence."""
+        """Return N poses at (N,) seconds since frame 0."""
         ...
 
 
@@ -77,7 +77,7 @@ def poses_at(trajectory: Trajectory, times_s: Float) -> Poses:
 
 
 class Still:
-    """The trajectory of the world itself."""
+    """The trajectory of the static world: identity poses."""
 
     def poses(self, times_s: Float) -> Poses:
         """Return N identity poses."""
@@ -87,17 +87,17 @@ class Still:
 
 @dataclass(frozen=True)
 class Driving:
-    """Follow a curve on the ground with both axles, as a car does.
+    """The trajectory of a vehicle that follows a curve on the ground with both axles.
 
     The origin is midway between the axles, x forward, z up.
 
     Attributes:
-        curve: Path of the car.
+        curve: Path of both axles.
         speed: Speed along the path.
         station_m: Arc length at time ``at_s``.
-        wheelbase_m: Distance of the two points that touch the curve.
-        lift_m: Function of (N,) stations to (N,) heights above the ground.
-        upright: Stay vertical on every slope.
+        wheelbase_m: Distance of the two axles.
+        lift_m: Function from (N,) arc lengths to (N,) heights above the ground.
+        upright: Stay vertical on slopes, as a pedestrian does.
     """
 
     curve: Curve
@@ -110,7 +110,7 @@ class Driving:
     upright: bool = False
 
     def station(self, times_s: Float) -> Float:
-        """Return (N,) arc lengths at (N,) seconds."""
+        """Return (N,) arc lengths along the curve at (N,) seconds."""
         travelled = self.speed.distance(times_s) - self.speed.distance(np.array([self.at_s]))
         return self.station_m + travelled
 
@@ -139,7 +139,7 @@ def on_ground(
 
 
 class Towed:
-    """A trailer. Its axle follows the kingpin of the tractor (a tractrix)."""
+    """The trajectory of a trailer, whose axle follows the tractor's kingpin (a tractrix)."""
 
     def __init__(
         self, tractor: Driving, kingpin_m: float, wheelbase_m: float, first_s: float, last_s: float
@@ -172,13 +172,14 @@ class Towed:
 
 @dataclass(frozen=True)
 class Limb:
-    """Swing about a horizontal hinge of the parent body, in step with the distance walked.
+    """A limb that swings about a horizontal hinge of its parent, in step with the distance walked.
 
     Attributes:
-        hinge_m: (3,) the hinge in the frame of the parent; origin of the limb.
+        parent: Trajectory of the body that carries the limb.
+        hinge_m: (3,) position of the hinge in the parent's frame; origin of the limb.
         swing: Amplitude in rad.
         stride_m: Distance walked in one full swing.
-        phase: In rad.
+        phase: Phase of the swing in rad.
     """
 
     parent: Driving
@@ -198,7 +199,7 @@ class Limb:
 
 
 class Rectangles(NamedTuple):
-    """Any number of rectangles on the ground.
+    """Rectangles on the ground, in arrays of any leading shape.
 
     Attributes:
         centre: (...,2) metres.
@@ -223,7 +224,7 @@ class Rectangles(NamedTuple):
 
     @staticmethod
     def joined(parts: Sequence[Rectangles]) -> Rectangles:
-        """Return all rectangles, along the first axis."""
+        """Return all rectangles, concatenated along the first axis."""
         return Rectangles(*(np.concatenate(c) for c in zip(*parts, strict=True)))
 
     def rows(self, rows: Int | slice) -> Rectangles:
@@ -232,7 +233,7 @@ class Rectangles(NamedTuple):
 
 
 def overlap(a: Rectangles, b: Rectangles) -> Bool:
-    """Return True where two rectangles touch, by separating axes. Shapes are broadcast."""
+    """Return True for rectangles that touch, by separating axes. Leading shapes are broadcast."""
     away = b.centre - a.centre
     apart = np.zeros(away.shape[:-1], bool)
     for p, q in ((a, b), (b, a)):

@@ -40,12 +40,12 @@ _EGO_START_M = 170.0
 
 
 def static_street(rng: np.random.Generator) -> Scene:
-    """Return the street in town in which only the ego vehicle moves."""
+    """Return the town street in which only the ego vehicle moves."""
     return street(rng, with_traffic=False)
 
 
 def street(rng: np.random.Generator, with_traffic: bool = True) -> Scene:
-    """Return the street in town."""
+    """Return the town street, with or without moving traffic."""
     bend = 1 / (36.0 * jitter(rng, 0.08))
     mild = jitter(rng, 0.3) / 190.0
     wiggle, phase = jitter(rng, 0.5) / 260.0, rng.uniform(0, 2 * np.pi)
@@ -162,7 +162,7 @@ _CROSS_X_M = 17.0
 
 
 def crossing(rng: np.random.Generator) -> Scene:
-    """Return the crossroads. The ego vehicle stands, and others cross before it."""
+    """Return the crossroads, with the ego vehicle at rest and others crossing in front of it."""
     main = Curve(np.column_stack([np.arange(-150.0, 200.5, 0.5), np.zeros(701)]))
     across = Curve(np.column_stack([np.full(801, _CROSS_X_M), np.arange(-200.0, 200.5, 0.5)]))
     roads = (Road(main, 5.6, 5.6), Road(across, 6.0, 6.0))

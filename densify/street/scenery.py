@@ -25,7 +25,7 @@ Panel = Callable[[float], Mesh]
 
 
 class Scenery:
-    """Collect the static objects, as one mesh and as footprints that nobody may drive over."""
+    """Collector of static objects, as one mesh and as footprints that traffic must not touch."""
 
     def __init__(self, ground: Ground, rng: np.random.Generator) -> None:
         self.ground = ground
@@ -35,10 +35,10 @@ class Scenery:
         self._num_parked = 0
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
-        """Stand a mesh, whose origin is on the ground, at a position.
+        """Place a mesh, whose origin is on the ground, at a position.
 
         Args:
-            solid: Part of the mesh that others can collide with.
+            solid: Part of the mesh that is tested for collisions; None for the whole mesh.
         """
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
         self._stand(mesh, upright((*xy, z), heading), solid or mesh)
@@ -61,12 +61,12 @@ class Scenery:
     def put_if_free(
         self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float, solid: Mesh | None = None
     ) -> None:
-        """Put the mesh where nothing else is, or leave it out."""
+        """Place the mesh if its position is free, else leave it out."""
         if self.is_free(solid or mesh, xy, heading, kerb_gap_m):
             self.put(mesh, xy, heading, solid)
 
     def park(self, xy: Float, forward: Float) -> None:
-        """Park a car. It leans with the slope as a driving car does."""
+        """Place a parked car, tilted with the slope like a driving car."""
         mesh = car_mesh(any_paint(self.rng), self.rng).of_instance(FIRST_PARKED + self._num_parked)
         self._num_parked += 1
         half = forward * WHEELBASE_M["car"] / 2
@@ -125,7 +125,7 @@ def _windows(w: float, d: float, storeys: int) -> list[Mesh]:
 
 
 def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
-    """Return a whole tree, and its trunk alone."""
+    """Return the mesh of a tree, and the mesh of its trunk."""
     height, spread = rng.uniform(5.5, 9.0), rng.uniform(1.5, 2.5)
     crown = max(2.3, 0.34 * height)
     thick = 0.02 * height + 0.03
@@ -221,7 +221,7 @@ def litter_bin() -> Mesh:
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a road between two stations: +1 its left, -1 its right."""
+    """One side (+1 left, -1 right) of a road between two stations (arc lengths)."""
 
     road: Road
     side: int
@@ -247,7 +247,7 @@ class Side:
 
 
 def line_with_plots(scenery: Scenery, side: Side) -> None:
-    """Put houses behind front gardens, each closed off by a hedge, a wall or a fence."""
+    """Place houses behind front gardens, each enclosed by a hedge, a wall or a fence."""
     rng, pavement_m = scenery.rng, scenery.ground.pavement_m
     station = side.begin_m
     while station < side.end_m - 8:
@@ -290,7 +290,7 @@ def _close_off(
 
 
 def furnish(scenery: Scenery, side: Side, spacing_m: float, trees: bool) -> None:
-    """Put lamp posts, trees, signs and bins along the kerb."""
+    """Place lamp posts, trees, signs and bins along the kerb."""
     rng = scenery.rng
     for station in np.arange(side.begin_m + rng.uniform(2, 8), side.end_m, spacing_m):
         heading = side.heading(station)
@@ -312,7 +312,7 @@ def park_cars(scenery: Scenery, side: Side, share: float, keep_free: Spans) -> N
     """Park cars along the kerb.
 
     Args:
-        share: Share of the parking places that are taken.
+        share: Share of the parking spaces that are taken.
     """
     rng = scenery.rng
     station = side.begin_m + 4.0
@@ -329,7 +329,7 @@ def park_cars(scenery: Scenery, side: Side, share: float, keep_free: Spans) -> N
 def mark_lanes(
     ground: Ground, road: Road, dashed: Sequence[float], solid: Sequence[float], spans: Spans
 ) -> Mesh:
-    """Paint lines at these offsets to the left of the centreline, only within the spans."""
+    """Paint lines at given offsets to the left of the centreline, only within the spans."""
     dashes = [(s, s + 3.0) for a, b in spans for s in np.arange(a, b - 3.0, 9.0)]
     parts = [strip(ground, road.curve, offset, 0.12, dashes) for offset in dashed]
     parts += [strip(ground, road.curve, offset, 0.12, spans) for offset in solid]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Define the sensors: their scanners, and every pulse of a sweep.
+"""Define the simulated sensors: their scanners, and every pulse of a sweep.
 
-A pattern has ``num_pulses(period_s)``, the number of pulses in a sweep, and ``directions(slots)``,
-(N,3) unit vectors in the axes of the scanner.
+A scan pattern has ``num_pulses(period_s)``, the number of pulses in a sweep, and
+``directions(slots)``, (N,3) unit vectors in the axes of the scanner.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ class Slots(NamedTuple):
     """The N pulses of a sweep in the order of time.
 
     Attributes:
-        number: (N,) int64 from 0.
-        share: (N,) firing time in periods from the reference time, -0.5 to 0.5.
+        number: (N,) int64 index of the pulse, from 0.
+        share: (N,) firing time minus the reference time, in periods, -0.5 to 0.5.
         time_s: (N,) firing time in seconds since frame 0, for patterns that continue from sweep
             to sweep.
     """
@@ -33,16 +33,16 @@ class Slots(NamedTuple):
 
 @dataclass(frozen=True)
 class Spinning:
-    """A scanner that spins clockwise, as viewed from above, once a sweep.
+    """A scan pattern that spins once a sweep, clockwise as viewed from above.
 
-    It faces forward at the reference time. Beams fire one after another, never two at once. Every
-    pulse has an azimuth of its own.
+    It faces forward at the reference time. Beams fire one after another, never two at once, so
+    every pulse has an azimuth of its own.
 
     Attributes:
-        elevation_deg: Of the beams in firing order.
-        columns_per_s: Firings of each beam. At 20 Hz a revolution has half the columns that it
-            has at 10 Hz.
-        phase: Turns by which it is ahead of a scanner that faces forward at the reference time.
+        elevation_deg: Elevations of the beams in firing order.
+        columns_per_s: Firings per second of each beam. A revolution at 20 Hz has half the columns
+            of a revolution at 10 Hz.
+        phase: Lead in turns over a scanner that faces forward at the reference time.
     """
 
     elevation_deg: tuple[float, ...]
@@ -73,15 +73,15 @@ class _Steady:
 
 @dataclass(frozen=True)
 class Raster(_Steady):
-    """A scanner that covers a rectangle, line by line, once a sweep.
+    """A scan pattern that covers a rectangle, line by line, once a sweep.
 
-    A fast mirror swings from side to side, a slow one goes from top to bottom. No two pulses of a
-    sweep have the same elevation.
+    A fast mirror swings from side to side, a slow mirror goes from top to bottom. No two pulses of
+    a sweep have the same elevation.
 
     Attributes:
         width_deg: Width of the field of view, with its centre straight ahead.
-        height_deg: Its height.
-        lines_per_s: Swings of the fast mirror, each to one side.
+        height_deg: Height of the field of view.
+        lines_per_s: Swings of the fast mirror per second, counting each direction.
     """
 
     width_deg: float
@@ -98,15 +98,15 @@ class Raster(_Steady):
 
 @dataclass(frozen=True)
 class Rosette(_Steady):
-    """A scanner with two prisms of equal power that turn at different rates.
+    """A scan pattern of two prisms of equal power that turn at different rates.
 
     It draws a rose around the forward axis. The rose continues from sweep to sweep and does not
     repeat, as in Livox's scanners.
 
     Attributes:
         width_deg: Diameter of the round field of view.
-        turns_per_s: Of the two prisms. Petals are drawn at their difference and turn at their
-            sum.
+        turns_per_s: Rotation rates of the two prisms. Petals are drawn at the difference of the
+            rates and turn at their sum.
     """
 
     width_deg: float
@@ -121,7 +121,7 @@ class Rosette(_Steady):
 
 
 def _pointing(azimuth: Float, elevation: Float) -> Float:
-    """Return (N,3) unit vectors of azimuths and elevations, (N,) rad each."""
+    """Return (N,3) unit vectors from (N,) azimuths and (N,) elevations in rad."""
     flat = np.cos(elevation)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
 
@@ -132,8 +132,8 @@ class Scanner:
 
     Attributes:
         max_range_m: Greatest range.
-        range_sigma_m: Standard deviation of the noise along the ray.
-        origin_m: (3,) origin of its rays, lidar frame.
+        range_sigma_m: Standard deviation of the range noise.
+        origin_m: (3,) position of the scanner, lidar frame.
     """
 
     pattern: Spinning | Raster | Rosette
@@ -144,23 +144,23 @@ class Scanner:
 
 @dataclass(frozen=True)
 class Sensor:
-    """One or several scanners that deliver a sweep together."""
+    """One or several scanners whose returns form one sweep."""
 
     name: str
     scanners: tuple[Scanner, ...]
 
     def each(self, field: str) -> Float:
-        """Return a field of all scanners, (S,) or (S,3)."""
+        """Return the values of a field for all S scanners, (S,) or (S,3)."""
         return np.array([getattr(scanner, field) for scanner in self.scanners], np.float64)
 
     @property
     def origins_m(self) -> Float:
-        """Return (S,3) origins of the rays of each scanner, lidar frame."""
+        """(S,3) positions of the scanners, lidar frame."""
         return self.each("origin_m")
 
     @property
     def azimuth_tells_time(self) -> bool:
-        """Return True if a single scanner spins about the origin of the lidar frame."""
+        """True if azimuth determines firing time: one scanner that spins about the origin."""
         first = self.scanners[0]
         spins = isinstance(first.pattern, Spinning)
         return len(self.scanners) == 1 and spins and not any(first.origin_m)
@@ -240,7 +240,7 @@ class Firings:
 
     Attributes:
         direction: (N,3) unit vectors, lidar axes.
-        offset_ns: (N,) int64 from the reference time.
+        offset_ns: (N,) int64 firing time minus the reference time.
         lidar: (N,) uint8 index of the scanner.
     """
 
@@ -255,7 +255,7 @@ def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
     The pulses of each scanner are evenly spaced in time.
 
     Args:
-        time_s: Reference time of the sweep, in seconds from frame 0.
+        time_s: Reference time of the sweep, in seconds since frame 0.
     """
     parts = []
     for index, scanner in enumerate(sensor.scanners):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Make the frames of a scene: sweeps, pictures and the exact motion of every body.
 
-Times are in seconds from frame 0's reference time here, and in absolute nanoseconds outside.
+Internal times are in seconds since frame 0, external times in absolute nanoseconds.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PRESETS = {"street": street, "static": static_street, "crossing": crossing, "hig
 def build_scene(preset: str, seed: int) -> Scene:
     """Return the scene of a preset and seed, always the same one.
 
-    Building takes 1 to 2 s. All sensors and rates share the last two scenes.
+    Building takes 1 to 2 s. The last two scenes are kept, for all sensors and sweep rates.
     """
     return PRESETS[preset](np.random.default_rng([seed, 0]))
 
@@ -42,9 +42,9 @@ class Bodies:
     """Poses of B bodies at the reference times of F frames.
 
     Attributes:
-        T_world_lidar: (F,4,4).
-        T_world_body: (F,B,4,4). Body 0 is the static world.
-        moving: (F,B) bool.
+        T_world_lidar: (F,4,4) poses of the lidar.
+        T_world_body: (F,B,4,4) poses of the bodies. Body 0 is the static world.
+        moving: (F,B) bool, True if the body's object moves around that time.
     """
 
     T_world_lidar: Float
@@ -52,11 +52,11 @@ class Bodies:
     moving: Bool
 
     def place(self, frame: int, body: NDArray[np.int32], points: Float) -> Float:
-        """Return (N,3) world positions, at that frame, of points that are fixed to bodies.
+        """Return the (N,3) world positions, at a frame's reference time, of points fixed to bodies.
 
         Args:
             body: (N,) index of the body of each point.
-            points: (N,3) in the frames of their bodies.
+            points: (N,3) metres, each in the frame of its body.
         """
         T_world_body = self.T_world_body[frame][body]
         placed: Float = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points)
@@ -65,7 +65,7 @@ class Bodies:
     def sweep(
         self, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], points: Float
     ) -> SweepTruth:
-        """Return the truth of a sweep whose points belong to these bodies."""
+        """Return the ground truth of a sweep; ``body`` and ``points`` are as in `place`."""
         T_world_lidar = self.T_world_lidar[frame]
         away = self.place(frame, body, points) - T_world_lidar[:3, 3]
         return SweepTruth(
@@ -75,9 +75,9 @@ class Bodies:
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
     ) -> Float:
-        """Return (N,3) displacements as in `densify.geometry.types.Truth.displacement`.
+        """Return (N,3) true scene flow, as in `densify.geometry.types.Truth.displacement`.
 
-        They are exactly 0 in the static world.
+        It is exactly 0 in the static world. Arguments are as in `place`.
         """
         self.check(target)
         there, here = (self.place(f, body, points) for f in (target, frame))
@@ -99,12 +99,12 @@ _MOVING_M, _MOVING_S = 0.05, 0.5
 
 @dataclass(frozen=True)
 class Simulator:
-    """A scene with a sensor. These fields and the frame number determine everything random.
+    """A scene with a sensor. Its fields and the frame number determine all random values.
 
     Attributes:
         hz: Sweeps per second, such as 5, 10 or 20. The period is a whole number of nanoseconds.
             The scene at a given time does not depend on it.
-        tilt_deg: As in `densify.street.lidar.T_ego_lidar`.
+        tilt_deg: Pitch of the mount, as in `densify.street.lidar.T_ego_lidar`.
     """
 
     preset: str
@@ -140,19 +140,19 @@ class Simulator:
         return scan(world, ego, self.sensor, time_s, rng, self.period_ns, self.tilt_deg)
 
     def image_stamps_ns(self, camera: str) -> dict[int, int]:
-        """Return the exposure time (middle row) of each image of a camera, by its number."""
+        """Return image number -> exposure time of the middle row, for a camera."""
         delay_ns, own_period_ns = SHUTTERS[camera]
         period_ns = own_period_ns or self.period_ns
         first_ns = EPOCH_NS + delay_ns
         return {n: first_ns + n * period_ns for n in range(DURATION_S * 10**9 // period_ns)}
 
     def picture(self, camera: str, number: int) -> Picture:
-        """Return an image of a camera, by its number."""
+        """Return the image of a camera with this number."""
         time_s = seconds(self.image_stamps_ns(camera)[number])
         return expose(self.scene.world, self.scene.ego, CAMERAS[camera], time_s)
 
     def T_world_lidar_at(self, time_ns: int) -> Float:
-        """Return (4,4) the pose of the lidar frame at any time."""
+        """Return the (4,4) pose of the lidar frame at any time."""
         T_world_ego = self.scene.ego.poses(np.array([seconds(time_ns)])).matrix()
         return T_world_ego @ T_ego_lidar(self.tilt_deg)
 
@@ -162,10 +162,10 @@ class Simulator:
         return self.bodies_at([self.stamp_ns(frame) for frame in range(self.num_frames)])
 
     def bodies_at(self, stamps_ns: Sequence[int], which: Sequence[int] | None = None) -> Bodies:
-        """Return the poses of all bodies at these times.
+        """Return the poses of bodies at these times.
 
         Args:
-            which: Bodies to return, all bodies of an object together; None for all.
+            which: Indices of bodies, all bodies of an object together; None for all bodies.
         """
         times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
@@ -183,10 +183,10 @@ class Simulator:
         )
 
     def in_bodies(self, frame: int, returns: Returns) -> Float:
-        """Return (N,3) measured points in the frames of the bodies that they belong to.
+        """Return the (N,3) measured points, each in the frame of the body it was measured on.
 
-        A raw point is moved to the world by the pose of the scanner at its firing time. From there
-        it is moved to its body by the pose of the body at the same time.
+        A raw point is transformed to the world by the scanner's pose at its firing time, and from
+        there to its body by the body's pose at the same time.
         """
         times = at_offsets(seconds(self.stamp_ns(frame)), returns.offset_ns)
         points = transform(T_ego_lidar(self.tilt_deg), returns.points.astype(np.float64))
@@ -204,7 +204,7 @@ def seconds(time_ns: int) -> float:
 
 
 def _moving(bodies: Sequence[Body], times_s: Float) -> Bool:
-    """Return (F,B) True where the body is part of an object that moves around that time."""
+    """Return (F,B) True if the body is part of an object that moves around that time."""
 
     def places(shift_s: float) -> Float:
         return np.stack([b.trajectory.poses(times_s + shift_s).position for b in bodies], axis=1)

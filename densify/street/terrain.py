@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Build the ground: a smooth hilly surface, the roads on it, and a mesh with real kerbs.
+"""Build the ground: a smooth hilly surface, the roads on it, and a mesh with kerbs.
 
-The height is a function of the position alone. The carriageway is the union of the strips of the
-roads with rounded corners, given as a signed distance. The triangles of the ground are cut along
-its zero line, at the upright kerb.
+The height is a function of position. The carriageway is the union of the road strips with rounded
+corners, given as a signed distance. The triangles of the ground are cut along its zero line, where
+the upright kerb is.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ class Curve:
         return self._spline(inside) + (station_m - inside)[..., None] * tangent, tangent
 
     def tangent(self, station_m: Float) -> Float:
-        """Return (N,2) unit directions of travel."""
+        """Return (N,2) unit directions of travel at (N,) arc lengths."""
         slope = self._slope(np.clip(station_m, 0.0, self.length_m))
         squared = slope * slope  # faster than np.linalg.norm
         unit: Float = slope / np.sqrt(squared[..., :1] + squared[..., 1:])
         return unit
 
     def normal(self, station_m: Float) -> Float:
-        """Return (N,2) unit vectors to the left of the direction of travel."""
+        """Return (N,2) unit vectors to the left of the direction of travel at (N,) arc lengths."""
         return left_of(self.tangent(station_m))
 
     @staticmethod
@@ -69,10 +69,10 @@ class Curve:
     ) -> Curve:
         """Return a curve of this length with a given curvature.
 
-        It passes the origin with heading +x at ``origin_m``.
+        At arc length ``origin_m`` it passes the origin with heading +x.
 
         Args:
-            curvature: Function of the arc length; 1/m, positive to the left.
+            curvature: Function from arc length to curvature in 1/m, positive to the left.
         """
         step = 0.05
         station = np.arange(0.0, length_m + step, step)
@@ -100,7 +100,7 @@ class Lane:
         """Build the lane.
 
         Args:
-            offset_m: Metres to the left of the road's own direction, constant or by station.
+            offset_m: Metres to the left of the road's direction, constant or a function of station.
         """
         stations = road.knots_m
         offset = offset_m(stations) if callable(offset_m) else np.full(len(stations), offset_m)
@@ -110,7 +110,7 @@ class Lane:
         self._stations = stations
 
     def at(self, station_m: float) -> float:
-        """Return the arc length on this lane abreast of the road's station."""
+        """Return the arc length on this lane beside a station (arc length) of the road."""
         return float(np.interp(station_m, self._stations, self._abreast_m))
 
 
@@ -164,7 +164,7 @@ class Terrain:
     Attributes:
         wave: (W,2) wave vectors k in rad/m.
         amplitude_m: (W,) amplitudes a.
-        phase: (W,) in rad.
+        phase: (W,) phases in rad.
     """
 
     wave: Float
@@ -193,7 +193,7 @@ class Terrain:
 
 @dataclass(frozen=True)
 class Road:
-    """A strip of ``left_m`` and ``right_m`` on the two sides of its centreline."""
+    """A strip that extends ``left_m`` and ``right_m`` from its centreline."""
 
     curve: Curve
     left_m: float
@@ -205,7 +205,7 @@ class Road:
         return stations, cKDTree(self.curve(stations))
 
     def coordinates(self, xy: Float) -> tuple[Float, Float]:
-        """Return the station along the road (N,) and the offset to its left (N,), in metres."""
+        """Return the (N,) arc length along the road, and the (N,) offset to its left, in metres."""
         stations, tree = self._samples
         station = stations[tree.query(xy)[1]]
         for _ in range(3):  # from the nearest sample to the foot of the perpendicular
@@ -226,7 +226,7 @@ class Ground:
     """Terrain with roads on it.
 
     Attributes:
-        kerb_m: Height of the kerb: everything beside the roads is higher by this.
+        kerb_m: Height of the kerb, by which everything outside the roads is raised.
     """
 
     terrain: Terrain

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Put the traffic of every scene on its lanes.
 
-Actors meet around the ego vehicle after 12 seconds, and touch nothing at any time. An actor that
-would touch anything is drawn again. Time zero is frame 0's, at every rate of sweeps.
+Actors meet around the ego vehicle after 12 seconds, and never collide. An actor that would collide
+is drawn at random again. Time 0 is frame 0 at every sweep rate.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def tracks(actor: Actor, times_s: Float) -> list[Rectangles]:
 
 
 class Traffic:
-    """Add actors that touch nothing at any time."""
+    """Collector of actors that never collide with each other or with static objects."""
 
     def __init__(self, ego: Driving, scenery: Scenery, rng: np.random.Generator) -> None:
         self.ground, self.ego = scenery.ground, ego
@@ -64,7 +64,7 @@ class Traffic:
         self._moving = _one(Rectangles.of(EGO_BOX, ego.poses(self._times), 0.2))
 
     def add(self, recipe: Recipe) -> None:
-        """Add an actor, or none if none of the draws fits.
+        """Add an actor, or none if every random draw collides.
 
         Args:
             recipe: Draws an actor. It is called again until an actor fits.
@@ -87,10 +87,10 @@ class Traffic:
     def drive(
         self, make: Maker, lane: Lane, station_m: float, speed: Speed | float, slack_m: float = 2.0
     ) -> None:
-        """Put a vehicle on a lane, abreast of a station of the road at the meeting time.
+        """Put a vehicle on a lane, beside a station (arc length) of the road at the meeting time.
 
         Args:
-            speed: A speed profile, or a number of m/s around which one is drawn.
+            speed: Speed profile, or a speed in m/s that is varied at random.
         """
 
         def recipe(rng: np.random.Generator) -> Actor:
@@ -134,7 +134,7 @@ def _one(track: Rectangles) -> Rectangles:
 
 
 def assemble(scenery: Scenery, parts: Sequence[Mesh], traffic: Traffic) -> Scene:
-    """Return the world: all static objects in one body, and the bodies of all actors."""
+    """Return the scene: all static objects in one body, and the bodies of all actors."""
     static = Body(Mesh.join([*parts, *scenery.meshes]), Still())
     bodies = [static, *(body for actor in traffic.actors for body in actor.bodies)]
     footprints = Rectangles.joined(scenery.footprints)
@@ -143,5 +143,5 @@ def assemble(scenery: Scenery, parts: Sequence[Mesh], traffic: Traffic) -> Scene
 
 
 def jitter(rng: np.random.Generator, share: float = 0.15) -> float:
-    """Return a random factor around 1."""
+    """Return a random factor of 1 ± ``share``."""
     return float(rng.uniform(1 - share, 1 + share))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Cast rays among moving rigid bodies, each ray at its own time.
 
-Rays are moved into the frame of each body by the body's pose at the ray's time. A body that moves
-during a sweep is therefore distorted as in reality. This module is the only one that imports
+Rays are transformed to the frame of each body by the body's pose at the ray's time. A body that
+moves during a sweep is therefore distorted as in reality. This module is the only one that imports
 Embree.
 """
 
@@ -29,9 +29,9 @@ class Body:
     """A rigid body.
 
     Attributes:
-        mesh: In the frame of the body.
-        instance: Number of the object that it is part of. -1: the triangles have instances of
-            their own.
+        mesh: Mesh in the frame of the body.
+        trajectory: Pose of the body over time.
+        instance: Number of the object it is part of; -1 if its triangles have object numbers.
     """
 
     mesh: Mesh
@@ -43,9 +43,9 @@ class Rays(NamedTuple):
     """N rays.
 
     Attributes:
-        origin: (N,3) world.
+        origin: (N,3) metres, world.
         direction: (N,3) unit vectors, world.
-        time_s: (N,).
+        time_s: (N,) seconds since frame 0.
     """
 
     origin: Float
@@ -57,12 +57,11 @@ class Hits(NamedTuple):
     """The hits of N rays.
 
     Attributes:
-        range_m: (N,), inf without a hit.
+        range_m: (N,) distances, inf without a hit.
         triangle: (N,) index over the triangles of all bodies, -1 without a hit.
         barycentric: (N,2) u and v, as in ``(1-u-v) a + u b + v c``.
-        normal: (N,3) of the triangle, world axes, to either side.
-        absorbed: (N,) True where the ray ends at a surface and does not come back. Its range is
-            inf.
+        normal: (N,3) normal of the triangle, world axes, of either sign.
+        absorbed: (N,) True if the ray ends at a surface without a return. Its range is inf.
     """
 
     range_m: Float
@@ -76,11 +75,11 @@ class Meeting(NamedTuple):
     """K rays that meet a surface.
 
     Attributes:
-        ray: (K,) numbers of the rays.
-        triangle: (K,) numbers of the triangles.
+        ray: (K,) ray indices.
+        triangle: (K,) triangle indices.
         place: (K,3) position in the frame of the body.
-        cosine: (K,) of the angle of incidence.
-        inside: (K,) True where the last surface that the ray passed was of the same object.
+        cosine: (K,) cosine of the angle of incidence.
+        inside: (K,) True if the previous surface that the ray passed was of the same object.
         layer: Number of surfaces that the rays have passed.
     """
 
@@ -94,7 +93,7 @@ class Meeting(NamedTuple):
 
 STOPS, PASSES, ABSORBED = range(3)
 Optics = Callable[[Meeting], Int]
-"""Returns for each of K meetings (K,) whether the ray stops there, passes or is absorbed."""
+"""Function that returns (K,) STOPS, PASSES or ABSORBED for the rays of a meeting."""
 
 
 class Triangles:
@@ -104,8 +103,8 @@ class Triangles:
     ``tint[k]`` belong to triangle k.
 
     Attributes:
-        first: Number of the first triangle of each body.
-        scenes: The scene of each body in the ray caster, in single precision.
+        first: Index of the first triangle of each body.
+        scenes: Embree scene of each body, in single precision.
     """
 
     def __init__(self, bodies: Sequence[Body]) -> None:
@@ -131,7 +130,7 @@ class World:
     """All bodies. Body 0 is static.
 
     Attributes:
-        seed: Of everything random about their surfaces.
+        seed: Seed of the random properties of surfaces.
     """
 
     def __init__(self, bodies: Sequence[Body], seed: int = 0) -> None:
@@ -139,18 +138,19 @@ class World:
 
     @cached_property
     def triangles(self) -> Triangles:
-        """The triangles of all bodies, made when first needed.
+        """The triangles of all bodies, built at first use.
 
-        Poses need none, and making them takes a third of the time of a scene.
+        Poses do not need the triangles, whose construction takes a third of the time of a scene.
         """
         return Triangles(self.bodies)
 
     def cast(self, rays: Rays, optics: Optics, num_together: int = 1, spread: float = 0.0) -> Hits:
-        """Return the first surface that each ray does not pass.
+        """Return the first surface at which each ray ends.
 
         Args:
-            num_together: Number of rays in a row that share origin and time and differ from the
-                first of them by at most ``spread`` rad.
+            optics: Decides for each surface that a ray meets.
+            num_together: Number of consecutive rays with the same origin and time, within
+                ``spread`` rad of the first of them.
         """
         every = np.arange(len(rays.time_s))
         best = self._cast_body(0, rays.origin, rays.direction, every, optics)
@@ -172,9 +172,9 @@ class World:
         return best
 
     def _near(self, rays: Rays, spread: float) -> Iterator[tuple[int, Int]]:
-        """Yield each body but the first, with the rays that may meet it.
+        """Yield the index of each body but the first, with the rays that may hit it.
 
-        These rays pass, or begin in, a ball that holds the body at all of their times.
+        These rays intersect a ball around the positions of the body at all of their times.
         """
         ends_s = np.array([rays.time_s.min(), rays.time_s.max()])
         origin, direction = rays.origin.T.copy(), rays.direction.T.copy()
@@ -195,13 +195,12 @@ class World:
     ) -> Hits:
         """Return the hits of rays with one body.
 
-        Distances are to the plane of the triangle, in double precision, also where a ray is
-        absorbed.
+        Distances are to the plane of the triangle, in double precision, also for absorbed rays.
 
         Args:
             origin: (N,3) in the frame of the body.
             direction: (N,3) in the frame of the body.
-            number: (N,) numbers of the rays.
+            number: (N,) indices of the rays.
         """
         surfaces, first, n = self.triangles, self.triangles.first[index], len(origin)
         hits = Hits(
@@ -246,7 +245,7 @@ def _device() -> Any:
 
 
 def _raycasting_scene(corners: Float) -> Any:
-    """Return the ray caster's scene of (T,3,3) corners of triangles."""
+    """Return the Embree scene of (T,3,3) triangle corners."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -256,7 +255,7 @@ def _raycasting_scene(corners: Float) -> Any:
 
 
 def _first_hit(scene: Any, origin: Float, direction: Float) -> tuple[NDArray[np.int64], Float]:
-    """Return the index of the first triangle hit (N,), -1 for none, and the place on it (N,2)."""
+    """Return the (N,) index of the first triangle hit, -1 for none, and (N,2) barycentric u, v."""
     found = scene.run(
         origin.astype(np.float32), direction.astype(np.float32), query="INTERSECT", output=True
     )

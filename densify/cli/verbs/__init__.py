@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Collect the verbs, and parse the command line.
 
-Each verb has a function ``add``, which adds its options, and a function ``answer``. The latter
-opens recordings, calls the Python API, writes files, and yields answers. Heavy packages are
-imported when a verb is called. Therefore help answers at once.
+A verb's module has a function ``add``, which adds its options, and a function ``answer``. The
+latter opens recordings, calls the Python API, writes files, and yields answers. Verbs import heavy
+packages only when they run, so help answers at once.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _command_line() -> argparse.ArgumentParser:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that complains in one line, suggests words, and takes no abbreviated options."""
+    """A parser with one-line errors and suggested words, which refuses abbreviated options."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options, allow_abbrev=False)

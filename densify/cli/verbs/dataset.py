@@ -79,7 +79,7 @@ def add(commands: Any) -> None:
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
-    """Make the set, or say how far it is."""
+    """Make the data set, or report its progress."""
     yield from _made(options) if options.status is None else _so_far(options)
 
 

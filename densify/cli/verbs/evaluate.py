@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answer ``densify evaluate``: depth maps against true ones."""
+"""Answer ``densify evaluate``: score depth maps against ground truth."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def add(commands: Any) -> None:
 
 
 def answer(options: argparse.Namespace) -> Iterator[Answer]:
-    """Score depth maps against the truth."""
+    """Score depth maps against ground truth."""
     from densify.bench.evaluation import evaluate
     from densify.readers.depth_trees import pair_depth_files
 

@@ -24,7 +24,7 @@ class Cloud:
         points: (M,3) metres, key frame, displaced by scene flow.
         rigid_points: (M,3) metres, key frame, by registration only, as in rigid accumulation.
         frame: (M,) int32 frame number of the source sweep.
-        since_key_ns: (M,) int64 reference time of the source sweep minus that of the key sweep.
+        since_key_ns: (M,) int64 ns, source sweep's reference time minus key sweep's reference time.
         row: (M,) int64 row of the point in the file of the source sweep.
         lidar: (M,) uint8 index of the scanner that measured the point.
         moving: (M,) bool, True if the point belongs to a moving object.
@@ -57,7 +57,7 @@ class Cloud:
         return np.sqrt(x * x + y * y + z * z).astype(np.float32)
 
     def joined(self, other: Cloud) -> Cloud:
-        """Return a cloud of the points of this cloud, then those of the other cloud."""
+        """Return a cloud of this cloud's points, then the other cloud's points."""
         return Cloud(**{n: np.concatenate([c, vars(other)[n]]) for n, c in vars(self).items()})
 
     def select(self, keep: Bool) -> Cloud:

@@ -20,7 +20,7 @@ METHOD_NAMES = {"none": "single sweep", "icp": "rigid accumulation", "flow": "sc
 
 @dataclass(frozen=True)
 class ObjectTrack:
-    """Poses of one moving object at n reference times: those of its sweeps and of the key.
+    """Poses of one moving object at n reference times, of the sweeps it is seen in and of the key.
 
     The object frame has its origin in the middle of the box, x along the direction of motion at the
     key's time, and the z axis of the key frame.
