@@ -91,8 +91,8 @@ def rays(camera: Camera, uv: Float) -> Float:
 def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
     """Return the (N,2,3) Jacobian of the projection, in pixels per metre.
 
-    Element [n, i, j] is the change of u (i = 0) or v (i = 1) per metre that point n moves along
-    axis j (x, y, z) of the camera frame.
+    Element [n, i, j] is the change of u (i = 0) or v (i = 1) of point n, per metre of motion
+    along axis j of the camera frame.
 
     Args:
         points_cam: (N,3) metres, camera frame; visible points only.

@@ -167,7 +167,7 @@ def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
 
     The velocity is the one that best aligns the points above the ground in the first three sweeps.
     Distances below the spacing of neighbouring rays count as 0, because a guard rail looks the same
-    from a vehicle at rest and from one that moves along it. The grid moves the second sweep by
+    from a vehicle at rest and from a vehicle that moves along the rail. The grid moves the second sweep by
     steps of 1 m, then by 0.5 m around the best position. Steps are smaller for sweeps less than 0.1
     s apart.
 

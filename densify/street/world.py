@@ -149,8 +149,8 @@ class World:
 
         Args:
             optics: Decides for each surface that a ray meets.
-            num_together: Number of consecutive rays with the same origin and time, within
-                ``spread`` rad of the first of them.
+            num_together: Number of consecutive rays with the same origin and time, whose
+                directions are within ``spread`` rad of the first ray's.
         """
         every = np.arange(len(rays.time_s))
         best = self._cast_body(0, rays.origin, rays.direction, every, optics)

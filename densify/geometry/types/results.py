@@ -22,8 +22,8 @@ METHOD_NAMES = {"none": "single sweep", "icp": "rigid accumulation", "flow": "sc
 class ObjectTrack:
     """Poses of one moving object at n reference times, of the sweeps it is seen in and of the key.
 
-    The object frame has its origin in the middle of the box, x along the direction of motion at the
-    key's time, and the z axis of the key frame.
+    The origin of the object frame is the middle of the box. Its x axis is along the motion at the
+    key's time, and its z axis is parallel to the z axis of the key frame.
 
     Attributes:
         instance: Number of the object, as in `Cloud`.
