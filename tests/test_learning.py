@@ -220,7 +220,7 @@ def test_the_command_trains_on_a_street(tmp_path: Path, capsys, monkeypatch) -> 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--steps", "0"], "--steps 0: expected 1 or more"),
+        (["--steps", "0", "--data", "streets"], "--steps 0: expected 1 or more"),
         (["--steps", "1", "--data", "nowhere"], "nowhere"),
         (["--steps", "1", "--data", "streets?seed=3"], "seeds are drawn"),
     ],

@@ -41,6 +41,7 @@ _POSE_M = 0.03  # standard deviation of the pose of the body
 _LIMBS_S = 0.1  # time from the key within which limbs keep their positions
 _PRIOR = 0.05  # number of rays that end on the body, assumed everywhere
 _WHOLE = 0.8  # closed share of the front from which a body is closed as a whole, as a car is
+_MOST_OPEN = 0.15  # share of the front that rays pass through; more of a truck with its underside
 _LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # share of rays that end on the body; a third at glass
 _VOTES_OF_WHOLE, _VOTES_OF_OPEN = 0.75, 0.97  # share of the votes along the silhouette
 _DEEP_M = 0.6  # farther behind the front of the hull are seats, axles and the far side
@@ -351,6 +352,7 @@ def _shown(
     """
     inside, now_m, surface_m = share > 0, layers.filled_m, (1 / surface).astype(np.float32)
     whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
+    whole &= (share[inside] < _LEAST_OF_WHOLE).mean() <= _MOST_OPEN
     before = (now_m > 0) & (now_m < surface_m - HIDDEN_M - HIDDEN_FRACTION * surface_m)
     closed = share >= (_LEAST_OF_WHOLE if whole else _LEAST_OF_OPEN)
     core = _well_inside(closed, float(np.median(layers.gap_px[inside]))) & ~before

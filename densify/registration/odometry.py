@@ -167,9 +167,9 @@ def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
 
     The velocity is the one that best aligns the points above the ground in the first three sweeps.
     Distances below the spacing of neighbouring rays count as 0, because a guard rail looks the same
-    from a vehicle at rest and from a vehicle that moves along the rail. The grid moves the second sweep by
-    steps of 1 m, then by 0.5 m around the best position. Steps are smaller for sweeps less than 0.1
-    s apart.
+    from a vehicle at rest and from a vehicle that moves along the rail. The grid moves the second
+    sweep by steps of 1 m, then by 0.5 m around the best position. Steps are smaller for sweeps less
+    than 0.1 s apart.
 
     Args:
         stamp_ns: (S,) ascending.

@@ -89,35 +89,20 @@ class _Search:
         return [np.ones(len(c.points), bool) for c in self._obstacles]
 
     def tracks(self) -> list[Track]:
-        """Return the confirmed tracks, tracks with the best starts first.
-
-        Points of a rejected track start no track in the first pass. In the second pass they may.
-        For example, two walkers that meet are one cluster for a moment, and its track claims both
-        persons at other times too. A track of the second pass must travel farther than it is long,
-        because a static side may seem to slide along itself.
-        """
-        starts = find_starts([batch.obstacles for batch in self.batches], self.clock)
-        untried, not_started = self._all_points(), self._all_points()
-        for may_start in (untried, not_started):
-            for n, cluster in starts:
-                batch = self.batches[n]
-                untaken = batch.gather(self._free)[cluster] & batch.gather(may_start)[cluster]
-                members = cluster[untaken]
-                if len(members) < MIN_POINTS:
-                    continue
-                track, verdict = self._track_of(members, n)
-                for j, rows in batch.split(members).items():
-                    not_started[j][rows] = False
-                for j, rows in track.claimed.items():
-                    untried[j][rows] = False
-                if verdict.moves and (may_start is untried or self._leaves_itself(track)):
-                    self._keep(track)
+        """Return the confirmed tracks, those with the best starts first."""
+        untried = self._all_points()
+        for n, cluster in find_starts([batch.obstacles for batch in self.batches], self.clock):
+            batch = self.batches[n]
+            untaken = batch.gather(self._free)[cluster] & batch.gather(untried)[cluster]
+            members = cluster[untaken]
+            if len(members) < MIN_POINTS:
+                continue
+            track, verdict = self._track_of(members, n)
+            for j, rows in track.claimed.items():
+                untried[j][rows] = False
+            if verdict.moves:
+                self._keep(track)
         return [track for track, _ in self._objects]
-
-    def _leaves_itself(self, track: Track) -> bool:
-        """Return True if the object travels farther than it is long."""
-        points = track.points_in(self._obstacles, sorted(track.claimed))
-        return track.path.travelled_m() > float(np.linalg.norm(np.ptp(points[:, :2], axis=0)))
 
     def _keep(self, track: Track) -> None:
         """Keep a confirmed track, unless a last test rejects it as a piece of a guard rail."""
