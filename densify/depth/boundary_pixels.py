@@ -54,11 +54,12 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
 
     A pixel is accepted if 97 % of the votes are for its depth. Boundary pixels vote too, with half
     the weight, and in a second round by their own share of votes. Their ``confidence`` becomes 0 to
-    0.2 by this share. An image that is offset by up to three search steps is shifted, with a
+    0.2 by this share. An image that is offset by up to one spacing of rays is shifted, with a
     warning. An image that is blurred or does not fit is ignored, with a warning. The returned
     ``lab`` is None if the image was not used.
 
     Args:
+        layers: Map with measured pixels (``depth_m``) and boundary pixels (``rim_m``).
         rims: ``image`` accepts pixels that the image confirms, ``keep`` also all others that no
             nearer patch covers, ``strict`` none.
     """
@@ -95,9 +96,10 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
 
 
 def shares(layers: Layers, pixel: Int) -> Float32:
-    """Return the (R,) share of the votes for the depth of each boundary pixel.
+    """Return the (R,) cautious share of the votes, 0 to 1, that confirm each boundary pixel.
 
     Args:
+        layers: Map with the boundary pixels (``rim_m``) and an aligned image.
         pixel: (R,) flat indices of the boundary pixels in the image.
     """
     voters = _voters(layers, np.maximum(layers.depth_m, layers.rim_m))
@@ -116,13 +118,15 @@ def voted_for(
     least_share: float,
     surely: bool = False,
 ) -> Bool:
-    """Return (P,) True where at least ``least_share`` of the votes are for the depth of a pixel.
+    """Return (P,) True where enough pixels around confirm the given depth of a pixel, see `vote`.
 
     Args:
-        known_m: (H,W) depths of the voting pixels in metres, 0 none.
-        pixel: (P,) flat indices of the pixels in the image.
-        depth_m: (P,) depths that are voted on, in metres.
-        surely: True for the cautious count of `vote`.
+        layers: Map with the image, the slopes and the ray spacing.
+        known_m: (H,W) depth in metres of the pixels that vote, 0 for pixels without a vote.
+        pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
+        depth_m: (P,) depths to confirm, in metres.
+        least_share: Least share of the votes, 0 to 1, that must be for the depth.
+        surely: True for the cautious share of `vote`.
     """
     weight = np.ones_like(known_m)
     share = vote(layers, _voters(layers, known_m), pixel, depth_m, weight, surely)
@@ -130,10 +134,11 @@ def voted_for(
 
 
 class Voters(NamedTuple):
-    """Pixels with a known depth, which vote on other pixels.
+    """Pixels with a known depth, which vote on the depths of pixels around them.
 
     Attributes:
-        steps: (16,H,W) steps to the first known pixel, of `densify.depth.neighbours.first_known`.
+        steps: (16,H,W) number of steps from each pixel to the first known pixel in 16 directions,
+            from `densify.depth.neighbours.first_known`.
         inverse: (H,W) inverse depth in 1/m, 0 where the depth is unknown.
         tilt: (H,W,2) slope of the inverse depth to the right and down, 1/m per px.
     """
@@ -144,6 +149,7 @@ class Voters(NamedTuple):
 
 
 def _voters(layers: Layers, known_m: Float32) -> Voters:
+    """Return the pixels with a depth ``known_m`` (H,W) above 0, in metres, as voters."""
     inverse = np.divide(1, known_m, out=np.zeros_like(known_m), where=known_m > 0)
     return Voters(first_known(known_m > 0), inverse, layers.tilt)
 
@@ -151,12 +157,17 @@ def _voters(layers: Layers, known_m: Float32) -> Voters:
 def vote(
     layers: Layers, voters: Voters, pixel: Int, depth_m: Float32, weight: Float32, surely: bool
 ) -> Float32:
-    """Return the (P,) weighted share of the votes for the depths of pixels.
+    """Return the (P,) weighted share of the votes, 0 to 1, that confirm the depth of each pixel.
+
+    The first known pixel in each of 16 directions votes for the depth if its own surface, extended
+    to the pixel, has that depth. Otherwise it votes against.
 
     Args:
-        pixel: (P,) flat indices of the pixels in the image.
-        depth_m: (P,) depths that are voted on, in metres.
-        weight: (H,W) weight of the vote of each known pixel.
+        layers: Map with the image, whose colour edges weaken votes, and the ray spacing.
+        voters: Known pixels with their surfaces.
+        pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
+        depth_m: (P,) depths to confirm, in metres.
+        weight: (H,W) weight of each voting pixel.
         surely: True takes the least share of five positions of the image (unshifted, and shifted by
             0.6 ray spacings to each side), with a small constant vote. False takes the unshifted
             image; the share is 0 without voters.
@@ -171,7 +182,7 @@ def vote(
 
 @inlined
 def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
-    """Return the number of steps in direction d from pixel (v, u) to the next other known pixel."""
+    """Return the number of steps in direction d from row v, column u to the next known pixel."""
     here = np.int64(steps[d, v, u])
     height, width = steps.shape[1:]
     for k in range(1, 3 if here == 0 else 1):
@@ -186,10 +197,10 @@ def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 @inlined
 def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill in the voter of each direction and its vote; return the numbers for and against.
+    """Fill in the 16 votes on the pixel in row v, column u; return the numbers for and against.
 
-    A voter votes for the depth of pixel (v, u) if its surface, extended there, has that depth.
-    steps: (16,) to the voter, 0 if there is none. agrees: (16,) True for a vote for the depth.
+    depth: depth to confirm, metres. gap: spacing of rays, px. steps: (16,) output, steps to the
+    voting pixel in each direction, 0 without a vote. agrees: (16,) output, True for a vote for.
     """
     same = _SAME_M + _SAME_FRACTION * depth
     num_for, num_against = 0, 0
@@ -236,10 +247,10 @@ def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _vote(first, last, pixel, inverse, voters, weight, lab, gap_px, surely, share):  # type: ignore[no-untyped-def]
-    """Fill ``share`` (P,) float32, as in `vote`.
+    """Fill ``share`` (P,) float32, the result of `vote`.
 
-    inverse: (P,) inverse depth voted on, 1/m. lab: (H,W,3), empty without an image. gap_px: (H,W)
-    spacing of rays in pixels.
+    inverse: (P,) inverse of the depth to confirm, 1/m. lab: (H,W,3) image, empty without an image.
+    gap_px: (H,W) spacing of rays in pixels. The other arguments are as in `vote`.
     """
     width, num = gap_px.shape[1], len(DIRECTIONS)
     steps, agrees = np.zeros(num, np.int64), np.zeros(num, np.bool_)

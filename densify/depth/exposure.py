@@ -38,10 +38,12 @@ _NUM_ROW_STEPS = 4  # of the search for the row that observes a point
 
 @dataclass(frozen=True)
 class Shot:
-    """The image and time that a depth map shows.
+    """The camera, image and time that a depth map shows.
 
     Attributes:
-        number: Number of the image, None if the map shows the time of the key sweep.
+        camera: Camera whose view the map has.
+        number: Number of the image, None if no image belongs to the map.
+        stamp_ns: Time that the map shows: exposure of the image, or time of the key sweep.
     """
 
     camera: Camera
@@ -55,7 +57,7 @@ def key_shots(
     key: int,
     settings: ProjectSettings = _USUAL,
 ) -> dict[str, Shot]:
-    """Return the shot of each depth map of a key sweep, by the name of the map.
+    """Return the `Shot` of each depth map of a key sweep, by the name of the map.
 
     By default each camera has one map, with its name. It shows the image exposed nearest to the key
     sweep, the earlier of two. With ``project.per=image`` there is a map CAMERA/NUMBER for each
@@ -63,7 +65,10 @@ def key_shots(
     default map shows the time of the sweep.
 
     Args:
+        sequence: Recording with the times of sweeps and images.
+        cameras: Cameras that get depth maps.
         key: Frame number of the key sweep.
+        settings: Section ``project``.
     """
     stamp_ns = sequence.stamp_ns(key)
     begin_ns, end_ns = _own_time_ns(sequence, key)
@@ -103,7 +108,7 @@ def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str,
 
 
 def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
-    """Return start and end of the time that is nearer to the key sweep than to another sweep."""
+    """Return start and end, in ns, of the time nearer to the key sweep than to another sweep."""
     frames = list(sequence.frames)
     at = frames.index(key)
     stamps_ns = {}
@@ -123,10 +128,11 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
 
 
 class InView(NamedTuple):
-    """The K points of a cloud in an image.
+    """The K points of a cloud that lie in an image.
 
     Attributes:
-        rows: (K,) row numbers of the points in the cloud, ascending.
+        exposure: Camera and time of the image.
+        rows: (K,) indices of the points in the cloud, ascending.
         points_cam: (K,3) positions as in `Sight`.
         uv: (K,2) pixel coordinates as in `Sight`.
     """
@@ -138,7 +144,7 @@ class InView(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """Projected points.
+    """N points projected to an image.
 
     Attributes:
         points_cam: (N,3) positions in metres, camera frame, at the exposure.
@@ -153,12 +159,12 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True)
 class Exposure:
-    """A camera at the time of a shot.
+    """A camera at the time that a depth map shows.
 
     Attributes:
-        T_cam_key: (4,4) from the key sweep's lidar frame to the camera at the shot, with
+        T_cam_key: (4,4) from the key sweep's lidar frame to the camera at that time, with
             ego-motion.
-        late_s: Seconds from the key sweep's reference time to the shot.
+        late_s: Seconds from the key sweep's reference time to that time.
         twist: (6,) angular and linear velocity of the camera, rad/s and m/s in its own frame.
         number: Number of the image, None if the map shows no image.
         measure: Kind of depth, camera ``z`` or ``range``.
@@ -177,10 +183,17 @@ class Exposure:
     def of(
         sequence: LidarSequence, stretch: Stretch, key: int, shot: Shot, settings: Config
     ) -> Exposure:
-        """Return the exposure of a shot for the key sweep with frame number ``key``.
+        """Return the camera of a depth map at the map's time, relative to the key sweep.
 
         The camera pose is extrapolated from the key sweep with the vehicle's twist. If the
         recording has a pose of the image, the recorded pose is used instead.
+
+        Args:
+            sequence: Recording with the times and poses of images.
+            stretch: Registered sweeps of the window.
+            key: Frame number of the key sweep.
+            shot: Camera, image and time that the map shows.
+            settings: All settings; ``output.optical_flow`` adds the ``others``.
         """
         others: dict[str, Exposure] = {}
         if settings.output.optical_flow and shot.number is not None:
@@ -203,11 +216,15 @@ class Exposure:
         return _exposure(sequence, stretch, key, key, shot, settings, others)
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
-        """Project points (N,3) with velocities (N,3), given in the key sweep's lidar frame.
+        """Project N points to the image.
 
-        The points are at the reference time of that sweep. Moving points advance by their velocity
-        to the exposure. With a rolling shutter each row or column of the image has its own exposure
-        time. Points beside or behind a wide lens have no z and are not inside.
+        Moving points advance by their velocity to the exposure. With a rolling shutter each row or
+        column of the image has its own exposure time. Points beside or behind a wide lens have no z
+        and are not inside.
+
+        Args:
+            points: (N,3) positions in metres, key sweep's lidar frame, at its reference time.
+            velocity_m_s: (N,3) velocities in the same frame, ego-motion removed.
         """
         late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)
@@ -226,7 +243,7 @@ class Exposure:
         return Sight(there, uv, inside & (self.depth_m(there) > NEAREST_M))
 
     def sees(self, cloud: Cloud) -> InView:
-        """Return the part of a cloud, at the key sweep's reference time, in the image."""
+        """Return the points in the image of a cloud at the key sweep's reference time."""
         sight = self.see(cloud.points, cloud.velocity_m_s)
         rows = np.flatnonzero(sight.inside)
         points_cam, uv = (a.take(rows, axis=0) for a in (sight.points_cam, sight.uv))
@@ -246,7 +263,10 @@ def _exposure(
     settings: Config,
     others: Mapping[str, Exposure] | None = None,
 ) -> Exposure:
-    """Return the exposure of a shot, extrapolated from the sweep with this frame number."""
+    """Return the exposure of a shot, its pose extrapolated from sweep ``frame`` of the stretch.
+
+    The other arguments and the result are relative to the key sweep, as in `Exposure.of`.
+    """
     camera, registered = shot.camera, stretch[frame]
     late_s = float(shot.stamp_ns - registered.sweep.stamp_ns) * 1e-9
     twist = registered.twist_before if late_s < 0 else registered.twist_after

@@ -68,11 +68,12 @@ class Aligned(NamedTuple):
 
 
 def align_image(layers: Layers) -> Aligned | None:
-    """Return the image of the layers, shifted to fit, None if it does not fit or is blurred.
+    """Return the layers' image, shifted to fit the depth; None if it does not fit or is blurred.
 
-    The score of a shift is in standard deviations of the scores of distant shifts. The best shift
-    must be at most 3.2 steps away. With a score of 3.05 or more the image stays in place, unless
-    the best score is more than 1.9 higher. Otherwise it is shifted if the best score is at least 5.
+    Shifts are tried in steps of 0.3 ray spacings. The score of a shift is in standard deviations of
+    the scores of distant shifts. The best shift must be at most 3.2 steps long. If the score
+    without a shift is 3.05 or more, the image stays in place, unless the best score is more than
+    1.9 higher. Otherwise it is shifted if the best score is at least 5.
 
     An image whose edges have a blur of more than two steps is not used. The sharper an edge, the
     more another blur lowers its gradient (Zhuo and Sim, "Defocus map estimation from a single
@@ -101,7 +102,7 @@ def align_image(layers: Layers) -> Aligned | None:
 def _standing_out(sums: Float) -> Float:
     """Return the (29,29) scores of all shifts, in standard deviations of distant shifts.
 
-    sums: (29,29) of `_edge_sums`; a slow trend is removed.
+    A slow trend over the shifts is removed. sums: (29,29) sum of each shift, from `_edge_sums`.
     """
     offsets = np.arange(-_REACH, _REACH + 1)
     right, down = np.meshgrid(offsets, offsets)
@@ -114,11 +115,11 @@ def _standing_out(sums: Float) -> Float:
 
 
 def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
-    """Return (29,29) the colour changes of the shifted image across depth discontinuities.
+    """Return the (29,29) sum of colour changes across depth discontinuities for each shift.
 
-    Rows are steps down, columns steps to the right. Discontinuities are boundary pixels, and depth
-    jumps between neighbouring known pixels, with boundary pixels and without. The sums of each kind
-    are divided by their mean.
+    Row and column are the shift of the image down and to the right, from -14 to 14 steps of
+    ``step_px`` pixels. Discontinuities are boundary pixels, and depth jumps between neighbouring
+    known pixels, with boundary pixels and without. The sums of each kind are divided by their mean.
     """
     known_m = np.maximum(layers.depth_m, layers.rim_m)
     strict_m = np.where(layers.rim_m == 0, layers.depth_m, np.float32(0))
@@ -140,9 +141,14 @@ def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
 def _sums(
     changes: Float32, row: Int, column: Int, right: float | Float32, down: float | Float32
 ) -> Float:
-    """Return (29,29) the sums of colour changes at E shifted pixels along a direction.
+    """Return the (29,29) sums of colour changes at E pixels, one sum for each shift of the image.
 
-    row and column: (E,) of the pixels, in steps. right and down: (E,) or common direction.
+    Args:
+        changes: (2,h,w) colour change per step to the right and down, padded by 14 steps.
+        row: (E,) row of each pixel, in steps.
+        column: (E,) column of each pixel, in steps.
+        right: Part to the right of the unit direction across the discontinuity, (E,) or common.
+        down: Part of this direction downwards, (E,) or common.
     """
     width, (x, y) = changes.shape[2], changes.reshape(2, -1)
     offsets = np.arange(-_REACH, _REACH + 1)
@@ -159,10 +165,18 @@ def _some(values: Int) -> Int:
 
 
 def _jumps(depth_m: Float32, gap: int, step_px: int) -> tuple[Int, Int]:
-    """Return rows and columns, in steps, of depth jumps (H,W) from one surface to another.
+    """Return the positions of depth jumps between neighbouring known pixels of an image row.
 
-    The jumps are between neighbouring known pixels of a row, at most ``gap`` steps apart. Both
-    surfaces must continue, which excludes most foliage.
+    On both sides of the jump the next known pixel must continue the surface, which excludes most
+    foliage.
+
+    Args:
+        depth_m: (H,W) depth in metres, 0 for unknown pixels.
+        gap: Greatest distance between the two pixels of a jump, in steps.
+        step_px: Length of a step of the search, in pixels.
+
+    Returns:
+        The (E,) row and the (E,) column of the middle of each jump, in steps.
     """
     row, column = np.nonzero(depth_m)
     known_m = depth_m[row, column]
@@ -176,7 +190,7 @@ def _jumps(depth_m: Float32, gap: int, step_px: int) -> tuple[Int, Int]:
 
 
 def _blur_px(lab: Float32) -> float:
-    """Return the standard deviation of the blur of the image's strongest edges."""
+    """Return the standard deviation, in px, of the blur of the image's strongest edges."""
     light = lab[..., 0]
     again = cv2.GaussianBlur(light, (0, 0), _REBLUR_PX).astype(np.float32, copy=False)
     before, after = (np.hypot(*_gradient(image)) for image in (light, again))
@@ -196,7 +210,10 @@ def _reduced(image: Float32, step_px: int) -> Float32:
 
 
 def _across(depth_m: Float32, step_px: int) -> Float32:
-    """Return (2,H,W) the unit direction (right, down) of the greatest change of depth, reduced."""
+    """Return (2,h,w) the unit direction (right, down) of the greatest change of depth.
+
+    The map of h by w cells has one cell for ``step_px`` by ``step_px`` pixels of ``depth_m`` (H,W).
+    """
     known = depth_m > 0
     inverse = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=known)
     sums, weight = (
@@ -220,5 +237,5 @@ def _changes(lab: Float32) -> Float32:
 
 
 def _gradient(image: Float32) -> Float32:
-    """Return (2,H,W) the gradient right and down."""
+    """Return the (2,H,W) gradient of an image (H,W) to the right and down."""
     return np.stack([cv2.Sobel(image, cv2.CV_32F, *order) for order in ((1, 0), (0, 1))])

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Close the surfaces of moving objects, so that no background shows through them.
 
-Much of a near car gives no lidar return: dark paint, glass. Other sweeps measured the background
-there while the car was elsewhere. Therefore every moving object has a body: the convex hull of all
-its points of the window, at the key sweep's time. The rays of all sweeps are moved along with the
-object. The body is closed where they end on it. Between a pedestrian's legs or under a bumper they
-pass through, and it stays open.
+Dark paint and glass give few returns, and other sweeps measured the background there. Every moving
+object has a body: the convex hull of its points of the window, at the key sweep's time. The rays of
+all sweeps are moved along with it. It is closed where they end on it, and open where they pass.
 
-In the image, pixels well inside the closed part show the body. The image decides the pixels along
-its silhouette. The surface is the front of the hull, moved smoothly onto the object's own returns.
+The front of a body is the nearest surface of the hull in each pixel, moved smoothly onto the
+object's own returns. Pixels well inside the closed part show it, the image decides the silhouette.
 """
 
 from __future__ import annotations
@@ -50,12 +48,12 @@ _AGREES = 2.0  # tolerance, as a multiple of the tolerance between two static po
 
 
 class MovingBody(NamedTuple):
-    """A moving object at the key sweep's reference time, in its lidar frame, metres.
+    """The convex hull of a moving object, and the K rays of all sweeps that meet the hull.
 
     Attributes:
-        corners: (V,3) corners of the convex hull.
-        velocity_m_s: (3,) velocity of the object without ego-motion.
-        entries: (K,3) positions where rays enter the hull.
+        corners: (V,3) corners of the hull in metres, key sweep's lidar frame and reference time.
+        velocity_m_s: (3,) velocity of the object without ego-motion, same frame.
+        entries: (K,3) positions where the rays enter the hull, same frame and time.
         ends: (K,) True if the ray ends on the object, False if it passes through.
         weight: (K,) weight of the ray, lower far from the key sweep in time and just below the
             hull's surface; 0 if the ray ends far behind the front, as on wheels.
@@ -73,7 +71,8 @@ class MovingBody(NamedTuple):
 def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
     """Return the bodies of moving objects by instance number.
 
-    Objects whose points span no volume have no body. cloud: at the key sweep's reference time.
+    Objects whose points span no volume have no body. cloud: points of the window at the key sweep's
+    reference time. rays: origins of the rays that measured these points.
     """
     instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)]).tolist()
     own = {k: cloud.select(cloud.moving & (cloud.instance == k)) for k in instances}
@@ -99,7 +98,7 @@ def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
 def without_sweep(
     bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
 ) -> dict[int, MovingBody]:
-    """Return the bodies from the other sweeps alone. cloud: points of these sweeps."""
+    """Return the bodies without sweep ``frame``. cloud: points of all other sweeps."""
     told = {}
     for k, body in bodies.items():
         corners = _corners(cloud.points[cloud.moving & (cloud.instance == k)])
@@ -121,7 +120,7 @@ def _corners(points: Float) -> Float:
 
 
 class _Met(NamedTuple):
-    """Rays that meet a hull, with columns as in `MovingBody`."""
+    """The rays of one sweep that meet a hull; fields as in `MovingBody`."""
 
     entries: Float
     ends: Bool
@@ -133,11 +132,10 @@ _NOT_MET = _Met(np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0), np.zeros(0, np
 
 
 class _Sweep(NamedTuple):
-    """The returns of one sweep, key sweep's lidar frame.
+    """The N returns of one sweep (``cloud``) and their rays, key sweep's lidar frame.
 
-    origin: (3,) of the lidar at the reference time. azimuth: (N,) radians, seen from there.
-    range_m: (N,) horizontal distance from there. moved_m: greatest motion of the scanner from
-    there.
+    origin: (3,) lidar at the sweep's reference time. azimuth and range_m: (N,) radians and
+    horizontal distance of each return from it. moved_m: greatest distance of a ray's start from it.
     """
 
     cloud: Cloud
@@ -149,6 +147,7 @@ class _Sweep(NamedTuple):
 
     @staticmethod
     def of(cloud: Cloud, rays: Rays, frame: int) -> _Sweep:
+        """Return the returns of sweep ``frame`` among the points of the window (``cloud``)."""
         part = cloud.select(cloud.frame == frame)
         origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
         x, y = (part.rigid_points - origin)[:, :2].T
@@ -156,9 +155,9 @@ class _Sweep(NamedTuple):
         return _Sweep(part, rays, origin, np.arctan2(y, x), np.hypot(x, y), float(moved_m))
 
     def met(self, instance: int, corners: Float, T_key_there: Float) -> _Met:
-        """Return the rays that meet a hull, with their entry points at the key sweep's time.
+        """Return the sweep's rays that meet the hull of object ``instance``, moved along with it.
 
-        corners: (V,3) of the hull then. T_key_there: (4,4) motion of the object from this sweep.
+        corners: (V,3) corners at the key's time. T_key_there: (4,4) motion from sweep to key.
         """
         part = self.cloud.select(self._toward(poses.transform(poses.inverse(T_key_there), corners)))
         start = poses.transform(T_key_there, self.rays.starts(part))
@@ -194,9 +193,9 @@ def close_bodies(
 ) -> Layers:
     """Return the layers with the surfaces of moving bodies; ``solid`` marks their pixels.
 
-    Points clearly in front of a body stay. Elsewhere inside the outline of its hull only
-    measurements of moving objects stay. Pixels with a return of the body on its surface count as
-    measured. cloud: at the key sweep's reference time.
+    Depths clearly in front of a body stay. Elsewhere inside the outline of its hull only depths of
+    moving objects stay. Pixels with a return of the body on its surface count as measured. cloud:
+    points at the key sweep's reference time. bodies: bodies by instance number.
     """
     changed = ("depth_m", "filled_m", "confidence", "tilt", "point")
     layers = replace(layers, **{name: getattr(layers, name).copy() for name in changed})
@@ -234,9 +233,10 @@ def outlines(bodies: Iterable[MovingBody], exposure: Exposure) -> Bool:
 
 
 class _Front(NamedTuple):
-    """The front of a hull in the image.
+    """The nearest surface of a body's hull in each pixel of the image.
 
-    box: rows and columns of the image, h by w pixels. inverse: (h,w) inverse depth, 1/m, 0 outside.
+    box: rows and columns of the image around the hull, h by w pixels. inverse: (h,w) inverse depth
+    of the surface in 1/m, 0 outside the outline of the hull.
     """
 
     box: tuple[slice, slice]
@@ -244,7 +244,7 @@ class _Front(NamedTuple):
 
     @staticmethod
     def of(body: MovingBody, exposure: Exposure, margin_px: int) -> _Front | None:
-        """Return the front, None if the body is out of view. margin_px: margin around the box."""
+        """Return the front of a body, None if out of view; its box is ``margin_px`` wider."""
         camera = exposure.camera
         sight = exposure.see(body.corners, _each(body.velocity_m_s, body.corners))
         if not sight.inside.any():
@@ -267,7 +267,7 @@ class _Front(NamedTuple):
         return _Front(box, inverse.reshape(row.shape)) if inside.any() else None
 
     def pixels(self, exposure: Exposure, points: Float, velocity_m_s: Float32) -> _Pixels:
-        """Return the pixels within the box of points (N,3), key sweep's lidar frame."""
+        """Project points (N,3), key sweep's lidar frame, to pixels within the box."""
         sight = exposure.see(points, velocity_m_s)
         column, row = np.rint(np.where(sight.inside, sight.uv.T, -1)).astype(np.int64)
         row, column = row - self.box[0].start, column - self.box[1].start
@@ -278,7 +278,7 @@ class _Front(NamedTuple):
         return _Pixels(which, (row[which], column[which]), depth_m)
 
     def closed(self, body: MovingBody, exposure: Exposure, spacing_px: Float32) -> Float:
-        """Return the (h,w) share of the rays entering at a pixel that end on the body."""
+        """Return the (h,w) share, 0 to 1, of the rays entering at a pixel that end on the body."""
         blur_px = np.maximum(RAY_BLUR * np.median(spacing_px, axis=(0, 1)), 1.0)
         at = self.pixels(exposure, body.entries, _each(body.velocity_m_s, body.entries))
         front_m = 1 / np.maximum(self.inverse[at.place], 1e-6)
@@ -293,7 +293,7 @@ class _Front(NamedTuple):
 
 
 class _Pixels(NamedTuple):
-    """Points in a box of the image: indices of the points, their rows and columns, their depth."""
+    """Points in a box of the image: index, row and column in the box, and depth of each point."""
 
     which: Int
     place: tuple[Int, Int]
@@ -303,9 +303,9 @@ class _Pixels(NamedTuple):
 def _close(
     layers: Layers, cloud: Cloud, exposure: Exposure, rows: Int, body: MovingBody, front: _Front
 ) -> Bool:
-    """Put the surface of one body into ``layers``, the box of its front; return (h,w) its pixels.
+    """Put the surface of one body into ``layers`` in place; return (h,w) True at its pixels.
 
-    rows: row numbers of the body's points in the cloud.
+    layers: part of the map in the box of ``front``. rows: indices of its points in the cloud.
     """
     surface = _surface(layers, rows, front)
     surface_m = (1 / surface).astype(np.float32)
@@ -331,7 +331,7 @@ def _close(
 
 
 def _surface(layers: Layers, rows: Int, front: _Front) -> Float:
-    """Return the (h,w) inverse depth (1/m) of the surface of the body with points ``rows``."""
+    """Return the (h,w) inverse depth (1/m) of a body's surface; arguments as in `_close`."""
     inside = front.inverse > 0
     known_m = np.maximum(layers.depth_m, layers.rim_m)
     own = inside & (known_m > 0) & np.isin(layers.point, rows)
@@ -346,9 +346,8 @@ def _shown(
 ) -> tuple[Bool, Bool]:
     """Return (h,w) the pixels that show a body, and (h,w) the pixels where its returns count.
 
-    Other content inside its outline is removed from ``layers``. surface: (h,w) inverse depth of the
-    body, 1/m. agree_m: (h,w) tolerance of depth behind it. share: (h,w) share of the rays that end
-    on it, 0 outside its outline.
+    Other depths in its outline are removed from ``layers``. surface: (h,w) its inverse depth, 1/m.
+    agree_m: (h,w) tolerance behind it. share: (h,w) rays that end on it, 0 outside its outline.
     """
     inside, now_m, surface_m = share > 0, layers.filled_m, (1 / surface).astype(np.float32)
     whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
@@ -379,9 +378,9 @@ def _well_inside(closed: Bool, away_px: float) -> Bool:
 
 
 def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
-    """Return the (h,w) smooth offset o of the pixels ``inside``.
+    """Return the (h,w) smooth offset o, in 1/m, of the pixels ``inside`` (h,w).
 
-    It minimises Σ known (o - offset)² + stiff Σ |∇o|² + held Σ o².
+    It minimises Σ known (o - offset)² + `_STIFF` Σ |∇o|² + `_HELD` Σ o².
     """
     number = np.cumsum(inside).reshape(inside.shape) - 1
     across, down = inside[:, :-1] & inside[:, 1:], inside[:-1] & inside[1:]

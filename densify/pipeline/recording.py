@@ -56,7 +56,7 @@ _TELL_SPEED = 2  # sweeps
 
 
 class Piece(NamedTuple):
-    """Registered sweeps of one block that share a world.
+    """Consecutive registered sweeps of one block that share a world.
 
     number: index of the block. row: index of the piece in the block. poses: poses of the piece's
     sweeps and of one sweep before them, in the levelled lidar frame of the first of ``frames``.
@@ -70,7 +70,7 @@ class Piece(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """Accumulated points at a key's time, the sweeps' flow (or None), and the objects' tracks."""
+    """Accumulated points at a key's time, flow from sweep to sweep (or None), objects' tracks."""
 
     cloud: Cloud
     flow: StretchFlow | None
@@ -98,15 +98,18 @@ class Recording:
         watch: Watch | None = None,
         looks_around: bool = False,
     ) -> None:
-        """Read the time stamps, and choose the blocks of sweeps.
+        """Read the time stamps, and cut the sweeps into blocks that are computed together.
 
-        window: number of sweeps on each side of a key. keys: frame numbers; only sweeps around
-        these keys are read; None for all sweeps. cache: keeps results on disk. run: text shared by
-        all processes of a run, during which no sweep changes; None for this object alone. watch:
-        measures the steps. looks_around: also search motion ``flow.look_around_s`` beyond the
-        windows.
+        Args:
+            window: Number of sweeps on each side of a key.
+            keys: Frame numbers, around which sweeps are read; None for every frame.
+            cache: Cache of results on disk.
+            run: Name of a run whose processes share digests of sweeps; None for no sharing.
+            watch: Measures the cost of each step.
+            looks_around: True also searches motion ``flow.look_around_s`` beyond the windows.
 
-        Raises InputError if a key does not exist.
+        Raises:
+            InputError: A key does not exist.
         """
         self.sequence, self.settings = sequence, settings
         self.timeline = timeline = Timeline.of(sequence)
@@ -139,7 +142,7 @@ class Recording:
         self._far = lru_cache(maxsize=1)(self._find_far)
 
     def _look_around(self, keys: Collection[int]) -> tuple[float, float]:
-        """Return `FlowSettings.around` for the point rate of the first key."""
+        """Return seconds around windows, and between sweeps, in which motion is searched."""
         if not keys or self.settings.flow.look_around_s == 0:
             return 0.0, 0.0
         try:
@@ -147,8 +150,6 @@ class Recording:
         except InputError:  # raised again where the key is made
             return 0.0, 0.0
         return self.settings.flow.around(num_points / (self.timeline.period_ns * 1e-9))
-
-    # A key
 
     def window_frames(self, key: int) -> WindowFrames:
         """Return the frames of a key's window, and the reasons if it is smaller than requested.
@@ -180,7 +181,7 @@ class Recording:
         return self._sweeps.read(frame)
 
     def around(self, key: int) -> Stretch:
-        """Return the registered sweeps in which motion for a key's window is searched."""
+        """Return the registered sweeps, within and around a key's window, searched for motion."""
         piece = self._piece(key)
         return self._stretch(piece.number, self._searched(piece.number, piece.row))
 
@@ -192,7 +193,8 @@ class Recording:
     def motion(self, key: int, engine: str | None = None) -> Motion:
         """Return the scene flow of all points in a key's window.
 
-        engine: name, None for ``flow.engine``. With two sweeps ``pairs`` replaces ``groups``.
+        engine: name of the scene-flow engine, None for ``flow.engine``. With two sweeps ``pairs``
+        replaces ``groups``.
         """
         engine, window, piece = (
             engine or self.settings.flow.engine,
@@ -216,7 +218,7 @@ class Recording:
     def step(self, frame: int) -> StretchFlow:
         """Return the flow of a sweep to the next sweep, or else to the previous sweep.
 
-        A sweep without neighbours has no step. Raises as `window_frames`, but not for such a sweep.
+        The result is empty for a sweep without neighbours. Errors are as in `window_frames`.
         """
         window = self.window(frame)
         beside = [f for f in window.frames if f > frame] or [f for f in window.frames if f < frame]
@@ -268,8 +270,6 @@ class Recording:
         pieces = self._pieces(self.cut.number_of[key])
         return next(piece for piece in pieces if key in piece.frames)
 
-    # The steps of a block
-
     def _registration(self, number: int) -> Registration:
         """Register each run of consecutive sweeps, split at sweeps that cannot be registered."""
         settings, frames = self.settings.register, self._registered_together(number)
@@ -319,13 +319,14 @@ class Recording:
         return pieces
 
     def _deskew(self, number: int, frame: int) -> RegisteredSweep:
+        """Return a sweep of block ``number``, deskewed, at its pose in the world of its piece."""
         piece = next(p for p in self._pieces(number) if frame in p.frames)
         sweep = self._sweeps.read(frame)
         with self._watch.stage("deskew"):
             return deskew([sweep], piece.poses).sweeps[0]
 
     def _make_stretch(self, number: int, frames: tuple[int, ...]) -> Stretch:
-        """Return sweeps of one piece, deskewed, in the world of the piece."""
+        """Return deskewed sweeps of one piece of block ``number``, in the world of the piece."""
         return Stretch(tuple(self._deskewed(number, f) for f in frames))
 
     def _find_searched(self, number: int, row: int) -> tuple[int, ...]:
@@ -344,7 +345,7 @@ class Recording:
             return ground(stretch)
 
     def _find_motion(self, number: int, row: int, engine: str) -> SharedMotion:
-        """Return the motion in a piece, its sweeps removed for the cache."""
+        """Return the scene flow in a piece, without the sweeps to keep the cache small."""
         asked, frames = self._in_windows(number), self._searched(number, row)
 
         def make() -> SharedMotion:

@@ -46,9 +46,11 @@ _View = tuple[Camera, Float]
 class _Passed(NamedTuple):
     """A sweep along the road.
 
-    registered: returns in view of a camera, deskewed if ``known``, else raw. sample: (N,3) deskewed
-    subset of all returns. travel_m: distance along the road from the window's first sweep. known:
-    the sweep is in the window.
+    Attributes:
+        registered: Returns in view of a camera, with the pose; deskewed if ``known``, else raw.
+        sample: (N,3) deskewed positions of a sample of all returns, metres, lidar frame.
+        travel_m: Distance along the road from the window's first sweep, negative before it.
+        known: True if the sweep is in the window, where poses are known.
     """
 
     registered: RegisteredSweep
@@ -106,7 +108,10 @@ class Road:
         return replace(far.joined(parts), left_out=tuple(sorted(left_out)))
 
     def _beyond(self, near: Stretch, views: Sequence[_View], side: int) -> list[_Passed]:
-        """Return the sweeps before (side -1) or after (side 1) the window, nearest first."""
+        """Return the sweeps before (side -1) or after (side 1) the window, nearest first.
+
+        near: registered sweeps of the window. views: cameras that must see a return to keep it.
+        """
         last = near.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
         begin_m = 0.0 if side < 0 else _travel_m(near)[-1]
         found, last_m, travel_m = list[_Passed](), 0.0, 0.0
@@ -179,10 +184,12 @@ class Road:
             return
 
     def _pose(self, frame: int) -> Float:
+        """Return the recorded ``T_world_lidar`` (4,4) of a sweep."""
         return cast(Float, self.sweeps.recorded_pose(frame))
 
 
 def _deskewed(p: _Passed) -> RegisteredSweep:
+    """Return the sweep's returns in view of a camera, deskewed."""
     sweep = p.registered
     if p.known:
         return sweep
@@ -190,7 +197,7 @@ def _deskewed(p: _Passed) -> RegisteredSweep:
 
 
 def _travel_m(near: Stretch) -> Float:
-    """Return (n,) metres travelled since the first sweep of the stretch."""
+    """Return the (n,) distance in metres from the first sweep to each of the window's n sweeps."""
     positions = np.stack([s.T_world_lidar[:3, 3] for s in near.sweeps])
     return np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
 
@@ -207,7 +214,16 @@ def _within(near: Stretch, views: Sequence[_View]) -> list[_Passed]:
 
 
 def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], frozenset[int]]:
-    """Return the sweeps with consistent poses, and the frames whose poses are unreliable."""
+    """Correct the poses along the road until the surfaces of the sweeps agree (`relax_poses`).
+
+    Args:
+        passed: Sweeps in the order of the road, with approximate poses.
+        near: Registered sweeps of the window; their poses stay.
+
+    Returns:
+        The sweeps of ``passed`` with corrected poses and velocities, and the frame numbers of the
+            sweeps whose poses remain unreliable.
+    """
     frames = tuple(p.registered.frame for p in passed)
     found = relax_poses(
         [p.sample for p in passed],
@@ -226,7 +242,10 @@ def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], f
 
 
 def _in_view(sweep: Sweep, T_world_lidar: Float, views: Sequence[_View]) -> Bool:
-    """Return (N,) True for returns of a raw sweep that a camera may see."""
+    """Return (N,) True for returns of a raw sweep that one of the cameras may see.
+
+    T_world_lidar: (4,4) pose of the sweep. views: cameras and their poses in the same world.
+    """
     keep = np.zeros(len(sweep), bool)
     rows = np.flatnonzero(far.in_reach(sweep))
     points = sweep.points[rows].astype(np.float32)

@@ -32,13 +32,13 @@ def add_warnings(
     key: int,
     shots: Mapping[str, Shot],
 ) -> dict[str, Result]:
-    """Return method -> result of a key, each with its ``warnings``.
+    """Return the results of one key with the field ``warnings`` filled in, by name of the method.
 
     Args:
-        results: Method -> result.
-        recording: The recording of the results.
+        results: Results by name of the method; not changed.
+        recording: Recording from which the results were computed.
         key: Frame number of the key sweep.
-        shots: Map name -> camera, image number and time of the map.
+        shots: Camera, image number and time of each depth map, by name of the map.
     """
     sequence, stretch = recording.sequence, recording.window(key)
     cameras = {shot.camera.name for shot in shots.values()}
@@ -59,6 +59,7 @@ def add_warnings(
 
 
 def _of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
+    """Yield warnings about a small window. follows: True if a method estimates scene flow."""
     window = recording.window_frames(key)
     for cut in window.cuts:
         yield f"the window is cut to frames {format_frames(window.frames)}: {cut}"
@@ -67,6 +68,7 @@ def _of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
 
 
 def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
+    """Yield warnings about missing point times and about points left out of the sweeps."""
     sweeps = [registered.sweep for registered in stretch.sweeps]
     if settings.register.deskew and any(sweep.offset_ns is None for sweep in sweeps):
         yield "the points have no times of their own: motion within a sweep is not undone"
@@ -122,6 +124,7 @@ def _of_motion(recording: Recording, key: int) -> Iterator[str]:
 
 
 def _of_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[str]:
+    """Yield a warning for each depth map to which no image belongs."""
     for name, shot in shots.items():
         if shot.number is not None:
             continue
@@ -138,7 +141,7 @@ def _of_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[s
 
 
 def of_result(result: Result, stretch: Stretch) -> Iterator[str]:
-    """Yield the warnings about the result of one method."""
+    """Yield the warnings about the result of one method; ``stretch`` holds the window's sweeps."""
     stamps_ns = [s.sweep.stamp_ns for s in stretch.sweeps]
     if METHODS[result.method].engine is not None and len(stamps_ns) > 1:
         period_s = float(np.median(np.diff(stamps_ns))) * 1e-9

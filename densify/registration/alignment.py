@@ -37,8 +37,8 @@ class Surface(NamedTuple):
     """Points thinned to voxels, with the covariance of each point's neighbours (small_gicp).
 
     Attributes:
-        points: Point cloud of small_gicp.
-        tree: Its k-d tree.
+        points: Points with covariances, a ``PointCloud`` of small_gicp, in metres.
+        tree: The k-d tree of these points.
     """
 
     points: Any
@@ -48,11 +48,11 @@ class Surface(NamedTuple):
     def of(
         points: Float, voxel_m: float = _VOXEL_M, num_neighbors: int = _NUM_NEIGHBORS
     ) -> Surface:
-        """Return the surface of a point cloud.
+        """Return the surface of a point cloud, in the frame of the points.
 
         Args:
-            points: (N,3) metres.
-            voxel_m: Side of a voxel.
+            points: (N,3) positions in metres.
+            voxel_m: Side of a voxel in metres; one point per voxel stays.
             num_neighbors: Number of neighbours for the covariance of a point.
         """
         import small_gicp
@@ -77,7 +77,7 @@ class Alignment(NamedTuple):
 
     @staticmethod
     def of(found: Any, source: Surface) -> Alignment:
-        """Return the alignment from a result of small_gicp."""
+        """Convert ``found``, the result of ``small_gicp.align`` for the surface ``source``."""
         num = int(found.num_inliers)
         return Alignment(
             T_target_source=np.asarray(found.T_target_source),
@@ -87,23 +87,29 @@ class Alignment(NamedTuple):
 
 
 class SurfaceMap:
-    """A voxel map of several surfaces in one frame."""
+    """A map of several surfaces in one common frame, the map frame.
+
+    Each cubic voxel, 1 m wide, holds the mean and the covariance of its points (Koide et al., ICRA
+    2021). Further surfaces can be aligned with the map by generalized ICP.
+    """
 
     def __init__(self) -> None:
+        """Begin with an empty map."""
         import small_gicp
 
         self._voxels = small_gicp.GaussianVoxelMap(_LEAF_M)
 
     def insert(self, surface: Surface, T_map_surface: Float) -> None:
-        """Add a surface at its pose (4,4) in the map."""
+        """Add a surface to the map; ``T_map_surface`` (4,4) is its pose in the map frame."""
         self._voxels.insert(surface.points, T_map_surface)
 
     def align(self, source: Surface, T_map_source: Float, match_m: float) -> Alignment:
-        """Align a surface with the map.
+        """Align a surface with the map, and return its pose in the map frame.
 
         Args:
-            T_map_source: (4,4) initial pose.
-            match_m: Greatest distance between corresponding points.
+            source: Surface in its own frame.
+            T_map_source: (4,4) initial pose of the surface in the map frame.
+            match_m: Greatest distance in metres between corresponding points.
         """
         import small_gicp
 
@@ -164,6 +170,7 @@ def align_with_planes(
     """Return the (4,4) motion of points that aligns them with the target, by point-to-plane ICP.
 
     Args:
+        target: Surface in the frame of the points.
         points: (N,3) metres, approximately aligned with the target already.
         voxel_m: Side of the voxels to which the points are thinned.
         match_m: Greatest distance between corresponding points.

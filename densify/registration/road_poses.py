@@ -87,9 +87,10 @@ def follow_road(
 
 
 class _ChainEnd:
-    """The map of all sweeps of the chain, and the pose, time and velocity of the last sweep."""
+    """The map of all sweeps registered so far, and pose, time and velocity of the last sweep."""
 
     def __init__(self, known: Sequence[RegisteredSweep], backwards: bool) -> None:
+        """Begin with the ``known`` sweeps; ``backwards`` if the chain goes back in time."""
         self._map, last = SurfaceMap(), known[-1]
         for s in known:
             if abs(s.sweep.stamp_ns - last.sweep.stamp_ns) <= _MAP_NS:
@@ -120,7 +121,18 @@ class _ChainEnd:
 
 
 def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: float) -> list[int]:
-    """Return the rows of the next few sweeps, about ``step_m`` apart at this speed."""
+    """Return the indices in ``stamp_ns`` of up to six sweeps to register next.
+
+    The sweeps are about ``step_m`` apart at the present speed, and at most about 0.4 s. If no sweep
+    is far enough away, the last one is returned.
+
+    Args:
+        stamp_ns: (n,) reference times of the sweeps along the road, nearest first.
+        row: Index of the first sweep that may be chosen.
+        last_ns: Reference time of the sweep registered last.
+        step_m: Wanted distance between sweeps.
+        speed_m_s: Speed of the vehicle.
+    """
     gap_ns = 1e9 * min(_LONGEST_GAP_S, step_m / max(speed_m_s, 1e-3))
     rows: list[int] = []
     for r in range(row, len(stamp_ns)):
@@ -219,12 +231,16 @@ def _submaps(known: Bool, num_sweeps: int) -> tuple[Int, Int]:
 
 
 class _Graph:
-    """A pose graph of m submaps and p alignments between two submaps each.
-
-    ends: (p,2) target and source submap of each alignment. fixed: (m,) True for submaps that stay.
-    """
+    """A pose graph: m submaps as nodes, and p alignments between two submaps as edges."""
 
     def __init__(self, ends: Int, fixed: Bool, pairs: Sequence[Alignment]) -> None:
+        """Build the graph.
+
+        Args:
+            ends: (p,2) indices of the target and the source submap of each alignment.
+            fixed: (m,) True for submaps whose pose stays.
+            pairs: The p alignments.
+        """
         self._ends, self._fixed = ends, fixed
         T_target_source = np.array([a.T_target_source for a in pairs]).reshape(-1, 4, 4)
         self._T_source_target = np.linalg.inv(T_target_source)
@@ -244,7 +260,10 @@ class _Graph:
         return T
 
     def holds(self, T: Float) -> Bool:
-        """Return (m,) True for submaps that reliable alignments connect to fixed submaps."""
+        """Return (m,) True for submaps that reliable alignments connect to fixed submaps.
+
+        T: (m,4,4) relaxed poses of the submaps.
+        """
         target, source = self._ends.T
         wrong = self.off_m(self._apart(T)) > _MOST_LEFT_M
         across = np.zeros((2, len(self._fixed)))
@@ -269,7 +288,10 @@ class _Graph:
         return poses.log(self._T_source_target @ self._between(T))
 
     def off_m(self, apart: Float) -> Float:
-        """Return (p,) root mean square distance of the surfaces after motions (p,6)."""
+        """Return the (p,) root mean square distance, in metres, of two surfaces of an alignment.
+
+        apart: (p,6) motion (rad, m) of the source away from its aligned pose.
+        """
         square = np.einsum("pi,pij,pj->p", apart, self._information, apart)
         return np.sqrt(np.maximum(square, 0))
 
