@@ -47,6 +47,7 @@ def flow_of_boxes(
     """Return the flow of the N points of one sweep to the next, and which flows are certain.
 
     Args:
+        here: Sweep of the N points.
         after: Next sweep in the same world. Only its pose and time are used.
         boxes: Boxes of ``here``.
         next_boxes: Boxes of ``after``; boxes of one object share the track name.
@@ -94,7 +95,7 @@ def flow_of_boxes(
 
 
 def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator[tuple[Int, Float]]:
-    """Yield the rows of the points in and around each box, and the box's pose (4,4, lidar frame).
+    """Yield, for each box, the indices of the points around it and its pose (4,4, lidar frame).
 
     A box drawn for one scanner gets points of that scanner only.
     """

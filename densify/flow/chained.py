@@ -22,6 +22,7 @@ class ChainedMotion:
     """Motion of a stretch, chained from flow between neighbouring sweeps: a `Motion`.
 
     Attributes:
+        stretch: Consecutive registered sweeps.
         step: Function that returns the flow of sweep index i to index j = i ± 1, in the lidar frame
             of sweep i. It is called on demand, once for each (i, j).
     """
@@ -67,7 +68,13 @@ class ChainedMotion:
         return replace(step, velocity_m_s=velocity_m_s)
 
     def _follow(self, i: int, near: int, onward: FlowField) -> FlowField:
-        """Chain the step from sweep i to sweep ``near`` with the flow ``onward`` from there."""
+        """Chain the flow from sweep index i to its neighbour ``near`` with the flow from there on.
+
+        Args:
+            i: Index of the sweep whose points move.
+            near: Index i + 1 or i - 1.
+            onward: Flow of the points of sweep ``near`` to the target.
+        """
         step = self._flow(i, near)
         here, there = self.stretch.sweeps[i], self.stretch.sweeps[near]
         T_there_here = self.stretch.T_target_source(there.frame, here.frame)

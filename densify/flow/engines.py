@@ -21,6 +21,7 @@ class Scene:
     """Input of a scene flow engine: registered sweeps in one world, their ground and free space.
 
     Attributes:
+        stretch: Consecutive registered sweeps.
         ground: Height map of the ground under all sweeps.
         asked: Frame numbers whose flow is needed, None for all. The other sweeps only help to find
             motion.
@@ -37,7 +38,7 @@ class Scene:
 
     @cached_property
     def candidates(self) -> tuple[Candidates, ...]:
-        """The points of each sweep that may move: another sweep saw through their position."""
+        """The points above the ground of each sweep, and which may move, see `find_candidates`."""
         return find_candidates(self.stretch, self.space, self.ground)
 
     def is_asked(self, i: int) -> bool:

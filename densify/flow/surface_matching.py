@@ -34,7 +34,7 @@ def apply(state: Float, points: Float, centre: Float) -> Float:
 
 
 def undo(state: Float, points: Float, centre: Float) -> Float:
-    """Return (N,3) points moved back by the inverse of `apply`, with the same arguments."""
+    """Return the (N,3) points moved back by the inverse of `apply`, with the same arguments."""
     return _turned(points - centre - state[..., :3], -state[..., 3]) + centre
 
 

@@ -139,13 +139,13 @@ def converted(camera: Camera, depth_m: Float32, given: str, wanted: str) -> Floa
 
 
 class _Lens(NamedTuple):
-    """The distortion of a lens on the plane.
+    """The distortion of a lens, which moves points of the plane in the module's docstring.
 
     Attributes:
-        numerator: Polynomial in the squared radius, over ``denominator`` the radial factor.
+        numerator: Polynomial in the squared radius; divided by ``denominator``, the radial factor.
         denominator: Polynomial in the squared radius.
-        p1: Tangential coefficient.
-        p2: Tangential coefficient.
+        p1: First tangential coefficient of OpenCV.
+        p2: Second tangential coefficient of OpenCV.
         limit: Squared radius up to which the distorted radius grows.
     """
 
@@ -192,8 +192,9 @@ def _lens(camera: Camera) -> _Lens:
 def _stops_growing(n: Polynomial, d: Polynomial) -> float:
     """Return the squared radius up to which the distorted radius grows.
 
-    With s = r² and the factor n(s)/d(s), the distorted radius r n/d stops growing at the first
-    positive root of n d + 2 s (n' d - n d'). Beyond a pole, the first root of d, it has no meaning.
+    The radial factor of radius r is n(s)/d(s) with s = r², and n', d' are derivatives by s. The
+    distorted radius r n/d stops growing at the first positive root of n d + 2 s (n' d - n d').
+    Beyond the first root of d it has no meaning.
     """
     growth = n * d + Polynomial([0.0, 2.0]) * (n.deriv() * d - n * d.deriv())
     roots = np.concatenate([growth.trim(1e-15).roots(), d.trim(1e-15).roots()])

@@ -28,7 +28,7 @@ class Clock:
 
     @staticmethod
     def of(stretch: Stretch) -> Clock:
-        """Return the clock of a stretch. Time 0 is the reference time of its first sweep."""
+        """Build the clock of a stretch of sweeps; time 0 is its first sweep's reference time."""
         stamp_ns = np.array([s.sweep.stamp_ns for s in stretch.sweeps], np.int64)
         return Clock(stamp_ns - stamp_ns[:1])
 
@@ -51,7 +51,7 @@ class Clock:
         return max(1, round(duration_s * 1e9 / self.period_ns))
 
     def batches(self) -> tuple[tuple[int, ...], ...]:
-        """Return groups of consecutive sweep indices, each group covering about 0.1 s.
+        """Return batches: groups of consecutive sweep indices, each covering about 0.1 s.
 
         A faster scanner measures fewer points per sweep, and objects move less between its sweeps.
         A batch therefore has about as many points as one sweep at 10 Hz. At 10 Hz or slower each

@@ -69,6 +69,8 @@ class Solution:
     Attributes:
         flow: (n,3) float64 metres, in the frame of the clouds.
         energy: Value of the objective ``data + alpha * smoothness``, m².
+        data: Data term of the objective, m².
+        smoothness: Smoothness term tr(FᵀLF), m².
         energies: Energy before each step and after the last step. A step is an Adam step or an
             alternation of pcg. Adam's energy may rise; its minimum is ``energy``. Pcg's never rises
             on the last level.
@@ -143,9 +145,14 @@ def _adam(
 class _Value:
     """The energy of a flow, with the matches that give its gradient.
 
-    data, smoothness: terms E_d and tr(FᵀLF). total: energy at the requested alpha. bent: (n,3) L F.
-    pull: (n,3) sum of the vectors from each moved point to its matches, minus half the gradient of
-    E_d. num_matches: (n,) number of matches of each point, both ways.
+    Attributes:
+        data: Term E_d of `densify.flow.objective.energy.energy`, m².
+        smoothness: Term tr(FᵀLF), m².
+        total: Energy at the requested alpha.
+        bent: (n,3) product L F.
+        pull: (n,3) sum of the vectors from each moved point to its matches: minus half the gradient
+            of E_d.
+        num_matches: (n,) number of matches of each point, both ways.
     """
 
     def __init__(self, problem: _Problem, flow: Float) -> None:
@@ -198,9 +205,10 @@ def _pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
 
 
 def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
-    """Return the (n,3) step of the flow that roughly minimises the quadratic.
+    """Return the (n,3) step X of the flow that roughly minimises the quadratic bound.
 
-    Conjugate gradients solve ``(diag(num_matches) + alpha L) X = -gradient / 2`` (Jacobi).
+    Conjugate gradients with a Jacobi preconditioner solve, with the Laplacian L,
+    ``(diag(num_matches) + alpha L) X = -gradient / 2``.
     """
     shape = problem.source.shape
     diagonal = value.num_matches[:, None]

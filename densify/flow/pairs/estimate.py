@@ -109,9 +109,10 @@ def flow_between(
     settings: ObjectiveSettings,
     initial: ArrayLike | None = None,
 ) -> FlowField:
-    """Return the flow by the published objective (Pontes, Hays, Lucey, 3DV 2020).
+    """Return the flow (N,3) of a source cloud to a target, by the published objective.
 
-    With ``static_prior`` only groups that certainly move have flow. Arguments: `estimate_flow`.
+    Source: Pontes, Hays, Lucey, 3DV 2020. With ``static_prior`` only groups that certainly move
+    have flow. The arguments are as in `estimate_flow`; ``settings`` is its section ``objective``.
     """
     objective = SolverSettings(
         solver=settings.solver,
@@ -164,7 +165,7 @@ def _flow_of_groups(
 
 
 def _attach_below(points: Float, field: FlowField, low: Int) -> None:
-    """Assign points just below a moving group (wheels, feet) to the group, in place."""
+    """Assign points ``low`` (indices) just below a moving group to the group, in place."""
     members = np.flatnonzero(field.instance >= 0)
     if len(members) and len(low):
         _, row = nearest(tree_of(points[members, :2]), points[low, :2], _BELOW_M)
@@ -175,8 +176,11 @@ def _tell_scanners(clouds: tuple[Float, Float], lag: tuple[Float, Float]) -> tup
     """Return (N,) and (M,) scanner numbers 0 or 1 for two scanners half a turn apart, else None.
 
     A spinning scanner has a phase: time plus or minus azimuth is constant over its points. If the
-    phases of two scanners are half a turn apart, only the doubled phases agree. ``lag`` is the
-    firing times as a share of the time between the clouds (whole turns).
+    phases of two scanners are half a turn apart, only the doubled phases agree.
+
+    Args:
+        clouds: The (N,3) and (M,3) points.
+        lag: (N,) and (M,) firing times as a share of the time between the clouds (whole turns).
     """
     both = np.concatenate(clouds)
     far = np.hypot(both[:, 0], both[:, 1]) > _MIDDLE_M
@@ -222,8 +226,9 @@ def _columns(
 class _Times(NamedTuple):
     """The firing times of two clouds.
 
-    lag: (N,) and (M,) times after the middle of the own cloud's times, as a share of ``apart_s``.
-    apart_s: Time from the middle of one cloud's times to the middle of the other cloud's times.
+    Attributes:
+        lag: (N,) and (M,) times after the middle of the own cloud's times, in units of ``apart_s``.
+        apart_s: Seconds from the middle of one cloud's times to the middle of the other's.
     """
 
     lag: tuple[Float, Float]
@@ -246,7 +251,10 @@ def _times(times_ns: tuple[Int, Int] | None) -> _Times | None:
 
 
 def _only_proven(source: Float, target: Float, flow: Float) -> FlowField:
-    """Keep the flow (N,3) of groups that fit the target better than if static, both ways."""
+    """Keep the flow (N,3) of groups of source points that fit the target better if moved.
+
+    The fit is tested from group to target and back. All other points get flow 0.
+    """
     field = FlowField.zero(len(source))
     moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > _LEAST_MOTION_M)
     num_groups, group = link(source[moved], _LINK_M)

@@ -150,8 +150,8 @@ class Hypotheses:
         All displacements follow the slope of the ground.
 
         Args:
-            groups: Rows in ``source`` of each group.
-            candidates: Rows in ``target`` of points that may be moving.
+            groups: Indices in ``source`` of each group's points.
+            candidates: Indices in ``target`` of points that may be moving.
             initial: (N,3) flow of the source points, at whose median a group also starts, or None.
             apart_s: Time between the clouds, None if unknown.
         """
@@ -182,7 +182,7 @@ class Hypotheses:
         )
 
     def seen(self, share: Float) -> Float:
-        """Return the (P,3) sample points, moved by a share (P,) of their hypothesis."""
+        """Return the (P,3) sample points, each moved by a share (P,) of its hypothesis's motion."""
         state = self.state[self.of_point] * share[:, None]
         return apply(state, self.source.points[self.row], self.centre[self.of_point])
 
@@ -223,8 +223,13 @@ def _step(
 ) -> Float:
     """Return the (H,4) Gauss-Newton steps of all hypotheses, to be subtracted from the states.
 
-    K matches have residual and arm (K,3), share (K,) of the motion, and information (K,3,3).
-    ``of_point`` (K,) is a match's hypothesis, ``prior`` (H,4) the gradient of the prior.
+    Args:
+        residual: (K,3) vectors, metres, of K matches from the target's point to the moved point.
+        arm: (K,3) vectors from the moved centre of rotation to the moved point.
+        share: (K,) share of the motion that the point has made.
+        information: (K,3,3) inverse covariance of the target's surface, 1/m².
+        of_point: (K,) index of the hypothesis.
+        prior: (H,4) gradient of the prior.
     """
     J = np.zeros((len(arm), 3, 4))
     J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = 1.0
@@ -245,9 +250,14 @@ def _num_vote_steps(apart_s: float | None) -> int:
 
 
 def _vote(points: Float, there: Float, n: int) -> Float:
-    """Return (S,3) displacements, zero first, that bring most points close to the other cloud.
+    """Return the (S,3) displacements, zero first, that bring most points close to the other cloud.
 
-    Each point has one vote for each displacement of up to n steps of 0.2 m along x and y.
+    Each point votes for all displacements of up to n steps of 0.2 m that bring it there.
+
+    Args:
+        points: (N,3) points of a group.
+        there: (M,3) points of the other cloud.
+        n: Number of steps to each side.
     """
     zero = np.zeros((1, 3))
     span_m = np.array([n * _VOTE_STEP_M, n * _VOTE_STEP_M, _VOTE_SLACK_M])
@@ -292,7 +302,10 @@ def slope_of(ground: HeightMap, place: Float) -> Float:
 
 
 def one_per_voxel(places: Float, side_m: float) -> Int:
-    """Return the rows of the first point in each cube, given its `PairCloud.places`."""
+    """Return the indices of the first point in each cube of side ``side_m``.
+
+    ``places`` (N,3) or (N,4) are search coordinates of the points, from `PairCloud.places`.
+    """
     voxel = np.floor(places / side_m).astype(np.int64)
     key = voxel @ np.array([1, 1 << 20, 1 << 40, 7][: voxel.shape[1]])
     return np.sort(np.unique(key, return_index=True)[1])

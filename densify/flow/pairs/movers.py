@@ -40,11 +40,14 @@ def find_movers(
     initial: Float | None = None,
     apart_s: float | None = None,
 ) -> tuple[list[RigidMotion], Int]:
-    """Return the motions of the moving groups, and (N,) each source point's motion, -1 for static.
+    """Return the motions of the groups of points that move from the source to the target.
 
     Args:
         initial: (N,3) flow. A group also starts at the median flow of its members.
         apart_s: Time between the clouds, None if unknown. The search covers up to 38 m/s.
+
+    Returns:
+        The motions, and (N,) the index of each source point's motion, -1 for static points.
     """
     with ThreadPoolExecutor(2) as pool:
         ours, theirs = pool.map(Unexplained.of, (source, target), (target, source))
@@ -78,9 +81,16 @@ def find_movers(
 def _choose(
     trials: list[Trial], groups: list[Int], ours: Unexplained, theirs: Unexplained
 ) -> tuple[list[RigidMotion], Int]:
-    """Return at most one motion per group, and (N,) the index of each source point's motion.
+    """Choose at most one motion per group; each target point is explained by at most one motion.
 
-    Each target point is explained by at most one motion.
+    Args:
+        trials: Tested motions of the groups.
+        groups: Indices of each group's source points.
+        ours: Evidence in the N source points.
+        theirs: Evidence in the target points.
+
+    Returns:
+        The motions, and (N,) the index of each source point's motion, -1 for none.
     """
     free = np.ones(len(theirs.unexplained), bool)
     trials = _thinnest([t for t in trials if t.proves(free)])
@@ -142,9 +152,16 @@ def _assigned(trials: list[Trial], target_group: Int) -> list[Trial]:
 def _attach(
     motions: list[RigidMotion], instance: Int, ours: Unexplained, theirs: Unexplained
 ) -> None:
-    """Give points close to a moving group its motion, in place, if it explains them.
+    """Assign further source points to a moving group nearby whose motion explains them.
 
-    Unexplained points may be up to 1 m away, others 0.3 m.
+    Points without a counterpart in the target may be up to 1 m away, others 0.3 m. A motion
+    explains a point if the moved point has a counterpart in the target.
+
+    Args:
+        motions: Motion of each moving group.
+        instance: (N,) index in ``motions`` of each source point, -1 for none; changed in place.
+        ours: The N source points, and which of them lack a counterpart in the target.
+        theirs: The same of the target points.
     """
     points = ours.cloud.points
     members, others = np.flatnonzero(instance >= 0), np.flatnonzero(instance < 0)

@@ -54,8 +54,9 @@ class Refined(NamedTuple):
     """A motion, and how thin the object's surfaces become when its points are moved by it.
 
     Attributes:
+        motion: Motion from the source to the target.
         thickness_m: Mean distance of points from their surface; None for too few surface points.
-        of_standing: Ratio of the thickness to the thickness without motion; None in the same case.
+        of_standing: ``thickness_m`` divided by the thickness of the unmoved points; None likewise.
     """
 
     motion: RigidMotion
@@ -75,8 +76,9 @@ def refined(
     """Return the refined motion of a group, or the given motion if its surfaces are thinner.
 
     Args:
-        members: Rows of the group in ``source``.
-        candidates: Rows in ``target`` of points that may belong to the object.
+        motion: Motion to start from.
+        members: Indices of the group's points in ``source``.
+        candidates: Indices in ``target`` of points that may belong to the object.
         timed: True if firing times are known. Then points of all scanners are compared, each at its
             own time. Otherwise points are compared with the other cloud, scanner by scanner.
     """
@@ -125,7 +127,7 @@ def _arrivals(
     target: PairCloud,
     candidates: Int,
 ) -> Int:
-    """Return the rows among ``candidates`` close to the members after any of the motions."""
+    """Return those ``candidates`` (target indices) that are close to the members after a motion."""
     points = source.points[thinned(members, _ARRIVED_POINTS)]
     arrived = np.concatenate([motion.seen(points) for motion in motions])
     low, high = arrived.min(0) - _NEAR_M, arrived.max(0) + _NEAR_M
@@ -144,7 +146,8 @@ class _Surfaces:
         points: (n,3) measured positions.
         share: (n,) share of the motion at the time of each measurement.
         sampling: (n,) index of the point's combination of cloud and scanner.
-        judges: (samplings, samplings) bool, True if the second defines surfaces for the first.
+        judges: (samplings, samplings) bool, True if points of the second combination define the
+            surfaces from which points of the first are measured.
         centre: (3,) centre of the rotation.
         reach_m: Radius of the neighbourhood that defines a plane.
     """
@@ -180,10 +183,14 @@ class _Surfaces:
         )
 
     def settled(self, start: Float, gates_m: Float) -> tuple[Float, float, float]:
-        """Return the state after a step for each gate, the mean thickness (m), and the plane share.
+        """Return the motion that makes the surfaces thin, from a start.
 
-        The plane share counts points with a plane. A gate is a distance: points beyond it have no
-        weight.
+        Args:
+            start: (4,) state x, y, z (m) and yaw (rad).
+            gates_m: Distances, one for each step; points farther from their plane have no weight.
+
+        Returns:
+            The state (4,), the mean thickness (m), and the share of points that have a plane.
         """
         state, told = start.copy(), np.empty(2)
         _settle(
@@ -202,7 +209,7 @@ class _Surfaces:
 
 
 def _evenly(cloud: PairCloud, rows: Int) -> Int:
-    """Return the rows thinned to one point of each scanner per voxel, at most 600 in all."""
+    """Return the indices ``rows``, thinned to one point of each scanner per voxel, at most 600."""
     side_m = _SIDE_M
     while True:
         first = one_per_voxel(cloud.places(cloud.points[rows], rows), side_m)
@@ -262,7 +269,7 @@ def _bring_back(points, share, centre, state, at):  # type: ignore[no-untyped-de
 
 @inlined
 def _add(H, g, J, weight, off_m):  # type: ignore[no-untyped-def]
-    """Add one residual, by its derivatives J (4,), to the normal equations."""
+    """Add one residual ``off_m`` with derivatives J (4,) to the normal equations H, g, in place."""
     for m in range(4):
         g[m] += weight * J[m] * off_m
         for n in range(4):

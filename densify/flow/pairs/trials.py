@@ -51,8 +51,8 @@ class Trial:
         misfit: Mean distance to the target with the motion, as a share of the tolerance.
         still_there: Number of target points unexplained if the group is static.
         firmly_there: Number of target points that no scanner explains if the group is static.
-        around: Rows of the target points close to the moved group.
-        explained: Rows of ``around`` that the motion explains.
+        around: Indices of the target points close to the moved group.
+        explained: Indices of those target points in ``around`` that the motion explains.
         own_gain_m: Decrease of the sum of distances from the group's points to the target.
         gain_m: ``own_gain_m`` plus the decrease for the target points around.
     """
@@ -74,7 +74,15 @@ class Trial:
     def of(
         group: int, members: Int, refined: Refined, ours: Unexplained, theirs: Unexplained
     ) -> Trial:
-        """Return the evidence for the motion of the source's ``members``, by nearest points."""
+        """Gather the evidence for a motion of one group, by nearest points.
+
+        Args:
+            group: Index of the group.
+            members: Indices of its points in the source.
+            refined: Motion to test.
+            ours: Evidence in the source cloud without motion.
+            theirs: Evidence in the target cloud without motion.
+        """
         sample = thinned(members, _LOOK_POINTS)
         place = ours.cloud.places(refined.motion.seen(ours.cloud.points[sample]), sample)
         far, tolerance_m = distances_m(place, theirs.cloud.tree), ours.tolerance_m(sample)
@@ -96,7 +104,7 @@ class Trial:
         )
 
     def after(self, found: Refined, settled: Trial) -> Trial:
-        """Return the trial of the refined motion ``found``.
+        """Return the trial of a refined motion ``found``, given this trial of the first motion.
 
         Its evidence is taken before refinement (``self``) or after it (``settled``), whichever fits
         better. Rings aligned with each other fit well, but hold the motion back.
@@ -160,7 +168,7 @@ class Trial:
 def promising(
     hypotheses: Hypotheses, ours: Unexplained, theirs: Unexplained
 ) -> list[tuple[int, RigidMotion]]:
-    """Return (group index, motion) for the hypotheses that pass a first test, in the source alone.
+    """Return (group index, motion) for the hypotheses that pass a first test in the source cloud.
 
     Among nearly equal motions of a group, the motion with the smallest misfit is taken.
     """

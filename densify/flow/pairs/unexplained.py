@@ -34,7 +34,7 @@ class Unexplained:
         unexplained: (N,) bool, True without a counterpart of the same scanner within the tolerance.
         firmly: (N,) bool, True if no scanner of the other cloud has a counterpart. Two scanners may
             measure the posts of a rail with different rings.
-        candidates: (C,) rows that belong to a group.
+        candidates: (C,) indices of the points that belong to a group.
         group: (N,) label of the group, -1 for none.
     """
 
@@ -49,7 +49,7 @@ class Unexplained:
 
     @staticmethod
     def of(cloud: PairCloud, other: PairCloud) -> Unexplained:
-        """Return the points of ``cloud`` that ``other`` does not explain."""
+        """Find the points of ``cloud`` without a counterpart in ``other``, and their groups."""
         rows = np.arange(len(cloud.points))
         own_m = distances_m(cloud.places(cloud.points, rows), other.tree)
         alone = own_m > EXPLAINED_M
@@ -59,9 +59,10 @@ class Unexplained:
         return Unexplained(cloud, own_m, alone)
 
     def tolerance_m(self, rows: Int) -> Float:
-        """Return for each row the greatest distance (m) at which another point is a counterpart.
+        """Return for each point the greatest distance (m) at which another point is a counterpart.
 
-        It is larger in sparse regions, which are sparse in both clouds.
+        ``rows`` are indices of points of the cloud. The distance is larger in sparse regions, which
+        are sparse in both clouds.
         """
         k = min(_NUM_SPACING + 1, self.cloud.even_tree.n)
         place = self.cloud.places(self.cloud.points[rows], rows)
@@ -69,7 +70,7 @@ class Unexplained:
         return np.clip(spacing_m, EXPLAINED_M, _MAX_EXPLAINED_M)
 
     def groups(self, ground: HeightMap) -> list[Int]:
-        """Return the rows of each group that may be a road user, without crowns and walls."""
+        """Return the point indices of each group that may be a road user, not a crown or a wall."""
         order = self.candidates[np.argsort(self.group[self.candidates], kind="stable")]
         parts = np.split(order, np.flatnonzero(np.diff(self.group[order])) + 1)
         return [

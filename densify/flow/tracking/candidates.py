@@ -33,7 +33,7 @@ class Strips:
     """Index that finds points in a box; fast because neighbours in scan order lie close."""
 
     def __init__(self, points: Float) -> None:
-        """Index the points (N,3), in scan order."""
+        """Index the points (N,3, metres), given in scan order."""
         self._points = points
         begins = np.arange(0, len(points), _STRIP)
         if len(points):
@@ -41,7 +41,7 @@ class Strips:
             self._high = np.maximum.reduceat(points, begins)
 
     def rows_inside(self, low: Float, high: Float) -> Int:
-        """Return the ascending rows of the points inside a box, given by two corners (3,)."""
+        """Return the ascending indices of the points in a box with corners low and high (3,)."""
         if not len(self._points):
             return np.zeros(0, np.int64)
         strips = np.flatnonzero(((self._low < high) & (self._high > low)).all(axis=1))
@@ -53,9 +53,9 @@ class Strips:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The points above the ground of one sweep, and which may move; attributes as in `Obstacles`.
+    """The C points above the ground of one sweep, and which of them may move.
 
-    These columns do not depend on the world's origin.
+    The attributes are as in `Obstacles`. They do not depend on the world's origin.
     """
 
     row: Int
@@ -66,7 +66,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Obstacles:
-    """The C points of one sweep, or of a batch, that lie above the ground.
+    """The C points above the ground (obstacles) in one sweep, or in a `Batch` of sweeps.
 
     Attributes:
         row: (C,) index into the sweep's points.
@@ -74,6 +74,7 @@ class Obstacles:
         time_s: (C,) firing time since the first sweep's reference time.
         seed: (C,) True if another sweep saw through the point.
         cluster: (C,) label of the cluster of candidates, -1 for other points.
+        num_clusters: Number of clusters; labels are below it.
     """
 
     row: Int
@@ -85,7 +86,13 @@ class Obstacles:
 
     @staticmethod
     def of(stretch: Stretch, i: int, found: Candidates) -> Obstacles:
-        """Return the obstacles of sweep i: its points above the ground, in the world."""
+        """Return the obstacles of the sweep with index i: its points above the ground, world frame.
+
+        Args:
+            stretch: Consecutive registered sweeps.
+            i: Index of the sweep in the stretch.
+            found: Candidates of this sweep, from `find_candidates`.
+        """
         registered = stretch.sweeps[i]
         return Obstacles(
             row=found.row,
@@ -109,10 +116,12 @@ class Obstacles:
 
 @dataclass(frozen=True)
 class Batch:
-    """The obstacles of consecutive sweeps within 0.1 s, see `Clock.batches`.
+    """A few consecutive sweeps within 0.1 s, searched together, and their obstacles.
+
+    At 10 Hz a batch is one sweep, see `Clock.batches`.
 
     Attributes:
-        sweeps: Indices of the sweeps.
+        sweeps: Indices of the sweeps in the stretch.
         time_ns: Middle between the first and the last reference time, since the stretch's first
             sweep.
         half_s: Half the time between the first and the last sweep.
@@ -128,7 +137,13 @@ class Batch:
 
     @staticmethod
     def of(sweeps: Sequence[int], obstacles: Sequence[Obstacles], clock: Clock) -> Batch:
-        """Build the batch of some sweeps, given the obstacles and the clock of all sweeps."""
+        """Build a batch from the sweeps with the indices ``sweeps``.
+
+        Args:
+            sweeps: Indices of consecutive sweeps.
+            obstacles: Obstacles of every sweep of the stretch.
+            clock: Reference times of every sweep of the stretch.
+        """
         parts = [obstacles[j] for j in sweeps]
         first_ns, last_ns = clock.time_ns[[sweeps[0], sweeps[-1]]].tolist()
         begins = np.cumsum([0] + [len(part.points) for part in parts[:-1]]).tolist()
@@ -136,18 +151,30 @@ class Batch:
         return Batch(tuple(sweeps), middle_ns, half_s, _merged(parts), tuple(begins))
 
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
-        """Concatenate this batch's arrays among ``columns``, an array for each sweep."""
+        """Concatenate the arrays of this batch's sweeps, in the order of ``obstacles``.
+
+        Args:
+            columns: For every sweep of the stretch, an array with a value for each obstacle.
+        """
         return np.concatenate([columns[j] for j in self.sweeps])
 
     def split(self, rows: Int) -> dict[int, Int]:
-        """Split ascending rows of the batch into rows of each sweep's obstacles, by sweep index."""
+        """Convert indices of obstacles in the batch to indices within each sweep's own obstacles.
+
+        Args:
+            rows: (K,) ascending indices into ``obstacles`` of the batch.
+
+        Returns:
+            Sweep index -> ascending indices into the `Obstacles` of that sweep. Sweeps without a
+                point are left out.
+        """
         parts = np.split(rows, np.searchsorted(rows, self.begins[1:]))
         own = zip(self.sweeps, parts, self.begins, strict=True)
         return {j: part - begin for j, part, begin in own if len(part)}
 
 
 def _merged(parts: Sequence[Obstacles]) -> Obstacles:
-    """Concatenate sweeps, joining clusters that come within `LINK_M` of each other."""
+    """Concatenate the obstacles of sweeps; clusters within `LINK_M` of each other become one."""
     if len(parts) == 1:
         return parts[0]
     first = np.cumsum([0] + [part.num_clusters for part in parts]).tolist()
@@ -182,6 +209,9 @@ def find_candidates(
 
     Args:
         among: Indices of the sweeps to work on; None for all.
+
+    Returns:
+        For each sweep worked on, its points above the ground.
     """
 
     def of_sweep(i: int) -> Candidates:
@@ -215,7 +245,13 @@ def closer_rings(points: Float, gap_m: Float) -> Float:
 
 
 def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
-    """Return (N,) firing times, s since the first sweep's reference time, of rows of sweep i."""
+    """Return (N,) firing times in seconds since the first sweep's reference time.
+
+    Args:
+        stretch: Consecutive registered sweeps.
+        i: Index of the sweep that measured the points.
+        rows: (N,) indices of the points in that sweep.
+    """
     sweep = stretch.sweeps[i].sweep
     offset_ns = np.zeros(len(rows), np.int64) if sweep.offset_ns is None else sweep.offset_ns[rows]
     begin_ns = stretch.sweeps[0].sweep.stamp_ns

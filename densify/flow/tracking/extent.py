@@ -60,7 +60,7 @@ class SweepPoints:
     def of(
         stretch: Stretch, i: int, ground: HeightMap, obstacles: Obstacles, sensors: Sensors
     ) -> SweepPoints:
-        """Return the points of sweep i more than 0.08 m above the ground."""
+        """Return the points of the sweep with index i that are over 0.08 m above the ground."""
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
@@ -148,10 +148,15 @@ def assign_points(
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
 ) -> list[Instance]:
-    """Return for each sweep of a batch (N,) the index of each point's object, -1 for none.
+    """Decide which moving object each point of a batch of sweeps belongs to.
 
     Args:
+        batch: Indices of consecutive sweeps within 0.1 s.
+        objects: Confirmed moving objects.
         obstacles: Points above the ground of each sweep of the stretch.
+
+    Returns:
+        For each sweep of the batch (N,) int32, the index of each point's object, -1 for none.
     """
     parts = [SweepPoints.of(stretch, i, ground, obstacles[i], space.sensors) for i in batch]
     attached = []
@@ -170,7 +175,7 @@ def assign_points(
 
 
 def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock) -> Instance:
-    """Return (N,) the index of the object of each point of sweep i, -1 for none.
+    """Return (N,) the index in ``objects`` of the object near each point of ``seen``, -1 for none.
 
     A point belongs to an object if it is close to the object's accumulated points or within their
     outline. The ground below a walker does not belong to the walker.

@@ -38,13 +38,17 @@ _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
-    """Return the clusters that may start a track, the best first, as (batch index, rows).
+    """Return the clusters that may start a track, the best first.
 
     Large clusters make good models. Far from the ends of the recording, sweeps on both sides show
     how the object moves.
 
     Args:
+        batches: Obstacles of each batch (consecutive sweeps within 0.1 s).
         clock: Times of the batches.
+
+    Returns:
+        For each cluster, the batch index and the indices of its points in the batch's obstacles.
     """
     starts = []
 
@@ -70,7 +74,8 @@ def velocities_beside(
 
     Args:
         batch: Batch of the cluster.
-        members: Rows of the cluster in the batch.
+        members: Indices of the cluster's points in the batch's obstacles.
+        objects: Moving objects found so far.
     """
     points = batch.obstacles.points[members]
     tree, middle = tree_of(points), points.mean(0, keepdims=True)
@@ -85,7 +90,8 @@ class Follower:
     """Tracker of clusters through the batches.
 
     Attributes:
-        free: For each sweep (C,) True for points that no track has claimed.
+        batches: Groups of consecutive sweeps within 0.1 s.
+        free: For each sweep (C,) True for obstacles that no track has claimed.
         clock: Times of the batches.
     """
 
@@ -98,7 +104,7 @@ class Follower:
         """Track a cluster forwards, then backwards; the model is made of all points found so far.
 
         Args:
-            members: Rows of the cluster in batch ``start``.
+            members: Indices of the cluster's points in the obstacles of batch ``start``.
             start: Index of the batch.
             velocity: (3,) initial velocity, m/s, world.
         """
@@ -125,7 +131,11 @@ class Follower:
     def _find(
         self, model: Model, track: Track, rate: Float, n: int
     ) -> tuple[Float, float, Int, Float] | None:
-        """Align the candidates of batch n with the model; ``rate`` (4,) is the state's.
+        """Align the candidates of one batch with the points of the object so far.
+
+        Args:
+            rate: (4,) rate of the state x, y, z, yaw at the start, per second.
+            n: Index of the batch.
 
         Returns:
             The state (4,), its time (s), the K rows that fit, and (K,3) the positions of these
@@ -159,7 +169,7 @@ class Follower:
 
 
 def _at_once(c: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
-    """Return the positions (N,3) of points at one time, given the rate of the object's state."""
+    """Return (N,3) obstacles ``rows`` moved to time ``time_s`` by the velocity ``rate[:3]``."""
     return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
 
 
@@ -172,6 +182,7 @@ def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float,
     Args:
         rate: (4,) rate of the state at the start, per second.
         num: Number of observations to use.
+        time_s: Time to predict.
 
     Returns:
         The state (4,), its rate (4,), and the standard deviation (3,) of x, y (m) and yaw (rad).

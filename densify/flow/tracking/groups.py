@@ -26,9 +26,10 @@ _FINE_M = 0.3  # ring gap up to which a limb has returns of several rings
 
 @dataclass(frozen=True)
 class GroupMotion:
-    """The motion of all objects in a stretch: a `Motion`.
+    """The motion of all objects in a stretch (consecutive registered sweeps): a `Motion`.
 
     Attributes:
+        stretch: The sweeps, in one world.
         tracks: Tracks of the confirmed moving objects.
         instance: For each sweep (N,) int32, the index in ``tracks`` for each point, -1 for static.
         bendings: Non-rigid motion of the tracks that have one, by index in ``tracks``.
@@ -40,7 +41,7 @@ class GroupMotion:
     bendings: Mapping[int, Bending]
 
     def with_stretch(self, stretch: Stretch) -> GroupMotion:
-        """See `densify.flow.engines.SharedMotion`."""
+        """Return the same motion on another copy of its stretch, see `SharedMotion`."""
         return replace(self, stretch=stretch)
 
     def flow(self, frame: int, target: int) -> FlowField:
@@ -123,7 +124,7 @@ def motion_of(
     """Find the moving objects among given candidates.
 
     Args:
-        candidates: Candidates of each sweep.
+        candidates: Candidates of each sweep: the points that may move.
         velocities_m_s: For each sweep (C,3) velocities of its C points above the ground, world
             frame. None estimates them by a vote of neighbouring sweeps.
     """
@@ -161,7 +162,7 @@ def motion_of(
 
 
 def _rows_of(instance: Instance) -> list[tuple[int, Int]]:
-    """Return (track index, ascending rows of its points) for each track in ``instance`` (N,)."""
+    """Return, for each track in ``instance`` (N,), its index and its points' ascending indices."""
     rows = np.flatnonzero(instance >= 0)
     rows = rows[np.argsort(instance[rows], kind="stable")]
     tracks, begins = np.unique(instance[rows], return_index=True)

@@ -38,7 +38,7 @@ Judge = Callable[[Track, "Evidence"], None]
 
 
 class Places(NamedTuple):
-    """What other sweeps observed at positions of the object.
+    """Counts of what other sweeps observed at positions where the object is at another time.
 
     Attributes:
         taken: Number of positions with a return of something else.
@@ -90,7 +90,7 @@ class Evidence(NamedTuple):
     slender: float
 
     def terms(self) -> dict[str, float]:
-        """Return the value of each term of the log odds, by the term's name."""
+        """Return the value of each term of the log odds, by its name in ``likelihood.json``."""
         static, moved, tests = self.violations
         less, more = sorted([self.before.log_taken(), self.after.log_taken()])
         return {
@@ -146,6 +146,7 @@ def judge(
 
     Args:
         track: Track to judge; its ``path`` is replaced.
+        objects: Objects confirmed so far, whose returns do not count against the track.
         judged: Function called with the track and its evidence.
     """
     if len(track.observations) < _NUM_STATES:
@@ -173,7 +174,10 @@ def judge(
 
 
 def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Violations:
-    """Count how often other sweeps see through a sample of the track's points, static and moved."""
+    """Count how often other sweeps see through a sample of the track's points.
+
+    Each point is tested at its measured position, and at the position to which the track moves it.
+    """
     tested = {}
     for batch in space.batches:
         num = _NUM_ASKED // len(batch)
@@ -225,6 +229,7 @@ def find_places_left(
     of other confirmed objects do not count.
 
     Args:
+        objects: Other confirmed objects.
         within_m: Greatest distance from a position to a return that takes it, m.
 
     Returns:
@@ -263,7 +268,10 @@ def find_places_left(
 def _returns_near(
     places: Float, reach_m: float, c: Obstacles, objects: Sequence[MovingObject]
 ) -> Float:
-    """Return the (N,3) points of a sweep close to the positions, without the objects' points."""
+    """Return the (N,3) points of a sweep within ``reach_m`` of ``places`` (M,3), world.
+
+    Points on the given moving objects are left out.
+    """
     rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
     rows = rows[is_near(tree_of(places), c.points[rows], reach_m)]
     for track, shape in objects:

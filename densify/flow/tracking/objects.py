@@ -43,14 +43,14 @@ def near_m(gap_m: Float | float) -> Any:
 
 @dataclass(frozen=True)
 class Observation:
-    """The pose of an object in one batch of sweeps.
+    """The pose of an object in one `Batch` (some consecutive sweeps within 0.1 s).
 
     Attributes:
         state: (4,) displacement x, y, z (m) and yaw (rad) since the first observation, world axes;
             z follows the ground.
         seen_s: Mean firing time of the object's points, since the first sweep of the stretch.
-        time_ns: Time of the batch, see `Batch`.
-        sweeps: Indices of the sweeps in which the object has points.
+        time_ns: Middle time of the batch, ns since the first sweep of the stretch.
+        sweeps: Indices of the sweeps of the batch in which the object has points.
     """
 
     state: Float
@@ -61,13 +61,16 @@ class Observation:
 
 @dataclass
 class Track:
-    """One rigid object. Its own frame is the world at its first observation.
+    """One rigid object, its pose in each `Batch` of sweeps, and its points.
+
+    The object's frame coincides with the world at the first observation. From there the object
+    moves by a state: displacement x, y, z (m) and yaw (rad) about ``centre``.
 
     Attributes:
-        centre: (3,) centre of its rotation, world at the first observation.
-        observations: Pose in each batch by batch index, in the order of tracking.
-        claimed: Points of the object by sweep index: rows of the sweep's `Obstacles`.
-        path: Smooth motion through the states; set by `smooth`.
+        centre: (3,) position about which the object rotates, in the object's frame.
+        observations: Batch index -> pose of the object, in the order of tracking.
+        claimed: Sweep index -> indices, in this sweep's `Obstacles`, of the object's points.
+        path: Smooth motion through the states over time; exists after `smooth`.
     """
 
     centre: Float
@@ -76,7 +79,15 @@ class Track:
     path: Path = field(init=False)
 
     def add(self, n: int, batch: Batch, state: Float, seen_s: float, rows: Int) -> None:
-        """Add the observation in batch index n; ``rows`` of its obstacles are ascending."""
+        """Add the observation of the object in one batch.
+
+        Args:
+            n: Index of the batch.
+            batch: The batch itself.
+            state: (4,) displacement x, y, z (m) and yaw (rad).
+            seen_s: Mean firing time of the object's points.
+            rows: Ascending indices of the object's points in the batch's obstacles.
+        """
         mine = batch.split(rows)
         self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(mine))
         self.claimed |= mine
@@ -98,7 +109,7 @@ class Track:
         return undo(self.path(time_s), points, self.centre)
 
     def carry(self, points: Float, from_s: float | Float, to_s: float | Float) -> Float:
-        """Move (N,3) points of the object, world, from one time to another."""
+        """Move (N,3) world points along with the object from one time to another."""
         return self.place(self.undo(points, from_s), to_s)
 
     def velocity_m_s(self, points: Float, time_s: float) -> Float:
@@ -110,7 +121,10 @@ class Track:
         return velocity_m_s
 
     def seen_through(self, points: Float, j: int, space: FreeSpace) -> Bool:
-        """Return (N,) True for (N,3) points, object's frame, that sweep j sees through."""
+        """Return (N,) True for (N,3) points, object's frame, seen through by the sweep of index j.
+
+        The points are first moved with the object to the time of that sweep.
+        """
         at_s = space.clock.time_s[j]
         carried = self.place(points, at_s)
         return space.seen_through(carried, j, self.velocity_m_s(carried, at_s))
@@ -124,7 +138,7 @@ class Track:
         return np.concatenate(parts)
 
     def rows_in(self, batch: Batch) -> Int:
-        """Return the rows of the batch's obstacles that belong to the object."""
+        """Return the indices, in the batch's obstacles, of the object's points."""
         sweeps = zip(batch.sweeps, batch.begins, strict=True)
         own = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
         return np.concatenate([np.zeros(0, np.int64), *own])  # all may have been taken away
@@ -142,7 +156,7 @@ class Track:
         return float(np.ptp([seen.seen_s for seen in self.observations.values()]))
 
     def rise_m(self, ground: HeightMap, state: Float) -> float:
-        """Return how much higher the ground is at a state (4,) than at the start.
+        """Return how much higher (m) the ground is below the object at a state (4,) than at first.
 
         It is the median over the object's position and 1 m to both sides, because the road below an
         object may never be observed.
@@ -152,7 +166,10 @@ class Track:
         return float(np.median(ground.under(start + state[:2]) - ground.under(start)))
 
     def seen_at(self, time_ns: int) -> float:
-        """Estimate when (s) a sweep with a given reference time measures the object."""
+        """Estimate when (s) the sweep with a reference time ``time_ns`` measures the object.
+
+        Both count from the first sweep. The delay is taken from the observation nearest in time.
+        """
         nearest = min(
             self.observations.items(), key=lambda item: (abs(item[1].time_ns - time_ns), item[0])
         )[1]
@@ -165,10 +182,11 @@ class Shape:
 
     Attributes:
         points: (M,3) metres.
+        tree: Search tree of the points.
         rim: (K,3) points that bound the others: corners of the convex outline, lowest and highest
             point.
-        edges: (E,3) normals and offsets of the convex outline seen from above; (0,3) if the points
-            span no area.
+        edges: (E,3) lines of the convex outline seen from above: outward normal x, y and offset, so
+            that ``normal · xy + offset`` is below 0 inside; (0,3) if the points span no area.
     """
 
     points: Float
@@ -178,7 +196,7 @@ class Shape:
 
     @staticmethod
     def of(points: Float) -> Shape:
-        """Return the shape of at least one point (M,3), object's frame."""
+        """Build the shape from an object's accumulated points (M,3), object's frame, M >= 1."""
         try:
             hull = ConvexHull(points[:, :2])
         except (QhullError, ValueError):  # too few points, or all on a line
@@ -195,7 +213,10 @@ class Shape:
         return inside
 
     def near(self, points: Float, within_m: float) -> Bool:
-        """Return (N,) True for (N,3) points in the outline or within ``within_m`` of a point."""
+        """Return (N,) True for (N,3) points that touch the object, object's frame.
+
+        They lie within ``within_m`` of one of its points, or inside its outline seen from above.
+        """
         return is_near(self.tree, points, within_m) | self.within_outline(points)
 
     @cached_property
@@ -243,7 +264,7 @@ class MovingObject(NamedTuple):
         return side if np.ptp(rim @ side) >= LONG_M else ahead
 
     def lane(self, at_s: float) -> Lane:
-        """Return the space ahead of and behind the object at a time, world."""
+        """Return the space ahead of and behind the object at a time (s), see `Lane`."""
         ahead = self.heading(at_s)
         rim = self.track.place(self.shape.rim, at_s)
         aside = rim[:, :2] @ [-ahead[1], ahead[0]]

@@ -58,6 +58,7 @@ class Path:
         Args:
             times_s: (m,) ascending times.
             states: (m,d) states at these times.
+            weights: (m,) weight of each state, of any scale.
         """
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
         num_spans = max(1, round((end_s - begin_s) / _KNOT_S))

@@ -41,7 +41,7 @@ _MIN_GAIN, _MIN_SHARE_BETTER = 0.05, 0.75
 
 @dataclass(frozen=True)
 class Part:
-    """The points of an object in one sweep.
+    """The points of one object in one sweep.
 
     Attributes:
         points: (n,3) metres, n >= 1, in the object's own frame (rigid motion removed).
@@ -54,14 +54,15 @@ class Part:
 
 @dataclass(frozen=True)
 class Softened:
-    """How an object bends from part (the object's points in one sweep) to part.
+    """How an object bends from sweep to sweep; its points in one sweep are a `Part`.
 
     Attributes:
         to_next: For each part (n,3) metres, displacement of its points to the time of the next part
             relative to the rigid motion, object's frame. It is 0 for the last part and for a rigid
             object.
         to_previous: As ``to_next``, to the time of the previous part; 0 for the first part.
-        alpha: Stiffness that held-out parts confirmed, inf for rigid.
+        parts: Points of the object in each sweep, by ascending time.
+        alpha: Weight of smoothness (stiffness) that held-out parts confirmed, inf for rigid.
         held_out_m: Root mean square distance of held-out parts from their prediction, by the alpha
             tried, inf first; empty if nothing was tried.
     """
@@ -167,14 +168,22 @@ def _squared_distance(a: Float, b: Float) -> float:
 
 
 class _Bending:
-    """Bends all parts at once, each to the next and to the previous one.
+    """Solver of the flow from each part (points of the object in one sweep) to its neighbours.
 
-    A hop leads from one part to a neighbouring part. The nodes (thinned points) of all hops lie
-    side by side in one cloud, so that one system of equations serves all hops. ``refine`` holds the
-    targets and minimises ``Σ w |f - target|² + Σ a |f|² + steady + alpha tr(Fᵀ L F)`` over the flow
-    F. The weight w fades with the distance to the target. The weight a holds a point to its rigid
-    position until it has clearly left (Geman, McClure 1987). The term steady keeps velocities
-    equal.
+    A hop leads from one part to the next or the previous part. A node is one point per voxel of
+    0.07 m. The nodes of all hops lie side by side in one cloud, and share one system of equations.
+    `refine` holds the targets t fixed and minimises, over the flow F::
+
+        Σ w |f - t|² + Σ a |f|² + steady + alpha tr(Fᵀ L F)
+
+    f: (3,) row of F: displacement of a node beyond the rigid motion, metres.
+    F: (nodes, 3) flow of all nodes, and L: (nodes, nodes) Laplacian of their graph (`_laplacian`).
+    t: (3,) current f, plus the mean of the other part's nodes around the moved node, minus the mean
+        of the part's own moved nodes around it.
+    w: Weight that fades from 1 to 0 with the distance to the target.
+    a: Weight of the rigid position, until the node has clearly left it (Geman, McClure 1987).
+    steady: Penalty on different velocities before and after (`_steadiness`).
+    alpha: Stiffness, the weight of smoothness.
     """
 
     def __init__(self, parts: tuple[Part, ...]) -> None:
@@ -193,7 +202,11 @@ class _Bending:
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
 
     def refine(self, level: int) -> None:
-        """Find all targets again and solve for the flow, at the stiffness of a level."""
+        """Find all targets again and solve for the flow, in place.
+
+        Args:
+            level: Index of the stiffness in `_ALPHAS`, 0 for the stiffest.
+        """
         moved = self._source + self._flow
         near = nearest_k(tree_of(self._target), moved, _NUM_BLURRED)[1]
         there, distance_m = _blurred(self._target, near, moved, _BLURS_M[level])
@@ -211,7 +224,7 @@ class _Bending:
             )
 
     def bring_beyond(self) -> None:
-        """Fill holes of each hop's target by the part beyond it, moved by the flow."""
+        """Fill holes in the target of each hop from a to b by the part beyond b, moved to b."""
         flows = self._by_hop()
         targets = []
         for a, b in self._hops:
@@ -247,7 +260,9 @@ class _Bending:
     def _steadiness(self) -> csr_array:
         """Return the (nodes, nodes) matrix of ``|f_next / dt_next + f_previous / dt_previous|²``.
 
-        It is scaled to a weight of 1 for equal intervals.
+        f_next and f_previous are a node's displacements to the next and the previous part, dt the
+        times between the parts. The sum is 0 at constant velocity. The matrix is scaled to a weight
+        of 1 for equal times.
         """
         number = {hop: k for k, hop in enumerate(self._hops)}
         times_s = [p.time_s for p in self._parts]
@@ -287,7 +302,7 @@ def _laplacian(points: Float) -> csr_array:
 def _averaged(
     parts: tuple[Part, ...], to_next: tuple[Float, ...], to_previous: tuple[Float, ...]
 ) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-    """Average the flows to next and previous with the reverse flows where points arrive."""
+    """Average each flow with the reversed flow back from the part where its points arrive."""
 
     def mean(a: int, b: int, onward: Float, back: Float) -> Float:
         arrived = parts[a].points + onward

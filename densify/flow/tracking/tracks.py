@@ -49,7 +49,7 @@ def find_tracks(
     velocities_m_s: Sequence[Float] | None = None,
     judged: Judge | None = None,
 ) -> list[Track]:
-    """Return the confirmed tracks of all moving objects in the stretch.
+    """Return the confirmed tracks of all moving objects in the stretch (consecutive sweeps).
 
     Args:
         obstacles: Points above the ground of each sweep.
@@ -61,7 +61,10 @@ def find_tracks(
 
 
 class _Search:
-    """State of the search: batches, points that no track has claimed, objects found so far."""
+    """State of the search: batches of sweeps, points still free, and objects found so far.
+
+    A point is free until a track claims it.
+    """
 
     def __init__(
         self,
@@ -89,7 +92,7 @@ class _Search:
         return [np.ones(len(c.points), bool) for c in self._obstacles]
 
     def tracks(self) -> list[Track]:
-        """Return the confirmed tracks, those with the best starts first."""
+        """Return the confirmed tracks; tracks from the best starting clusters come first."""
         untried = self._all_points()
         for n, cluster in find_starts([batch.obstacles for batch in self.batches], self.clock):
             batch = self.batches[n]
@@ -123,7 +126,12 @@ class _Search:
         return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
 
     def _velocity_of(self, members: Int, n: int) -> Float:
-        """Return the likely velocity (3,), m/s, world, of a cluster (rows of batch n)."""
+        """Return the likely velocity (3,), m/s, world frame, of a cluster.
+
+        Args:
+            members: Indices of the cluster's points in the obstacles of batch n.
+            n: Index of the batch.
+        """
         c = self.batches[n].obstacles
         if self._velocities_m_s is None:
             group = Group.of(c.points[members], c.time_s[members])
@@ -133,8 +141,9 @@ class _Search:
         return velocity
 
     def _track_of(self, members: Int, n: int) -> tuple[Track, Verdict]:
-        """Return the most likely track of a cluster (rows ``members`` of batch n), and its verdict.
+        """Return the most likely track of a cluster, and the log odds that it moves.
 
+        ``members`` are the indices of the cluster's points in the obstacles of batch index n.
         It starts at the velocity that most sweeps agree on, and at the velocities of adjacent
         objects such as a towing vehicle. If free-space violations remain, it is followed again from
         its first and last batch. More of the object may be in view there than one side that slides
@@ -203,12 +212,18 @@ class _Search:
             track.claimed[j] = np.concatenate([track.claimed[j], rows[together]])
 
     def _unclaimed(self, j: int, rows: Int, own: Int) -> Int:
-        """Return the ``rows`` of sweep j that are free candidates, without the track's ``own``."""
+        """Return those ``rows`` of sweep j that are free candidates, without ``own``.
+
+        Both are indices into the obstacles of sweep j; ``own`` belong to the track already.
+        """
         rows = rows[self._free[j][rows] & (self._obstacles[j].cluster[rows] >= 0)]
         return np.setdiff1d(rows, own, assume_unique=True)
 
     def _without_violations(self, track: Track, j: int, rows: Int) -> Int:
-        """Return the ``rows`` of sweep j that no sweep within 0.3 s sees through, once moved."""
+        """Return those ``rows`` of sweep j that, moved with the track, are never seen through.
+
+        The test covers all sweeps within 0.3 s; ``rows`` are indices into the obstacles of sweep j.
+        """
         c = self._obstacles[j]
         for i in self._space.others(j):
             if self._space.clock.near(i, j, _NEAR_S) and len(rows):
@@ -223,7 +238,14 @@ def _better(known: tuple[Track, Verdict], found: tuple[Track, Verdict]) -> tuple
 
 
 def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -> Bool:
-    """Return (N,) True for rows whose cluster is hit by a single ring or column of rays."""
+    """Return (N,) True for points whose cluster is hit by a single ring or column of rays.
+
+    Args:
+        c: Obstacles of one sweep.
+        rows: (N,) indices of the points in ``c``.
+        T_lidar_world: (4,4) pose of the world in the lidar frame.
+        sensors: Models of the scanners.
+    """
     if not len(rows):
         return np.zeros(0, bool)
     clusters, of_row = np.unique(c.cluster[rows], return_inverse=True)

@@ -59,9 +59,9 @@ class DistanceField:
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_to(self, found: Bytes, group: Group, velocities: Float) -> None:
-        """Raise ``found``, in place, to the nearness of the group's points at each velocity.
+        """Raise ``found``, in place, to the nearness of the moved group to this sweep's candidates.
 
-        Each point is moved to the time at which this sweep would measure the group.
+        Each point moves at each velocity, to the time at which this sweep would measure the group.
 
         Args:
             found: (V,N) nearness of each of N points at each of V velocities, 0 to 255.
@@ -89,7 +89,7 @@ class DistanceField:
 
 @dataclass(frozen=True)
 class Group:
-    """The points of a cluster in one batch.
+    """The N points of a cluster in one batch (consecutive sweeps within 0.1 s).
 
     Attributes:
         points: (N,3) world.
@@ -105,7 +105,7 @@ class Group:
 
     @staticmethod
     def of(points: Float, time_s: Float) -> Group:
-        """Return the group of points (N,3, world) with firing times (N,)."""
+        """Build the group from points (N,3, world) and their firing times (N,) in seconds."""
         middle_s = float(time_s.mean())
         return Group(points, time_s - middle_s, middle_s, points.mean(axis=0))
 
@@ -117,8 +117,9 @@ class Group:
 
 
 def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
-    """Return the horizontal velocity (3,), m/s, that best explains the neighbouring batches.
+    """Return the horizontal velocity (3,) of a cluster, m/s, that the neighbouring sweeps support.
 
+    At this velocity the moved points come nearest to candidates of other batches (see `Batch`).
     First the batches about 0.1 and 0.2 s before and after are compared, in coarse steps of
     velocity. A flat side shows its speed only at its ends, which move by less than a voxel in this
     short time. Therefore batches up to 0.5 s away are compared too, in fine steps.
@@ -141,13 +142,22 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
 
 
 def _batches_around(n: int, step_s: float, clock: Clock) -> list[int]:
-    """Return the batches one and two steps before and after batch n, where they exist."""
+    """Return the indices of the batches one and two steps of ``step_s`` before and after batch n.
+
+    Batches beyond the ends of the stretch are left out.
+    """
     asked = [clock.at(n, later_s) for later_s in (-2 * step_s, -step_s, step_s, 2 * step_s)]
     return sorted({m for m in asked if m is not None})
 
 
 def _best(group: Group, around: Sequence[Sequence[DistanceField]], velocities: Float) -> Float:
-    """Return the velocity (3,) among (V,3) that brings the group nearest to candidates."""
+    """Return the velocity (3,) among (V,3) that brings the group nearest to candidates.
+
+    Args:
+        group: Points of a cluster.
+        around: For each batch compared with, the distance fields of its sweeps.
+        velocities: (V,3) m/s.
+    """
     cost = np.zeros(len(velocities))
     for batch in around:
         nearness = np.zeros((len(velocities), len(group.points)), np.uint8)

@@ -25,7 +25,7 @@ class Cloud:
         rigid_points: (M,3) metres, key frame, by registration only, as in rigid accumulation.
         frame: (M,) int32 frame number of the source sweep.
         since_key_ns: (M,) int64 ns, source sweep's reference time minus key sweep's reference time.
-        row: (M,) int64 row of the point in the file of the source sweep.
+        row: (M,) int64 index of the point's row in the file of the source sweep.
         lidar: (M,) uint8 index of the scanner that measured the point.
         moving: (M,) bool, True if the point belongs to a moving object.
         instance: (M,) int32 number of the moving object, -1 for none.
@@ -61,7 +61,7 @@ class Cloud:
         return Cloud(**{n: np.concatenate([c, vars(other)[n]]) for n, c in vars(self).items()})
 
     def select(self, keep: Bool) -> Cloud:
-        """Return a cloud of the points where the (M,) mask is True."""
+        """Return a cloud with only the points where the (M,) mask ``keep`` is True."""
         rows = np.flatnonzero(keep)  # once for all columns
         return Cloud(**{name: column.take(rows, axis=0) for name, column in vars(self).items()})
 
@@ -93,7 +93,10 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Patches:
-    """The surface patches of the M points of a cloud, in the same order (`densify.depth.patches`).
+    """The surface patches of the M points of a cloud, in the same order.
+
+    A patch is the piece of surface around a point, as large as the spacing of the rays there. It
+    occludes what lies behind it (`densify.depth.patches`).
 
     Attributes:
         normal: (M,3) float32 normal of the tangent plane, of any length, key frame.
@@ -113,13 +116,16 @@ class Patches:
     place: NDArray[np.int32]
 
     def joined(self, other: Patches) -> Patches:
-        """Return these patches, then the other cloud's. The two clouds must not share a sweep."""
+        """Return these patches, then the patches of another cloud, made from other sweeps."""
         num_sweeps = np.int32(self.sweep.max(initial=-1) + 1)
         behind = vars(other) | {"sweep": num_sweeps + other.sweep}
         return Patches(**{n: np.concatenate([c, behind[n]]) for n, c in vars(self).items()})
 
     def select(self, keep: Bool) -> Patches:
-        """Return the patches of ``cloud.select(keep)``, with the sweeps renumbered from 0."""
+        """Return the patches of the points where the (M,) mask ``keep`` is True.
+
+        They belong to ``cloud.select(keep)``. The sweeps are renumbered from 0 without gaps.
+        """
         rows = np.flatnonzero(keep)
         kept = {name: column.take(rows, axis=0) for name, column in vars(self).items()}
         number = np.cumsum(np.bincount(kept["sweep"]) > 0) - 1
@@ -158,7 +164,7 @@ class StandingWorld:
     left_out: tuple[int, ...] = ()
 
     def select(self, keep: Bool | Int) -> StandingWorld:
-        """Return the points where a (K,) mask is True, or at the given rows."""
+        """Return a world with only the points of a (K,) mask, or of an array of point indices."""
         rows = np.flatnonzero(keep) if keep.dtype == bool else keep
         kept = {name: getattr(self, name).take(rows, axis=0) for name in _COLUMNS_OF_STANDING}
         return replace(self, **kept)
@@ -341,7 +347,7 @@ class DepthMap:
 
 @dataclass(frozen=True)
 class Mover:
-    """The points of one moving object, and its depth map in each camera, by map name."""
+    """One moving object alone: its points, and map name -> depth map of these points."""
 
     cloud: Cloud
     depth: Mapping[str, DepthMap]

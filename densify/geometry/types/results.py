@@ -46,7 +46,9 @@ class ObjectTrack:
 
 @dataclass(frozen=True)
 class Prior:
-    """A depth image supplied by the user, of the size of its depth map.
+    """A depth image supplied by the user, for example from a network, that completes a depth map.
+
+    It has the size of the map.
 
     Attributes:
         value: (H,W) float32 depth or inverse depth, relative or metric; 0 for no value.

@@ -158,7 +158,7 @@ class RegisteredSweep:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Registered sweeps in one common world, ascending by frame."""
+    """A stretch: consecutive registered sweeps in one common world, ascending by frame number."""
 
     sweeps: tuple[RegisteredSweep, ...]
 
@@ -211,7 +211,7 @@ class FlowField:
 
     @staticmethod
     def zero(num_points: int) -> FlowField:
-        """Return the flow of points that are all static."""
+        """Return the flow of ``num_points`` points that are all static."""
         return FlowField(
             displacement=np.zeros((num_points, 3)),
             moving=np.zeros(num_points, bool),
