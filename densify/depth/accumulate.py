@@ -96,6 +96,7 @@ def object_tracks(
     along its path over the window if that is longer.
 
     Args:
+        stretch: Registered sweeps of the window.
         fields: Scene flow of each sweep to the reference time of the key sweep.
         key: Frame number of the key sweep.
     """

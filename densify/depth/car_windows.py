@@ -86,10 +86,11 @@ def close_windows(
 
 
 def _close(layers: Layers, hole: Bool, depth_m: Float32, slopes: Float, least: np.float32) -> Bool:
-    """Put a plane into a hole except where something is in front of it; change ``layers`` in place.
+    """Put a plane into a hole of ``layers``, in place, except behind nearer measurements.
 
-    Return (h,w) True where a measured pixel is removed. depth_m: (h,w) depth of the plane. slopes:
-    (2,) slopes of its inverse depth, 1/m per px. least: least confidence of the rim.
+    Return (h,w) True where a measured pixel is removed. hole: (h,w) pixels of the hole. depth_m:
+    (h,w) depth of the plane. slopes: (2,) slopes of its inverse depth, 1/m per px. least: least
+    confidence of the rim.
     """
     known_m = layers.filled_m
     takes = hole & ((known_m == 0) | (known_m > depth_m + _agree_m(depth_m)))
@@ -114,7 +115,7 @@ def _num_rays(layers: Layers, pixels: Bool) -> float:
 def _log_odds(lost: float, on_rim: float) -> float:
     """Return the mean log-likelihood ratio of a ray, for glass against a surface like the rim.
 
-    The arguments are shares of missing returns in the hole and on the rim. A missing return adds
+    lost, on_rim: shares of missing returns in the hole and on its rim. A missing return adds
     log(P(missing | glass) / P(missing | surface)), a return the log ratio of 1 - P(missing).
     P(missing | glass) is the share in the hole if that is above the usual one.
     """
@@ -149,7 +150,7 @@ def _holes(layers: Layers) -> Iterator[tuple[tuple[slice, slice], Bool, Bool]]:
 
 
 def _smooth(known_m: Float32) -> Bool:
-    """Return (H,W) True at known pixels that are not just behind a depth discontinuity."""
+    """Return (H,W) True at known pixels without a nearer surface beside them; ``known_m`` in m."""
     front_m = ndimage.grey_erosion(np.where(known_m > 0, known_m, np.inf), footprint=_CROSS)
     smooth: Bool = (known_m > 0) & (known_m <= front_m + _agree_m(front_m))
     return smooth
@@ -174,7 +175,7 @@ def _plane_of(known_m: Float32, rim: Bool) -> Float | None:
 
 
 def _points(exposure: Exposure, uv: Float, depth_m: Float32) -> Float:
-    """Return (N,3) positions, key sweep's lidar frame, of static pixels (N,2) at depths (N,)."""
+    """Return (N,3) positions, key sweep's lidar frame, of pixels uv (N,2) with depths (N,)."""
     ray = cameras.rays(exposure.camera, uv.astype(np.float64))
     along = depth_m / exposure.depth_m(ray)
     return poses.transform(poses.inverse(exposure.T_cam_key), along[:, None] * ray)

@@ -145,9 +145,10 @@ def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float
     """Return the (H,W) confidence ``-log10(P) / 5`` with the probability P of an outlier.
 
     Args:
+        found: Rank, group and contradiction of each pixel, from `rank_pixels`.
         shown: (H,W) True at pixels with a depth; the confidence is 0 elsewhere.
-        tables: (G,2,R) share of outliers by group, term and step of the rank; None for the
-            package's own.
+        tables: (G,2,R) share of outliers by group (`GROUPS`), term (`CAUSES`) and step of the rank;
+            None for the package's own.
     """
     rank, group = found.rank[shown], found.group[shown]
     log_wrong = curves(amounts(found, shown), _own_tables() if tables is None else tables)
@@ -161,16 +162,17 @@ def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float
 
 
 def steps_of(rank: Float32) -> NDArray[np.int64]:
-    """Return the index, 0 to R - 1, of the step of each rank."""
+    """Return the index of the step of each rank (0 to 1), among R = `NUM_RANKS` equal steps."""
     return np.minimum((rank * NUM_RANKS).astype(np.int64), NUM_RANKS - 1)
 
 
 def amounts(found: Ranked, of: Bool) -> Float:
     """Return (G,2,R) by group and step of the rank: the number of pixels, and their contradiction.
 
-    The product with a table is the expected number of outliers.
+    The product with a table of `calibrated` is the expected number of outliers.
 
     Args:
+        found: Rank, group and contradiction of each pixel.
         of: (H,W) True at pixels that count.
     """
     place = found.group[of].astype(np.int64) * NUM_RANKS + steps_of(found.rank[of])

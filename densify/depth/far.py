@@ -87,7 +87,10 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
 
 
 def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
-    """Return the indices of the testing sweeps before and after sweep i, or only one of them."""
+    """Return the indices of the sweeps that test sweep i: one before and one after it, or one.
+
+    asked: indices of all testing sweeps. travel_m: (S,) positions of the sweeps along the road.
+    """
     apart_m = np.array([travel_m[j] - travel_m[i] for j in asked])
     sides = []
     for off_m in (-apart_m, apart_m):
@@ -102,9 +105,13 @@ def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
 def standing(
     sensors: Sensors, registered: RegisteredSweep, travel_m: float, gone: Bool
 ) -> StandingWorld:
-    """Return the static points of one sweep in the world frame, without ``gone`` points (N,).
+    """Return the static points of one sweep in the world frame, each with its surface patch.
 
-    ``gone`` is a mask of `departed`. travel_m: position of the sweep along the road.
+    Args:
+        sensors: Scanners, with the angles between their rays.
+        registered: Deskewed sweep.
+        travel_m: Position of the sweep along the road.
+        gone: (N,) True for points to leave out, which another sweep saw through (`departed`).
     """
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     one = np.zeros(len(sweep), np.int32)
@@ -151,9 +158,10 @@ _NOTHING = StandingWorld(
 
 
 def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
-    """Return (N,) False for points (N,3), world frame, that a camera certainly does not observe.
+    """Return (N,) True for the points (N,3), world frame, that a camera may observe.
 
-    The camera may be up to ``slack_m`` elsewhere. For a lens that is no pinhole all are True.
+    It is False only if the point is out of view from every position within ``slack_m`` metres of
+    ``T_cam_world`` (4,4). For a lens that is no pinhole all are True.
     """
     if camera.model != "pinhole":
         return np.ones(len(points), bool)

@@ -38,7 +38,9 @@ _ABOVE = 12  # index of the direction upwards
 
 
 def fill(layers: Layers, reach: float) -> Layers:
-    """Fill the pixels that have measured pixels on both sides and nine tenths of the votes.
+    """Fill the pixels that have measured pixels on both sides, if the pixels around confirm them.
+
+    A filled depth stays if at least nine tenths of the votes (`voted_for`) are for it.
 
     Args:
         layers: Map with measured pixels; it is not changed.
@@ -53,11 +55,11 @@ def fill(layers: Layers, reach: float) -> Layers:
 
 
 def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
-    """Drop pixels filled since ``before_m`` (H,W) with less than ``least_share`` of the votes.
+    """Drop pixels filled since the map ``before_m`` (H,W) that too few votes confirm (`voted_for`).
 
     Only measured pixels vote, because filled pixels would confirm themselves. Boundary pixels that
     were not accepted may only vote against, unless they are occluded. This protects the pillar of a
-    car, which has few measured pixels.
+    car, which has few measured pixels. least_share: share of the votes, 0 to 1, that is enough.
     """
     filled = (layers.filled_m > 0) & (before_m == 0)
     pixel = np.flatnonzero(filled)
@@ -180,7 +182,10 @@ def _surrounded(num, top, bottom, left, right, row, column):  # type: ignore[no-
 
 @inlined
 def _gather(known, top, bottom, left, right, row, column, inside):  # type: ignore[no-untyped-def]
-    """Collect a window's measured pixels; return their number, greatest and least inverse depth."""
+    """Put the measured pixels of a window (rows ``top`` to ``bottom`` - 1) into ``inside``.
+
+    Return the number of these pixels, and their greatest and least inverse depth in 1/m.
+    """
     num, near, far = 0, 0.0, np.inf
     for first in range(top, bottom, _ROWS):
         last = min(first + _ROWS, bottom)
@@ -200,7 +205,10 @@ def _gather(known, top, bottom, left, right, row, column, inside):  # type: igno
 
 @inlined
 def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
-    """Return the plane's inverse depth in the middle, its slopes, and the range of deviations."""
+    """Fit a plane to ``num`` pixels of ``inside``, with weights that fall to 0 at the reach (px).
+
+    Return its inverse depth in the middle, both slopes, and the range of deviations from it.
+    """
     n = u = v = uu = uv = vv = w = uw = vw = 0.0
     for i in range(num):
         there, du, dv = inside.inverse[i], inside.right[i], inside.down[i]
@@ -291,7 +299,7 @@ def fill_stars(layers: Layers) -> Layers:
 
 @inlined
 def _widest_gap(met):  # type: ignore[no-untyped-def]
-    """Return the largest number of neighbouring directions without a known pixel."""
+    """Return the largest number of neighbouring directions where ``met`` (16,) is False."""
     widest = run = 0
     for d in range(2 * len(met)):
         run = 0 if met[d % len(met)] else run + 1

@@ -30,7 +30,7 @@ class PointsInImage:
     """The K points of a cloud in an image.
 
     Attributes:
-        index: (K,) row numbers of the points in the cloud.
+        index: (K,) indices of the points in the cloud.
         uv: (K,2) column and row in px.
         depth: (K,) depth in m.
         focal_px: (K,2) local scale, px per metre at a depth of 1 m.
@@ -65,7 +65,7 @@ class PointsInImage:
         )
 
     def at(self, rows: Int) -> Int:
-        """Return the indices among these points of points with these row numbers in the cloud."""
+        """Return the indices, among these K points, of the points at ``rows`` of the cloud."""
         place = np.zeros(int(self.index.max(initial=-1)) + 1, np.int64)
         place[self.index] = np.arange(len(self.index))
         found: Int = place[rows]

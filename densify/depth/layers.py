@@ -14,7 +14,7 @@ from densify.geometry.types import Bool, Float32
 
 @dataclass(frozen=True)
 class Layers:
-    """The map of one camera and the properties of its pixels; (H,W) each, depths in m, 0 none.
+    """One depth map in the making, as images (H,W); depths in metres, 0 for pixels without depth.
 
     Attributes:
         depth_m: Depth of pixels that are accepted as measured.
@@ -23,13 +23,13 @@ class Layers:
         behind_patch: True if a boundary pixel is measured behind the patch of a nearer point.
         filled_m: Depth of accepted and of interpolated pixels.
         confidence: Confidence or rank of each pixel, 0 to 1.
-        point: Row number, in the cloud, of the point that measured the pixel; -1 none.
+        point: Index, in the cloud, of the point that measured the pixel; -1 none.
         tilt: (H,W,2) slope of the surface's inverse depth to the right and down, 1/m per px.
         spacing_px: (H,W,2) spacing of neighbouring rays of one sweep, across and down, at all
             pixels.
         lab: (H,W,3) camera image in L*a*b*, None if there is no image.
         warnings: Messages on parts of the request that could not be done.
-        solid: True in closed car windows and on moving bodies.
+        solid: True in closed car windows and on bodies of moving objects (`MovingBody`).
         glass: True where a measured pixel was removed from a car window.
         key_only: True if only the key sweep has returns of the surface.
     """

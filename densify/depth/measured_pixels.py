@@ -254,7 +254,7 @@ def _fit(reach_px):  # type: ignore[no-untyped-def]
 
 @inlined
 def _extend(reach, u, v):  # type: ignore[no-untyped-def]
-    """Raise the extent of the surface in eight directions by a point at (u, v)."""
+    """Raise ``reach`` (8,), the extent of the surface in eight directions, by a point at (u, v)."""
     reach[0], reach[1] = max(reach[0], u), max(reach[1], -u)
     reach[2], reach[3] = max(reach[2], v), max(reach[3], -v)
     a, b = np.sqrt(0.5) * (u + v), np.sqrt(0.5) * (u - v)
@@ -276,12 +276,13 @@ def _count(seen):  # type: ignore[no-untyped-def]
 def _look_round(points, shape, i, u0, v0, centre, agree, inner, witness_ns, m, reach):  # type: ignore[no-untyped-def]
     """Compare the points around pixel (v0, u0) with the tangent plane of point i.
 
-    The plane has inverse depth ``centre`` in the pixel, and points within ``agree`` of it agree.
-    witness_ns: greatest age of a point behind the plane that shows a discontinuity, `_NEVER_NS` for
-    static points. The moments m (9,) of the fit and the extent of the surface, reach (8,), are
-    filled in. Return a bit for each sweep that agrees, the age of the youngest of these sweeps, and
-    the number of points in the fit. Return also their weighted sum of squares, True if a point is
-    close behind, and for a moving point the number of agreeing returns of the key sweep.
+    The plane has inverse depth ``centre`` (1/m) in the pixel, and points within ``agree`` (1/m) of
+    it agree. inner: radius of discontinuities, px. witness_ns: greatest age of a point behind the
+    plane that shows a discontinuity, `_NEVER_NS` for static points. The moments m (9,) of the fit
+    and the extent of the surface, reach (8,), are filled in. Return a bit for each sweep that
+    agrees, the age of the youngest of these sweeps, and the number of points in the fit. Return
+    also their weighted sum of squares, True if a point is close behind, and for a moving point the
+    number of agreeing returns of the key sweep.
     """
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns

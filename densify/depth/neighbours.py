@@ -94,7 +94,7 @@ def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
 
 @inlined
 def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
-    """Return both slopes of the least-squares plane from centred second moments."""
+    """Return both slopes of the least-squares plane from centred second moments of `plane`."""
     determinant = uu * vv - uv * uv
     return (vv * uw - uv * vw) / determinant, (uu * vw - uv * uw) / determinant
 

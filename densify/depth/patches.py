@@ -46,6 +46,7 @@ def patches(
     Args:
         cloud: M accumulated points.
         key: Frame number of the key sweep.
+        sensors: Scanners, with the angles between their rays.
         origins: (S,3) origins of the scanners, key sweep's lidar frame, by frame number.
         key_image: Range image of the key sweep; if None, no point is ``free``.
         wanted: (M,) True for points in view of a camera, None for all. Other points get only their
@@ -145,7 +146,7 @@ def _cell(azimuth, elevation, grid):  # type: ignore[no-untyped-def]
 
 @inlined
 def _spacing(azimuth, elevation, table):  # type: ignore[no-untyped-def]
-    """Return the ray spacings in rad, along azimuth and elevation, from a `RayTable`."""
+    """Return the angles (rad) to the next ray along azimuth and elevation, from a `RayTable`."""
     row = min(max(int((elevation - table.low_rad) / table.bin_rad), 0), table.along.shape[0] - 1)
     columns = table.along.shape[1]
     column = int((azimuth + np.pi) * (columns / (2 * np.pi))) % columns
@@ -154,6 +155,7 @@ def _spacing(azimuth, elevation, table):  # type: ignore[no-untyped-def]
 
 @inlined
 def _before(seen, i, j):  # type: ignore[no-untyped-def]
+    """Return True if point i is nearer than point j; between equal ranges the direction decides."""
     if seen[2, i] != seen[2, j]:
         return seen[2, i] < seen[2, j]
     if seen[0, i] != seen[0, j]:
@@ -206,7 +208,8 @@ def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
 def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-untyped-def]
     """Return the change of inverse range per radian along one angle, NaN without a point.
 
-    The change along the other angle is removed.
+    axis: the angle, 0 azimuth or 1 elevation. The change by the other angle ``across``, whose slope
+    is ``slope_across``, is removed. there: index of the compared point, -1 none.
     """
     if there < 0:
         return np.nan

@@ -163,6 +163,7 @@ class _Cells(NamedTuple):
 
     @staticmethod
     def over(guide: Float32) -> _Cells:
+        """Return up to 40,000 cells that cover the image ``guide`` (H,W), logarithm of depth."""
         height, width = guide.shape
         size = max(1, int(np.ceil(np.sqrt(guide.size / _MAX_CELLS))))
         rows, columns = (
@@ -217,7 +218,8 @@ def _correction(
     """Return (H,W) the correction of the logarithm of depth, and (H,W) its remaining error.
 
     The error is the mean error of known pixels nearby on the same surface. Far from known pixels
-    there is no correction, and the error is the mean over the image.
+    there is no correction, and the error is the mean over the image. filled_m: known depth, 0 none.
+    log_depth: logarithm of the prior's depth; guide: smoothed; steepness: its range around a pixel.
     """
     cells = _Cells.over(guide)
     area, num = cells.size**2, cells.guide.size

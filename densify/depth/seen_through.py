@@ -33,6 +33,7 @@ class Rays:
     """The rays of the sweeps of a window, in the lidar frame of the key sweep.
 
     Attributes:
+        stretch: Registered sweeps of the window.
         key: Frame number of the key sweep.
     """
 
@@ -100,7 +101,7 @@ def without_seen_through(
 
 
 def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
-    """Return (H,W) the number of positions (K,2) px in each pixel, blurred to 2.5 deviations."""
+    """Return (H,W) the number of positions uv (K,2) in each pixel, blurred by ``blur_px``."""
     column, row = np.rint(uv).astype(np.int64).T
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
     size = 2 * round(2.5 * blur_px) + 1

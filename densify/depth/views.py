@@ -51,7 +51,7 @@ from densify.scores import depth_metrics
 
 
 class SeenCloud(NamedTuple):
-    """A cloud, its surface patches, and the bodies of its moving objects by instance number."""
+    """A cloud, its surface patches, and the hulls of its moving objects by instance number."""
 
     cloud: Cloud
     patches: Patches
@@ -97,7 +97,7 @@ class Views:
         images: Mapping[str, NDArray[np.uint8]],
         settings: Config,
     ) -> Views:
-        """Return the views of the key sweep with frame number ``key``."""
+        """Return the cameras and times of the maps of key sweep ``key``, shown by ``shots``."""
         sensors = Sensors.of(stretch.sweeps)
         return Views(
             key=key,
@@ -117,7 +117,7 @@ class Views:
         )
 
     def see(self, cloud: Cloud, visible: bool = True) -> SeenCloud:
-        """Return a cloud with patches; if ``visible`` they mark what the key sweep saw through."""
+        """Return a cloud and its patches; ``visible`` marks those the key sweep saw through."""
         key_image = self.key_image if visible else None
         wanted = np.zeros(len(cloud), bool)
         for exposure in self.exposures.values():
@@ -136,7 +136,9 @@ class Views:
         """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`.
 
         Args:
-            standing_only: True for maps with visibility.
+            found: Static points along the road.
+            T_key_found: (4,4) from the world of ``found`` to the key sweep's lidar frame.
+            standing_only: True leaves out points that a sweep of the window saw through.
         """
         cloud, surface = far_cloud(
             found, T_key_found, stretch, self.key, self.exposures, standing_only

@@ -30,10 +30,10 @@ def ground(stretch: Stretch) -> HeightMap:
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Ground heights on a grid of square cells.
+    """Ground heights on a grid of square cells, in a world frame with z up.
 
     Attributes:
-        heights_m: (X,Y) ground height at the centres of the cells.
+        heights_m: (X,Y) z of the ground in metres at the centres of X by Y cells.
         low_m: (2,) x and y of the grid's lower corner.
         cell_m: Side of a cell.
     """

@@ -138,7 +138,10 @@ class RangeImage:
         fewer than ``least`` cells are filled. The counts of several sweeps may be added.
 
         Args:
+            points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
             margins_m: Least distance of a return beyond a point: metres, and share of the range.
+            least: Least number of filled cells, of nine, for a count.
+            velocity_m_s: As in `sees_through`.
         """
         points32 = np.ascontiguousarray(points, np.float32)
         velocity = np.zeros((0, 3), np.float32)
@@ -175,7 +178,7 @@ class _Cells(NamedTuple):
 def _images(
     registered: RegisteredSweep, lidar: int, num_together: int, by_ring: bool
 ) -> list[ScannerImage]:
-    """Return the images of one scanner, finest first."""
+    """Return the images of scanner ``lidar``, finest first; arguments as in `RangeImage.of`."""
     rays = aimed(registered, lidar)
     images: list[ScannerImage] = []
     for cells in _cells(rays, num_together, by_ring):
@@ -234,7 +237,7 @@ def _cell_of(rays: Aimed, row_edges_rad: Float32, num_columns: int) -> tuple[Int
 
 
 def _over_3x3(join: Callable[..., Any], cells: NDArray[Any], empty: float) -> NDArray[Any]:
-    """Join each of the (R,C) cells with its eight neighbours; columns wrap around."""
+    """Join each of the (R,C) cells with its eight neighbours; columns wrap; ``empty``: outside."""
     beside = join(join(np.roll(cells, 1, axis=1), cells), np.roll(cells, -1, axis=1))
     padded = np.pad(beside, ((1, 1), (0, 0)), constant_values=empty)
     return np.asarray(join(join(padded[:-2], padded[1:-1]), padded[2:]))
@@ -257,7 +260,7 @@ def _share_vouched(image: ScannerImage, rays: Aimed) -> float:
 
 
 def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
-    """Choose the cells of a scanner's images, finest first."""
+    """Choose the cells of one scanner's images, finest first; arguments as in `RangeImage.of`."""
     if len(rays.azimuth) < FEW_POINTS:
         return [_grid(_uniform_edges(rays.elevation, np.deg2rad(2.0)), np.deg2rad(1.0))]
     layout = measure([rays])

@@ -95,7 +95,7 @@ class RayTable(NamedTuple):
     along: Float32
 
     def at(self, azimuth: NDArray[np.floating], elevation: NDArray[np.floating]) -> Float:
-        """Return the (N,2) angles across and along at N directions."""
+        """Return the (N,2) angles ``across`` and ``along`` at N directions in radians."""
         rows, columns = self.along.shape
         row = np.clip((elevation - self.low_rad) / self.bin_rad, 0, rows - 1).astype(np.int64)
         column = ((azimuth + np.pi) * (columns / (2 * np.pi))).astype(np.int64) % columns
@@ -121,7 +121,7 @@ class Layout:
 
 
 def measure(sweeps: Sequence[Aimed]) -> Layout:
-    """Return the layout of a scanner, measured by its rays in a few sweeps.
+    """Return the layout of one scanner, measured in its rays of a few sweeps (``sweeps``).
 
     Lasers that do not share an origin, as in KITTI's HDL-64E, mix their rings at close range. Their
     returns still follow at even steps along the azimuth: such a scanner samples in lines.

@@ -42,7 +42,7 @@ class FreeSpace:
         T_lidar_world: W transforms (4,4) from the world to the lidar at the reference time.
         clock: Reference times of the sweeps.
         sensors: Scanners, with the angles between their rays.
-        batches: Indices of sweeps that are tested together, see `Clock.batches`.
+        batches: Indices of consecutive sweeps that are tested together, see `Clock.batches`.
     """
 
     images: tuple[RangeImage, ...]
@@ -75,12 +75,13 @@ class FreeSpace:
         return float(self.sensors.finest_gap_m(in_lidar)[0])
 
     def others(self, i: int) -> list[int]:
-        """Return the first sweep of each other batch that is tested against sweep i, by index."""
+        """Return the indices of the sweeps, one of each other batch, to test against sweep i."""
         around = self.clock.around(i, REACH_S, _MOST_TESTED * max(map(len, self.batches)))
         return sorted({self._batch_of[j][0] for j in around} - {self._batch_of[i][0]})
 
     @cached_property
     def _batch_of(self) -> dict[int, tuple[int, ...]]:
+        """Indices of the sweeps in the same batch, by index of the sweep."""
         return {j: batch for batch in self.batches for j in batch}
 
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:

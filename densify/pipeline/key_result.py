@@ -69,7 +69,7 @@ def methods_of_run(method: str, settings: Config) -> tuple[str, ...]:
 
 
 def looks_around(methods: Sequence[str]) -> bool:
-    """Return True if a method of the list estimates scene flow."""
+    """Return True if a named method estimates scene flow, which also searches around the window."""
     return any(METHODS[name].engine is not None for name in methods if name in METHODS)
 
 

@@ -211,6 +211,7 @@ def densify(
         key: Frame number of the key sweep.
         methods: Names of `METHODS`.
         cameras: Names of cameras; None for all.
+        watch: Measures the cost of each stage.
         with_images: Colour the cloud, and score depth if there is ground truth. The maps are the
             same either way.
         priors: Depth images that complete the maps of the last method.

@@ -39,11 +39,10 @@ class Sweeps:
         """Prepare to read.
 
         Args:
-            timeline: Times of its sweeps.
+            timeline: Times of the sweeps.
             num_kept: Number of sweeps kept in memory.
             cache: Cache on disk, None for no cache.
-            run: Text shared by all processes of a run, during which no sweep changes; None for this
-                object alone.
+            run: Name of a run whose processes share digests of sweeps; None for no sharing.
             watch: Measures the stage ``read``.
         """
         self._sequence, self._timeline, self._settings = sequence, timeline, settings
@@ -92,7 +91,7 @@ class Sweeps:
 
 @dataclass(frozen=True)
 class Cut:
-    """Blocks of sweeps, ascending in time, which may overlap.
+    """Blocks of consecutive sweeps that are computed together, in time order; they may overlap.
 
     Attributes:
         blocks: Frame numbers of each block: the windows of its keys, and the sweeps between and
@@ -156,6 +155,7 @@ class Cut:
 
 
 def _cut(timeline: Timeline, window: int, groups: Sequence[Sequence[int]]) -> Cut:
+    """Return one block for each group of keys: all sweeps from its first to its last window."""
     blocks = []
     for keys in groups:
         first = timeline.window(keys[0], window).frames[0]

@@ -115,7 +115,7 @@ def register(
 
 
 def _between(known: Trajectory, stamp_ns: Int) -> Float:
-    """Return poses (n,4,4) at n other times, interpolated or extrapolated at constant velocity."""
+    """Return (n,4,4) poses of ``known`` at n other times, at constant velocity between sweeps."""
     T_world_lidar = []
     for time_ns in stamp_ns:
         later = int(np.searchsorted(known.stamp_ns, time_ns, side="right"))

@@ -93,9 +93,10 @@ class _SweepRow:
     ) -> None:
         """Prepare the sweeps.
 
-        num_neighbors: number of points for a normal. match_m: greatest distance between
-        corresponding points, for each round. most_m: greatest correction of a predicted position; a
-        sweep with a larger correction keeps its prediction.
+        Args:
+            num_neighbors: Number of neighbouring points that give a normal.
+            match_m: Greatest distance in metres between corresponding points, for each round.
+            most_m: Greatest correction in metres; a sweep that needs more keeps its prediction.
         """
         self._sweeps = [subsample(sweep, _NUM_POINTS) for sweep in sweeps]
         self.stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)

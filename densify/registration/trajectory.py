@@ -57,7 +57,7 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True)
 class Registration:
-    """The poses of a block of sweeps.
+    """The poses of a block: consecutive sweeps that are registered together.
 
     Attributes:
         pieces: Trajectories of consecutive sweeps, each in a world of its own, including the

@@ -143,8 +143,15 @@ def errors_by_part(
     """Return `depth_errors` of parts of the pixels, by name of the part.
 
     The parts are ``all`` pixels, ranges of true depth (``0-10 m`` … ``over 80 m``), `depth_edges`
-    (``edge``) and other pixels (``not edge``). With (H,W) ``moving`` pixels given, there are also
-    parts ``moving`` and ``static``. predicted_m and truth_m: (H,W) metres, 0 none.
+    (``edge``) and other pixels (``not edge``). With ``moving`` pixels given, there are also parts
+    ``moving`` and ``static``.
+
+    Args:
+        predicted_m: (H,W) depth z in metres, 0 none.
+        truth_m: (H,W) true depth z in metres, 0 none.
+        moving: (H,W) True at pixels of moving objects, None if unknown.
+        focal_px: Focal length fx of the camera.
+        baseline_m: Stereo baseline that turns depth into disparity.
     """
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]
@@ -220,7 +227,7 @@ def depth_scores(
 def scores_by_motion(
     depth_m: Float32, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
 ) -> dict[str, dict[str, Any]]:
-    """Return `depth_errors` of one image as ``scores["all"|"moving"|"static"]``."""
+    """Return `depth_errors` of depths (H,W) as ``scores["all"|"moving"|"static"]``."""
     masks = {"all": None, "moving": moving_mask, "static": ~moving_mask}
     return {
         part: asdict(depth_errors(depth_m, truth_depth_m, mask, focal_px=camera.focal_px))
