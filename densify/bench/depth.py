@@ -182,9 +182,10 @@ def _exact_truth(
 
 
 class _Sums:
-    """Counts of pixels over key sweeps and cameras, by ground truth, map and kind of pixels.
+    """Sums of pixel counts over key sweeps and cameras, by ground truth, map and kind of pixels.
 
-    The three counts are pixels with a true depth, pixels that also have a depth, and outliers.
+    The three counts are pixels with a true depth, those that have a depth in the map too, and
+    outliers among the latter.
     """
 
     def __init__(self) -> None:

@@ -88,7 +88,7 @@ class SweepTruth(NamedTuple):
 
     @staticmethod
     def of(truth: Truth, window: Window, frame: int) -> SweepTruth:
-        """Return the ground truth of a sweep of the window, by its frame number."""
+        """Gather the exact ground truth of the sweep ``frame`` (its number) of the window."""
         rows = window.stretch[frame].sweep.row
         targets = window.towards_key(frame), window.key, window.frames[0], window.frames[-1]
         step, to_key, first, last = (truth.displacement(frame, t)[rows] for t in targets)
@@ -102,7 +102,7 @@ class SweepTruth(NamedTuple):
 
 @dataclass(frozen=True)
 class Scorer:
-    """The scores of methods on one window.
+    """Scorer of methods on one window of sweeps.
 
     Most errors are over points above the ground, because no method moves the ground.
 
@@ -124,6 +124,7 @@ class Scorer:
         """Return the scorer of a window.
 
         Args:
+            sources: Frame numbers of the sweeps to score.
             place: Folder of true flow, see `densify.readers.flow_files`. None for the exact ground
                 truth of the recording, if available.
         """
@@ -217,7 +218,7 @@ class Scorer:
         return scores
 
     def _above(self, column: Callable[[int], Any]) -> Any:
-        """Return a column's values for the points above the ground, joined over the sources."""
+        """Return values of points above the ground; ``column`` maps frame number -> (N,) values."""
         return np.concatenate([column(f)[self.window.above[f]] for f in self.sources])
 
 

@@ -82,7 +82,7 @@ It returns the flow of the drawn source points, or of all source points."""
 
 
 def _objective(solver: str, **settings: Any) -> Flow:
-    """Return a method that minimizes the paper's loss with a solver and its settings."""
+    """Return a method of scene flow that minimises the paper's objective by a named solver."""
 
     def flow(source: Float, target: Float, pair: PaperPair) -> Float:
         return solve(source, target, SolverSettings(solver=solver, **settings)).flow

@@ -123,7 +123,7 @@ def _silhouettes(registered: RegisteredSweep) -> Silhouettes:
 
 
 def alternatives(T: Float) -> dict[str, Float]:
-    """Return the name of each common mistake -> the corrected ``T_cam_lidar`` (4,4)."""
+    """Return common mistake -> ``T_cam_lidar`` (4,4), the lidar's pose in the camera, corrected."""
     turned = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     return {
         "the inverse of the given pose (T_lidar_cam instead of T_cam_lidar)": poses.inverse(T),

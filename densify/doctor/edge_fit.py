@@ -181,7 +181,10 @@ def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
 
 
 def _grid(free: Bool) -> Float:
-    """Return (M,4) offsets: all pitches and yaws, combined with each roll, then with each delay."""
+    """Return (M,4) offsets, as in `Fit`: all pitches and yaws with each roll, then with each delay.
+
+    ``free`` (4,) is True for the parameters that are fitted.
+    """
     axes = [np.arange(-r, r + s / 2, s) for r, s in zip(_REACH, _STEP, strict=True)]
     parts = []
     for axis in (2, 3):
@@ -208,7 +211,10 @@ class _Lines(NamedTuple):
 
     @staticmethod
     def of(camera: Camera, view: View, offset: Float) -> _Lines:
-        """Return the discontinuities in view, projected with an offset (4,)."""
+        """Project the depth discontinuities of a view into its image.
+
+        ``offset`` (4,) changes the camera's rotation and clock, as in `Fit`.
+        """
 
         def project(more: Float) -> tuple[Float, Bool]:
             seen_s = view.exposed_s + offset[3] + more[3]
@@ -251,7 +257,10 @@ def _sum(lines: Sequence[_Lines], offset: Float) -> float:
 
 
 def _is_beside(offsets: Float, other: Float) -> Any:
-    """Return True for offsets more than 1 degree of pitch or yaw, or 0.1 s, from another offset."""
+    """Return (M,) True for offsets (M,4) clearly apart from another offset (4,).
+
+    They differ by more than 1 degree of pitch or yaw, or by 0.1 s.
+    """
     return (np.abs(offsets - other)[..., [0, 1, 3]] > (1.0, 1.0, 0.1)).any(axis=-1)
 
 

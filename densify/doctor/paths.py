@@ -30,7 +30,7 @@ CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
 def changed(
     rotation: Callable[[Float], Float] = np.copy, scale: float = 1.0
 ) -> Callable[[Float], Float]:
-    """Return a function that maps the rotation and scales the translation of poses (4,4)."""
+    """Return a function on poses (4,4) that maps the rotation (3,3) and scales the translation."""
 
     def change(T: Float) -> Float:
         new = np.eye(4)
@@ -41,7 +41,10 @@ def changed(
 
 
 def _rolled(by: int) -> Callable[[Float], Float]:
-    """Return a function on rotations (3,3) that shifts the order of their quaternion's elements."""
+    """Return a function that corrects a rotation (3,3) whose quaternion was read in wrong order.
+
+    The function shifts the elements x y z w cyclically by ``by`` places, as `numpy.roll`.
+    """
     return lambda R: Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), by)).as_matrix()
 
 
@@ -93,7 +96,12 @@ def check_poses(sample: Sample) -> list[Finding]:
 
 
 def _described(given: list[Float], found: list[Float], spots: list[Spot]) -> tuple[str, str]:
-    """Return the main error of the poses, scale or drift, as text, and its correction."""
+    """Return the main error of the poses, scale or drift, as text, and its correction as text.
+
+    Args:
+        given: Recorded pose (4,4) of the last sweep relative to the first, for each spot.
+        found: The same pose by odometry.
+    """
     given_m, found_m = (np.array([T[:3, 3] for T in steps]) for steps in (given, found))
     off_m, way_m = (given_m - found_m).mean(axis=0), found_m.mean(axis=0)
     if np.linalg.norm(off_m) < 0.5 * np.linalg.norm(given_m - found_m, axis=1).mean():
@@ -113,7 +121,8 @@ def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
     """Measure the time shift between the poses and the sweeps.
 
     It is the shift at which the poses agree best with odometry. It is observable only where the
-    vehicle turns or changes its speed.
+    vehicle turns or changes its speed. ``found`` has, for each registered spot (some sweeps),
+    the pose (4,4) of the last sweep relative to the first by odometry.
     """
     late_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
     cost, num_used = np.zeros(len(late_s)), 0

@@ -86,10 +86,10 @@ def check_axes(sample: Sample) -> list[Finding]:
 
 
 def _ground_share(sample: Sample, up: Float) -> float:
-    """Return the share of near returns in the fullest layer with few returns below it.
+    """Return the share of near returns in the fullest layer (slab across ``up``) with few below it.
 
-    The layer must not be above the origin. The share counts in excess of an even spread over all
-    heights. The result is the median over the spots.
+    ``up`` is a unit vector (3,). The layer must not be above the origin. The share counts in excess
+    of an even spread over all heights. The result is the median over the spots.
     """
     shares = []
     for spot in sample.spots:

@@ -54,7 +54,8 @@ def _check_compensation(
 ) -> Finding:
     """Check that the motion within a sweep is not compensated already.
 
-    R: (3,3) from lidar to scanner axes. origins_m: candidate positions (3,) in scanner axes.
+    ``R`` (3,3) turns lidar to scanner axes. ``origins_m`` are two possible positions (3,) of the
+    scanner, in scanner axes.
     """
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     spot = sample.fastest
@@ -113,7 +114,11 @@ def _still_points(sample: Sample, lidar: int) -> Float:
 def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: Float) -> Finding:
     """Compare the given with the found position of a scanner.
 
-    points, given_m and found_m are in the scanner's axes, to which R turns the lidar axes.
+    Args:
+        points: (N,3) returns, in the scanner's axes.
+        R: (3,3) rotation from lidar to scanner axes.
+        given_m: (3,) position as configured, in the scanner's axes.
+        found_m: (3,) position at which the rings are sharpest, in the scanner's axes.
     """
     name = "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
     given, found = sharpness(points, given_m), sharpness(points, found_m)

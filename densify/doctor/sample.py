@@ -22,7 +22,7 @@ _STEP_S = 0.1
 
 @dataclass(frozen=True)
 class Spot:
-    """A few consecutive sweeps at one position in the recording.
+    """A spot: a few consecutive sweeps at one position in the recording.
 
     Attributes:
         sweeps: Raw sweeps, own vehicle included.
@@ -120,7 +120,7 @@ class Sample:
 
 
 def _chosen(timeline: Timeline) -> list[list[int]]:
-    """Return the frame numbers of each spot: disjoint groups of sweeps about 0.1 s apart."""
+    """Return the frame numbers of each spot: separate groups of sweeps about 0.1 s apart."""
     frames = timeline.frames
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
     length = min(len(frames), stride * (_NUM_SWEEPS - 1) + 1)

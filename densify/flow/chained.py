@@ -70,10 +70,7 @@ class ChainedMotion:
     def _follow(self, i: int, near: int, onward: FlowField) -> FlowField:
         """Chain the flow from sweep index i to its neighbour ``near`` with the flow from there on.
 
-        Args:
-            i: Index of the sweep whose points move.
-            near: Index i + 1 or i - 1.
-            onward: Flow of the points of sweep ``near`` to the target.
+        ``near`` is i + 1 or i - 1. ``onward`` is the flow of the points of sweep ``near``.
         """
         step = self._flow(i, near)
         here, there = self.stretch.sweeps[i], self.stretch.sweeps[near]

@@ -100,7 +100,7 @@ def _root(parent: Int, cell: int) -> int:
 
 @inlined
 def _touch(points: Float, start: Int, one: int, other: int, squared: float) -> bool:
-    """Return True if a point of one cell is closer than the distance to a point of the other."""
+    """Return True if two points, one of each cell, are closer than the root of ``squared``."""
     for i in range(start[one], start[one + 1]):
         for j in range(start[other], start[other + 1]):
             dx, dy = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]

@@ -80,11 +80,11 @@ class StoredCloud:
 
     @property
     def stamp_ns(self) -> Int:
-        """The (M,) reference times of the source sweeps in ns since 1970, exact to 1 µs."""
+        """(M,) int64 reference time of each point's source sweep, ns since 1970, exact to 1 µs."""
         return np.rint(self.gps_time * 1e6).astype(np.int64) * 1000 + _LAS_EPOCH_NS
 
     def select(self, keep: Bool | Int) -> StoredCloud:
-        """Return some of the points. ``keep`` is a mask (M,) or an array of point indices."""
+        """Return a cloud with only the points of a mask (M,), or of an array of point indices."""
         return StoredCloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def columns(self) -> dict[str, NDArray[Any]]:

@@ -30,7 +30,7 @@ _MAX_VALUE = np.iinfo(np.uint16).max
 
 
 def encode_png(image: NDArray[np.uint16] | NDArray[np.uint8]) -> bytes:
-    """Return the bytes of a PNG of (H,W) gray or (H,W,3) blue, green, red; 8 or 16 bits."""
+    """Return the bytes of a PNG file of an image (H,W), or (H,W,3) as blue, green, red."""
     return cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes()
 
 
@@ -67,7 +67,10 @@ def write_depth_png(path: Path, depth_m: Float32) -> None:
 
 
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
-    """Write `stored_confidence` with 8 bits, 0 where `write_depth_png` stores no depth.
+    """Write a confidence map as PNG of 8 bits.
+
+    A pixel stores ``1 + rint(254 * confidence)``: 1 to 255 for confidence 0 to 1. It stores 0 where
+    `write_depth_png` stores no depth.
 
     Args:
         confidence: (H,W) confidence from 0 to 1.
@@ -80,7 +83,10 @@ def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> N
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
-    """Write `stored_age` with 16 bits, 0 where `write_depth_png` stores no depth.
+    """Write an age map as PNG of 16 bits.
+
+    A pixel stores ``1 + rint(1000 * age_s)``, age in steps of 1 ms, and 65535 for 65.5 s or more.
+    It stores 0 where `write_depth_png` stores no depth.
 
     Args:
         age_s: (H,W) seconds between the image's exposure and the sweep that measured the pixel, 0
@@ -108,8 +114,8 @@ def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
 def write_flow_png(path: Path, flow_px: Float32) -> None:
     """Write optical flow in the format of KITTI's flow benchmark (Menze and Geiger, CVPR 2015).
 
-    The PNG has 16 bits. Red stores ``rint(64 * flow) + 2^15`` to the right, green the flow down.
-    Blue is 1 where the flow is known.
+    The PNG has 16 bits. Red stores ``rint(64 * u) + 2^15`` for the flow u to the right in pixels,
+    green the same for the flow down. Blue is 1 where the flow is known; elsewhere all are 0.
 
     Args:
         flow_px: (H,W,2) flow in pixels, to the right and down, NaN where unknown. Flow beyond 512
@@ -123,7 +129,7 @@ def write_flow_png(path: Path, flow_px: Float32) -> None:
 
 
 def metres(stored: NDArray[np.uint16]) -> Float32:
-    """Return the (H,W) float32 metres of a stored depth map, without rounding."""
+    """Return the (H,W) float32 depth in metres of stored pixel values, ``stored / 256``."""
     return stored.astype(np.float32) / np.float32(_STEPS_PER_M)
 
 

@@ -115,7 +115,10 @@ def flow_npz(field: FlowField, **beside: Any) -> bytes:
 
 
 def _followed(known: dict[int, Float], frame: int, stretch: Stretch) -> Float:
-    """Return the (4,4) pose of a sweep, chained to the last earlier pose in ``known``, by frame."""
+    """Return the (4,4) pose of a sweep, chained to the last earlier pose in ``known``.
+
+    ``known`` is frame number -> (4,4) pose in the world of the whole recording.
+    """
     before = next((f for f in reversed(known) if f in stretch.frames), None)
     if before is None:
         return stretch[frame].T_world_lidar

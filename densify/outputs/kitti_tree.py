@@ -54,9 +54,10 @@ _FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 
 
 def split_of(drive: str) -> Split:
-    """Return the split of a recording by its name, such as ``2011_09_26_drive_0013_sync``.
+    """Return the part of KITTI's depth benchmark that a recording belongs to: "val" or "train".
 
-    The split is "val" for the 13 validation drives of KITTI's depth benchmark, else "train".
+    The name, such as ``2011_09_26_drive_0013_sync``, decides. It is "val" for the 13 validation
+    drives of the benchmark, else "train".
     """
     match = _KITTI_DRIVE.fullmatch(drive)
     return "val" if match and match[1] in _VALIDATION else "train"

@@ -65,7 +65,7 @@ def read_tracks(path: Path) -> list[ObjectTrack]:
 
 @contextmanager
 def damage_named(path: Path) -> Iterator[None]:
-    """Turn errors from unexpected content within the block into InputError with the path."""
+    """Turn errors by unexpected file content within the block into InputError with the path."""
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:

@@ -94,7 +94,8 @@ class Driving:
     Attributes:
         curve: Path of both axles.
         speed: Speed along the path.
-        station_m: Arc length at time ``at_s``.
+        station_m: Arc length along the path at time ``at_s``.
+        at_s: Time of ``station_m``, seconds since frame 0.
         wheelbase_m: Distance of the two axles.
         lift_m: Function from (N,) arc lengths to (N,) heights above the ground.
         upright: Stay vertical on slopes, as a pedestrian does.
@@ -126,7 +127,10 @@ class Driving:
 def on_ground(
     terrain: Terrain, rear: Float, front: Float, lift_m: Float, upright: bool = False
 ) -> Poses:
-    """Return poses of bodies that touch the ground at two points, (N,2) each."""
+    """Return the N poses of bodies that touch the ground at a rear and a front point.
+
+    ``rear`` and ``front`` (N,2) are x, y in the world, ``lift_m`` (N,) heights above the ground.
+    """
     a = np.column_stack([rear, terrain.height(rear) + lift_m])
     b = np.column_stack([front, terrain.height(front) + lift_m])
     middle = (a + b) / 2
@@ -199,12 +203,14 @@ class Limb:
 
 
 class Rectangles(NamedTuple):
-    """Rectangles on the ground, in arrays of any leading shape.
+    """Footprints of bodies: rectangles in the horizontal x-y plane of the world.
+
+    The arrays may have any leading shape, written "...".
 
     Attributes:
-        centre: (...,2) metres.
-        forward: (...,2) unit vectors.
-        half_m: (...,2) half length and half width.
+        centre: (...,2) x, y of the centre, metres, world.
+        forward: (...,2) unit vector along the length, world.
+        half_m: (...,2) half length and half width, metres.
     """
 
     centre: Float
@@ -213,7 +219,10 @@ class Rectangles(NamedTuple):
 
     @staticmethod
     def of(mesh: Mesh, poses: Poses, slack_m: float = 0.0) -> Rectangles:
-        """Return (N,) rectangles of a mesh at N poses."""
+        """Return the N footprints of a mesh at N poses: its bounding box seen from above.
+
+        Each side is moved outwards by ``slack_m``.
+        """
         low, high = mesh.bounds
         n = len(poses.position)
         middle = np.append((low + high)[:2] / 2, 0.0)
@@ -228,12 +237,15 @@ class Rectangles(NamedTuple):
         return Rectangles(*(np.concatenate(c) for c in zip(*parts, strict=True)))
 
     def rows(self, rows: Int | slice) -> Rectangles:
-        """Return the rectangles of these rows."""
+        """Return the rectangles with these indices along the first axis."""
         return Rectangles(*(column[rows] for column in self))
 
 
 def overlap(a: Rectangles, b: Rectangles) -> Bool:
-    """Return True for rectangles that touch, by separating axes. Leading shapes are broadcast."""
+    """Return (...) True for pairs of rectangles that touch; leading shapes are broadcast.
+
+    Two rectangles are apart if a side of either of them separates the two (separating axes).
+    """
     away = b.centre - a.centre
     apart = np.zeros(away.shape[:-1], bool)
     for p, q in ((a, b), (b, a)):

@@ -193,7 +193,7 @@ class Terrain:
 
 @dataclass(frozen=True)
 class Road:
-    """A strip that extends ``left_m`` and ``right_m`` from its centreline."""
+    """A road: a strip that extends ``left_m`` and ``right_m`` metres from its centreline."""
 
     curve: Curve
     left_m: float
@@ -227,6 +227,7 @@ class Ground:
 
     Attributes:
         kerb_m: Height of the kerb, by which everything outside the roads is raised.
+        pavement_m: Width of the pavement beside the roads.
     """
 
     terrain: Terrain
@@ -328,7 +329,7 @@ def _grid(low: Float, high: Float, cell_m: float) -> tuple[Float, Float]:
 
 
 def strip(ground: Ground, curve: Curve, offset_m: float, width_m: float, spans: Spans) -> Mesh:
-    """Return paint on the road: a band along the curve, over the given spans of stations."""
+    """Return paint on the road: a band along the curve over spans of arc length (from, to)."""
     meshes = []
     for begin, end in spans:
         stations = np.linspace(begin, end, max(2, int((end - begin) / 1.0) + 1))

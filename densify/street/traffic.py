@@ -46,7 +46,7 @@ class Scene:
 
 
 def tracks(actor: Actor, times_s: Float) -> list[Rectangles]:
-    """Return (T,) rectangles of each solid body of an actor, with room for swinging limbs."""
+    """Return, per solid body of an actor, its T footprints (rectangles on the ground) over time."""
     slack_m = 0.3 if len(actor.bodies) > actor.num_solid else 0.1
     solid = actor.bodies[: actor.num_solid]
     return [Rectangles.of(b.mesh, b.trajectory.poses(times_s), slack_m) for b in solid]
@@ -90,7 +90,9 @@ class Traffic:
         """Put a vehicle on a lane, beside a station (arc length) of the road at the meeting time.
 
         Args:
+            make: Function that makes the vehicle from its trajectory.
             speed: Speed profile, or a speed in m/s that is varied at random.
+            slack_m: Greatest random change of the station.
         """
 
         def recipe(rng: np.random.Generator) -> Actor:

@@ -72,7 +72,7 @@ class Hits(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """K rays that meet a surface.
+    """K rays that meet a surface of a body, for which `Optics` decides whether they end there.
 
     Attributes:
         ray: (K,) ray indices.
@@ -80,7 +80,7 @@ class Meeting(NamedTuple):
         place: (K,3) position in the frame of the body.
         cosine: (K,) cosine of the angle of incidence.
         inside: (K,) True if the previous surface that the ray passed was of the same object.
-        layer: Number of surfaces that the rays have passed.
+        layer: Number of surfaces that the rays have passed before.
     """
 
     ray: Int
@@ -172,7 +172,7 @@ class World:
         return best
 
     def _near(self, rays: Rays, spread: float) -> Iterator[tuple[int, Int]]:
-        """Yield the index of each body but the first, with the rays that may hit it.
+        """Yield the index of each body but the first, and the indices of the rays that may hit it.
 
         These rays intersect a ball around the positions of the body at all of their times.
         """

@@ -254,10 +254,7 @@ def _vote(points: Float, there: Float, n: int) -> Float:
 
     Each point votes for all displacements of up to n steps of 0.2 m that bring it there.
 
-    Args:
-        points: (N,3) points of a group.
-        there: (M,3) points of the other cloud.
-        n: Number of steps to each side.
+    ``points`` (N,3) are a group, ``there`` (M,3) the other cloud.
     """
     zero = np.zeros((1, 3))
     span_m = np.array([n * _VOTE_STEP_M, n * _VOTE_STEP_M, _VOTE_SLACK_M])

@@ -86,8 +86,6 @@ def _choose(
     Args:
         trials: Tested motions of the groups.
         groups: Indices of each group's source points.
-        ours: Evidence in the N source points.
-        theirs: Evidence in the target points.
 
     Returns:
         The motions, and (N,) the index of each source point's motion, -1 for none.
@@ -161,7 +159,7 @@ def _attach(
         motions: Motion of each moving group.
         instance: (N,) index in ``motions`` of each source point, -1 for none; changed in place.
         ours: The N source points, and which of them lack a counterpart in the target.
-        theirs: The same of the target points.
+        theirs: The target points, and which of them lack a counterpart in the source.
     """
     points = ours.cloud.points
     members, others = np.flatnonzero(instance >= 0), np.flatnonzero(instance < 0)

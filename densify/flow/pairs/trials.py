@@ -79,7 +79,6 @@ class Trial:
         Args:
             group: Index of the group.
             members: Indices of its points in the source.
-            refined: Motion to test.
             ours: Evidence in the source cloud without motion.
             theirs: Evidence in the target cloud without motion.
         """

@@ -89,7 +89,6 @@ class Obstacles:
         """Return the obstacles of the sweep with index i: its points above the ground, world frame.
 
         Args:
-            stretch: Consecutive registered sweeps.
             i: Index of the sweep in the stretch.
             found: Candidates of this sweep, from `find_candidates`.
         """
@@ -248,7 +247,6 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
     """Return (N,) firing times in seconds since the first sweep's reference time.
 
     Args:
-        stretch: Consecutive registered sweeps.
         i: Index of the sweep that measured the points.
         rows: (N,) indices of the points in that sweep.
     """

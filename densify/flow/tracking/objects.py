@@ -83,7 +83,6 @@ class Track:
 
         Args:
             n: Index of the batch.
-            batch: The batch itself.
             state: (4,) displacement x, y, z (m) and yaw (rad).
             seen_s: Mean firing time of the object's points.
             rows: Ascending indices of the object's points in the batch's obstacles.

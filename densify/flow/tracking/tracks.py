@@ -128,9 +128,7 @@ class _Search:
     def _velocity_of(self, members: Int, n: int) -> Float:
         """Return the likely velocity (3,), m/s, world frame, of a cluster.
 
-        Args:
-            members: Indices of the cluster's points in the obstacles of batch n.
-            n: Index of the batch.
+        ``members`` are the indices of the cluster's points in the obstacles of batch index n.
         """
         c = self.batches[n].obstacles
         if self._velocities_m_s is None:
@@ -240,11 +238,7 @@ def _better(known: tuple[Track, Verdict], found: tuple[Track, Verdict]) -> tuple
 def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -> Bool:
     """Return (N,) True for points whose cluster is hit by a single ring or column of rays.
 
-    Args:
-        c: Obstacles of one sweep.
-        rows: (N,) indices of the points in ``c``.
-        T_lidar_world: (4,4) pose of the world in the lidar frame.
-        sensors: Models of the scanners.
+    ``rows`` (N,) are indices into the obstacles ``c`` of one sweep.
     """
     if not len(rows):
         return np.zeros(0, bool)

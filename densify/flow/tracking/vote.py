@@ -153,10 +153,7 @@ def _batches_around(n: int, step_s: float, clock: Clock) -> list[int]:
 def _best(group: Group, around: Sequence[Sequence[DistanceField]], velocities: Float) -> Float:
     """Return the velocity (3,) among (V,3) that brings the group nearest to candidates.
 
-    Args:
-        group: Points of a cluster.
-        around: For each batch compared with, the distance fields of its sweeps.
-        velocities: (V,3) m/s.
+    ``around`` has, for each batch compared with, the distance fields of its sweeps.
     """
     cost = np.zeros(len(velocities))
     for batch in around:

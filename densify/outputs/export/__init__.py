@@ -96,7 +96,7 @@ def export_run(
 
 
 def facts(export: Export) -> dict[str, Any]:
-    """Return the known ones of density and num_points as plain mappings."""
+    """Return the fields ``density`` and ``num_points`` of export.yaml, without unknown values."""
     density = {
         camera: {product: kept._asdict() for product, kept in products.items()}
         for camera, products in export.density.items()

@@ -36,7 +36,12 @@ _UNOBSERVED = np.array([140, 140, 140], np.uint8)
 
 
 class Kept(NamedTuple):
-    """A share of pixels with a depth, or a number of points, before and after the thresholds."""
+    """A share of pixels with a depth, or a number of points, and how much the thresholds keep.
+
+    Attributes:
+        before: Value without thresholds on confidence and age.
+        after: Value within the thresholds.
+    """
 
     before: float
     after: float
@@ -214,7 +219,7 @@ def finished_runs(
 
 
 class ShownSweep(NamedTuple):
-    """A sweep as measured, with its registered pose.
+    """A sweep as measured, for display, with its registered pose.
 
     Attributes:
         frame: Frame number.
@@ -230,7 +235,7 @@ class ShownSweep(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """An image of a camera, with its depth maps.
+    """An image of a camera (name and exposure time), with its depth maps.
 
     Attributes:
         name: Name of the map.
@@ -250,14 +255,15 @@ class Shot(NamedTuple):
 
 
 class Timeline(NamedTuple):
-    """A densified key sweep with its sweeps and images.
+    """All that a viewer shows of one densified key sweep: cloud, sweeps and camera images.
 
     Attributes:
-        run: The finished run.
+        run: The finished run of this key sweep.
         T_world_key: (4,4) pose of the key sweep. The world is the first key sweep's lidar frame.
         cloud: Accumulated points at the key sweep's time, key sweep's lidar frame.
-        sweeps: One or more sweeps, by time.
-        shots: Images of the chosen maps.
+        sweeps: Sweeps of the window as measured, ascending in time; the key sweep alone if the
+            viewer shows several runs.
+        shots: Camera images with their depth maps, one `Shot` for each chosen map.
     """
 
     run: FinishedRun

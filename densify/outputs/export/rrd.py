@@ -93,7 +93,7 @@ def _entities(timeline: Timeline) -> Iterator[tuple[int, int, str, Any]]:
 
 
 def _of_shot(shot: Shot) -> Iterator[tuple[str, Any]]:
-    """Yield entity path below the camera and rerun object, for pose, lens, image and depth."""
+    """Yield (entity path below the camera, rerun object) for pose, lens, image and depth."""
     import rerun as rr
 
     yield "", _transform(poses.inverse(shot.view.T_cam_key))
