@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from densify.bench import doctor as bench
 from densify.config import Config
@@ -255,3 +256,18 @@ def test_the_clock_of_poses_is_measured_in_a_bend(late_ms: int) -> None:
     assert clock.values["low_s"] - 0.01 <= late_ms * 1e-3 <= clock.values["high_s"] + 0.01
     assert clock.verdict == (Verdict.SUSPICIOUS if late_ms else Verdict.FINE)
     assert f"by {-late_ms:+.0f} ms" in clock.remedy or not late_ms
+
+
+@pytest.mark.parametrize("right", ["x y z w", "w x y z"])
+def test_the_order_of_quaternions_is_named(right: str) -> None:
+    """The four numbers of a file, read in the other order, and corrected."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("zyx", [0.7, -0.2, 0.4]).as_matrix()
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    file = [x, y, z, w] if right == "x y z w" else [w, x, y, z]
+    other = "w x y z" if right == "x y z w" else "x y z w"
+    as_xyzw = file if other == "x y z w" else [*file[1:], file[0]]
+    read = T.copy()
+    read[:3, :3] = Rotation.from_quat(as_xyzw).as_matrix()
+    mistake = f"their quaternions are {right}, read as {other}"
+    np.testing.assert_allclose(paths.HYPOTHESES[mistake](read), T, atol=1e-12)

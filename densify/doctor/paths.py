@@ -53,8 +53,8 @@ HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
     "they are a camera's, not the lidar's": lambda T: poses.inverse(CAM_AXES) @ T @ CAM_AXES,
     "they are in millimetres": changed(scale=1e-3),
     "they are in kilometres": changed(scale=1e3),
-    "their quaternions are x y z w, read as w x y z": changed(_rolled(-1)),
-    "their quaternions are w x y z, read as x y z w": changed(_rolled(1)),
+    "their quaternions are x y z w, read as w x y z": changed(_rolled(1)),
+    "their quaternions are w x y z, read as x y z w": changed(_rolled(-1)),
     "their rotations are transposed": changed(np.transpose),
 }
 """Common mistake of poses -> the function (4,4) -> (4,4) that corrects it."""
