@@ -123,6 +123,7 @@ def test_only_what_moves_along_itself_is_slender(along_deg, slender, monkeypatch
         track.claimed[n] = np.arange(20)
         line = np.stack([offset_m, 0 * offset_m, 0 * offset_m], 1) + state[:3]
         obstacles.append(SimpleNamespace(points=line, time_s=np.full(20, 0.1 * n)))
+    track.smooth()
     monkeypatch.setattr(likelihood, "count_violations", lambda *_: Violations(25, 0, 100))
     nowhere = Places(0, 0), Places(0, 0)
     monkeypatch.setattr(likelihood, "find_places_left", lambda *_: nowhere)

@@ -140,18 +140,17 @@ def judge(
     objects: Sequence[MovingObject],
     judged: Judge | None = None,
 ) -> Verdict:
-    """Fit the smooth path of a track, in place, and return the log odds that it moves.
+    """Return the log odds that a smoothed track moves.
 
     A track with fewer than 3 observations counts as static: its log odds are minus infinity.
 
     Args:
-        track: Track to judge; its ``path`` is replaced.
+        track: Track to judge, with the path of `Track.smooth`.
         objects: Objects confirmed so far, whose returns do not count against the track.
         judged: Function called with the track and its evidence.
     """
     if len(track.observations) < _NUM_STATES:
         return Verdict(-np.inf, -np.inf)
-    track.smooth()
     violations = count_violations(track, obstacles, space)
     within_m = near_m(space.gap_m(track.centre, next(iter(track.claimed))))
     best = Places(0, violations.tests)

@@ -163,6 +163,8 @@ class _Search:
 
     def _follow(self, members: Int, n: int, velocity: Float) -> tuple[Track, Verdict]:
         track = self._follower.follow(members, n, velocity)
+        if len(track.observations) > 1:
+            track.smooth()
         return track, self._judge(track)
 
     def _gather(self, track: Track) -> None:
