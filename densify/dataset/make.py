@@ -97,22 +97,19 @@ def make_dataset(
 ) -> Summary:
     """Make a training set from the key sweeps of whole recordings.
 
-    A repeated call continues the set: finished key sweeps are kept and failed key sweeps are tried
-    again. The files do not depend on the number of processes, shards or interruptions. The manifest
-    records the outcome of every key sweep.
+    A repeated call continues the set: it keeps finished key sweeps and tries failed ones again. The
+    files do not depend on processes, shards or interruptions.
 
     Args:
         data: Recordings, as `densify.open_sequence` takes them.
         out: Folder of the training set.
         keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``, None for all.
         recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
-        num_workers: Number of processes. 1 uses this process. None uses as many as cores, free
-            memory and key sweeps allow. A script that starts several needs ``if __name__ ==
-            "__main__"``.
+        num_workers: Number of processes; None for as many as cores and memory allow. A script that
+            starts several needs ``if __name__ == "__main__"``.
         scheduler: Address of a Dask scheduler whose workers replace local processes. They need the
             same files at the same paths. ``tcp://`` trusts everybody on that network.
-        shard: (i, n) for the i-th of n parts of the work, from 1. Machines that share ``out`` may
-            work on different parts at the same time.
+        shard: (i, n), part i of n, from 1. Machines that share ``out`` may make parts at once.
         verify: Compare finished files with their recorded hashes, and make damaged files again.
         report: Function called with the progress, before the first and after every key sweep.
 
@@ -131,32 +128,20 @@ def make_dataset(
     check_place(out)
     Cache()  # raises InputError if other users can write to the cache folder
     num_workers = _num_processes(num_workers, recipe, drives)
-    leftover_age_s = 0.0 if shard is None else LEFT_AFTER_S
-    with Manifest(out, shard) as manifest:
+    age_s, part = (0.0, "") if shard is None else (LEFT_AFTER_S, f"-{shard[0]}of{shard[1]}")
+    log = out.absolute() / f"densify{part}.log"
+    with Manifest(out, shard) as manifest, logged_to(log):
         write_plan(out, recipe, drives)
-        name = "densify.log" if shard is None else f"densify-{shard[0]}of{shard[1]}.log"
-        log = out.absolute() / name
-        with logged_to(log):
-            clear_leftovers(out, leftover_age_s)
-            if recipe.layout == "kitti-depth":
-                settings = as_mapping(recipe.config)
-                write_readme(out, method=recipe.method, window=recipe.window, settings=settings)
-            blocks = _blocks(drives, shard)
-            wanted = {(drive.name, key) for drive, keys in blocks for key in keys}
-            before = read_manifests(out)
-            done = finished(before.values(), out, verify)
-            records = {name: before[name] for name in sorted(wanted & done)}
-            _log.info(
-                "%d keys, %d finished, %d to make with %d worker(s)",
-                len(wanted),
-                len(records),
-                len(wanted) - len(records),
-                num_workers,
-            )
-            left = _jobs(blocks, records.keys(), recipe, out, num_workers)
-            made = call_all(make_key, left, num_workers, log, scheduler)
-            summary = _record(made, manifest, records, len(wanted), report)
-            clear_leftovers(out, leftover_age_s)  # hidden folders of killed workers
+        clear_leftovers(out, age_s)
+        if recipe.layout == "kitti-depth":
+            write_readme(out, recipe.method, recipe.window, as_mapping(recipe.config))
+        blocks = _blocks(drives, shard)
+        num_keys, records = sum(len(keys) for _, keys in blocks), _finished(blocks, out, verify)
+        _log.info("%d of %d keys finished, %d worker(s)", len(records), num_keys, num_workers)
+        left = _jobs(blocks, records.keys(), recipe, out, num_workers)
+        made = call_all(make_key, left, num_workers, log, scheduler)
+        summary = _record(made, manifest, records, num_keys, report)
+        clear_leftovers(out, age_s)  # hidden folders of killed workers
     return summary
 
 
@@ -210,6 +195,14 @@ def _blocks(drives: Sequence[Drive], shard: tuple[int, int] | None) -> list[Bloc
     i, n = shard or (1, 1)
     blocks = [(drive, keys) for drive in drives for keys in drive.blocks]
     return blocks[len(blocks) * (i - 1) // n : len(blocks) * i // n]
+
+
+def _finished(blocks: Sequence[Block], out: Path, verify: bool) -> dict[Key, KeyRecord]:
+    """Return the records of the blocks' finished key sweeps."""
+    wanted = {(drive.name, key) for drive, keys in blocks for key in keys}
+    before = read_manifests(out)
+    done = finished(before.values(), out, verify)
+    return {name: before[name] for name in sorted(wanted & done)}
 
 
 def _jobs(

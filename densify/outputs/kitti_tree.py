@@ -113,7 +113,7 @@ def write_key(
     return {p.relative_to(root).as_posix(): FileRecord.of(p.read_bytes()) for p in paths}
 
 
-def write_readme(root: Path, *, method: str, window: int, settings: Mapping[str, Any]) -> None:
+def write_readme(root: Path, method: str, window: int, settings: Mapping[str, Any]) -> None:
     """Write ``README.txt``, which describes the files beside it and how they were made.
 
     The text depends only on the arguments and the version of densify.

@@ -37,7 +37,6 @@ _POINT_SIZE_PX = 3
 _TITLE_PX, _SCALE_PX = 36, 60
 _FONT_PT, _LETTER_PX = 13.0, 0.85  # width of a letter, per point of the font
 _FEWEST_OUTLIERS = 1e-4  # the axis is linear below this share and logarithmic above
-_MEDIAN_SHARE = 20  # the running median covers one twentieth of all steps
 
 
 def write_plot(path: Path, figure: Figure) -> None:

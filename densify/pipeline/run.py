@@ -23,15 +23,18 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from densify.config import Config, resolve
 from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError
-from densify.depth.exposure import key_shots, load_images
+from densify.depth.exposure import Shot, key_shots, load_images
 from densify.depth.views import HeldOut, Views
 from densify.flow.engines import check_engine
 from densify.free_space.range_image import RangeImage
 from densify.geometry.compiled import num_threads
-from densify.geometry.types import LidarSequence, Progress, Result, StretchFlow
+from densify.geometry.types import Cloud, LidarSequence, Progress, Result, StretchFlow
 from densify.pipeline.costs import Watch
 from densify.pipeline.key_result import (
     COMPARED,
@@ -41,7 +44,7 @@ from densify.pipeline.key_result import (
     methods_of_run,
     result_of_method,
 )
-from densify.pipeline.recording import Recording
+from densify.pipeline.recording import Beyond, Recording
 from densify.pipeline.warnings import add_warnings
 from densify.readers.timeline import choose_cameras
 
@@ -83,11 +86,11 @@ def run(
         InputError: The recording or the settings cannot be used.
         ComputationError: Registration fails.
     """
-    methods = methods_of_run(method, resolve(config))
-    watch = Watch(progress)
-    recording = _open(sequence, [key], window, methods, cameras, config, None, watch)
-    priors = _open_prior(prior, sequence, cameras)
-    return densify(recording, key, methods, cameras, watch, priors=priors)[method]
+    made = run_keys(sequence, [key], window, method, cameras, config, progress, prior=prior)
+    ((_, result),) = made
+    if isinstance(result, Exception):
+        raise result
+    return result
 
 
 def run_keys(
@@ -155,8 +158,8 @@ def compare(
         InputError: The recording or the settings cannot be used.
         ComputationError: Registration fails.
     """
-    watch, config = Watch(progress), resolve(config).scored()
-    recording = _open(sequence, [key], window, methods, cameras, config, cache, watch)
+    watch, settings = Watch(progress), resolve(config).scored()
+    recording = _open(sequence, [key], window, methods, cameras, settings, cache, watch)
     priors = _open_prior(prior, sequence, cameras)
     return densify(recording, key, methods, cameras, watch, priors=priors)
 
@@ -221,7 +224,7 @@ def densify(
         ComputationError: As in `run`.
     """
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
-    stretch = recording.window(key)
+    recording.window(key)  # raises its errors before an image is read
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
     with watch.stage("images"):
         images = load_images(sequence, shots)
@@ -236,17 +239,8 @@ def densify(
                 key, method.all_sweeps, method.engine, settings.output.flow != "none"
             )
         beyond = far.result() if far is not None else None
-        key_image = RangeImage.of(stretch[key])
-        views = Views.of(sequence, stretch, key, key_image, shots, images, settings)
-        truth = views.truth(sequence.truth) if with_images and sequence.truth else {}
-        held_out = None
-        if settings.is_scored:
-            with watch.stage("held out"):
-                held_out = HeldOut.of(views, moments[methods[-1]].cloud)
-        shown = images if with_images else {}
-        scene = KeyScene(
-            settings, key, stretch, beyond, key_image, views, shown, truth, held_out, watch
-        )
+        cloud = moments[methods[-1]].cloud
+        scene = _scene_of(recording, key, shots, images, beyond, cloud, with_images, watch)
         filled = [settings.is_scored or name == methods[-1] for name in methods]
         make = partial(result_of_method, scene)
         made = list(pool.map(make, methods, moments.values(), filled))
@@ -255,11 +249,35 @@ def densify(
         from densify.pipeline.prior import complete_with_prior
 
         with watch.stage("prior"):
-            made[-1] = complete_with_prior(made[-1], priors, shots, truth, settings.prior.kind)
+            kind = settings.prior.kind
+            made[-1] = complete_with_prior(made[-1], priors, shots, scene.truth, kind)
     results: dict[str, Result] = {}
     for result in made:
         results[result.method] = replace(result, costs=watch.costs(), baselines=dict(results))
     return add_warnings(results, recording, key, shots)
+
+
+def _scene_of(
+    recording: Recording,
+    key: int,
+    shots: Mapping[str, Shot],
+    images: Mapping[str, NDArray[np.uint8]],
+    beyond: Beyond | None,
+    cloud: Cloud,
+    with_images: bool,
+    watch: Watch,
+) -> KeyScene:
+    """Return the shared inputs of a key's methods; ``cloud`` says which points of it move."""
+    sequence, settings, stretch = recording.sequence, recording.settings, recording.window(key)
+    key_image = RangeImage.of(stretch[key])
+    views = Views.of(sequence, stretch, key, key_image, shots, images, settings)
+    truth = views.truth(sequence.truth) if with_images and sequence.truth else {}
+    held_out = None
+    if settings.is_scored:
+        with watch.stage("held out"):
+            held_out = HeldOut.of(views, cloud)
+    shown = images if with_images else {}
+    return KeyScene(settings, key, stretch, beyond, key_image, views, shown, truth, held_out, watch)
 
 
 def _or_error(make: Callable[[int], T], frame: int) -> T | ComputationError | InputError:

@@ -78,7 +78,7 @@ def pair_depth_files(
 
     The frame in both paths must agree; the drive and the camera too if all paths name them. In a
     folder with files of a known layout, other files are ignored. If ``truth`` has KITTI's
-    ``groundtruth`` maps, no others are used.
+    ``groundtruth`` maps, only these maps are used.
 
     Args:
         predicted: Path of an estimated map, or of a folder searched with its subfolders.

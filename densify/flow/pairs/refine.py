@@ -281,7 +281,6 @@ def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told):  
     """Fill the normal equations H, g and ``told``; return the sum of Tukey weights."""
     H[:], g[:] = 0.0, 0.0
     total, distance_m, num_planes, first = 0.0, 0.0, 0, 0
-    squared_reach = reach_m * reach_m
     J, C = np.empty(4), np.zeros((3, 3))
     order = np.argsort(at[:, 0])
     px, py, pz = at[order, 0], at[order, 1], at[order, 2]
@@ -298,13 +297,11 @@ def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told):  
                 break
             dy, dz = py[j] - y, pz[j] - z
             squared = dx * dx + dy * dy + dz * dz
-            if squared >= squared_reach or not judges[kind[k], kind[j]]:
+            if squared >= reach_m * reach_m or not judges[kind[k], kind[j]]:
                 continue
-            w = 1 - squared / squared_reach
+            w = 1 - squared / (reach_m * reach_m)
             w *= w
-            num += 1
-            W += w
-            t += w * when[j]
+            num, W, t = num + 1, W + w, t + w * when[j]
             mx += w * dx
             my += w * dy
             mz += w * dz
@@ -318,10 +315,9 @@ def _add_up(at, share, sampling, judges, centre, reach_m, gate_m, H, g, told):  
             distance_m += _LIMIT_M
             continue
         t, mx, my, mz = t / W, mx / W, my / W, mz / W
-        xx, xy, xz = xx / W - mx * mx, xy / W - mx * my, xz / W - mx * mz
-        yy, yz, zz = yy / W - my * my, yz / W - my * mz, zz / W - mz * mz
-        C[0, 0], C[1, 1], C[2, 2] = xx, yy, zz
-        C[1, 0], C[2, 0], C[2, 1] = xy, xz, yz  # of a symmetric matrix the lower half is read
+        C[0, 0], C[1, 1], C[2, 2] = xx / W - mx * mx, yy / W - my * my, zz / W - mz * mz
+        # Of a symmetric matrix the lower half is read.
+        C[1, 0], C[2, 0], C[2, 1] = xy / W - mx * my, xz / W - mx * mz, yz / W - my * mz
         variances, axes = np.linalg.eigh(C)
         thick, a, b, c = max(variances[0], 0.0), axes[0, 0], axes[1, 0], axes[2, 0]
         if variances[1] < _MIN_WIDTH_M2:
