@@ -97,16 +97,15 @@ def make_dataset(
 ) -> Summary:
     """Make a training set from the key sweeps of whole recordings.
 
-    A repeated call continues the set: it keeps finished key sweeps and tries failed ones again. The
-    files do not depend on processes, shards or interruptions.
+    A repeated call keeps finished key sweeps. Files do not depend on processes or interruptions.
 
     Args:
         data: Recordings, as `densify.open_sequence` takes them.
         out: Folder of the training set.
         keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``, None for all.
         recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
-        num_workers: Number of processes; None for as many as cores and memory allow. A script that
-            starts several needs ``if __name__ == "__main__"``.
+        num_workers: Number of processes, as many as possible if None. More than one needs ``if
+            __name__ == "__main__"`` in a script.
         scheduler: Address of a Dask scheduler whose workers replace local processes. They need the
             same files at the same paths. ``tcp://`` trusts everybody on that network.
         shard: (i, n), part i of n, from 1. Machines that share ``out`` may make parts at once.
@@ -130,18 +129,19 @@ def make_dataset(
     num_workers = _num_processes(num_workers, recipe, drives)
     age_s, part = (0.0, "") if shard is None else (LEFT_AFTER_S, f"-{shard[0]}of{shard[1]}")
     log = out.absolute() / f"densify{part}.log"
-    with Manifest(out, shard) as manifest, logged_to(log):
-        write_plan(out, recipe, drives)
-        clear_leftovers(out, age_s)
-        if recipe.layout == "kitti-depth":
-            write_readme(out, recipe.method, recipe.window, as_mapping(recipe.config))
-        blocks = _blocks(drives, shard)
-        num_keys, records = sum(len(keys) for _, keys in blocks), _finished(blocks, out, verify)
-        _log.info("%d of %d keys finished, %d worker(s)", len(records), num_keys, num_workers)
-        left = _jobs(blocks, records.keys(), recipe, out, num_workers)
-        made = call_all(make_key, left, num_workers, log, scheduler)
-        summary = _record(made, manifest, records, num_keys, report)
-        clear_leftovers(out, age_s)  # hidden folders of killed workers
+    with Manifest(out, shard) as manifest:
+        write_plan(out, recipe, drives)  # no log where the plan is refused
+        with logged_to(log):
+            clear_leftovers(out, age_s)
+            if recipe.layout == "kitti-depth":
+                write_readme(out, recipe.method, recipe.window, as_mapping(recipe.config))
+            blocks = _blocks(drives, shard)
+            num_keys, records = sum(len(keys) for _, keys in blocks), _finished(blocks, out, verify)
+            left = _jobs(blocks, records.keys(), recipe, out, num_workers)
+            _log.info("%d of %d keys finished, %d worker(s)", len(records), num_keys, num_workers)
+            made = call_all(make_key, left, num_workers, log, scheduler)
+            summary = _record(made, manifest, records, num_keys, report)
+            clear_leftovers(out, age_s)  # hidden folders of killed workers
     return summary
 
 
