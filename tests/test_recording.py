@@ -31,9 +31,8 @@ GIVEN = resolve(POSES_GIVEN)
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of 6 sweeps that look 4 beyond, so that short recordings have many."""
+    """Blocks of 6 keys, so that short recordings have many."""
     monkeypatch.setattr(sweeps, "BLOCK_S", 0.6)
-    monkeypatch.setattr(sweeps, "AROUND_S", 0.4)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +44,7 @@ def long_street() -> TinySequence:
 
 
 def drive_of(sequence, folder: Path, window: int = 2, config: Config = GIVEN) -> Recording:
-    return Recording(sequence, config, window, cache=Cache(LIMIT, folder))
+    return Recording(sequence, config, window, cache=Cache(LIMIT, folder), looks_around=True)
 
 
 def maps_of(drive: Recording, key: int) -> pipeline.Result:

@@ -23,7 +23,7 @@ from densify.geometry.types import Result
 from densify.outputs.kitti_tree import FileRecord, write_key
 from densify.outputs.store import write_result
 from densify.pipeline import run as pipeline
-from densify.pipeline.key_result import methods_of_run
+from densify.pipeline.key_result import looks_around, methods_of_run
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
 
@@ -38,6 +38,7 @@ class Job:
         drive: Name of the recording's folder.
         data: Text of ``--data``, with an absolute path.
         folder: Folder of the recording's files, relative to ``out``.
+        keys: Key frame numbers of the training set, by which the recording is cut into blocks.
         cameras: Names of the wanted cameras.
         out: Folder of the training set.
         run: Unique text of the command's run, because long-lived workers must reopen the recording
@@ -48,6 +49,7 @@ class Job:
     drive: str
     data: str
     folder: str
+    keys: tuple[int, ...]
     cameras: tuple[str, ...]
     recipe: Recipe
     out: Path
@@ -145,6 +147,14 @@ def _opened(job: Job) -> tuple[Recording, Cache]:
             f"the worker on {platform.node()} has densify {__version__}, the command has "
             f"{job.version}; install the same on both"
         )
-    cache, sequence = Cache(), open_sequence(job.data)
-    recording = Recording(sequence, job.recipe.config, job.recipe.window, cache=cache, run=job.run)
+    cache, sequence, recipe = Cache(), open_sequence(job.data), job.recipe
+    recording = Recording(
+        sequence,
+        recipe.config,
+        recipe.window,
+        job.keys,
+        cache,
+        job.run,
+        looks_around=looks_around([recipe.method]),
+    )
     return recording, cache

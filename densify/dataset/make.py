@@ -215,7 +215,7 @@ def _jobs(
     run, groups = uuid4().hex, []
     for drive, keys in blocks:
         cameras, place = tuple(drive.cameras), out.absolute()
-        job = Job(drive.name, drive.data, drive.folder, cameras, recipe, place, run)
+        job = Job(drive.name, drive.data, drive.folder, drive.keys, cameras, recipe, place, run)
         if group := [(job, key) for key in keys if (drive.name, key) not in done]:
             groups.append(group)
     # Workers begin at distant blocks, because neighbouring blocks share results too.

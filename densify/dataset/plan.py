@@ -171,9 +171,9 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]
         folder = f"{split_of(sequence.name) if split == 'kitti' else split}/{name}"
         if recipe.layout == "densify":
             folder = name if len(data) > 1 else "."
-        cut = Cut.whole(Timeline.of(sequence), recipe.window)
-        grouped = groupby(_keys(sequence, keys, spec), cut.number_near)
-        blocks = tuple(tuple(block) for _, block in grouped)
+        wanted = _keys(sequence, keys, spec)
+        cut = Cut.of(Timeline.of(sequence), recipe.window, wanted)
+        blocks = tuple(tuple(block) for _, block in groupby(wanted, cut.number_of.__getitem__))
         drives[name] = Drive(name, Spec.parse(spec).absolute(), folder, cameras, blocks)
     return list(drives.values())
 

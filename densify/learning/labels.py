@@ -56,7 +56,7 @@ def label_sweeps(
     if boxes is None or all(boxes(frame) is None for frame in sequence.frames):
         known = ", ".join(f"{row.boxes} ({row.name})" for row in READERS if row.boxes)
         raise InputError(f"{sequence.name}: no tracked boxes; expected one of {known}")
-    recording = Recording(sequence, config, 1)
+    recording = Recording(sequence, config, 1, frames, looks_around=True)
     for done, frame in enumerate(frames):
         if progress:
             progress("label", done, len(frames))

@@ -8,14 +8,14 @@
     far            static surfaces along the road beyond the windows
 
 A block is split into pieces at sweeps that cannot be read or registered, and at holes in time.
-`run` and `compare` cut blocks around a few keys and read no other sweeps; `dataset` and
-`flow_steps` cut the whole recording (`densify.pipeline.sweeps`). Registration, motion and far are
-cached.
+Blocks are cut around the keys, and no other sweeps are read (`densify.pipeline.sweeps`).
+Registration, motion and far are cached.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -104,7 +104,7 @@ class Recording:
             window: Number of sweeps on each side of a key.
             keys: Frame numbers, around which sweeps are read; None for every frame.
             cache: Cache of results on disk.
-            run: Name of a run whose processes share digests of sweeps; None for no sharing.
+            run: Name of a run whose processes share results through the cache; None for no sharing.
             watch: Measures the cost of each step.
             looks_around: True also searches motion ``flow.look_around_s`` beyond the windows.
 
@@ -114,18 +114,15 @@ class Recording:
         self.sequence, self.settings = sequence, settings
         self.timeline = timeline = Timeline.of(sequence)
         self._num_around, self._watch, self._cache = window, watch or Watch(), cache
-        self._step_around, self._num_lead_in = 1, timeline.num_in(LEAD_IN_S)
-        if keys is None:
-            self.cut = Cut.whole(timeline, window)
-        else:
-            Cut.around(timeline, window, keys)  # refuses bad ones before a sweep is read
-            looks_around &= engine_row(settings.flow.engine)[0].shared
-            around_s, step_s = self._look_around(keys) if looks_around else (0.0, 0.0)
-            self.cut = Cut.around(timeline, window, keys, around_s)
-            self._step_around = max(1, timeline.num_in(step_s))
-            # The sweeps around a window count as lead-in, too.
-            self._num_lead_in = max(_TELL_SPEED, timeline.num_in(LEAD_IN_S - around_s))
-        self._is_whole = keys is None
+        keys = timeline.frames if keys is None else keys
+        Cut.of(timeline, window, keys)  # refuses bad ones before a sweep is read
+        looks_around &= engine_row(settings.flow.engine)[0].shared
+        around_s, step_s = self._look_around(keys) if looks_around else (0.0, 0.0)
+        self.cut = Cut.of(timeline, window, keys, around_s)
+        self._step_around = max(1, timeline.num_in(step_s))
+        # The sweeps around a window count as lead-in, too.
+        self._num_lead_in = max(_TELL_SPEED, timeline.num_in(LEAD_IN_S - around_s))
+        self._run = run
         most = max((len(block) for block in self.cut.blocks), default=0)
         num_raw = most + self._num_lead_in
         self._sweeps = Sweeps(
@@ -145,11 +142,11 @@ class Recording:
         """Return seconds around windows, and between sweeps, in which motion is searched."""
         if not keys or self.settings.flow.look_around_s == 0:
             return 0.0, 0.0
-        try:
-            num_points = len(self.sequence[min(keys)])
-        except InputError:  # raised again where the key is made
-            return 0.0, 0.0
-        return self.settings.flow.around(num_points / (self.timeline.period_ns * 1e-9))
+        for key in sorted(keys):
+            with suppress(InputError):  # raised again where the key is made
+                num_points = len(self.sequence[key])
+                return self.settings.flow.around(num_points / (self.timeline.period_ns * 1e-9))
+        return 0.0, 0.0
 
     def window_frames(self, key: int) -> WindowFrames:
         """Return the frames of a key's window, and the reasons if it is smaller than requested.
@@ -374,9 +371,10 @@ class Recording:
             with self._watch.stage("far"):
                 return road.find_standing(stretch, keys, with_near=len(keys) > 1)
 
-        if not self._is_whole:  # computing is cheaper than reading the road's sweeps for a digest
-            return make()
-        return self._kept("far", road.frames(near), make, [far_m, cameras, near])
+        # Processes of one run share the result. A digest would read every sweep of the road.
+        shared = self._cache if self._run is not None else None
+        inputs = [self._run, self.sequence.name, number, row]
+        return kept(shared, "far", lambda: inputs, make)
 
     def _in_windows(self, number: int) -> frozenset[int]:
         """Return the frames of the windows of a block's keys."""

@@ -77,11 +77,6 @@ class Road:
     settings: RegisterSettings
     far_m: float
 
-    def frames(self, near: Sequence[int]) -> list[int]:
-        """Return the frames that may be read, ascending: the window (``near``) and around it."""
-        num = int(_MOST_S * 1e9 / self.timeline.period_ns)
-        return [*self.timeline.before(near[0], num), *near, *self.timeline.after(near[-1], num)]
-
     def find_standing(self, near: Stretch, keys: Sequence[int], with_near: bool) -> StandingWorld:
         """Return the static surfaces along the road, in the world of ``near``.
 

@@ -185,7 +185,7 @@ def flow_steps(
     Raises:
         InputError: The arguments are invalid; raised at the call, before the first frame.
     """
-    recording = _open(sequence, None, 1, ["flow"], None, config, cache, None)
+    recording = _open(sequence, frames, 1, ["flow"], None, config, cache, None)
 
     def steps() -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
         for done, frame in enumerate(frames):
@@ -300,7 +300,7 @@ def _open_prior(
 
 def _open(
     sequence: LidarSequence,
-    keys: Sequence[int] | None,
+    keys: Sequence[int],
     window: int,
     methods: Sequence[str],
     cameras: Sequence[str] | None,

@@ -6,7 +6,6 @@ The keys of a block share registration and motion.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,7 +19,6 @@ from densify.pipeline.costs import Watch
 from densify.readers.timeline import Timeline, check_key, check_window, read_sweep
 
 BLOCK_S = 2.0
-AROUND_S = 1.0  # least time around a block in which moving objects are searched
 
 
 class Sweeps:
@@ -81,7 +79,7 @@ class Sweeps:
 
         def find() -> str:
             try:
-                return digest([self._read(frame), self.recorded_pose(frame)])
+                return digest([self.read(frame), self.recorded_pose(frame)])
             except InputError as error:
                 return str(error)
 
@@ -102,64 +100,43 @@ class Cut:
     blocks: tuple[tuple[int, ...], ...]
     number_of: Mapping[int, int]
 
-    def number_near(self, frame: int) -> int:
-        """Return the index of the block of the last key up to this frame, or of the first key."""
-        keys = sorted(self.number_of)
-        return self.number_of[keys[max(0, bisect_right(keys, frame) - 1)]]
-
     def keys_of(self, number: int) -> list[int]:
         """Return the keys of a block."""
         return [key for key, n in self.number_of.items() if n == number]
 
     @staticmethod
-    def whole(timeline: Timeline, window: int) -> Cut:
-        """Cut the whole recording into blocks of `BLOCK_S` seconds, with every sweep as a key.
-
-        Blocks are counted from time 0. Maps of a sweep are therefore the same for any choice of
-        keys.
-        """
-        check_window(window)
-        groups: dict[int, list[int]] = {}
-        for frame in timeline.frames:
-            groups.setdefault(timeline.stamp_of(frame) // round(BLOCK_S * 1e9), []).append(frame)
-        window = max(window, timeline.num_in(AROUND_S))
-        return _cut(timeline, window, [groups[at] for at in sorted(groups)])
-
-    @staticmethod
-    def around(
-        timeline: Timeline, window: int, keys: Collection[int], beyond_s: float = 0.0
-    ) -> Cut:
+    def of(timeline: Timeline, window: int, keys: Collection[int], beyond_s: float = 0.0) -> Cut:
         """Cut blocks around the windows of some keys, ``beyond_s`` seconds longer on each side.
 
         Keys with overlapping windows share a block, unless they are more than `BLOCK_S` apart.
 
+        Args:
+            timeline: Times of the sweeps.
+            window: Number of sweeps on each side of a key.
+            keys: Frame numbers, in any order.
+
         Raises:
             InputError: A key does not exist.
         """
+        check_window(window)
+        groups: list[list[int]] = []
+        last_row = -1  # of the last key's window
         for key in keys:
             check_key(key)
-        check_window(window)
-        window += round(beyond_s * 1e9 / timeline.period_ns)
-        groups: list[list[int]] = []
         for key in sorted(set(keys)):
-            first = timeline.row[timeline.window(key, window).frames[0]]
-            if (
-                groups
-                and first <= timeline.row[timeline.window(groups[-1][-1], window).frames[-1]]
-                and timeline.stamp_of(key) - timeline.stamp_of(groups[-1][0]) < BLOCK_S * 1e9
+            frames = timeline.window(key, window).frames
+            if timeline.row[frames[0]] <= last_row and (
+                timeline.stamp_of(key) - timeline.stamp_of(groups[-1][0]) < BLOCK_S * 1e9
             ):
                 groups[-1].append(key)
             else:
                 groups.append([key])
-        return _cut(timeline, window, groups)
-
-
-def _cut(timeline: Timeline, window: int, groups: Sequence[Sequence[int]]) -> Cut:
-    """Return one block for each group of keys: all sweeps from its first to its last window."""
-    blocks = []
-    for keys in groups:
-        first = timeline.window(keys[0], window).frames[0]
-        last = timeline.window(keys[-1], window).frames[-1]
-        blocks.append(timeline.frames[timeline.row[first] : timeline.row[last] + 1])
-    number_of = {key: number for number, keys in enumerate(groups) for key in keys}
-    return Cut(tuple(blocks), number_of)
+            last_row = timeline.row[frames[-1]]
+        window += round(beyond_s * 1e9 / timeline.period_ns)
+        blocks = []
+        for group in groups:
+            first = timeline.row[timeline.window(group[0], window).frames[0]]
+            last = timeline.row[timeline.window(group[-1], window).frames[-1]]
+            blocks.append(timeline.frames[first : last + 1])
+        number_of = {key: number for number, group in enumerate(groups) for key in group}
+        return Cut(tuple(blocks), number_of)
