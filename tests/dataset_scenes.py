@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Small recordings across the border of two blocks, in memory and as a KITTI raw drive, and the
-sets that are made of them."""
+"""Small recordings, in memory and as a KITTI raw drive, and the sets that are made of them."""
 
 from __future__ import annotations
 
@@ -17,11 +16,9 @@ import numpy as np
 
 import densify
 from densify.dataset.manifest import damaged_files, read_manifests
-from densify.pipeline.sweeps import BLOCK_S
 from tests.command import files_in
 from tests.scenes import (
     CAMERA,
-    SWEEP_S,
     Arc,
     Scanner,
     Scene,
@@ -32,7 +29,7 @@ from tests.scenes import (
     street,
 )
 
-BORDER = round(2 * BLOCK_S / SWEEP_S)
+BORDER = 40
 FRAMES = range(BORDER - 4, BORDER + 5)
 COARSE = Scanner(24, 360)
 DRIVE = "2011_09_26_drive_0013_sync"
@@ -42,8 +39,8 @@ DRIVE = "2011_09_26_drive_0013_sync"
 def across_border(
     frames: Sequence[int] = FRAMES, scanner: Scanner = COARSE, movers: bool = True
 ) -> TinySequence:
-    """At the first frame of a block the vehicle is at the start of a street, at 4 m/s, behind a car
-    at 8 m/s and with one coming towards it at 7 m/s."""
+    """At frame `BORDER` the vehicle is at the start of a street, at 4 m/s, behind a car at 8 m/s.
+    Another car comes towards it at 7 m/s."""
     cars = car(9 - 8 * 4, 1.8, 8, 1), car(22 + 7 * 4, 2.3, 7, 2, np.pi)
     world = World((*street(50.0), *(cars if movers else ())))
     return TinySequence(Scene(world, Arc(-4 * 4, -1.5, 0, 4.0), scanner), frames)

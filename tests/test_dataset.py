@@ -82,10 +82,15 @@ def test_a_set_is_what_it_says(border_set: Path, capsys) -> None:
 
 
 def test_shards_workers_and_a_killed_run_make_what_one_makes(
-    border_drive: Path, border_set: Path, empty_cache: Path, tmp_path: Path, monkeypatch
+    empty_cache: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    out = tmp_path / "out"
-    arguments = ["--data", border_drive, *OPTIONS, "--out", out]
+    """Of two blocks, with a hole in time between them."""
+    frames = [*range(BORDER - 4, BORDER), *range(BORDER + 5, BORDER + 9)]
+    drive = write_drive(across_border(frames), tmp_path / "2011_09_26")
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    assert exit_code("dataset", "--data", drive, *OPTIONS, "--out", whole) == 0
+    shutil.rmtree(empty_cache)
+    arguments = ["--data", drive, *OPTIONS, "--out", out]
     with command(*arguments, "--shard", "1/2", "--workers", "2") as process:
         end = time.monotonic() + PATIENCE_S
         while not any('"done"' in p.read_text() for p in out.glob("manifest*.jsonl")):
@@ -100,7 +105,7 @@ def test_shards_workers_and_a_killed_run_make_what_one_makes(
     for shard, workers in (("1/2", 2), ("2/2", 1)):
         assert exit_code("dataset", *arguments, "--shard", shard, "--workers", workers) == 0
         made.append(keys_of(maps_in(out)))
-    assert made[0] < made[1] == set(FRAMES)
+    assert made[0] < made[1] == set(frames)
     kept = {path for path in before if int(path.stem) in finished}
     assert {path: times(out)[path] for path in kept} == {path: before[path] for path in kept}
     # Another run makes nothing again, and clears what the killed one has left.
@@ -108,8 +113,8 @@ def test_shards_workers_and_a_killed_run_make_what_one_makes(
     monkeypatch.setattr(make, "call_all", lambda _, groups, *rest: iter(groups))
     assert exit_code("dataset", *arguments) == 0
     assert times(out) == before
-    is_whole(out, border_set)
-    assert (out / "dataset.json").read_bytes() == (border_set / "dataset.json").read_bytes()
+    is_whole(out, whole)
+    assert (out / "dataset.json").read_bytes() == (whole / "dataset.json").read_bytes()
 
 
 def test_damaged_files_are_made_again(

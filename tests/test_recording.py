@@ -21,7 +21,7 @@ from densify.pipeline import sweeps
 from densify.pipeline.recording import Recording
 from densify.pipeline.warnings import _of_window
 from densify.readers.street import Street
-from tests.dataset_scenes import BORDER, across_border
+from tests.dataset_scenes import BORDER, FRAMES, across_border
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
 from tests.small_street import POSES_GIVEN
 
@@ -105,12 +105,14 @@ def test_keys_do_not_depend_on_others(small_blocks, long_street, tmp_path: Path)
 # Windows
 
 
-def test_no_window_is_cut_at_a_border(tmp_path: Path) -> None:
+def test_no_window_is_cut_where_two_blocks_meet(small_blocks, tmp_path: Path) -> None:
     for source in ("dataset", "kiss-icp"):
         config = resolve({"register": {"source": source}})
         drive = drive_of(across_border(), tmp_path, 2, config)
-        assert drive.window(BORDER - 1).frames == tuple(range(BORDER - 3, BORDER + 2))
-        assert drive.window(BORDER).frames == tuple(range(BORDER - 2, BORDER + 3))
+        assert len(drive.cut.blocks) == 2
+        for key in FRAMES:
+            near = range(max(key - 2, FRAMES[0]), min(key + 2, FRAMES[-1]) + 1)
+            assert drive.window(key).frames == tuple(near)
 
 
 def test_a_hole_in_time_ends_windows_and_begins_a_world(tmp_path: Path) -> None:
