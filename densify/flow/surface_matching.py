@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from densify.geometry.compiled import Kernel
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Int
 
@@ -40,9 +41,11 @@ def undo(state: Float, points: Float, centre: Float) -> Float:
 
 def _turned(arms: Float, yaw: float | Float) -> Float:
     """Return (N,3) vectors ``arms``, turned by ``yaw`` (rad) about the vertical."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    x, y, z = arms.T
-    return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
+    (x, y, _), c, s = arms.T, np.cos(yaw), np.sin(yaw)
+    turned = arms.copy()
+    turned[:, 0] = c * x - s * y
+    turned[:, 1] = s * x + c * y
+    return turned
 
 
 def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
@@ -104,20 +107,52 @@ class Model:
         for gate_m in GATES_M:
             at_model = undo(state, points, centre)
             distance_m, row = nearest(self._tree, at_model, gate_m)
-            found = np.flatnonzero(row >= 0)
-            if len(found) < MIN_FIT:
+            num = np.count_nonzero(row >= 0)
+            if num < MIN_FIT:
                 return None
-            row, arm = row[found], at_model[found] - centre
-            weight = (1 - (distance_m[found] / gate_m) ** 2) ** 2
-            cos, sin = np.cos(state[3]), np.sin(state[3])
-            J = np.zeros((len(found), 3, 3))  # derivative of the model's point by x, y and yaw
-            J[:, 0, 0], J[:, 1, 0] = cos, -sin
-            J[:, 0, 1], J[:, 1, 1] = sin, cos
-            J[:, 0, 2], J[:, 1, 2] = -arm[:, 1], arm[:, 0]
-            weight *= min(1.0, MAX_WEIGHT / len(found))
-            JA = J.transpose(0, 2, 1) @ (self.information[row] * weight[:, None, None])
-            H = (JA @ J).sum(axis=0) + np.diag(prior)
-            off = at_model[found] - self.points[row]
-            g = (JA @ off[:, :, None]).sum(axis=0)[:, 0] + prior * (predicted - state)[[0, 1, 3]]
+            most, yaw = min(1.0, MAX_WEIGHT / num), float(state[3])
+            H, g = np.diag(prior), prior * (predicted - state)[[0, 1, 3]]
+            off, share = at_model - self.points[row], distance_m / gate_m
+            _add_matches(at_model - centre, off, row, share, self.information, yaw, most, H, g)
             state[[0, 1, 3]] += np.linalg.solve(H, g)
         return state
+
+
+@Kernel
+def _add_matches(
+    arms: Float,
+    off: Float,
+    row: Int,
+    share: Float,
+    information: Float,
+    yaw: float,
+    most: float,
+    H: Float,
+    g: Float,
+) -> None:
+    """Add the normal equations of x, y and yaw to H (3,3) and g (3,), in place.
+
+    Args:
+        arms: (N,3) from the centre to the points, metres, object's frame.
+        off: (N,3) from the matched model points to the points.
+        row: (N,) matched model points, -1 for none.
+        share: (N,) distance to the match as a share of the greatest distance.
+        information: (M,3,3) of the model points.
+        yaw: Of the object, rad.
+        most: Greatest weight of a match.
+    """
+    J, JA = np.zeros((2, 3, 3))  # J: derivative of the model's point by x, y and yaw
+    J[0, 0] = J[1, 1] = np.cos(yaw)
+    J[0, 1] = np.sin(yaw)
+    J[1, 0] = -J[0, 1]
+    for i in range(len(row)):
+        if row[i] < 0:
+            continue
+        A, weight = information[row[i]], most * (1 - share[i] ** 2) ** 2
+        J[0, 2], J[1, 2] = -arms[i, 1], arms[i, 0]
+        for a in range(3):
+            for b in range(3):
+                JA[a, b] = weight * (J[0, a] * A[0, b] + J[1, a] * A[1, b])
+            g[a] += JA[a, 0] * off[i, 0] + JA[a, 1] * off[i, 1] + JA[a, 2] * off[i, 2]
+            for b in range(3):
+                H[a, b] += JA[a, 0] * J[0, b] + JA[a, 1] * J[1, b]

@@ -37,6 +37,7 @@ _LEAST_GAP_RAD, _MAX_GAP_RAD = 1e-4, np.deg2rad(4.0)
 _EVEN, _MIN_EVEN_SHARE = 0.2, 0.5  # share of the usual gap; share of the returns
 _MIN_GAPS_PER_BIN = 30
 _MIN_PER_COLUMN = 5
+_APART_RAD = 4 * np.pi  # more than twice the range of angles
 _AT_ONCE = 0.03  # share of the duration of a sweep
 
 _MIN_COUNT = 24  # least number of returns for a density
@@ -192,13 +193,17 @@ def _some_sectors(rays: Aimed) -> Aimed:
     return rays
 
 
-def _gaps(group: NDArray[Any], angle: Float32) -> Float:
-    """Return the differences between neighbouring angles of the same group.
+def _in_groups(group: NDArray[Any], angle: Float32) -> Float:
+    """Return the (N,) angles in ascending order, group by group, with large gaps between groups.
 
     group: (N,) whole number of each angle's group.
     """
-    apart = 4 * np.pi  # more than the greatest difference within a group
-    found: Float = np.diff(np.sort(group * apart + angle.astype(np.float64)))
+    return np.sort(group * _APART_RAD + angle.astype(np.float64))
+
+
+def _gaps(group: NDArray[Any], angle: Float32) -> Float:
+    """Return the differences between neighbouring angles of the same group, see `_in_groups`."""
+    found: Float = np.diff(_in_groups(group, angle))
     return found[found < 2 * np.pi]
 
 
@@ -239,14 +244,12 @@ def _table_of_lines(sweeps: Sequence[Aimed], step_rad: float) -> RayTable:
     """
     gaps, middles = [], []
     for rays in sweeps:
-        sector = np.floor(rays.azimuth / _COLUMN_RAD)
-        order = np.lexsort((rays.elevation, sector))
-        elevation = rays.elevation[order].astype(float)
-        gap = np.diff(elevation)
-        kept = (np.diff(sector[order]) == 0) & (gap < _MAX_GAP_RAD)
-        kept &= gap > max(step_rad / 2, _LEAST_GAP_RAD)
+        ordered = _in_groups(np.floor(rays.azimuth / _COLUMN_RAD), rays.elevation)
+        gap = np.diff(ordered)
+        kept = (gap < _MAX_GAP_RAD) & (gap > max(step_rad / 2, _LEAST_GAP_RAD))
         gaps.append(gap[kept])
-        middles.append((elevation[:-1] + gap / 2)[kept])
+        middle = ordered[:-1][kept] + gap[kept] / 2
+        middles.append(middle - _APART_RAD * np.rint(middle / _APART_RAD))
     low = float(min(r.elevation.min() for r in sweeps)) - _LINE_BIN_RAD
     high = float(max(r.elevation.max() for r in sweeps)) + _LINE_BIN_RAD
     num_bins = int((high - low) / _LINE_BIN_RAD) + 2

@@ -25,9 +25,10 @@ def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Fl
         (N,) distances and (N,) int64 rows of the tree's points; inf and -1 for a query without a
         point closer than ``within_m``.
     """
-    distance_m, row = tree.query(queries, distance_upper_bound=within_m)
-    distance_m = np.asarray(distance_m)
-    return distance_m, np.where(np.isfinite(distance_m), row, -1).astype(np.int64)
+    distance_m, found = tree.query(queries, distance_upper_bound=within_m)
+    row = np.asarray(found, np.int64)
+    row[row == tree.n] = -1
+    return np.asarray(distance_m), row
 
 
 def nearest_k(tree: cKDTree, queries: Float, k: int) -> tuple[Float, Int]:

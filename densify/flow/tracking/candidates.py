@@ -34,21 +34,21 @@ class Strips:
 
     def __init__(self, points: Float) -> None:
         """Index the points (N,3, metres), given in scan order."""
-        self._points = points
         begins = np.arange(0, len(points), _STRIP)
-        if len(points):
-            self._low = np.minimum.reduceat(points, begins)
-            self._high = np.maximum.reduceat(points, begins)
+        self._low = np.ascontiguousarray(np.minimum.reduceat(points, begins).T)
+        self._high = np.ascontiguousarray(np.maximum.reduceat(points, begins).T)
+        padded = np.full((len(begins) * _STRIP, 3), np.inf)  # the padding is in no box
+        padded[: len(points)] = points
+        strips = padded.reshape(len(begins), _STRIP, 3)
+        self._strips = np.ascontiguousarray(strips.transpose(0, 2, 1))
 
     def rows_inside(self, low: Float, high: Float) -> Int:
         """Return the ascending indices of the points in a box with corners low and high (3,)."""
-        if not len(self._points):
-            return np.zeros(0, np.int64)
-        strips = np.flatnonzero(((self._low < high) & (self._high > low)).all(axis=1))
-        rows = (strips[:, None] * _STRIP + np.arange(_STRIP)).ravel()
-        rows = rows[rows < len(self._points)]
-        points = self._points[rows]
-        return np.asarray(rows[((points > low) & (points < high)).all(axis=1)], np.int64)
+        low, high = low[:, None], high[:, None]
+        found = np.flatnonzero(((self._low < high) & (self._high > low)).all(axis=0))
+        points = self._strips[found]
+        strip, place = np.nonzero(((points > low) & (points < high)).all(axis=1))
+        return found[strip] * _STRIP + place
 
 
 @dataclass(frozen=True)

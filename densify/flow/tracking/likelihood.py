@@ -191,11 +191,14 @@ def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSp
     for j, *_ in space.batches:
         sources = [i for i in tested if j in others[i]]
         if sources:
-            in_object = np.concatenate([body[i] for i in sources])
-            moved += int(track.seen_through(in_object, j, space).sum())
-            in_world = np.concatenate([points[i] for i in sources])
-            static += int(space.seen_through(in_world, j).sum())
-            num_tests += len(in_object)
+            carried = track.place(np.concatenate([body[i] for i in sources]), space.clock.time_s[j])
+            velocity_m_s = track.velocity_m_s(carried, space.clock.time_s[j])
+            both = np.concatenate([carried, *(points[i] for i in sources)])
+            velocity_m_s = np.concatenate([velocity_m_s, np.zeros_like(carried)])
+            violated = space.seen_through(both, j, velocity_m_s)
+            moved += int(violated[: len(carried)].sum())
+            static += int(violated[len(carried) :].sum())
+            num_tests += len(carried)
     return Violations(static, moved, num_tests)
 
 
@@ -234,34 +237,30 @@ def find_places_left(
     Returns:
         Counts of sweeps before the object arrives at a position, and of sweeps after it left.
     """
-    some = {i: rows[:: len(rows) // _NUM_ASKED + 1] for i, rows in track.claimed.items()}
-    tree = tree_of(track.points_in(obstacles, track.claimed))
+    sweeps = list(track.claimed)
+    parts = [
+        obstacles[i].points[rows[:: len(rows) // _NUM_ASKED + 1]]
+        for i, rows in track.claimed.items()
+    ]
+    everywhere, of_place = np.concatenate(parts), np.repeat(sweeps, [len(part) for part in parts])
+    tree = tree_of(track.points_in(obstacles, sweeps))
     rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
     room_m = LINK_M + REACH_S * float(np.linalg.norm(rate[:2]))
-
-    def count(batch: tuple[int, ...], sweeps: Sequence[int]) -> Places:
-        places = np.concatenate([np.zeros((0, 3)), *(obstacles[i].points[some[i]] for i in sweeps)])
-        in_object = track.undo(places, space.clock.time_s[batch[0]])
-        away_m, _ = nearest(tree, in_object, room_m)
-        places = places[(away_m > LINK_M) & np.isfinite(away_m)]
-        if not len(places):
-            return Places(0, 0)
-        returns = np.concatenate(
-            [_returns_near(places, within_m, obstacles[j], objects) for j in batch]
-        )
-        taken = np.zeros(len(places), bool)
-        if len(returns):
-            taken = is_near(tree_of(returns), places, within_m)
+    counts = np.zeros((2, 2), np.int64)
+    for batch in space.batches:
+        away_m, _ = nearest(tree, track.undo(everywhere, space.clock.time_s[batch[0]]), room_m)
+        left = (away_m > LINK_M) & np.isfinite(away_m)
+        left &= (of_place < batch[0]) | (of_place > batch[-1])
+        if not left.any():
+            continue
+        places, is_after = everywhere[left], of_place[left] < batch[0]
+        returns = [_returns_near(places, within_m, obstacles[j], objects) for j in batch]
+        taken = is_near(tree_of(np.concatenate(returns)), places, within_m)
         empty = space.seen_through(places, batch[0]) & ~taken
-        return Places(int(taken.sum()), int(empty.sum()))
-
-    def total(parts: Sequence[Places]) -> Places:
-        return Places(sum(p.taken for p in parts), sum(p.empty for p in parts))
-
-    return (
-        total([count(batch, [i for i in some if i > batch[-1]]) for batch in space.batches]),
-        total([count(batch, [i for i in some if i < batch[0]]) for batch in space.batches]),
-    )
+        for count, side in zip(counts, (~is_after, is_after), strict=True):
+            count += [np.count_nonzero(taken & side), np.count_nonzero(empty & side)]
+    before, after = counts.tolist()
+    return Places(*before), Places(*after)
 
 
 def _returns_near(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, PPoly
 
 from densify.geometry.types import Float
 
@@ -24,6 +24,8 @@ _WORTH_SOFTENING = 0.8  # a softer path must lower the leave-one-out error to th
 _ACCELERATION_STATES, _ACCELERATION_S = 5, 0.35
 _JERK_STATES, _JERK_S = 8, 0.65
 _DEGREE = 3
+# Powers 3 to 0 of the time since a span began, by the coefficients of the four B-splines on it.
+_CUBIC = np.array([[-1, 3, -3, 1], [3, -6, 3, 0], [-3, 0, 3, 0], [1, 4, 1, 0]]) / 6
 
 
 @dataclass(frozen=True)
@@ -87,24 +89,28 @@ class Path:
         return Path(knots, coefficients, begin_s, end_s, residual_m)
 
     @cached_property
-    def _spline(self) -> BSpline:
-        return BSpline(self.knots_s, self.coefficients, _DEGREE)
-
-    @cached_property
-    def _derivative(self) -> BSpline:
-        return self._spline.derivative()
+    def _pieces(self) -> PPoly:
+        """The path as polynomials in time; the first and the last piece are its ends' tangents."""
+        num_spans = len(self.coefficients) - _DEGREE
+        width_s = (self.end_s - self.begin_s) / num_spans
+        controls = np.stack([self.coefficients[k : k + num_spans] for k in range(_DEGREE + 1)])
+        cubic = np.einsum("pk,knd->pnd", _CUBIC, controls)
+        first, last = np.zeros((2, _DEGREE + 1, 1, cubic.shape[2]))
+        first[2:] = cubic[2:, :1]
+        first[3] -= first[2]
+        last[3], last[2] = cubic[:, -1:].sum(axis=0), np.arange(3.0, -1.0, -1) @ cubic[:, -1]
+        powers = width_s ** -np.arange(_DEGREE, -1.0, -1)
+        pieces = np.concatenate([first, cubic, last], axis=1) * powers[:, None, None]
+        return PPoly(pieces, self.begin_s + width_s * np.arange(-1.0, num_spans + 2))
 
     def __call__(self, time_s: float | Float) -> Float:
         """Return the states (..., d) at the given times (...) in seconds."""
-        inside = np.clip(time_s, self.begin_s, self.end_s)
-        state: Float = self._spline(inside)
-        if np.any(time_s != inside):
-            state = state + np.asarray(time_s - inside)[..., None] * self._derivative(inside)
+        state: Float = self._pieces(time_s)
         return state
 
     def rate(self, time_s: float | Float) -> Float:
         """Return the derivatives (..., d) of the states per second at the given times (...)."""
-        rate: Float = self._derivative(np.clip(time_s, self.begin_s, self.end_s))
+        rate: Float = self._pieces(time_s, 1)
         return rate
 
     def travelled_m(self) -> float:

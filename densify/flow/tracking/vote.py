@@ -22,7 +22,7 @@ _MAX_SPEED_M_S = 38.0
 _NEAR_S = 0.1  # time to the nearer batches; the others are twice as far
 _STEP_M = 0.2  # side of a voxel
 _FEW_POINTS, _MANY_POINTS = 60, 600
-_TIMES_ASKED = 3  # iterations, because the firing time depends on the position
+_TIMES_ASKED = 2  # iterations, because the firing time depends on the position
 _FINE_S, _FINE_M_S = 0.5, 0.2  # time span and velocity step of the last vote
 
 
@@ -70,10 +70,11 @@ class DistanceField:
         """
         if self.tree is None:
             return
-        elapsed_s = np.zeros(len(velocities))
+        _, row = nearest(self.tree, group.middle[None])
         for _ in range(_TIMES_ASKED):
-            _, row = nearest(self.tree, group.middle + elapsed_s[:, None] * velocities)
             elapsed_s = self.time_s[row] - group.middle_s
+            _, row = nearest(self.tree, group.middle + elapsed_s[:, None] * velocities)
+        elapsed_s = self.time_s[row] - group.middle_s
         _look_up.over_rows(
             len(velocities),
             group.points,
