@@ -30,7 +30,8 @@ def seen_from(camera, points, normal, spacing_m, measure):
         np.full(n, -1, np.int32),
     )
     exposure = Exposure(camera, np.eye(4), measure=measure)
-    return project(make_cloud(points), exposure, ProjectSettings(support=1), patches, filled=False)
+    cloud = make_cloud(points)
+    return project(cloud, exposure.sees(cloud), ProjectSettings(support=1), patches, filled=False)
 
 
 def pixels(camera, step=1):

@@ -21,6 +21,7 @@ from densify.depth.seen_through import Rays
 from densify.geometry.types import Stretch
 
 CAMERA = make_camera(width=420, height=160, focal=400.0)
+EXPOSURE = Exposure(CAMERA, T_CAM_LIDAR)
 WALL_M, STEP_M = 20.0, 0.7  # the box moves to the left by so much from sweep to sweep
 LOW, HIGH = np.array([10.0, -2.0, -0.8]), np.array([11.8, 2.0, 0.8])  # of the box, in the key sweep
 PANE = ((-1.2, 1.2), (0.2, 0.6))  # across and up, metres
@@ -75,16 +76,16 @@ def scanned(dark, passes):
 def maps(dark, passes):
     """The map without and with bodies, true depth of the box (0 none), y and z of its front."""
     cloud, rays = scanned(dark, passes)
-    exposure, surface = Exposure(CAMERA, T_CAM_LIDAR), patches_of(cloud)
+    exposure, surface = EXPOSURE, patches_of(cloud)
     v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px]
     ray = np.stack([np.ones(u.shape), (CAMERA.K[0, 2] - u) / 400, (CAMERA.K[1, 2] - v) / 400], -1)
     enter, leave = enters(np.zeros(3), ray.reshape(-1, 3), LOW, HIGH)
     true_m = np.where(enter < leave, enter, 0).reshape(u.shape)
     knobs = ProjectSettings()
-    before = project(cloud, exposure, knobs, surface, rays=rays)
-    bodies = moving_bodies(cloud, rays)
+    before = project(cloud, exposure.sees(cloud), knobs, surface, rays=rays)
+    bodies = moving_bodies(cloud, rays, [exposure])
     assert bodies.keys() == {0}
-    after = project(cloud, exposure, knobs, surface, rays=rays, bodies=bodies)
+    after = project(cloud, exposure.sees(cloud), knobs, surface, rays=rays, bodies=bodies)
     return before, after, true_m, *(ray * LOW[0])[..., 1:].transpose(2, 0, 1)
 
 
@@ -164,7 +165,7 @@ def test_a_smooth_offset_is_the_least_of_its_sum():
 
 def test_only_what_lies_far_behind_the_front_is_inside():
     cloud, rays = scanned(lambda y, z: within(y, z, DOOR), lambda y, z: np.zeros(len(y), bool))
-    body, exposure = moving_bodies(cloud, rays)[0], Exposure(CAMERA, T_CAM_LIDAR)
+    body, exposure = moving_bodies(cloud, rays, [EXPOSURE])[0], EXPOSURE
     shape, middle = (CAMERA.height_px, CAMERA.width_px), (CAMERA.height_px // 2, 210)
     for depth_m, inside in ((10.1, False), (11.0, True)):
         far = stage.far_inside([body], exposure, np.full(shape, depth_m, np.float32))
@@ -173,7 +174,7 @@ def test_only_what_lies_far_behind_the_front_is_inside():
 
 def test_a_body_without_a_sweep_has_none_of_its_rays_and_points():
     cloud, rays = scanned(lambda y, z: within(y, z, DOOR), lambda y, z: np.zeros(len(y), bool))
-    body = moving_bodies(cloud, rays)[0]
+    body = moving_bodies(cloud, rays, [EXPOSURE])[0]
     others = cloud.select(cloud.frame != KEY)
     told = without_sweep({0: body}, others, KEY)[0]
     assert set(told.frame) == set(body.frame) - {KEY}
@@ -187,4 +188,11 @@ def test_flat_and_tiny_objects_have_no_body(num):
     cloud = make_cloud(points)
     cloud.moving[:], cloud.instance[:] = True, 0
     sweep = fired(KEY, points, np.eye(4), np.zeros(6))
-    assert moving_bodies(cloud, Rays(Stretch((sweep,)), KEY)) == {}
+    assert moving_bodies(cloud, Rays(Stretch((sweep,)), KEY), [EXPOSURE]) == {}
+
+
+def test_objects_out_of_view_have_no_body():
+    cloud, rays = scanned(lambda y, z: within(y, z, DOOR), lambda y, z: np.zeros(len(y), bool))
+    backwards = Exposure(CAMERA, T_CAM_LIDAR @ np.diag([-1.0, -1, 1, 1]))
+    assert moving_bodies(cloud, rays, [backwards]) == {}
+    assert moving_bodies(cloud, rays, [backwards, EXPOSURE]).keys() == {0}

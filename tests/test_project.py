@@ -72,7 +72,9 @@ def patches_of(cloud, origins=None, key_image=None):
 
 def view(cloud, camera, T_cam_key, knobs, origins=None):
     """`project` with the cloud's patches."""
-    return project(cloud, Exposure(camera, T_cam_key), knobs, patches_of(cloud, origins))
+    return project(
+        cloud, Exposure(camera, T_cam_key).sees(cloud), knobs, patches_of(cloud, origins)
+    )
 
 
 def take(cloud, index):
@@ -205,7 +207,7 @@ def see(
     if since_key_ns is not None:
         cloud = replace(cloud, since_key_ns=np.asarray(since_key_ns))
     cloud.moving[:] = moving
-    return project(cloud, Exposure(camera, np.eye(4)), knobs, surface, filled)
+    return project(cloud, Exposure(camera, np.eye(4)).sees(cloud), knobs, surface, filled)
 
 
 def test_back_wall_does_not_shine_through_the_gaps_of_the_front_wall():

@@ -83,8 +83,8 @@ def maps(solid, **knobs):
     v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px]
     y = -(u - CAMERA.K[0, 2]) / CAMERA.K[0, 0] * FRONT_M
     z = -(v - CAMERA.K[1, 2]) / CAMERA.K[1, 1] * FRONT_M
-    before = project(cloud, exposure, SETTINGS, surface)
-    return before, project(cloud, exposure, SETTINGS, surface, rays=rays), solid(y, z)
+    before = project(cloud, exposure.sees(cloud), SETTINGS, surface)
+    return before, project(cloud, exposure.sees(cloud), SETTINGS, surface, rays=rays), solid(y, z)
 
 
 @pytest.mark.parametrize("measure", ["z", "range"])

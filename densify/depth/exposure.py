@@ -142,6 +142,15 @@ class InView(NamedTuple):
     points_cam: Float
     uv: Float
 
+    def joined(self, other: InView, num: int) -> InView:
+        """Return the points of this cloud (``num`` points) with those of another one appended."""
+        return InView(
+            self.exposure,
+            np.concatenate([self.rows, num + other.rows]),
+            np.concatenate([self.points_cam, other.points_cam]),
+            np.concatenate([self.uv, other.uv]),
+        )
+
 
 class Sight(NamedTuple):
     """N points projected to an image.

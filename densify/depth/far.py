@@ -244,9 +244,10 @@ def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
     near = np.flatnonzero(may_see(exposure.camera, T_cam_world, points, _SLACK_M))
     there = poses.transform(T_key_world, points[near].astype(np.float64))
     sight = exposure.see(there, np.zeros(there.shape, np.float32))
-    rows = near[sight.inside]
-    depth = exposure.depth_m(sight.points_cam[sight.inside])
-    place = np.column_stack([sight.uv[sight.inside], np.log(depth) / _SAME_DEPTH])
+    inside = np.flatnonzero(sight.inside)
+    rows, uv = near[inside], sight.uv.take(inside, axis=0)
+    depth_m = exposure.depth_m(sight.points_cam.take(inside, axis=0))
+    place = np.column_stack([uv, np.log(depth_m) / _SAME_DEPTH])
     cell = np.rint(place.astype(np.float32))
     # A pixel is supported only by several sweeps, so neighbouring pixels take different sweeps.
     mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))

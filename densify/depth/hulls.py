@@ -28,13 +28,13 @@ def crossing(spaces: Float, start: Float, way: Float) -> tuple[Float, Float]:
         way: (K,3) direction of each line.
     """
     enter, leave = np.full(len(way), -np.inf), np.full(len(way), np.inf)
-    for side in spaces:
-        slope, outside = way @ side[:3], start @ side[:3] + side[3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = -outside / slope
-        np.maximum(enter, t, out=enter, where=slope < 0)
-        np.minimum(leave, t, out=leave, where=slope > 0)
-        leave[(slope == 0) & (outside > 0)] = -np.inf
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for side in spaces:
+            slope = way @ side[:3] + 0.0  # no -0: a line along a side that is outside never enters
+            t = (start @ -side[:3] - side[3]) / slope
+            inward = slope < 0
+            np.maximum(enter, np.where(inward, t, -np.inf), out=enter)
+            np.fmin(leave, np.where(inward, np.inf, t), out=leave)
     return enter, leave
 
 

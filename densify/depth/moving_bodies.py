@@ -11,7 +11,7 @@ object's own returns. Pixels well inside the closed part show it, the image deci
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -29,8 +29,9 @@ from densify.depth.hulls import crossing, half_spaces, passes_near
 from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
 from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
+from densify.depth.object_rays import ObjectRays, rays_toward
 from densify.depth.seen_through import RAY_BLUR, Rays
-from densify.geometry import cameras, poses
+from densify.geometry import cameras
 from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.types import Cloud
 
@@ -68,30 +69,33 @@ class MovingBody(NamedTuple):
     frame: NDArray[np.integer]
 
 
-def moving_bodies(cloud: Cloud, rays: Rays) -> dict[int, MovingBody]:
-    """Return the bodies of moving objects by instance number.
+def moving_bodies(
+    cloud: Cloud, rays: Rays, exposures: Collection[Exposure]
+) -> dict[int, MovingBody]:
+    """Return the bodies of moving objects in view of a camera, by instance number.
 
-    Objects whose points span no volume have no body. cloud: points of the window at the key sweep's
-    reference time. rays: origins of the rays that measured these points.
+    Objects whose points span no volume have no body.
+
+    Args:
+        cloud: Points of the window at the key sweep's reference time.
+        rays: Origins of the rays that measured these points.
+        exposures: Cameras and times of the depth maps.
     """
-    instances = np.unique(cloud.instance[cloud.moving & (cloud.instance >= 0)]).tolist()
-    own = {k: cloud.select(cloud.moving & (cloud.instance == k)) for k in instances}
-    corners = {k: _corners(own[k].points) for k in instances}
-    met: dict[int, list[_Met]] = {k: [_NOT_MET] for k in instances if len(corners[k])}
-    for frame in rays.stretch.frames if met else ():
-        sweep = _Sweep.of(cloud, rays, frame)
-        for k in met:
-            seen = own[k].frame == frame
-            if seen.any():
-                T_key_there = poses.fit_rigid(own[k].rigid_points[seen], own[k].points[seen])
-                met[k].append(sweep.met(k, corners[k], T_key_there))
+    moving = np.flatnonzero(cloud.moving & (cloud.instance >= 0))
+    instance = cloud.instance[moving]
+    own = {k: moving[instance == k] for k in np.unique(instance).tolist()}
+    hulls = {k: _corners(cloud.points[rows]) for k, rows in own.items()}
+    velocity_m_s = {k: np.median(cloud.velocity_m_s[rows], axis=0) for k, rows in own.items()}
+
+    def is_shown(k: int) -> bool:
+        """Return True if a corner of the object's hull is in an image."""
+        each_m_s = _each(velocity_m_s[k], hulls[k])
+        return any(exposure.see(hulls[k], each_m_s).inside.any() for exposure in exposures)
+
+    own = {k: rows for k, rows in own.items() if is_shown(k)}
     return {
-        k: MovingBody(
-            corners[k],
-            np.median(own[k].velocity_m_s, axis=0),
-            *(np.concatenate(column) for column in zip(*found, strict=True)),
-        )
-        for k, found in met.items()
+        k: MovingBody(hulls[k], velocity_m_s[k], *_met(cloud, k, hulls[k], found))
+        for k, found in rays_toward(cloud, rays, own, hulls).items()
     }
 
 
@@ -119,73 +123,25 @@ def _corners(points: Float) -> Float:
         return points[:0]
 
 
-class _Met(NamedTuple):
-    """The rays of one sweep that meet a hull; fields as in `MovingBody`."""
+def _met(
+    cloud: Cloud, instance: int, corners: Float, rays: ObjectRays
+) -> tuple[Float, Bool, Float, NDArray[np.integer]]:
+    """Return entries, ends, weight and frame of the rays that meet a hull, as in `MovingBody`.
 
-    entries: Float
-    ends: Bool
-    weight: Float
-    frame: NDArray[np.integer]
-
-
-_NOT_MET = _Met(np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0), np.zeros(0, np.int32))
-
-
-class _Sweep(NamedTuple):
-    """The N returns of one sweep (``cloud``) and their rays, key sweep's lidar frame.
-
-    origin: (3,) lidar at the sweep's reference time. azimuth and range_m: (N,) radians and
-    horizontal distance of each return from it. moved_m: greatest distance of a ray's start from it.
+    corners: (V,3) corners of the hull of object ``instance``. rays: rays of all sweeps toward it.
     """
-
-    cloud: Cloud
-    rays: Rays
-    origin: Float
-    azimuth: Float
-    range_m: Float
-    moved_m: float
-
-    @staticmethod
-    def of(cloud: Cloud, rays: Rays, frame: int) -> _Sweep:
-        """Return the returns of sweep ``frame`` among the points of the window (``cloud``)."""
-        part = cloud.select(cloud.frame == frame)
-        origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
-        x, y = (part.rigid_points - origin)[:, :2].T
-        moved_m = np.linalg.norm(rays.starts(part) - origin, axis=1).max(initial=0)
-        return _Sweep(part, rays, origin, np.arctan2(y, x), np.hypot(x, y), float(moved_m))
-
-    def met(self, instance: int, corners: Float, T_key_there: Float) -> _Met:
-        """Return the sweep's rays that meet the hull of object ``instance``, moved along with it.
-
-        corners: (V,3) corners at the key's time. T_key_there: (4,4) motion from sweep to key.
-        """
-        part = self.cloud.select(self._toward(poses.transform(poses.inverse(T_key_there), corners)))
-        start = poses.transform(T_key_there, self.rays.starts(part))
-        way = poses.transform(T_key_there, part.rigid_points) - start
-        near, spaces = passes_near(corners, start, way), half_spaces(corners)
-        part, start, way = part.select(near), start[near], way[near]
-        enter, leave = crossing(spaces, start, way)
-        meets = (enter > 0) & (enter < np.minimum(leave, 1))
-        part, start, way, enter = part.select(meets), start[meets], way[meets], enter[meets]
-        middle = start + (enter + np.minimum(leave[meets], 1))[:, None] / 2 * way
-        below_m = -(middle @ spaces[:, :3].T + spaces[:, 3]).max(axis=1, initial=-np.inf)
-        ends = part.moving & (part.instance == instance)
-        weight = np.exp(-abs(part.since_key_ns) * 1e-9 / _LIMBS_S)
-        weight[~ends] *= 1 - np.exp(-0.5 * (np.maximum(below_m[~ends], 0) / _POSE_M) ** 2)
-        weight[ends & ((1 - enter) * np.linalg.norm(way, axis=1) > _DEEP_M)] = 0
-        return _Met(start + enter[:, None] * way, ends, weight, part.frame)
-
-    def _toward(self, corners: Float) -> Bool:
-        """Return (N,) True for returns whose rays may meet a hull with these corners (V,3)."""
-        x, y = (corners - self.origin)[:, :2].T
-        middle_x, middle_y = x.mean(), y.mean()
-        radius_m = np.hypot(x - middle_x, y - middle_y).max() + self.moved_m
-        range_m = np.hypot(middle_x, middle_y)
-        aside = self.azimuth - np.arctan2(middle_y, middle_x)
-        aside = abs((aside + np.pi) % (2 * np.pi) - np.pi)
-        half = np.pi if range_m <= radius_m else np.arcsin(radius_m / range_m)
-        toward: Bool = (aside <= half) & (self.range_m > range_m - radius_m)
-        return toward
+    rays = rays.select(passes_near(corners, rays.start, rays.way))
+    spaces = half_spaces(corners)
+    enter, leave = crossing(spaces, rays.start, rays.way)
+    meets = (enter > 0) & (enter < np.minimum(leave, 1))
+    (rows, start, way), enter = rays.select(meets), enter[meets]
+    middle = start + (enter + np.minimum(leave[meets], 1))[:, None] / 2 * way
+    below_m = -(middle @ spaces[:, :3].T + spaces[:, 3]).max(axis=1, initial=-np.inf)
+    ends = cloud.moving[rows] & (cloud.instance[rows] == instance)
+    weight = np.exp(-abs(cloud.since_key_ns[rows]) * 1e-9 / _LIMBS_S)
+    weight[~ends] *= 1 - np.exp(-0.5 * (np.maximum(below_m[~ends], 0) / _POSE_M) ** 2)
+    weight[ends & ((1 - enter) * np.linalg.norm(way, axis=1) > _DEEP_M)] = 0
+    return start + enter[:, None] * way, ends, weight, cloud.frame[rows]
 
 
 def close_bodies(

@@ -18,7 +18,7 @@ from densify.config import ProjectSettings
 from densify.depth.boundary_pixels import accept_boundary_pixels
 from densify.depth.car_windows import close_windows
 from densify.depth.confidence import calibrated, contradicted, rank_pixels
-from densify.depth.exposure import Exposure
+from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import fill, fill_stars, without_isolated
 from densify.depth.image_points import PointsInImage, points_in_image
 from densify.depth.layers import Layers
@@ -36,7 +36,7 @@ _LEAST_CONFIDENCE = np.float32(1) / np.iinfo(np.uint8).max  # stored as 1; 0 is 
 
 def project(
     cloud: Cloud,
-    exposure: Exposure,
+    view: InView,
     settings: ProjectSettings,
     patches: Patches,
     filled: bool = True,
@@ -49,7 +49,8 @@ def project(
 
     Args:
         cloud: M accumulated points at the key sweep's reference time.
-        exposure: Camera and time of the map. Moving objects are shown at their position then.
+        view: Points of the cloud in the image, with its camera and time. Moving objects are shown
+            at their position then.
         settings: Section ``project``. Without ``visibility`` each pixel takes its nearest point.
         patches: Surface patches of the cloud.
         filled: False leaves out the fill.
@@ -59,7 +60,7 @@ def project(
             open.
         bodies: Bodies of moving objects by instance number.
     """
-    view, camera, visible = exposure.sees(cloud), exposure.camera, settings.visibility
+    exposure, camera, visible = view.exposure, view.exposure.camera, settings.visibility
     points = points_in_image(cloud, view, patches, vetoed=visible)
     own = np.clip(cloud.confidence[points.index], _LEAST_CONFIDENCE, 1.0)
     reason = np.full(len(cloud), Reason.OUTSIDE, np.uint8)

@@ -59,6 +59,18 @@ class Rays:
             starts[mine] = poses.transform(self.stretch.T_target_source(self.key, frame), start)
         return starts
 
+    def moved_m(self, frame: int) -> float:
+        """Return a bound of the distances of a sweep's rays, at their start, from its lidar."""
+        registered = self.stretch[frame]
+        sweep = registered.sweep
+        numbers = range(int(sweep.lidar.max(initial=0)) + 1)
+        bound_m = float(np.linalg.norm([sweep.origin_m(n) for n in numbers], axis=1).max())
+        if sweep.offset_ns is not None:
+            speeds = (registered.twist_before, registered.twist_after)
+            speed_m_s = max(float(np.linalg.norm(twist[3:])) for twist in speeds)
+            bound_m += speed_m_s * 1e-9 * float(np.abs(sweep.offset_ns).max(initial=0))
+        return bound_m
+
 
 def without_seen_through(
     layers: Layers, cloud: Cloud, view: InView, rays: Rays, reason: NDArray[np.uint8]

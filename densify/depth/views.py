@@ -14,7 +14,7 @@ from scipy import ndimage
 from densify.config import Config, ProjectSettings
 from densify.depth.car_windows import share_lost
 from densify.depth.confidence import reliability
-from densify.depth.exposure import Exposure, Shot
+from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.far import far_cloud
 from densify.depth.image_alignment import lab
 from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
@@ -51,19 +51,24 @@ from densify.scores import depth_metrics
 
 
 class SeenCloud(NamedTuple):
-    """A cloud, its surface patches, and the hulls of its moving objects by instance number."""
+    """A cloud as the cameras see it.
+
+    patches: surface patches of the points. in_view: points in each image, by name of the map.
+    bodies: hulls of moving objects by instance number.
+    """
 
     cloud: Cloud
     patches: Patches
+    in_view: Mapping[str, InView]
     bodies: Mapping[int, MovingBody] = {}
 
     def joined(self, far: SeenCloud | None) -> SeenCloud:
         """Return the cloud with the points of sweeps beyond the window appended."""
         if far is None or not len(far.cloud):
             return self
-        return self._replace(
-            cloud=self.cloud.joined(far.cloud), patches=self.patches.joined(far.patches)
-        )
+        num, surface = len(self.cloud), self.patches.joined(far.patches)
+        in_view = {name: v.joined(far.in_view[name], num) for name, v in self.in_view.items()}
+        return SeenCloud(self.cloud.joined(far.cloud), surface, in_view, self.bodies)
 
 
 @dataclass(frozen=True)
@@ -118,17 +123,20 @@ class Views:
 
     def see(self, cloud: Cloud, visible: bool = True) -> SeenCloud:
         """Return a cloud and its patches; ``visible`` marks those the key sweep saw through."""
-        key_image = self.key_image if visible else None
+        key_image, in_view = self.key_image if visible else None, self.in_view(cloud)
         wanted = np.zeros(len(cloud), bool)
-        for exposure in self.exposures.values():
-            wanted[exposure.sees(cloud).rows] = True
-        return SeenCloud(
-            cloud, patches(cloud, self.key, self.sensors, self.origins, key_image, wanted)
-        )
+        for view in in_view.values():
+            wanted[view.rows] = True
+        surface = patches(cloud, self.key, self.sensors, self.origins, key_image, wanted)
+        return SeenCloud(cloud, surface, in_view)
+
+    def in_view(self, cloud: Cloud) -> dict[str, InView]:
+        """Return the points of a cloud in each image, by name of the map."""
+        return {name: exposure.sees(cloud) for name, exposure in self.exposures.items()}
 
     def bodies(self, cloud: Cloud) -> dict[int, MovingBody]:
         """Return the bodies of moving objects by instance number, from all points of the window."""
-        return moving_bodies(cloud, self.rays)
+        return moving_bodies(cloud, self.rays, self.exposures.values())
 
     def far(
         self, found: StandingWorld, T_key_found: Float, stretch: Stretch, standing_only: bool
@@ -146,7 +154,7 @@ class Views:
         if self.key_image is not None and standing_only:
             free = seen_through_by_key(cloud.points, cloud.velocity_m_s, self.key_image)
             surface = replace(surface, free=free)
-        return SeenCloud(cloud, surface)
+        return SeenCloud(cloud, surface, self.in_view(cloud))
 
     def depth(
         self, seen: SeenCloud, visible: bool = True, filled: bool = True
@@ -159,20 +167,11 @@ class Views:
         """
         settings = replace(self.settings, visibility=visible)
         lost = None if self.key_image is None else share_lost(self.key_image)
-        return {
-            name: project(
-                seen.cloud,
-                exposure,
-                settings,
-                seen.patches,
-                filled,
-                self.lab.get(name),
-                self.rays,
-                lost,
-                seen.bodies,
-            )
-            for name, exposure in self.exposures.items()
-        }
+        maps = {}
+        for name, view in seen.in_view.items():
+            shown = self.lab.get(name), self.rays, lost, seen.bodies
+            maps[name] = project(seen.cloud, view, settings, seen.patches, filled, *shown)
+        return maps
 
     def coloured(
         self,
@@ -190,7 +189,7 @@ class Views:
         """
         rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
-            view = self.exposures[name].sees(seen.cloud)
+            view = seen.in_view[name]
             u, v = np.rint(view.uv).astype(np.int64).T
             surface_m = depth[name].filled_m[v, u]
             reach_m = surface_m + HIDDEN_M + HIDDEN_FRACTION * surface_m
@@ -227,21 +226,22 @@ class Views:
             for name, exposure in self.exposures.items()
         }
 
-    def rejected(self, cloud: Cloud, depth: Mapping[str, DepthMap]) -> dict[str, NDArray[np.uint8]]:
+    def rejected(
+        self, seen: SeenCloud, depth: Mapping[str, DepthMap]
+    ) -> dict[str, NDArray[np.uint8]]:
         """Return for each map (H,W) the `Reason` of a pixel's nearest rejected point, 0 none.
 
         Points that lost their pixel to another point do not count.
         """
         maps = {}
-        for name, e in self.exposures.items():
-            reason = depth[name].reason
-            left_out = ~np.isin(reason, [Reason.KEPT, Reason.OUTSIDE, Reason.NOT_CHOSEN])
-            sight = e.see(cloud.points[left_out], cloud.velocity_m_s[left_out])
-            inside = sight.inside
-            farthest_first = np.argsort(-e.depth_m(sight.points_cam[inside]), kind="stable")
-            column, row = np.rint(sight.uv[inside][farthest_first]).astype(np.int64).T
+        for name, view in seen.in_view.items():
+            reason, depth_m = depth[name].reason[view.rows], view.exposure.depth_m(view.points_cam)
+            farthest_first = np.argsort(-depth_m, kind="stable")
+            lost = np.isin(reason[farthest_first], [Reason.KEPT, Reason.NOT_CHOSEN], invert=True)
+            rejected = farthest_first[lost]
+            column, row = np.rint(view.uv[rejected]).astype(np.int64).T
             maps[name] = np.zeros(depth[name].depth_m.shape, np.uint8)
-            maps[name][row, column] = reason[left_out][inside][farthest_first]
+            maps[name][row, column] = reason[rejected]
         return maps
 
     def movers(
@@ -339,8 +339,8 @@ class HeldOut:
         def alone(part: SeenCloud) -> dict[str, DepthMap]:
             """Return the maps of returns of the key sweep."""
             return {
-                name: project(part.cloud, exposure, settings, part.patches, filled=False)
-                for name, exposure in views.exposures.items()
+                name: project(part.cloud, view, settings, part.patches, filled=False)
+                for name, view in part.in_view.items()
             }
 
         seen = views.see(own)
@@ -359,7 +359,8 @@ class HeldOut:
         surface = seen.patches.select(others)
         surface = replace(surface, free=np.zeros(len(surface.free), bool))
         cloud = seen.cloud.select(others)
-        return SeenCloud(cloud, surface, without_sweep(seen.bodies, cloud, self.views.key))
+        bodies = without_sweep(seen.bodies, cloud, self.views.key)
+        return SeenCloud(cloud, surface, self.views.in_view(cloud), bodies)
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Return the scores of each map made without the key sweep, None if no points remain.

@@ -19,6 +19,7 @@ mei
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -172,10 +173,16 @@ def _lens(camera: Camera) -> _Lens:
             f"{camera.model} lens in their usual order, any others 0, got {list(given)}; correct "
             f"the calibration or rectify the images"
         )
+    return _lens_of(camera.model, tuple(given))
+
+
+@lru_cache
+def _lens_of(model: str, given: tuple[float, ...]) -> _Lens:
+    """Return the lens of a model with these coefficients."""
     below, p1, p2 = [1.0], 0.0, 0.0
-    if camera.model == "fisheye":
+    if model == "fisheye":
         above = [1.0, *given]
-    elif camera.model == "mei":
+    elif model == "mei":
         above = [1.0, *given[1:3]]
         p1, p2 = given[3:]
     else:
@@ -184,7 +191,7 @@ def _lens(camera: Camera) -> _Lens:
         above, below = [1.0, k1, k2, k3], [1.0, *others]
     numerator, denominator = Polynomial(above), Polynomial(below)
     limit = _stops_growing(numerator, denominator)
-    if camera.model == "fisheye":
+    if model == "fisheye":
         limit = min(limit, np.pi**2)
     return _Lens(numerator, denominator, p1, p2, limit)
 

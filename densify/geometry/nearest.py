@@ -54,15 +54,17 @@ def thinned(points: Float | Float32, order: Int, step: float, most: int) -> Int:
     """Thin points by a grid, and return the rows of the points that are kept, ascending.
 
     Args:
-        points: (N,3).
+        points: (N,3); the box around them has at most 2^63 / N cells.
         order: (K,) rows of the candidates, the preferred ones first. All other rows are dropped.
         step: Side of a grid cell, in the unit of the points.
         most: Number of candidates kept in each cell.
     """
-    low = points.min(axis=0, initial=np.inf).astype(np.float64)
-    cell = ((points.take(order, axis=0) - low) / step).astype(np.int64)
-    _, cell = np.unique(cell @ [1 << 42, 1 << 21, 1], return_inverse=True)
-    by_cell = np.argsort(cell, kind="stable")
-    start = np.append(0, np.cumsum(np.bincount(cell)))[cell[by_cell]]
-    first = by_cell[np.arange(len(by_cell)) - start < most]
-    return np.sort(order[first])
+    cell = np.zeros(len(points), np.int64)
+    for x in points.T:
+        along = ((x - x.min(initial=np.inf).astype(np.float64)) / step).astype(np.int64)
+        cell = cell * (along.max(initial=0) + 1) + along
+    bits = len(order).bit_length()  # the lower bits say the place in the order
+    ranked = np.sort((cell[order] << bits) | np.arange(len(order)))
+    first = np.flatnonzero(np.diff(ranked >> bits, prepend=-1))
+    in_cell = np.arange(len(ranked)) - np.repeat(first, np.diff(first, append=len(ranked)))
+    return np.sort(order[ranked[in_cell < most] & ((1 << bits) - 1)])

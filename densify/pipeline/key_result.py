@@ -149,7 +149,7 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment, filled: bool) -
         tracks=moment.tracks,
         movers=movers,
         optical_flow=views.optical_flow(cloud, depth) if output.optical_flow else {},
-        rejected=views.rejected(cloud, depth) if output.rejected else {},
+        rejected=views.rejected(seen, depth) if output.rejected else {},
         images=scene.images,
         stamp_ns=stretch[scene.key].sweep.stamp_ns,
         views=views.cameras(),

@@ -60,9 +60,9 @@ class Cloud:
         """Return a cloud of this cloud's points, then the other cloud's points."""
         return Cloud(**{n: np.concatenate([c, vars(other)[n]]) for n, c in vars(self).items()})
 
-    def select(self, keep: Bool) -> Cloud:
-        """Return a cloud with only the points where the (M,) mask ``keep`` is True."""
-        rows = np.flatnonzero(keep)  # once for all columns
+    def select(self, keep: Bool | Int) -> Cloud:
+        """Return a cloud with only the points of an (M,) mask, or of an array of point indices."""
+        rows = np.flatnonzero(keep) if keep.dtype == bool else keep  # once for all columns
         return Cloud(**{name: column.take(rows, axis=0) for name, column in vars(self).items()})
 
     def columns(self) -> dict[str, NDArray[Any]]:

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: MIT
+"""Find the rays of a window that may meet the hulls of moving objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from densify.depth.seen_through import Rays
+from densify.geometry import poses
+from densify.geometry.arrays import Bool, Float, Float32, Int
+from densify.geometry.types import Cloud
+
+
+class ObjectRays(NamedTuple):
+    """K rays, moved along with an object from their sweep to the key's time.
+
+    rows: (K,) indices of their returns in the cloud. start and way: (K,3) origin of each ray, and
+    vector from there to the return, key sweep's lidar frame.
+    """
+
+    rows: Int
+    start: Float
+    way: Float
+
+    def select(self, keep: Bool) -> ObjectRays:
+        """Return the rays where ``keep`` (K,) is True."""
+        return ObjectRays(self.rows[keep], self.start[keep], self.way[keep])
+
+
+def rays_toward(
+    cloud: Cloud, rays: Rays, own: Mapping[int, Int], corners: Mapping[int, Float]
+) -> dict[int, ObjectRays]:
+    """Return the rays of all sweeps that may meet the hull of each object, by instance number.
+
+    Args:
+        cloud: Points of the window at the key sweep's reference time.
+        rays: Origins of the rays that measured these points.
+        own: Indices of each object's points in the cloud.
+        corners: (V,3) corners of each object's hull at the key's time.
+    """
+    found: dict[int, list[ObjectRays]] = {k: [] for k in own}
+    for frame in rays.stretch.frames if own else ():
+        returns, motions = _Returns.of(cloud, rays, frame), dict[int, Float]()
+        for k, rows in own.items():
+            seen = rows[cloud.frame[rows] == frame]
+            if len(seen):
+                motions[k] = poses.fit_rigid(cloud.rigid_points[seen], cloud.points[seen])
+        toward = {
+            k: returns.toward(poses.transform(poses.inverse(T_key_there), corners[k]))
+            for k, T_key_there in motions.items()
+        }
+        starts = rays.starts(cloud.select(np.concatenate([returns.rows[:0], *toward.values()])))
+        for k, T_key_there in motions.items():
+            rows = toward[k]
+            start, starts = poses.transform(T_key_there, starts[: len(rows)]), starts[len(rows) :]
+            end = poses.transform(T_key_there, cloud.rigid_points[rows])
+            found[k].append(ObjectRays(rows, start, end - start))
+    return {
+        k: ObjectRays(
+            np.concatenate([part.rows for part in parts]),
+            np.concatenate([part.start for part in parts]),
+            np.concatenate([part.way for part in parts]),
+        )
+        for k, parts in found.items()
+    }
+
+
+class _Returns(NamedTuple):
+    """The N returns of one sweep in a cloud, key sweep's lidar frame.
+
+    rows: (N,) their indices in the cloud. origin: (3,) lidar at the sweep's reference time. level:
+    (2,N) horizontal positions from there in metres. moved_m: greatest distance of a ray's start.
+    """
+
+    rows: Int
+    origin: Float
+    level: Float32
+    moved_m: float
+
+    @staticmethod
+    def of(cloud: Cloud, rays: Rays, frame: int) -> _Returns:
+        """Return the returns of sweep ``frame`` among the points of the window (``cloud``)."""
+        rows = np.flatnonzero(cloud.frame == frame)
+        origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
+        level = (cloud.rigid_points.take(rows, axis=0) - origin)[:, :2].T.astype(np.float32)
+        return _Returns(rows, origin, level, rays.moved_m(frame))
+
+    def toward(self, corners: Float) -> Int:
+        """Return the rows of the returns whose rays may meet a hull with these corners (V,3)."""
+        x, y = (corners - self.origin)[:, :2].T
+        middle = np.array([x.mean(), y.mean()])
+        range_m = np.hypot(*middle)
+        radius_m = np.hypot(x - middle[0], y - middle[1]).max() + self.moved_m
+        if range_m <= radius_m:
+            return self.rows
+        right, ahead = (middle / range_m).astype(np.float32)
+        wide = np.float32(radius_m / np.sqrt(range_m**2 - radius_m**2))
+        along = right * self.level[0] + ahead * self.level[1]
+        aside = ahead * self.level[0] - right * self.level[1]
+        return self.rows[(along > range_m - radius_m) & (abs(aside) <= wide * along)]
