@@ -87,6 +87,16 @@ def test_frames_made_side_by_side_are_those_made_one_by_one(tmp_path, monkeypatc
             assert column is made is None or column.tobytes() == made.tobytes()
 
 
+def test_kept_frames_are_read_without_building_the_scene(tmp_path, monkeypatch):
+    monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path))
+    spec, images = "street?sensor=vlp16&cameras=fast", [("fast", 200)]
+    Street.from_spec(spec).prepare([70], images)
+    monkeypatch.setattr(Simulator, "scene", property(lambda self: pytest.fail("built again")))
+    again = Street.from_spec(spec)
+    again.prepare([70], images)
+    assert len(again.returns(70).points) > 10_000 and again.image("fast", 200).any()
+
+
 def test_nothing_moves_in_the_static_street_and_parked_cars_never_do(street, static):
     assert not static.truth.sweep(KEY).moving.any()
     assert not static.truth.moving_mask("image_02", KEY).any()

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
+from threading import Lock
 from typing import Any, TypeVar
 from urllib.parse import parse_qsl
 
@@ -75,6 +76,7 @@ class Street:
         self.frames = range(self.simulator.num_frames)
         self.cameras: Mapping[str, Camera] = cameras_beside(tilt_deg, cameras)
         self.truth = StreetTruth(self)
+        self._building = Lock()
         self._cache: Cache | None = Cache(folder=own_folder("street"))
         self._posed = f"{VERSION} {preset} {seed}{options}, with any sensor"
         self._swept = f"{VERSION} {preset} {seed} {sensor}{options}"
@@ -132,7 +134,6 @@ class Street:
 
     def prepare(self, frames: Sequence[int], images: Sequence[tuple[str, int]] = ()) -> None:
         """Render missing sweeps and images (camera, number) into the cache, on all cores."""
-        _ = self.simulator.scene.world.triangles  # made once, before threads start
         with ThreadPoolExecutor(num_threads()) as pool:
             list(pool.map(lambda image: self.picture(*image), images))
             list(pool.map(self.returns, frames))
@@ -161,12 +162,17 @@ class Street:
         return self._kept("bodies", self._posed, lambda: self.simulator.bodies)
 
     def _kept_returns(self, frame: int) -> Returns:
-        make = partial(self.simulator.returns, frame)
+        make = partial(self._render, self.simulator.returns, frame)
         return self._kept("sweep", (self._swept, frame), make)
 
     def _kept_picture(self, camera: str, number: int) -> Picture:
-        make = partial(self.simulator.picture, camera, number)
+        make = partial(self._render, self.simulator.picture, camera, number)
         return self._kept("image", (self._pictured, camera, number), make)
+
+    def _render(self, render: Callable[..., T], *arguments: Any) -> T:
+        with self._building:
+            _ = self.simulator.scene.world.triangles  # made once, for all threads
+        return render(*arguments)
 
     def _kept(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
         def rendered() -> T:
