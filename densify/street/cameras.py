@@ -171,11 +171,12 @@ def through_glass(world: World) -> Optics:
 
 def _colours(world: World, rays: Rays, hits: Hits) -> Float:
     """Return (N,3) linear RGB of the ray hits: sun with shadows, sky light and haze."""
-    colour = _sky(rays.direction)
-    rows = np.flatnonzero(hits.triangle >= 0)
+    colour, is_hit = np.empty(rays.direction.shape), hits.triangle >= 0
+    colour[~is_hit] = _sky(rays.direction[~is_hit])
+    rows = np.flatnonzero(is_hit)
     triangle, direction, normal = hits.triangle[rows], rays.direction[rows], hits.normal[rows]
     material, range_m = world.triangles.material[triangle], hits.range_m[rows, None]
-    a, b = hits.barycentric[rows, 0, None], hits.barycentric[rows, 1, None]
+    a, b = hits.barycentric[rows].astype(np.float64).T[:, :, None]
     uv = world.triangles.uv[triangle]
     at = uv[:, 0] * (1 - a - b) + uv[:, 1] * a + uv[:, 2] * b
     texture = shade_factor(material, at)[:, None]
@@ -192,8 +193,11 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
     lit[sunny] = ~np.isfinite(world.cast(shadow_rays, through_glass(world)).range_m)
     sun = 1.15 * (lit * towards_sun)[:, None] * np.array([1.0, 0.95, 0.86])
     ambient = (0.34 + 0.16 * normal[:, 2:]) * np.array([0.88, 0.95, 1.08])
+    shiny = np.flatnonzero(GLOSS[material])
+    direction, normal = direction[shiny], normal[shiny]
     mirrored = direction - 2 * np.einsum("ni,ni->n", direction, normal)[:, None] * normal
-    light = np.clip(painted, 0, 1) ** 2.2 * (sun + ambient) + GLOSS[material, None] * _sky(mirrored)
+    light = np.clip(painted, 0, 1) ** 2.2 * (sun + ambient)
+    light[shiny] += GLOSS[material[shiny], None] * _sky(mirrored)
     haze = np.exp(-range_m / 700.0)
     colour[rows] = light * haze + (1 - haze) * np.array([0.62, 0.72, 0.82])
     return colour

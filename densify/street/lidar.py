@@ -29,6 +29,7 @@ from densify.street.sensors import Sensor, firings
 from densify.street.world import ABSORBED, PASSES, STOPS, Hits, Meeting, Optics, Rays, World
 
 _PARTS = (Material.BODYWORK, Material.FRAME, Material.GLASS)
+_IS_LEAKY = np.isin(np.arange(len(Material)), (*_PARTS, Material.LEAF))
 _BRIGHTNESS = (0.2, 0.55)  # between dark, middle and bright paint
 _INCIDENCE_DEG = (10.0, 30.0, 50.0, 67.5, 82.5)
 # Percent of rays that are lost, and that pass: for each part, five incidences of dark, middle and
@@ -68,21 +69,23 @@ def laser(world: World, luck: Float) -> Optics:
     surfaces = world.triangles
 
     def optics(met: Meeting) -> Int:
-        material = surfaces.material[met.triangle]
-        outcome = np.full(len(material), STOPS)
-        again = (luck[met.ray] + met.layer * _GOLDEN) % 1.0
-        outcome[(material == Material.LEAF) & (again < _LEAF_PASSES)] = PASSES
-        outcome[(material == Material.GLASS) & met.inside] = PASSES
-        rows = np.flatnonzero(_of_vehicle(material) & ~met.inside)
-        triangle = met.triangle[rows]
-        part = np.argmax(material[rows, None] == np.array(_PARTS), axis=1)
-        brightness = np.digitize(surfaces.tint[triangle].mean(axis=1), _BRIGHTNESS)
-        incidence_deg = np.degrees(np.arccos(np.clip(met.cosine[rows], 0.0, 1.0)))
+        outcome = np.full(len(met.ray), STOPS)
+        rows = np.flatnonzero(_IS_LEAKY[surfaces.material[met.triangle]])
+        material, instance = (c[met.triangle[rows]] for c in (surfaces.material, surfaces.instance))
+        inside = (instance >= 0) & (instance == met.passed[rows])
+        again = (luck[met.ray[rows]] + met.layer * _GOLDEN) % 1.0
+        outcome[rows[(material == Material.LEAF) & (again < _LEAF_PASSES)]] = PASSES
+        outcome[rows[(material == Material.GLASS) & inside]] = PASSES
+        outside = (material != Material.LEAF) & ~inside
+        rows, material, instance = rows[outside], material[outside], instance[outside]
+        part = np.argmax(material[:, None] == np.array(_PARTS), axis=1)
+        brightness = np.digitize(surfaces.tint[met.triangle[rows]].mean(axis=1), _BRIGHTNESS)
+        cosine = np.abs(met.facing[rows])
+        incidence_deg = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
         lost, passes = (
             _between(table[part, brightness], incidence_deg) for table in (_LOST, _PASSES)
         )
-        owner = world.seed + 3 * surfaces.instance[triangle].astype(np.int64) + part
-        level = patches(met.place[rows], owner)
+        level = patches(met.place(rows), world.seed + 3 * instance.astype(np.int64) + part)
         outcome[rows[level > 1 - passes]] = PASSES
         outcome[rows[level < lost]] = ABSORBED
         return outcome
@@ -116,18 +119,23 @@ def patches(place: Float, owner: Int) -> Float:
         place: (N,3) positions in metres.
         owner: (N,) object indices. Different objects have independent numbers.
     """
-    cell = np.floor(place / _PATCH_M).astype(np.int64)
+    cell = np.floor(place / _PATCH_M)
     share = place / _PATCH_M - cell
     share = share * share * (3 - 2 * share)
-    total, squared = np.zeros(len(place)), np.zeros(len(place))
-    for corner in product((0, 1), repeat=3):
-        weight = np.prod(np.where(corner, share, 1 - share), axis=1)
-        i, j, k = (cell + corner).T
-        number = noise(i + 1_000_003 * owner, j + 1_000_003 * k)
-        total += weight * ndtri(np.clip(number, 1e-9, 1 - 1e-9))
-        squared += weight * weight
-    level: Float = ndtr(total / np.sqrt(squared))
-    return level
+    i, j, k = cell.astype(np.int64).T
+    one, other = i + 1_000_003 * owner, j + 1_000_003 * k
+    _, first, which = np.unique(noise(one, other), return_index=True, return_inverse=True)
+    corners = [
+        noise(one[first] + x, other[first] + y + 1_000_003 * z)
+        for x, y, z in product((0, 1), repeat=3)
+    ]
+    level = ndtri(np.clip(corners, 1e-9, 1 - 1e-9)).T.take(which, axis=0).T
+    for part in share.T:  # halves the corners, axis by axis
+        near, far = np.split(level, 2)
+        level = near + part * (far - near)
+    spread = np.prod(share**2 + (1 - share) ** 2, axis=1)
+    smooth: Float = ndtr(level[0] / np.sqrt(spread))
+    return smooth
 
 
 def _between(rows: Float, incidence_deg: Float) -> Float:
@@ -203,10 +211,11 @@ def scan(
         Rays(next(beams), spot.reshape(-1, 3), next(beams)),
         laser(world, luck.ravel()), len(_SPOT), 2 * _SPOT_RAD,
     )  # fmt: skip
-    range_m, hit, edge = _echo(echoes, spot, rng)
-    material, tint = world.triangles.material[hit.triangle], world.triangles.tint[hit.triangle]
+    range_m, ray, edge = _echo(echoes, spot, rng)
+    triangle, normal = echoes.triangle[ray], echoes.normal.take(ray, axis=0)
+    material, tint = world.triangles.material[triangle], world.triangles.tint[triangle]
     reflectivity = REFLECTIVITY[material] * (0.6 + 0.4 * tint.mean(axis=1))
-    grazing = np.abs(np.einsum("ni,ni->n", hit.normal, spot[:, 0]))
+    grazing = np.abs(np.einsum("ni,ni->n", normal, spot[:, 0]))
     heard = (1 - share_lost(material, tint, range_m)) * np.where(edge, 0.85, 1.0)
     keep = np.isfinite(range_m) & (rng.random(n) < heard)
     range_m = np.where(keep, range_m, 0.0)
@@ -215,14 +224,14 @@ def scan(
     points = fired.direction * range_m[:, None]
     np.add(points, origin_m, out=points, where=origin_m != 0)  # a coordinate of -0.0 stays one
     brightness = reflectivity * (0.35 + 0.65 * grazing) * (1 + 0.05 * rng.normal(size=n))
-    body = world.triangles.body[hit.triangle[keep]]
+    body = world.triangles.body[triangle[keep]]
     return Returns(
         points[keep].astype(np.float32),
         np.clip(np.round(brightness[keep], 2), 0, 1).astype(np.float32),
         fired.offset_ns[keep],
         fired.lidar[keep],
         body,
-        world.triangles.instance[hit.triangle[keep]],
+        world.triangles.instance[triangle[keep]],
     )
 
 
@@ -241,7 +250,7 @@ def _spot(direction: Float) -> list[Float]:
     return [direction, *(ray / lengths(ray) for ray in rays)]
 
 
-def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Hits, Bool]:
+def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Int, Bool]:
     """Return the echo of each laser spot.
 
     On one plane the centre ray counts. At an edge each ray of the spot is equally likely to be the
@@ -252,10 +261,9 @@ def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, H
         spot: (N,S,3) directions of the rays, the centre first.
 
     Returns:
-        (N,) range in metres, hit surface of each spot, and (N,) True for spots at an edge.
+        (N,) range in metres, (N,) index of the ray that counts, (N,) True for spots at an edge.
     """
     n, num = spot.shape[:2]
-    rows = np.arange(n)
     range_m = echoes.range_m.reshape(n, num)
     slant = np.einsum("ni,nsi->ns", echoes.normal[::num], spot)
     with np.errstate(divide="ignore", invalid="ignore"):  # a ray without a hit has infinite range
@@ -263,11 +271,12 @@ def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, H
     some = np.isfinite(range_m)
     edge = some.any(axis=1) & ~(off_plane < _FLAT_M).all(axis=1)
     # any of the rays with a hit, all equally likely
-    pick = np.argmax(rng.random((num, n)) * some.T, axis=0)
-    pick = np.where(edge, pick, 0)
-    chosen = range_m[rows, pick]
-    other = range_m[rows, rng.integers(num, size=n)]
-    melts = edge & np.isfinite(other) & (rng.random(n) < _MELT_PROBABILITY)
-    melts[melts] = np.abs(other[melts] - chosen[melts]) < _MERGE_M
-    chosen[melts] = (chosen[melts] + other[melts]) / 2
-    return chosen, Hits(*(column[rows * num + pick] for column in echoes)), edge
+    at = np.flatnonzero(edge)
+    pick = np.argmax(rng.random((num, n))[:, at] * some[at].T, axis=0)
+    chosen, other = range_m[at, pick], range_m[at, rng.integers(num, size=(n,))[at]]
+    merged = np.isfinite(other) & (rng.random((n,))[at] < _MELT_PROBABILITY)
+    merged[merged] = np.abs(other[merged] - chosen[merged]) < _MERGE_M
+    chosen[merged] = (chosen[merged] + other[merged]) / 2
+    range_m, ray = range_m[:, 0].copy(), np.arange(0, n * num, num)
+    range_m[at], ray[at] = chosen, at * num + pick
+    return range_m, ray, edge

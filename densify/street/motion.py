@@ -73,7 +73,10 @@ def poses_at(trajectory: Trajectory, times_s: Float) -> Poses:
     new = np.diff(times_s, prepend=np.nan) != 0
     if new.all():
         return trajectory.poses(times_s)
-    return trajectory.poses(times_s[new]).rows(np.cumsum(new) - 1)
+    poses = trajectory.poses(times_s[new])
+    if len(poses.position) == 1:
+        return Poses(*(np.broadcast_to(c, (len(new), *c.shape[1:])) for c in poses))
+    return poses.rows(np.cumsum(new) - 1)
 
 
 class Still:

@@ -44,6 +44,9 @@ class Curve:
 
     def __call__(self, station_m: Float) -> Float:
         """Return (N,2) points at (N,) arc lengths."""
+        inside = np.clip(station_m, 0.0, self.length_m)
+        if np.array_equal(inside, station_m):  # the tangent is not needed
+            return self._spline(inside)
         return self.with_tangent(station_m)[0]
 
     def with_tangent(self, station_m: Float) -> tuple[Float, Float]:

@@ -8,20 +8,23 @@ Embree.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.geometry.types import Bool, Float, Int
+from densify.geometry.types import Bool, Float, Float32, Int
 from densify.street.mesh import Mesh, across, lengths
-from densify.street.motion import Still, Trajectory, poses_at
+from densify.street.motion import Poses, Trajectory, poses_at
 
 _STEP_M = 2e-3  # from a surface that a ray passes to its next origin
 _MAX_LAYERS = 8  # most layers of glass and leaves that one ray passes
+_STEP_S, _NUM_STEPS = 0.05, 20  # between the positions of a body that bound it, and at once
+_BLOCK = 16  # consecutive rays that are tested together
+_TINY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -60,15 +63,15 @@ class Hits(NamedTuple):
         range_m: (N,) distances, inf without a hit.
         triangle: (N,) index over the triangles of all bodies, -1 without a hit.
         barycentric: (N,2) u and v, as in ``(1-u-v) a + u b + v c``.
-        normal: (N,3) normal of the triangle, world axes, of either sign.
         absorbed: (N,) True if the ray ends at a surface without a return. Its range is inf.
+        normal: (N,3) normal of the triangle, world axes, of either sign.
     """
 
     range_m: Float
     triangle: Int
-    barycentric: Float
-    normal: Float
+    barycentric: Float32
     absorbed: Bool
+    normal: Float
 
 
 class Meeting(NamedTuple):
@@ -77,18 +80,26 @@ class Meeting(NamedTuple):
     Attributes:
         ray: (K,) ray indices.
         triangle: (K,) triangle indices.
-        place: (K,3) position in the frame of the body.
-        cosine: (K,) cosine of the angle of incidence.
-        inside: (K,) True if the previous surface that the ray passed was of the same object.
         layer: Number of surfaces that the rays have passed before.
+        origin: (K,3) origins of the rays in the frame of the body.
+        direction: (K,3) unit vectors in the frame of the body.
+        distance_m: (K,) distances from the origins.
+        facing: (K,) inner products of directions and normals.
+        passed: (K,) object number of the previous surface that the ray passed, -1 for none.
     """
 
     ray: Int
     triangle: Int
-    place: Float
-    cosine: Float
-    inside: Bool
     layer: int
+    origin: Float
+    direction: Float
+    distance_m: Float
+    facing: Float
+    passed: NDArray[np.int32]
+
+    def place(self, rows: Int) -> Float:
+        """Return the positions of some of the rays, (R,3) in the frame of the body."""
+        return self.origin[rows] + self.distance_m[rows, None] * self.direction[rows]
 
 
 STOPS, PASSES, ABSORBED = range(3)
@@ -125,6 +136,32 @@ class Triangles:
         self.normal: Float = normal[keep] / length[keep]
         self.scenes = [_raycasting_scene(c) for c in np.split(corners[keep], self.first[1:-1])]
 
+    def first_hit(
+        self, parts: Iterable[tuple[int, int]], origin: Float, direction: Float
+    ) -> tuple[Int, Int, Float]:
+        """Return the rays that hit their body, the first triangle that each hits, and u, v there.
+
+        Args:
+            parts: Index of a body and the end of its rays, by ascending ends.
+            origin: (N,3) in the frame of the ray's body.
+            direction: (N,3) in the frame of the ray's body.
+        """
+        start, ray = origin.astype(np.float32), direction.astype(np.float32)
+        met, triangle, barycentric, begin = [], [], [], 0
+        for index, end in parts:
+            if end > begin:
+                found = self.scenes[index].run(
+                    start[begin:end], ray[begin:end], query="INTERSECT", output=True
+                )
+                rows = np.flatnonzero(found["primID"] >= 0)
+                met.append(rows + begin)
+                triangle.append(found["primID"][rows] + self.first[index])
+                barycentric.append(np.stack([found["u"][rows], found["v"][rows]], axis=1))
+            begin = end
+        if not met:
+            return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))
+        return np.concatenate(met), np.concatenate(triangle), np.concatenate(barycentric)
+
 
 class World:
     """All bodies. Body 0 is static.
@@ -135,6 +172,7 @@ class World:
 
     def __init__(self, bodies: Sequence[Body], seed: int = 0) -> None:
         self.bodies, self.seed = tuple(bodies), seed
+        self._centres = lru_cache(None)(self._find_centres)
 
     @cached_property
     def triangles(self) -> Triangles:
@@ -153,84 +191,168 @@ class World:
                 directions are within ``spread`` rad of the first ray's.
         """
         every = np.arange(len(rays.time_s))
-        best = self._cast_body(0, rays.origin, rays.direction, every, optics)
-        for index, near in self._near(Rays(*(c[::num_together] for c in rays)), spread):
-            rows = (near[:, None] * num_together + np.arange(num_together)).ravel()
-            trajectory, time_s = self.bodies[index].trajectory, rays.time_s[rows]
-            origin, direction = rays.origin[rows], rays.direction[rows]
-            if isinstance(trajectory, Still):
-                found = self._cast_body(index, origin, direction, rows, optics)
-            else:
-                poses = poses_at(trajectory, time_s)
-                ray = poses.undo(origin), poses.unturn(direction)
-                found = self._cast_body(index, *ray, rows, optics)
-                found = found._replace(normal=poses.turn(found.normal))
-            nearer = np.flatnonzero(found.range_m < best.range_m[rows])
-            for column, new in zip(best, found, strict=True):
-                column[rows[nearer]] = new[nearer]
+        best = self._cast_bodies([(0, len(every))], rays.origin, rays.direction, every, optics)
+        groups = Rays(*(column[::num_together] for column in rays))
+        farthest_m = np.maximum.reduce(best.range_m.reshape(-1, num_together).T)
+        near = [
+            (index, rows, poses_at(self.bodies[index].trajectory, groups.time_s[rows]))
+            for index, rows in self._near(groups, farthest_m, spread)
+        ]
+        if near:
+            self._add_moving(best, rays, near, optics, num_together)
         best.range_m[best.absorbed] = np.inf
         return best
 
-    def _near(self, rays: Rays, spread: float) -> Iterator[tuple[int, Int]]:
+    def _add_moving(
+        self,
+        best: Hits,
+        rays: Rays,
+        near: Sequence[tuple[int, Int, Poses]],
+        optics: Optics,
+        num: int,
+    ) -> None:
+        """Enter the hits of moving bodies that are nearer than those in ``best``.
+
+        Args:
+            near: Index of each body, the groups of rays that may hit it, and its poses then.
+            num: Number of rays in a group.
+        """
+        poses = [pose for _, _, pose in near]
+        groups = np.concatenate([rows for _, rows, _ in near])
+        ends = num * np.cumsum([len(rows) for _, rows, _ in near])
+        parts = [(index, end) for (index, _, _), end in zip(near, ends.tolist(), strict=True)]
+        at = Poses(*(np.concatenate(column) for column in zip(*poses, strict=True)))
+        rows = (groups[:, None] * num + np.arange(num)).ravel()
+        origin = at.undo(rays.origin.take(groups * num, axis=0)).repeat(num, axis=0)
+        direction = rays.direction.take(rows, axis=0).reshape(-1, num, 3) @ at.rotation
+        found = self._cast_bodies(parts, origin, direction.reshape(-1, 3), rows, optics)
+        begin = 0
+        for pose, (_, end) in zip(poses, parts, strict=True):
+            new = np.flatnonzero(found.range_m[begin:end] < best.range_m[rows[begin:end]])
+            found.normal[begin + new] = pose.rows(new // num).turn(found.normal[begin + new])
+            new += begin
+            for name in Hits._fields:
+                getattr(best, name)[rows[new]] = getattr(found, name)[new]
+            begin = end
+
+    def _near(self, rays: Rays, farthest_m: Float, spread: float) -> Iterator[tuple[int, Int]]:
         """Yield the index of each body but the first, and the indices of the rays that may hit it.
 
-        These rays intersect a ball around the positions of the body at all of their times.
+        These rays intersect a ball around the positions of the body at all of their times, before
+        their static surface. Blocks of consecutive rays are tested before each ray.
+
+        Args:
+            farthest_m: (N,) distances beyond which hits of a ray do not matter.
         """
-        ends_s = np.array([rays.time_s.min(), rays.time_s.max()])
-        origin, direction = rays.origin.T.copy(), rays.direction.T.copy()
-        for index, body in enumerate(self.bodies[1:], start=1):
-            low, high = body.mesh.bounds
-            ends = body.trajectory.poses(ends_s).apply(np.tile((low + high) / 2, (2, 1)))
-            moved_m, half_m = np.linalg.norm(ends[1] - ends[0]), np.linalg.norm(high - low) / 2
-            away = ends.mean(axis=0)[:, None] - origin
-            along = np.einsum("in,in->n", away, direction)
-            reach_m = half_m + 0.75 * moved_m + 0.1 + spread * np.abs(along)
-            is_near = np.einsum("in,in->n", away, away) - along * along < reach_m * reach_m
-            rows = np.flatnonzero(is_near & (along > -reach_m))
+        if len(self.bodies) < 2 or not len(rays.time_s):
+            return
+        first = np.arange(0, len(rays.time_s), _BLOCK)
+        count = np.diff(np.append(first, len(rays.time_s)))
+        origin, direction = (
+            np.add.reduceat(c, first) / count[:, None] for c in (rays.origin, rays.direction)
+        )
+        direction /= np.maximum(lengths(direction), _TINY)
+        around_m, around = (
+            np.maximum.reduceat(lengths(c - np.repeat(middle, count, axis=0))[:, 0], first)
+            for c, middle in ((rays.origin, origin), (rays.direction, direction))
+        )
+        blocks = origin, direction, np.maximum.reduceat(farthest_m, first)
+        for index, (centre, radius_m) in enumerate(self._balls(rays.time_s), start=1):
+            wide = _meets_ball(blocks, centre, radius_m + around_m, spread + around)
+            rows = (np.flatnonzero(wide)[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
+            rows = rows[: np.searchsorted(rows, len(rays.time_s))]
+            each = rays.origin[rows], rays.direction[rows], farthest_m[rows]
+            rows = rows[_meets_ball(each, centre, radius_m, spread)]
             if len(rows):
                 yield index, rows
 
-    def _cast_body(
-        self, index: int, origin: Float, direction: Float, number: Int, optics: Optics
+    def _balls(self, times_s: Float) -> Iterator[tuple[Float, float]]:
+        """Yield centre (3,) and radius of a ball around each moving body at all of these times."""
+        begin, end = (int(t // _STEP_S) for t in (times_s.min(), times_s.max()))
+        parts = range(begin // _NUM_STEPS, (end + 1) // _NUM_STEPS + 1)
+        paths = np.concatenate([self._centres(part) for part in parts])
+        paths = paths[begin % _NUM_STEPS :][: end - begin + 2]
+        low, high = paths.min(axis=0), paths.max(axis=0)
+        moved_m = lengths(high - low)[:, 0]
+        for body, centre, m in zip(self.bodies[1:], (low + high) / 2, moved_m, strict=True):
+            yield centre, float(m + np.linalg.norm(np.subtract(*body.mesh.bounds))) / 2 + 0.1
+
+    def _find_centres(self, part: int) -> Float:
+        """Return the (S,B,3) centres of the moving bodies' bounding boxes at S times."""
+        times_s: Float = (part * _NUM_STEPS + np.arange(_NUM_STEPS)) * np.float64(_STEP_S)
+        return np.stack(
+            [
+                body.trajectory.poses(times_s).apply(np.mean([body.mesh.bounds], axis=1))
+                for body in self.bodies[1:]
+            ],
+            axis=1,
+        )
+
+    def _cast_bodies(
+        self,
+        parts: Sequence[tuple[int, int]],
+        origin: Float,
+        direction: Float,
+        number: Int,
+        optics: Optics,
     ) -> Hits:
-        """Return the hits of rays with one body.
+        """Return the hits of rays, each with one body.
 
         Distances are to the plane of the triangle, in double precision, also for absorbed rays.
 
         Args:
-            origin: (N,3) in the frame of the body.
-            direction: (N,3) in the frame of the body.
+            parts: Index of a body and the end of its rays, by ascending ends.
+            origin: (N,3) in the frame of the ray's body.
+            direction: (N,3) in the frame of the ray's body.
             number: (N,) indices of the rays.
         """
-        surfaces, first, n = self.triangles, self.triangles.first[index], len(origin)
+        surfaces, n = self.triangles, len(origin)
         hits = Hits(
-            np.full(n, np.inf), np.full(n, -1), np.zeros((n, 2)), np.zeros((n, 3)),
-            np.zeros(n, bool),
+            np.full(n, np.inf), np.full(n, -1), np.zeros((n, 2), np.float32), np.zeros(n, bool),
+            np.zeros((n, 3)),
         )  # fmt: skip
-        rows, begin, passed = np.arange(n), np.zeros(n), np.full(n, -1, np.int32)
+        rows, start, ray, passed = np.arange(n), origin, direction, np.full(n, -1, np.int32)
         for layer in range(_MAX_LAYERS):
-            ray = direction[rows]
-            start = origin[rows] + begin[rows, None] * ray
-            triangle, barycentric = _first_hit(surfaces.scenes[index], start, ray)
-            met = np.flatnonzero(triangle >= 0)
-            rows, triangle, ray = rows[met], triangle[met] + first, ray[met]
-            if not len(rows):
+            ends = np.searchsorted(rows, [end for _, end in parts]).tolist()
+            spans = zip((index for index, _ in parts), ends, strict=True)
+            met, triangle, barycentric = surfaces.first_hit(spans, start, ray)
+            if not len(met):
                 break
-            normal, instance = surfaces.normal[triangle], surfaces.instance[triangle]
-            to_plane = np.einsum("ni,ni->n", surfaces.corner[triangle] - origin[rows], normal)
+            rows, passed, ray = rows[met], passed[met], ray.take(met, axis=0)
+            begin, normal = origin.take(rows, axis=0), surfaces.normal.take(triangle, axis=0)
+            corner = surfaces.corner.take(triangle, axis=0)
             facing = np.einsum("ni,ni->n", ray, normal)
-            distance = to_plane / facing
-            place = origin[rows] + distance[:, None] * ray
-            inside = (instance >= 0) & (instance == passed[rows])
-            meeting = Meeting(number[rows], triangle, place, np.abs(facing), inside, layer)
+            distance_m = np.einsum("ni,ni->n", corner - begin, normal) / facing
+            meeting = Meeting(number[rows], triangle, layer, begin, ray, distance_m, facing, passed)
             outcome = optics(meeting)
-            ends, goes_on = outcome != PASSES, outcome == PASSES
-            ended = distance, triangle, barycentric[met], normal, outcome == ABSORBED
-            for column, new in zip(hits, ended, strict=True):
-                column[rows[ends]] = new[ends]
-            rows = rows[goes_on]
-            begin[rows], passed[rows] = distance[goes_on] + _STEP_M, instance[goes_on]
+            hits.range_m[rows], hits.triangle[rows] = distance_m, triangle
+            hits.barycentric[rows], hits.absorbed[rows] = barycentric, outcome == ABSORBED
+            hits.normal[rows] = normal
+            on = np.flatnonzero(outcome == PASSES)
+            rows, ray, passed = rows[on], ray[on], surfaces.instance[triangle[on]]
+            hits.range_m[rows], hits.triangle[rows] = np.inf, -1
+            start = begin[on] + (distance_m[on] + _STEP_M)[:, None] * ray
         return hits
+
+
+def _meets_ball(
+    rays: tuple[Float, Float, Float], centre: Float, radius_m: Float | float, spread: Float | float
+) -> Bool:
+    """Return (N,) True for rays that meet a ball.
+
+    Args:
+        rays: (N,3) origins in metres, (N,3) unit vectors, and (N,) lengths in metres.
+        centre: (3,) centre of the ball.
+        radius_m: Radius of the ball, (N,) or one.
+        spread: Greatest difference of a ray's true direction from its unit vector, (N,) or one.
+    """
+    origin, direction, farthest_m = rays
+    away = centre - origin
+    along = np.einsum("ni,ni->n", away, direction)
+    square = np.einsum("ni,ni->n", away, away)
+    reach_m = radius_m + spread * (np.sqrt(square) + radius_m)
+    meets: Bool = square - along * along < reach_m * reach_m
+    return meets & (along > -reach_m) & (along - reach_m < farthest_m)
 
 
 @cache
@@ -252,11 +374,3 @@ def _raycasting_scene(corners: Float) -> Any:
     scene = EmbreeScene(_device())
     TriangleMesh(scene, corners.astype(np.float32))
     return scene
-
-
-def _first_hit(scene: Any, origin: Float, direction: Float) -> tuple[NDArray[np.int64], Float]:
-    """Return the (N,) index of the first triangle hit, -1 for none, and (N,2) barycentric u, v."""
-    found = scene.run(
-        origin.astype(np.float32), direction.astype(np.float32), query="INTERSECT", output=True
-    )
-    return found["primID"].astype(np.int64), np.stack([found["u"], found["v"]], 1).astype(float)
