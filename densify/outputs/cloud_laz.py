@@ -134,7 +134,7 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     header.add_extra_dims(
         [laspy.ExtraBytesParams(name, kind, text) for name, kind, text in _EXTRA_DIMENSIONS]
     )
-    las = laspy.LasData(header)
+    las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header))
     las.xyz = cloud.points
     las.gps_time = (stamp_ns - _LAS_EPOCH_NS + cloud.since_key_ns) * 1e-9
     las.intensity = np.rint(65535 * np.clip(cloud.intensity, 0, 1)).astype(np.uint16)

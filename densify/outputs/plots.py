@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Draw pictures with matplotlib: figure.png, compare.png, curve.png, and the loss of a training.
+"""Draw pictures: figure.png, compare.png and curve.png.
 
-figure.png and compare.png show depth over the camera's image. curve.png shows outliers over
-density.
+figure.png and compare.png show depth over the camera's image. They are drawn with OpenCV, because a
+run should not wait for matplotlib. curve.png shows outliers over density.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from densify.geometry.types import METHOD_NAMES, Float32, Result
 from densify.outputs.atomic import write_file
-from densify.outputs.depth_png import Picture
+from densify.outputs.depth_png import Picture, encode_png
 from densify.outputs.key_outputs import Context
 
 if TYPE_CHECKING:
@@ -34,16 +34,9 @@ _NO_DEPTH_M = np.float32(1e6)
 _BRIGHTNESS = 0.45
 _MIN_WIDTH_PX = 480
 _POINT_SIZE_PX = 3
-_TITLE_PX, _SCALE_PX = 36, 60
-_FONT_PT, _LETTER_PX = 13.0, 0.85  # width of a letter, per point of the font
+_TITLE_PX, _SCALE_PX, _BAR_PX, _MARGIN_PX = 36, 60, 15, 12
+_FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.6
 _FEWEST_OUTLIERS = 1e-4  # the axis is linear below this share and logarithmic above
-
-
-def write_plot(path: Path, figure: Figure) -> None:
-    """Write a matplotlib figure as PNG. Equal figures give equal bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    write_file(path, buffer.getvalue())
 
 
 def write_key_figure(result: Result, context: Context, folder: Path) -> None:
@@ -72,7 +65,7 @@ def write_figure(path: Path, results: Mapping[str, Result]) -> None:
         depth_m = (result.full if product == "full" else result.depth)[camera].depth_m
         text = f"{title}: {np.count_nonzero(depth_m) / depth_m.size:.1%} of pixels"
         drawn[text + _error(result, camera, product)] = depth_m
-    write_plot(path, draw_figure(_image(last, camera), drawn))
+    write_file(path, encode_png(draw_figure(_image(last, camera), drawn)))
 
 
 def _image(result: Result, camera: str) -> Picture:
@@ -90,8 +83,8 @@ def _error(result: Result, camera: str, product: str) -> str:
     return ""
 
 
-def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Figure:
-    """Draw depth maps over an image, from top to bottom in the order of the mapping.
+def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
+    """Return a picture (h,w,3), as blue, green, red, of panels with depth over a camera's image.
 
     Each depth covers 3 x 3 pixels. Where they overlap, the nearest depth is drawn. Colours run from
     red at 3 m to blue at 80 m on a logarithmic scale.
@@ -100,32 +93,57 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Figure:
         image: (H,W,3) uint8 RGB image, drawn in gray.
         panels: Title -> (H,W) depth in metres, 0 for no depth.
     """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
-
-    scale = ScalarMappable(LogNorm(_NEAR_M, _FAR_M, clip=True), "turbo_r")
     kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
-    enlarge = max(1.0, _MIN_WIDTH_PX / image.shape[1])
-    panel, width = (enlarge * size_px for size_px in image.shape[:2])
-    height = len(panels) * (panel + _TITLE_PX) + _SCALE_PX
-    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
-    gray = _BRIGHTNESS * (image @ np.array([0.299, 0.587, 0.114]))
-    for number, (title, depth_m) in enumerate(panels.items(), 1):
-        bottom = height - number * (panel + _TITLE_PX)
-        axes = figure.add_axes((0, bottom / height, 1, panel / height))
-        axes.set_axis_off()
-        size = min(_FONT_PT, width / (_LETTER_PX * len(title)))
-        axes.set_title(title, loc="left", x=0.01, fontsize=size)
-        axes.imshow(gray, "gray", vmin=0, vmax=255, interpolation="nearest", aspect="auto")
-        nearest = cv2.erode(np.where(depth_m > 0, depth_m, _NO_DEPTH_M), kernel)
-        colours = scale.to_rgba(nearest, bytes=True)
-        colours[nearest >= _NO_DEPTH_M] = 0
-        axes.imshow(colours, interpolation="nearest", aspect="auto")
-    bar = figure.add_axes((0.05, 0.6 * _SCALE_PX / height, 0.9, 0.25 * _SCALE_PX / height))
-    shown = figure.colorbar(scale, bar, orientation="horizontal", ticks=_TICKS_M, format="%d m")
-    shown.minorticks_off()
-    return figure
+    gray = (_BRIGHTNESS * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8)
+    enlarge, parts = max(1.0, _MIN_WIDTH_PX / image.shape[1]), []
+    for title, depth_m in panels.items():
+        nearest_m = np.where(depth_m > 0, depth_m, _NO_DEPTH_M)
+        nearest_m = cv2.erode(nearest_m, kernel).astype(np.float32, copy=False)
+        picture = cv2.merge([gray, gray, gray])
+        picture[nearest_m < _NO_DEPTH_M] = _colours(nearest_m)[nearest_m < _NO_DEPTH_M]
+        picture = cv2.resize(picture, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_NEAREST)
+        strip = np.full((_TITLE_PX, picture.shape[1], 3), 255, np.uint8)
+        _write(strip, title, _MARGIN_PX, picture.shape[1] - _MARGIN_PX)
+        parts += [strip, picture]
+    return np.concatenate([*parts, _scale(parts[0].shape[1])])
+
+
+def _colours(depth_m: Float32) -> Picture:
+    """Return the (h,w,3) colours, as blue, green, red, of depths (h,w) in metres."""
+    far = np.log(depth_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M)
+    levels = np.rint(255 * (1 - np.clip(far, 0, 1))).astype(np.uint8)
+    return cv2.applyColorMap(levels, cv2.COLORMAP_TURBO).astype(np.uint8, copy=False)
+
+
+def _scale(width_px: int) -> Picture:
+    """Return the (h,w,3) colour scale with its ticks."""
+    scale = np.full((_SCALE_PX, width_px, 3), 255, np.uint8)
+    left, long_px = width_px // 20, width_px - 2 * (width_px // 20)
+    log = np.linspace(np.log(_NEAR_M), np.log(_FAR_M), long_px)
+    bar = scale[_MARGIN_PX : _MARGIN_PX + _BAR_PX, left : left + long_px]
+    bar[:] = _colours(np.exp(log).astype(np.float32)[None])
+    for tick_m in _TICKS_M:
+        at = left + int(np.searchsorted(log, np.log(tick_m) - 1e-9))
+        scale[_MARGIN_PX + _BAR_PX : _MARGIN_PX + _BAR_PX + 4, at - 1 : at + 1] = 0
+        _write(scale[_MARGIN_PX + _BAR_PX :], f"{tick_m} m", at - left, at + left, centred=True)
+    return scale
+
+
+def _write(strip: Picture, text: str, left_px: int, right_px: int, centred: bool = False) -> None:
+    """Write a line of text into the middle of a strip (h,w,3), smaller if it is too long."""
+    (width_px, height_px), _ = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)
+    shrink = min(1.0, (right_px - left_px) / width_px)
+    if centred:
+        left_px = (left_px + right_px - round(shrink * width_px)) // 2
+    at = left_px, (strip.shape[0] + height_px) // 2
+    cv2.putText(strip, text, at, _FONT, shrink * _FONT_SCALE, (0, 0, 0), 1, cv2.LINE_AA)
+
+
+def write_plot(path: Path, figure: Figure) -> None:
+    """Write a matplotlib figure as PNG. Equal figures give equal bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    write_file(path, buffer.getvalue())
 
 
 def write_curve(result: Result, context: Context, folder: Path) -> None:
