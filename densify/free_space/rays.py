@@ -113,14 +113,20 @@ def aim(begin, end, points, offset_s, origin, axes, twists, rays):  # type: igno
         axes: (3,3) rotation from the lidar frame to the scanner's axes.
         twists: (2,6) twist of the lidar before and after the reference time.
     """
-    x, y, z = np.empty((3, 1), np.float32)
-    for i in range(begin, end):
-        x[0], y[0], z[0] = _at_time(points[i, 0], points[i, 1], points[i, 2], offset_s[i], twists)
-        _from_scanner(x, y, z, 1, origin, axes)
-        level = np.sqrt(x[0] * x[0] + y[0] * y[0])
-        rays[0, i] = _azimuth(x[0], y[0])
-        rays[1, i] = _azimuth(level, z[0])
-        rays[2, i] = np.sqrt(level * level + z[0] * z[0])
+    x, y, z = np.empty((3, _BLOCK), np.float32)
+    for start in range(begin, end, _BLOCK):
+        size = min(_BLOCK, end - start)
+        for k in range(size):
+            i = start + k
+            x[k], y[k], z[k] = _at_time(
+                points[i, 0], points[i, 1], points[i, 2], offset_s[i], twists
+            )
+        _from_scanner(x, y, z, size, origin, axes)
+        for k in range(size):
+            level = np.sqrt(x[k] * x[k] + y[k] * y[k])
+            rays[0, start + k] = _azimuth(x[k], y[k])
+            rays[1, start + k] = _azimuth(level, z[k])
+            rays[2, start + k] = np.sqrt(level * level + z[k] * z[k])
 
 
 @inlined
@@ -139,36 +145,29 @@ def _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row,
     Two rounds from the position at the reference time converge.
     """
     num_columns, by_azimuth = image.nearest_m.shape[1], len(image.offset_s) == 1
-    for k in range(size):
-        x[k], y[k], z[k] = points[start + k, 0], points[start + k, 1], points[start + k, 2]
-    _from_scanner(x, y, z, size, image.origin_m, image.axes)
-    for _ in range(2):
+    time_s[:size] = _ZERO
+    for round in range(3):
+        for k in range(size):
+            i, t = start + k, time_s[k]
+            if len(velocity) > 0:
+                x[k], y[k], z[k] = _at_time(
+                    points[i, 0] + t * velocity[i, 0], points[i, 1] + t * velocity[i, 1],
+                    points[i, 2] + t * velocity[i, 2], t, image.twists,
+                )  # fmt: skip
+            else:
+                x[k], y[k], z[k] = _at_time(
+                    points[i, 0], points[i, 1], points[i, 2], t, image.twists
+                )
+        _from_scanner(x, y, z, size, image.origin_m, image.axes)
         for k in range(size):
             column[k] = _column(_azimuth(x[k], y[k]), num_columns)
-        if by_azimuth:
-            for k in range(size):
-                time_s[k] = image.offset_s[0, column[k]]
-        else:
+        if round == 2 or not by_azimuth:
             for k in range(size):
                 elevation[k] = _azimuth(np.sqrt(x[k] * x[k] + y[k] * y[k]), z[k])
             _rows(elevation, size, image.row_edges_rad, row)
+        if round < 2:
             for k in range(size):
-                time_s[k] = image.offset_s[max(row[k], 0), column[k]]
-        for k in range(size):
-            x[k], y[k], z[k] = points[start + k, 0], points[start + k, 1], points[start + k, 2]
-        if len(velocity) > 0:
-            for k in range(size):
-                x[k] += time_s[k] * velocity[start + k, 0]
-                y[k] += time_s[k] * velocity[start + k, 1]
-                z[k] += time_s[k] * velocity[start + k, 2]
-        for k in range(size):
-            x[k], y[k], z[k] = _at_time(x[k], y[k], z[k], time_s[k], image.twists)
-        _from_scanner(x, y, z, size, image.origin_m, image.axes)
-    for k in range(size):
-        column[k] = _column(_azimuth(x[k], y[k]), num_columns)
-    for k in range(size):
-        elevation[k] = _azimuth(np.sqrt(x[k] * x[k] + y[k] * y[k]), z[k])
-    _rows(elevation, size, image.row_edges_rad, row)
+                time_s[k] = image.offset_s[0 if by_azimuth else max(row[k], 0), column[k]]
 
 
 @Kernel
@@ -188,7 +187,7 @@ def see_beyond(begin, end, points, velocity, image, margins, least, beyond):  # 
     moving, by_azimuth = len(velocity) > 0, len(image.offset_s) == 1
     settled_s = np.float32(image.settled_s)
     x, y, z, time_s, elevation = np.empty((5, _BLOCK), np.float32)
-    row, column = np.zeros((2, _BLOCK), np.int32)
+    row, column = np.empty((2, _BLOCK), np.int32)
     # Each point needs a long chain of steps. A block of points takes every step in parallel.
     for start in range(begin, end, _BLOCK):
         size = min(_BLOCK, end - start)
