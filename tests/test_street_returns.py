@@ -164,7 +164,7 @@ def test_levels_of_patches_are_even_and_smooth():
 
 def test_the_dark_and_the_far_road_lose_returns():
     def lost(material: Material, tint: float, range_m: float) -> float:
-        columns = np.array([material]), np.full((1, 3), tint), np.array([range_m])
+        columns = np.array([material]), np.array([tint]), np.array([range_m])
         return float(share_lost(*columns)[0])
 
     assert lost(Material.ASPHALT, 1.0, 10.0) < 0.005 < 0.1 < lost(Material.ASPHALT, 1.0, 60.0)

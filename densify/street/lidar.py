@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
-from densify.geometry.poses import rotate, transform
+from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, Float32, Int
 from densify.street.materials import REFLECTIVITY, Material, noise
 from densify.street.mesh import across, lengths
@@ -79,7 +79,7 @@ def laser(world: World, luck: Float) -> Optics:
         outside = (material != Material.LEAF) & ~inside
         rows, material, instance = rows[outside], material[outside], instance[outside]
         part = np.argmax(material[:, None] == np.array(_PARTS), axis=1)
-        brightness = np.digitize(surfaces.tint[met.triangle[rows]].mean(axis=1), _BRIGHTNESS)
+        brightness = np.digitize(surfaces.mean_tint[met.triangle[rows]], _BRIGHTNESS)
         cosine = np.abs(met.facing[rows])
         incidence_deg = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
         lost, passes = (
@@ -98,13 +98,13 @@ def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
 
     Args:
         material: (N,) materials.
-        tint: (N,3) factors on the colours of the materials.
+        tint: (N,) mean factors on the colours of the materials.
         range_m: (N,) distances in metres.
     """
     ground, dark, other = (
         np.interp(range_m, _RANGE_M, lost) for lost in (_GROUND_LOST, _DARK_LOST, _OTHER_LOST)
     )
-    is_dark = (REFLECTIVITY[material] * tint.mean(axis=1) < _DARK) & ~_of_vehicle(material)
+    is_dark = (REFLECTIVITY[material] * tint < _DARK) & ~_of_vehicle(material)
     return np.where(material <= Material.PAINT, ground, np.where(is_dark, dark, other))
 
 
@@ -204,7 +204,7 @@ def scan(
     ego_poses = poses_at(ego, times)
     origin_m = sensor.origins_m[fired.lidar]
     origin = ego_poses.apply(transform(T, sensor.origins_m)[fired.lidar])
-    spot = np.stack([ego_poses.turn(rotate(T, ray)) for ray in _spot(fired.direction)], axis=1)
+    spot = _spot(fired.direction) @ (ego_poses.rotation @ T[:3, :3]).transpose(0, 2, 1)
     luck = rng.random((len(_SPOT), n)).T
     beams = (np.repeat(column, len(_SPOT), axis=0) for column in (origin, times))
     echoes = world.cast(
@@ -213,8 +213,8 @@ def scan(
     )  # fmt: skip
     range_m, ray, edge = _echo(echoes, spot, rng)
     triangle, normal = echoes.triangle[ray], echoes.normal.take(ray, axis=0)
-    material, tint = world.triangles.material[triangle], world.triangles.tint[triangle]
-    reflectivity = REFLECTIVITY[material] * (0.6 + 0.4 * tint.mean(axis=1))
+    material, tint = world.triangles.material[triangle], world.triangles.mean_tint[triangle]
+    reflectivity = REFLECTIVITY[material] * (0.6 + 0.4 * tint)
     grazing = np.abs(np.einsum("ni,ni->n", normal, spot[:, 0]))
     heard = (1 - share_lost(material, tint, range_m)) * np.where(edge, 0.85, 1.0)
     keep = np.isfinite(range_m) & (rng.random(n) < heard)
@@ -241,13 +241,13 @@ def at_offsets(time_s: float, offset_ns: Int) -> Float:
     return times
 
 
-def _spot(direction: Float) -> list[Float]:
-    """Return five (N,3) ray directions for N beams: spot centre, then four around it."""
+def _spot(direction: Float) -> Float:
+    """Return (N,5,3) ray directions of N beams: spot centre, then four around it."""
     level = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
     level /= lengths(level)
     upward = across(direction, level)
     rays = [direction + _SPOT_RAD * (a * level + b * upward) for a, b in _SPOT[1:]]
-    return [direction, *(ray / lengths(ray) for ray in rays)]
+    return np.stack([direction, *(ray / lengths(ray) for ray in rays)], axis=1)
 
 
 def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Int, Bool]:
@@ -269,7 +269,8 @@ def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, I
     with np.errstate(divide="ignore", invalid="ignore"):  # a ray without a hit has infinite range
         off_plane = np.abs(range_m - (range_m * slant)[:, :1] / slant)
     some = np.isfinite(range_m)
-    edge = some.any(axis=1) & ~(off_plane < _FLAT_M).all(axis=1)
+    flat = off_plane < _FLAT_M
+    edge = np.logical_or.reduce([*some.T]) & ~np.logical_and.reduce([*flat.T])
     # any of the rays with a hit, all equally likely
     at = np.flatnonzero(edge)
     pick = np.argmax(rng.random((num, n))[:, at] * some[at].T, axis=0)

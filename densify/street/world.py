@@ -110,8 +110,8 @@ Optics = Callable[[Meeting], Int]
 class Triangles:
     """The triangles of all bodies in a row, without triangles of no area.
 
-    ``body[k]``, ``material[k]``, ``instance[k]``, ``corner[k]``, ``normal[k]``, ``uv[k]`` and
-    ``tint[k]`` belong to triangle k.
+    ``body[k]``, ``material[k]``, ``instance[k]``, ``corner[k]``, ``normal[k]``, ``uv[k]``,
+    ``tint[k]`` and ``mean_tint[k]`` belong to triangle k.
 
     Attributes:
         first: Index of the first triangle of each body.
@@ -121,20 +121,23 @@ class Triangles:
     def __init__(self, bodies: Sequence[Body]) -> None:
         meshes = [b.mesh.of_instance(b.instance) if b.instance >= 0 else b.mesh for b in bodies]
         mesh = Mesh.join(meshes)
-        corners = mesh.vertices.astype(np.float32).astype(np.float64)[mesh.triangles]
+        single = mesh.vertices.astype(np.float32).take(mesh.triangles, axis=0)
+        corners = single.astype(np.float64)
         normal = across(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = lengths(normal)
-        keep = length[:, 0] > 1e-7
+        keep = np.flatnonzero(length[:, 0] > 1e-7)
         counts = [len(m.triangles) for m in meshes]
         self.body = np.repeat(np.arange(len(meshes), dtype=np.int32), counts)[keep]
         self.first: Int = np.searchsorted(self.body, np.arange(len(meshes) + 1))
         self.material = mesh.material[keep].astype(np.int64)
-        self.tint: Float = mesh.tint[keep]
-        self.uv: Float = mesh.uv[mesh.triangles[keep]]
+        self.tint: Float = mesh.tint.take(keep, axis=0)
+        self.mean_tint: Float = self.tint.mean(axis=1)
+        self.uv: Float = mesh.uv.take(mesh.triangles.take(keep, axis=0), axis=0)
         self.instance = mesh.instance[keep]
-        self.corner: Float = corners[keep, 0]
-        self.normal: Float = normal[keep] / length[keep]
-        self.scenes = [_raycasting_scene(c) for c in np.split(corners[keep], self.first[1:-1])]
+        self.corner: Float = corners[:, 0].take(keep, axis=0)
+        self.normal: Float = normal.take(keep, axis=0) / length.take(keep, axis=0)
+        each = np.split(single.take(keep, axis=0), self.first[1:-1])
+        self.scenes = [_raycasting_scene(corners) for corners in each]
 
     def first_hit(
         self, parts: Iterable[tuple[int, int]], origin: Float, direction: Float
@@ -193,7 +196,7 @@ class World:
         every = np.arange(len(rays.time_s))
         best = self._cast_bodies([(0, len(every))], rays.origin, rays.direction, every, optics)
         groups = Rays(*(column[::num_together] for column in rays))
-        farthest_m = np.maximum.reduce(best.range_m.reshape(-1, num_together).T)
+        farthest_m = np.maximum.reduce([*best.range_m.reshape(-1, num_together).T])
         near = [
             (index, rows, poses_at(self.bodies[index].trajectory, groups.time_s[rows]))
             for index, rows in self._near(groups, farthest_m, spread)
@@ -366,11 +369,11 @@ def _device() -> Any:
     return EmbreeDevice()
 
 
-def _raycasting_scene(corners: Float) -> Any:
+def _raycasting_scene(corners: Float32) -> Any:
     """Return the Embree scene of (T,3,3) triangle corners."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
     scene = EmbreeScene(_device())
-    TriangleMesh(scene, corners.astype(np.float32))
+    TriangleMesh(scene, corners)
     return scene
