@@ -34,41 +34,48 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
         drop_lost: True leaves out moving points that cannot be followed to the key sweep, False
             keeps their rigid positions.
     """
-    parts = []
-    for registered, flow in zip(stretch.sweeps, fields, strict=True):
-        sweep = registered.sweep
+    kept = [np.flatnonzero(~(drop_lost & flow.lost)) for flow in fields]
+    cloud, first = _empty_cloud(sum(map(len, kept))), 0
+    for registered, flow, rows in zip(stretch.sweeps, fields, kept, strict=True):
+        part = slice(first, first + len(rows))
+        first, sweep = part.stop, registered.sweep
         T_key_lidar = stretch.T_target_source(key, registered.frame)
-        kept = np.flatnonzero(~flow.lost) if drop_lost else np.arange(len(sweep))
-        rigid = poses.transform(T_key_lidar, sweep.points)
-        points = rigid.copy()
-        moves = flow.moving & ~flow.lost
-        points[moves] += poses.rotate(T_key_lidar, flow.total[moves])
-        velocity_m_s = np.zeros(points.shape, np.float32)
-        if flow.velocity_m_s is not None:
-            velocity_m_s[moves] = poses.rotate(T_key_lidar, flow.velocity_m_s[moves])
+        cloud.rigid_points[part] = poses.transform(T_key_lidar, sweep.points).take(rows, axis=0)
+        cloud.points[part] = cloud.rigid_points[part]
         since_key_ns = sweep.stamp_ns - stretch[key].sweep.stamp_ns
         own = max(0.1, 1 - _CONFIDENCE_PER_S * abs(since_key_ns) * 1e-9)
-        confidence = np.full(len(sweep), own)
-        confidence[moves & (registered.frame != key)] *= _CONFIDENCE_MOVED
-        num = len(kept)
-        parts.append(
-            {
-                "points": points[kept],
-                "rigid_points": rigid[kept],
-                "frame": np.full(num, registered.frame, np.int32),
-                "since_key_ns": np.full(num, since_key_ns, np.int64),
-                "row": sweep.row[kept],
-                "lidar": sweep.lidar[kept],
-                "moving": flow.moving[kept],
-                "instance": flow.instance[kept],
-                "velocity_m_s": velocity_m_s[kept],
-                "confidence": confidence[kept].astype(np.float32),
-                "intensity": sweep.intensity[kept],
-                "rgb": np.zeros((num, 3), np.uint8),
-                "far": np.zeros(num, bool),
-            }
-        )
-    return Cloud(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
+        cloud.frame[part], cloud.since_key_ns[part] = registered.frame, since_key_ns
+        cloud.confidence[part], cloud.intensity[part] = own, sweep.intensity[rows]
+        cloud.row[part], cloud.lidar[part] = sweep.row[rows], sweep.lidar[rows]
+        cloud.moving[part], cloud.instance[part] = flow.moving[rows], flow.instance[rows]
+
+        moves = np.flatnonzero((flow.moving & ~flow.lost)[rows])
+        place, rows = part.start + moves, rows[moves]
+        cloud.points[place] += poses.rotate(T_key_lidar, flow.total[rows])
+        if flow.velocity_m_s is not None:
+            cloud.velocity_m_s[place] = poses.rotate(T_key_lidar, flow.velocity_m_s[rows])
+        if registered.frame != key:
+            cloud.confidence[place] = own * _CONFIDENCE_MOVED
+    return cloud
+
+
+def _empty_cloud(num: int) -> Cloud:
+    """Return a cloud of ``num`` points of the window, to be filled in."""
+    return Cloud(
+        points=np.empty((num, 3)),
+        rigid_points=np.empty((num, 3)),
+        frame=np.empty(num, np.int32),
+        since_key_ns=np.empty(num, np.int64),
+        row=np.empty(num, np.int64),
+        lidar=np.empty(num, np.uint8),
+        moving=np.empty(num, bool),
+        instance=np.empty(num, np.int32),
+        velocity_m_s=np.zeros((num, 3), np.float32),
+        confidence=np.empty(num, np.float32),
+        intensity=np.empty(num, np.float32),
+        rgb=np.zeros((num, 3), np.uint8),
+        far=np.zeros(num, bool),
+    )
 
 
 class _ObjectPoints(NamedTuple):

@@ -143,31 +143,38 @@ def _holes(layers: Layers) -> Iterator[_Hole]:
     index = np.arange(rays_per_px.size).reshape(rays_per_px.shape)
     away_px = max(1, round(float(np.median(layers.gap_px))))
     wide = np.ones((2 * away_px + 1, 2 * away_px + 1), np.uint8)
-    label, boxes = _parts(_smooth(layers.filled_m), 8)
-    for number, box in enumerate(boxes, start=1):
+    label, surfaces = _parts(_smooth(layers.filled_m), 8)
+    for number, sides in enumerate(surfaces, start=1):
+        box = _box(sides, 0)
         surface = label[box] == number
         if rays_per_px[box][~surface].sum() <= least_rays:
             continue
         holes, inner = _parts(_enclosed(surface) & ~surface, 4)
         num_rays = np.bincount(holes.ravel(), rays_per_px[box].ravel())[1:]
         for k in np.flatnonzero(num_rays > least_rays):
-            around = tuple(slice(max(0, s.start - away_px), s.stop + away_px) for s in inner[k])
+            around = _box(inner[k], away_px)
             hole = holes[around] == k + 1
             rim = surface[around] & (cv2.dilate(hole.astype(np.uint8), wide) > 0)
             there = index[box][around]
             yield _Hole(there[hole], there[rim], num_rays[k])
 
 
-def _parts(pixels: Bool, connectivity: int) -> tuple[NDArray[np.int32], list[tuple[slice, slice]]]:
+def _parts(pixels: Bool, connectivity: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Label the connected parts of a mask (h,w), with 4 or 8 neighbours, from 1; 0 elsewhere.
 
-    Return the (h,w) labels, and the box (rows and columns) of each part.
+    Return the (h,w) labels, and the (P,4) left, top, width and height in pixels of each part.
     """
-    _, label, boxes, _ = cv2.connectedComponentsWithStats(
+    _, label, parts, _ = cv2.connectedComponentsWithStats(
         pixels.astype(np.uint8), connectivity=connectivity
     )
-    sides = [(slice(y, y + h), slice(x, x + w)) for x, y, w, h, _ in boxes[1:].tolist()]
-    return label.astype(np.int32, copy=False), sides
+    return label.astype(np.int32, copy=False), parts[1:, :4].astype(np.int32, copy=False)
+
+
+def _box(part: NDArray[np.int32], margin_px: int) -> tuple[slice, slice]:
+    """Return rows and columns of the box of a part (4,) from `_parts`, with a margin around it."""
+    left, top, width, height = part.tolist()
+    low, high = max(0, top - margin_px), top + height + margin_px
+    return slice(low, high), slice(max(0, left - margin_px), left + width + margin_px)
 
 
 def _enclosed(surface: Bool) -> Bool:

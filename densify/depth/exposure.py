@@ -34,6 +34,8 @@ _log = logging.getLogger("densify")
 _USUAL = ProjectSettings()
 _JITTER = 1.5  # greatest ratio of a used half period to half the shorter neighbouring period
 _NUM_ROW_STEPS = 4  # of the search for the row that observes a point
+AT_ONCE = 1 << 16
+"""Number of points that are projected together: their columns fit into the cache of a core."""
 
 
 @dataclass(frozen=True)
@@ -253,10 +255,14 @@ class Exposure:
 
     def sees(self, cloud: Cloud) -> InView:
         """Return the points in the image of a cloud at the key sweep's reference time."""
-        sight = self.see(cloud.points, cloud.velocity_m_s)
-        rows = np.flatnonzero(sight.inside)
-        points_cam, uv = (a.take(rows, axis=0) for a in (sight.points_cam, sight.uv))
-        return InView(self, rows, points_cam, uv)
+        parts = []
+        for first in range(0, max(1, len(cloud)), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            sight = self.see(cloud.points[part], cloud.velocity_m_s[part])
+            inside = np.flatnonzero(sight.inside)
+            columns = (column.take(inside, axis=0) for column in (sight.points_cam, sight.uv))
+            parts.append((first + inside, *columns))
+        return InView(self, *(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def depth_m(self, points_cam: Float) -> Float:
         """Return the (N,) depth of points (N,3), camera frame: z or range, by ``measure``."""

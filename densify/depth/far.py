@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from densify.depth.exposure import Exposure
+from densify.depth.exposure import AT_ONCE, Exposure
 from densify.depth.patches import FREE, tangents
 from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
@@ -198,10 +198,10 @@ def far_cloud(
     """
     beyond = ~np.isin(found.frames, stretch.frames)
     rows = np.flatnonzero(beyond[found.source])
-    needed = np.zeros(len(rows), bool)
+    needed = np.zeros(len(found), bool)
     for exposure in exposures.values():
-        needed[_seen(found.points.take(rows, axis=0), T_key_found, exposure)] = True
-    rows = rows[needed]
+        needed[_seen(found.points, rows, T_key_found, exposure)] = True
+    rows = np.flatnonzero(needed)
     points = poses.transform(T_key_found, found.points.take(rows, axis=0).astype(np.float64))
     if standing_only:
         ends = sorted({stretch.frames[0], stretch.frames[-1]} - {key})
@@ -235,23 +235,27 @@ def far_cloud(
     return cloud, surface
 
 
-def _seen(points: Float32, T_key_world: Float, exposure: Exposure) -> Int:
-    """Return the row numbers, ascending, of the points (N,3), world frame, that a camera needs.
+def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) -> Int:
+    """Return those of the ``rows`` (K,) of points (N,3), world frame, that a camera needs.
 
     A camera needs one point in every pixel and step of depth, from sweeps in mixed order.
     """
     T_cam_world = exposure.T_cam_key @ T_key_world
-    near = np.flatnonzero(may_see(exposure.camera, T_cam_world, points, _SLACK_M))
-    there = poses.transform(T_key_world, points[near].astype(np.float64))
-    sight = exposure.see(there, np.zeros(there.shape, np.float32))
-    inside = np.flatnonzero(sight.inside)
-    rows, uv = near[inside], sight.uv.take(inside, axis=0)
-    depth_m = exposure.depth_m(sight.points_cam.take(inside, axis=0))
-    place = np.column_stack([uv, np.log(depth_m) / _SAME_DEPTH])
-    cell = np.rint(place.astype(np.float32))
+    kept, cells = [rows[:0]], [np.zeros((0, 3), np.float32)]
+    for first in range(0, len(rows), AT_ONCE):
+        part = rows[first : first + AT_ONCE]
+        near = part[may_see(exposure.camera, T_cam_world, points.take(part, axis=0), _SLACK_M)]
+        there = poses.transform(T_key_world, points.take(near, axis=0).astype(np.float64))
+        sight = exposure.see(there, np.zeros(there.shape, np.float32))
+        inside = np.flatnonzero(sight.inside)
+        depth_m = exposure.depth_m(sight.points_cam.take(inside, axis=0))
+        place = np.column_stack([sight.uv.take(inside, axis=0), np.log(depth_m) / _SAME_DEPTH])
+        kept.append(near[inside])
+        cells.append(np.rint(place.astype(np.float32)))
+    rows = np.concatenate(kept)
     # A pixel is supported only by several sweeps, so neighbouring pixels take different sweeps.
     mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
-    return rows[thinned(cell, mixed, 1.0, 1)]
+    return rows[thinned(np.concatenate(cells), mixed, 1.0, 1)]
 
 
 def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import cg
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from densify.depth.boundary_pixels import MOST_CONFIDENCE, VOTERS_REACH, voted_for
@@ -45,6 +45,7 @@ _LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # share of rays that end on the body
 _VOTES_OF_WHOLE, _VOTES_OF_OPEN = 0.75, 0.97  # share of the votes along the silhouette
 _DEEP_M = 0.6  # farther behind the front of the hull are seats, axles and the far side
 _STIFF, _HELD = 3.0, 0.01  # weights of a smooth and of a small offset, against one return
+_ROUNDING = float(np.finfo(np.float32).eps)  # of the stored depth
 _AGREES = 2.0  # tolerance, as a multiple of the tolerance between two static points of a surface
 
 
@@ -348,7 +349,8 @@ def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
     weight = known[inside].astype(np.float64)
     diagonal = np.asarray(joins.sum(axis=1)).ravel() + weight + _HELD
     found = np.zeros(inside.shape)
-    found[inside] = spsolve((sparse.diags(diagonal) - joins).tocsc(), weight * offset[inside])
+    system = (sparse.diags(diagonal) - joins).tocsr()
+    found[inside] = cg(system, weight * offset[inside], rtol=_ROUNDING)[0]
     return found
 
 

@@ -61,10 +61,11 @@ def thinned(points: Float | Float32, order: Int, step: float, most: int) -> Int:
     """
     cell = np.zeros(len(points), np.int64)
     for x in points.T:
-        along = ((x - x.min(initial=np.inf).astype(np.float64)) / step).astype(np.int64)
-        cell = cell * (along.max(initial=0) + 1) + along
+        along = ((x - x.min(initial=np.inf)) / step).astype(np.int64)
+        cell *= along.max(initial=0) + 1
+        cell += along
     bits = len(order).bit_length()  # the lower bits say the place in the order
-    ranked = np.sort((cell[order] << bits) | np.arange(len(order)))
-    first = np.flatnonzero(np.diff(ranked >> bits, prepend=-1))
-    in_cell = np.arange(len(ranked)) - np.repeat(first, np.diff(first, append=len(ranked)))
-    return np.sort(order[ranked[in_cell < most] & ((1 << bits) - 1)])
+    ranked = np.sort((cell[order] << bits) + np.arange(len(order)))
+    cell, first = ranked >> bits, np.ones(len(ranked), bool)
+    first[most:] = cell[most:] != cell[:-most]
+    return np.sort(order[ranked[first] & ((1 << bits) - 1)])

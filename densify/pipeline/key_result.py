@@ -101,12 +101,15 @@ class KeyScene(NamedTuple):
     watch: Watch
 
 
-def result_of_method(scene: KeyScene, name: str, moment: Moment, filled: bool) -> Result:
+def result_of_method(
+    scene: KeyScene, moments: dict[str, Moment], name: str, filled: bool
+) -> Result:
     """Return the result of one method, without its baselines.
 
     Args:
+        moments: Points at the key's time, as each method accumulates them. Those of this method
+            are taken out to save memory.
         name: Name of the method, of `METHODS`.
-        moment: Points at the key's time, as this method accumulates them.
         filled: Fill holes of the maps by interpolation.
     """
     method, output = METHODS[name], scene.settings.output
@@ -114,10 +117,13 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment, filled: bool) -
     visible = method.visible and scene.settings.project.visibility
 
     far = _see_far(scene, method)
+    cloud, flow, tracks = moments.pop(name)
     with watch.stage("project"):
-        seen = views.see(moment.cloud, visible).joined(far)
+        seen = views.see(cloud, visible)
         if visible:
-            seen = seen._replace(bodies=views.bodies(moment.cloud))
+            seen = seen._replace(bodies=views.bodies(cloud))
+        seen = seen.joined(far)
+        cloud = seen.cloud
     held_out = None
     if scene.held_out is not None:
         with watch.stage("held out"):
@@ -125,9 +131,9 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment, filled: bool) -
     with watch.stage("project"):
         movers = {}
         if output.movers == "separate":
-            movers = views.movers(moment.cloud, visible, seen.bodies, scene.images)
+            movers = views.movers(cloud, visible, seen.bodies, scene.images)
         if output.movers != "keep":
-            static = moment.cloud.select(~moment.cloud.moving)
+            static = cloud.select(~cloud.moving & ~cloud.far)
             seen = views.see(static, visible).joined(far)
         depth = _add_ages(scene, method, views.depth(seen, visible, filled))
         if visible:
@@ -145,8 +151,8 @@ def result_of_method(scene: KeyScene, name: str, moment: Moment, filled: bool) -
         cloud=cloud,
         depth=depth,
         metrics=metrics,
-        flow=moment.flow,
-        tracks=moment.tracks,
+        flow=flow,
+        tracks=tracks,
         movers=movers,
         optical_flow=views.optical_flow(cloud, depth) if output.optical_flow else {},
         rejected=views.rejected(seen, depth) if output.rejected else {},

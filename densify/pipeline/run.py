@@ -239,11 +239,13 @@ def densify(
                 key, method.all_sweeps, method.engine, settings.output.flow != "none"
             )
         beyond = far.result() if far is not None else None
-        cloud = moments[methods[-1]].cloud
-        scene = _scene_of(recording, key, shots, images, beyond, cloud, with_images, watch)
+        scene = _scene_of(
+            *(recording, key, shots, images, beyond, moments[methods[-1]].cloud),
+            *(with_images, watch),
+        )
         filled = [settings.is_scored or name == methods[-1] for name in methods]
-        make = partial(result_of_method, scene)
-        made = list(pool.map(make, methods, moments.values(), filled))
+        make = partial(result_of_method, scene, moments)
+        made = list(pool.map(make, methods, filled))
 
     if priors is not None:
         from densify.pipeline.prior import complete_with_prior
