@@ -173,7 +173,11 @@ def vote(
             image; the share is 0 without voters.
     """
     share = np.zeros(len(pixel), np.float32)
-    lab = np.zeros((0, 0, 3), np.float32) if layers.lab is None else layers.lab
+    # of one layout, or `_vote` is compiled for each
+    lab = (
+        np.zeros((0, 0, 3), np.float32) if layers.lab is None else np.ascontiguousarray(layers.lab)
+    )
+    voters = voters._replace(tilt=np.ascontiguousarray(voters.tilt))
     _vote.over_rows(
         len(pixel), pixel, 1 / depth_m, voters, weight, lab, layers.gap_px, surely, share
     )
@@ -253,7 +257,7 @@ def _vote(first, last, pixel, inverse, voters, weight, lab, gap_px, surely, shar
     gap_px: (H,W) spacing of rays in pixels. The other arguments are as in `vote`.
     """
     width, num = gap_px.shape[1], len(DIRECTIONS)
-    steps, agrees = np.zeros(num, np.int64), np.zeros(num, np.bool_)
+    steps, agrees = np.empty(num, np.int64), np.empty(num, np.bool_)
     doubt = _DOUBT if surely else 0.0
     for i in range(first, last):
         v, u = pixel[i] // width, pixel[i] % width

@@ -267,7 +267,10 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, s
                 continue
             if centre > 0:
                 filled_m[row, column] = 1 / min(max(centre, far), near)
-                confidence[row, column] = inside.confidence[:num].min()
+                least = np.float32(np.inf)
+                for i in range(num):
+                    least = min(least, inside.confidence[i])
+                confidence[row, column] = least
                 tilt[row, column, 0], tilt[row, column, 1] = slope_u, slope_v
                 share[row, column] = (step + 1) / len(reaches)
                 break
@@ -316,7 +319,7 @@ def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  
     in m and least confidence, 0 where the predictions differ.
     """
     height, width = inverse.shape
-    met = np.zeros(len(DIRECTIONS), np.bool_)
+    met = np.empty(len(DIRECTIONS), np.bool_)
     for p in range(first, last):
         row, column = pixel[p] // width, pixel[p] % width
         reach_px = _STAR_REACH * max(spacing_px[row, column, 0], spacing_px[row, column, 1])

@@ -278,7 +278,8 @@ def _by_pixel(pixel, rank, depth, frame, uv, confidence, start, order):  # type:
         start[p + 1] += 1
     for p in range(len(start) - 1):
         start[p + 1] += start[p]
-    filled = np.zeros(len(start) - 1, np.int32)
+    filled = np.empty(len(start) - 1, np.int32)
+    filled[:] = 0
     for i in range(len(pixel)):
         p = pixel[i]
         at = start[p] + filled[p]

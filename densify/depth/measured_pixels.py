@@ -344,7 +344,7 @@ def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-u
     (m), extent of the surface as a multiple of the radius of discontinuities, and number of
     agreeing returns of the key sweep.
     """
-    m, reach = np.zeros(9), np.zeros(8)
+    m, reach = np.empty(9), np.empty(8)
     for p in range(first, last):
         if taken[p] or points.start[p] == points.start[p + 1]:
             continue
@@ -376,4 +376,7 @@ def _settle(first, last, points, few, shape, taken, found):  # type: ignore[no-u
         found[4, p] = np.sqrt(max(squares / m[0] - mean * mean, 0.0)) / (w0 * w0)
         found[5, p] = _ALL_ROUND
         if behind and inner > 0:
-            found[5, p] = reach.min() / inner
+            least = reach[0]
+            for far in reach[1:]:
+                least = min(least, far)
+            found[5, p] = least / inner

@@ -246,7 +246,7 @@ def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, s
     members: (n,) indices of the points. seen: (3,N) of `_look`. cells: of `_nearest_in_cells`.
     """
     right, left = np.array([-2, -1, -3]), np.array([2, 1, 3])
-    same = np.zeros(3, np.int64)
+    same = np.array([0, 0, 0])
     up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
     straight = np.array([0, 1, -1, 0])
     for k in range(first, last):

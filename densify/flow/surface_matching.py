@@ -141,7 +141,8 @@ def _add_matches(
         yaw: Of the object, rad.
         most: Greatest weight of a match.
     """
-    J, JA = np.zeros((2, 3, 3))  # J: derivative of the model's point by x, y and yaw
+    J, JA = np.empty((2, 3, 3))  # J: derivative of the model's point by x, y and yaw
+    J[:] = 0.0
     J[0, 0] = J[1, 1] = np.cos(yaw)
     J[0, 1] = np.sin(yaw)
     J[1, 0] = -J[0, 1]
