@@ -10,6 +10,7 @@ without an image edge between them belong to the same surface.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -112,7 +113,7 @@ def shares(layers: Layers, pixel: Int) -> Float32:
 
 def voted_for(
     layers: Layers,
-    known_m: Float32,
+    known_m: Sequence[Float32],
     pixel: Int,
     depth_m: Float32,
     least_share: float,
@@ -122,15 +123,22 @@ def voted_for(
 
     Args:
         layers: Map with the image, the slopes and the ray spacing.
-        known_m: (H,W) depth in metres of the pixels that vote, 0 for pixels without a vote.
+        known_m: Maps (H,W) with the depth in metres of the pixels that vote, 0 for pixels without a
+            vote. Each map must confirm the depth. All maps have the same depths where they vote.
         pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
         depth_m: (P,) depths to confirm, in metres.
         least_share: Least share of the votes, 0 to 1, that must be for the depth.
         surely: True for the cautious share of `vote`.
     """
-    weight = np.ones_like(known_m)
-    share = vote(layers, _voters(layers, known_m), pixel, depth_m, weight, surely)
-    return share >= _ROUNDED * least_share
+    confirmed, weight = np.ones(len(pixel), bool), np.ones_like(layers.depth_m)
+    steps = None
+    for map_m in known_m:
+        voters = _voters(layers, map_m)
+        other_voters = True if steps is None else (voters.steps != steps).any(axis=0).flat[pixel]
+        rows, steps = np.flatnonzero(confirmed & other_voters), voters.steps
+        share = vote(layers, voters, pixel[rows], depth_m[rows], weight, surely)
+        confirmed[rows] = share >= _ROUNDED * least_share
+    return confirmed
 
 
 class Voters(NamedTuple):

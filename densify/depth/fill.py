@@ -65,10 +65,8 @@ def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     pixel = np.flatnonzero(filled)
     accepted_m = layers.depth_m
     with_rims_m = np.where(layers.behind_patch, accepted_m, np.maximum(accepted_m, layers.rim_m))
-    for known_m in (with_rims_m, accepted_m):
-        depth_m = layers.filled_m.flat[pixel]
-        pixel = pixel[voted_for(layers, known_m, pixel, depth_m, least_share)]
-    filled.flat[pixel] = False
+    maps_m, depth_m = (with_rims_m, accepted_m), layers.filled_m.flat[pixel]
+    filled.flat[pixel] = ~voted_for(layers, maps_m, pixel, depth_m, least_share)
     return layers.without(filled)
 
 

@@ -322,7 +322,7 @@ def _shown(
     layers.tilt[core] = np.stack(list(np.gradient(surface))[::-1], axis=-1)[core]
     shows, votes = core.copy(), _VOTES_OF_WHOLE if whole else _VOTES_OF_OPEN
     pixel, depth_m = np.flatnonzero(outline), surface_m[outline]
-    shows[outline] = voted_for(layers, layers.filled_m, pixel, depth_m, votes, surely=not whole)
+    shows[outline] = voted_for(layers, [layers.filled_m], pixel, depth_m, votes, surely=not whole)
     return shows, shows if whole else core
 
 
