@@ -241,9 +241,11 @@ def lengthen(
         instance: (N,) index of each point's object, -1 for none; changed in place.
         i: First sweep of the batch.
     """
+    batch_s = np.ptp(seen.time_s) if len(seen.time_s) else 0.0
     for k, (track, shape) in enumerate(objects):
         mine = np.flatnonzero(instance == k)
-        if not len(mine) or _speed_m_s(track, i, space.clock) <= _WALKS_M_S:
+        speed_m_s = _speed_m_s(track, i, space.clock)
+        if not len(mine) or speed_m_s <= _WALKS_M_S:
             continue
         at_s = track.seen_at(space.clock.time_ns[i])
         lane = MovingObject(track, shape).lane(at_s)
@@ -251,6 +253,7 @@ def lengthen(
         reach = np.array([1.5 * LANE_M, 1.5 * LANE_M, np.inf])
         rows = seen.strips.rows_inside(middle - reach, middle + reach)
         rows = rows[instance[rows] < 0]
+        rows = rows[lane.holds(seen.points[rows], speed_m_s * batch_s)]
         at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
         fits = lane.holds(at_once)
         rows, along = rows[fits], at_once[fits, :2] @ lane.ahead

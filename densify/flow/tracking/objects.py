@@ -162,7 +162,8 @@ class Track:
         """
         way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
         start = self.centre[:2] + np.outer([-_BESIDE_M, 0.0, _BESIDE_M], [-way[1], way[0]])
-        return float(np.median(ground.under(start + state[:2]) - ground.under(start)))
+        before_m, there_m = ground.under(np.concatenate([start, start + state[:2]])).reshape(2, -1)
+        return float(np.sort(there_m - before_m)[len(start) // 2])
 
     def seen_at(self, time_ns: int) -> float:
         """Estimate when (s) the sweep with a reference time ``time_ns`` measures the object.
@@ -286,8 +287,8 @@ class Lane(NamedTuple):
     left_m: float
     top_m: float
 
-    def holds(self, points: Float) -> Bool:
-        """Return (N,) True for points (N,3, world) inside the lane."""
+    def holds(self, points: Float, slack_m: float = 0.0) -> Bool:
+        """Return (N,) True for points (N,3, world) inside the lane or within ``slack_m`` of it."""
         aside = points[:, :2] @ [-self.ahead[1], self.ahead[0]]
-        inside: Bool = (aside > self.right_m) & (aside < self.left_m) & (points[:, 2] < self.top_m)
-        return inside
+        inside: Bool = (aside > self.right_m - slack_m) & (aside < self.left_m + slack_m)
+        return inside & (points[:, 2] < self.top_m + slack_m)

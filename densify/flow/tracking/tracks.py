@@ -108,19 +108,13 @@ class _Search:
         return [track for track, _ in self._objects]
 
     def _keep(self, track: Track) -> None:
-        """Keep a confirmed track, unless a last test rejects it as a piece of a guard rail."""
+        """Keep a confirmed track, with all points that its motion explains."""
         self._gather(track)
-        # A piece of a guard rail is recognised by the rest of it.
-        if not self._judge(track).moves:
-            return
         _refine(track, self._obstacles, self._ground)
         self._claim_in_line(track)
         for j, rows in track.claimed.items():
             self._free[j][rows] = False
         self._objects.append(MovingObject(track, self._shape_of(track)))
-
-    def _judge(self, track: Track) -> Verdict:
-        return judge(track, self._obstacles, self._space, self._objects, self._judged)
 
     def _shape_of(self, track: Track) -> Shape:
         return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
@@ -165,7 +159,7 @@ class _Search:
         track = self._follower.follow(members, n, velocity)
         if len(track.observations) > 1:
             track.smooth()
-        return track, self._judge(track)
+        return track, judge(track, self._obstacles, self._space, self._objects, self._judged)
 
     def _gather(self, track: Track) -> None:
         """Claim, in place, free candidates in or near the object that its motion explains.

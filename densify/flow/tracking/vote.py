@@ -22,7 +22,6 @@ _MAX_SPEED_M_S = 38.0
 _NEAR_S = 0.1  # time to the nearer batches; the others are twice as far
 _STEP_M = 0.2  # side of a voxel
 _FEW_POINTS, _MANY_POINTS = 60, 600
-_TIMES_ASKED = 2  # iterations, because the firing time depends on the position
 _FINE_S, _FINE_M_S = 0.5, 0.2  # time span and velocity step of the last vote
 
 
@@ -70,10 +69,9 @@ class DistanceField:
         """
         if self.tree is None:
             return
-        _, row = nearest(self.tree, group.middle[None])
-        for _ in range(_TIMES_ASKED):
-            elapsed_s = self.time_s[row] - group.middle_s
-            _, row = nearest(self.tree, group.middle + elapsed_s[:, None] * velocities)
+        _, row = nearest(self.tree, group.middle[None])  # the firing time depends on the position
+        moved = group.middle + (self.time_s[row] - group.middle_s) * velocities
+        _, row = nearest(self.tree, moved)
         elapsed_s = self.time_s[row] - group.middle_s
         _look_up.over_rows(
             len(velocities),
