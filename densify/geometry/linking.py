@@ -57,17 +57,18 @@ def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: floa
         within_m: Distance in metres, for both tests.
         least_share: Share of 0 to 1.
     """
-    seeds = points[seed]
+    close, seeds = np.zeros(len(points), bool), points[seed]
     if not len(seeds):
-        return np.zeros(len(points), bool)
+        return close
+    near = np.flatnonzero(is_near(tree_of(seeds), points, within_m))
     num_points, num_seeds = (
         tree_of(cloud).query_ball_point(seeds, within_m, return_length=True)
-        for cloud in (points, seeds)
+        for cloud in (points[near], seeds)
     )
-    seeds = seeds[num_seeds >= least_share * num_points]
-    if not len(seeds):
-        return np.zeros(len(points), bool)
-    return is_near(tree_of(seeds), points, within_m)
+    dense = seeds[num_seeds >= least_share * num_points]
+    if len(dense):
+        close[near] = is_near(tree_of(dense), points[near], within_m)
+    return close
 
 
 @Kernel
