@@ -122,7 +122,7 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     """
     import laspy
 
-    if len(cloud) and not np.abs(cloud.points).max() < _MAX_COORDINATE_M:
+    if len(cloud) and not max(cloud.points.max(), -cloud.points.min()) < _MAX_COORDINATE_M:
         raise ValueError(f"cloud: expected finite points within {_MAX_COORDINATE_M:.0f} m")
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.scales = np.full(3, _SCALE_M)
@@ -141,9 +141,11 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     las.red, las.green, las.blue = (cloud.rgb.astype(np.uint16) * 257).T
     las.return_number = np.ones(len(cloud), np.uint8)
     las.number_of_returns = np.ones(len(cloud), np.uint8)
-    vector = dict(zip(_DISPLACED, (cloud.points - cloud.rigid_points).T, strict=True))
+    for axis, name in enumerate(_DISPLACED):
+        las[name] = (cloud.points[:, axis] - cloud.rigid_points[:, axis]).astype(np.float32)
     for name, kind, _ in _EXTRA_DIMENSIONS:
-        las[name] = (vector[name] if name in vector else getattr(cloud, name)).astype(kind)
+        if name not in _DISPLACED:
+            las[name] = getattr(cloud, name).astype(kind)
     buffer = io.BytesIO()
     las.write(buffer, do_compress=True)
     write_file(path, buffer.getvalue())
