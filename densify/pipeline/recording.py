@@ -128,6 +128,7 @@ class Recording:
         self._sweeps = Sweeps(
             sequence, timeline, settings.register, num_raw, cache, run, self._watch
         )
+        self.forget_raw = self._sweeps.read.cache_clear
         self.registration = lru_cache(maxsize=2)(self._registration)
         self._pieces = lru_cache(maxsize=2)(self._find_pieces)
         # Keyed by the index of the block and of the piece, because a Piece cannot be hashed.

@@ -239,6 +239,8 @@ def densify(
                 key, method.all_sweeps, method.engine, settings.output.flow != "none"
             )
         beyond = far.result() if far is not None else None
+        if len(recording.cut.blocks) == 1:  # no other block needs them
+            recording.forget_raw()
         scene = _scene_of(
             *(recording, key, shots, images, beyond, moments[methods[-1]].cloud),
             *(with_images, watch),
