@@ -37,6 +37,7 @@ _STEP_M = 2.0
 _MOST_S = 15.0  # on each side; a standing vehicle observes nothing new
 _LEAST_STEP_M = 0.5 * _STEP_M
 _SAME_VIEW_M = 3.0
+_UNSEEN_SHARE = 0.5  # of far_m where no camera looks: those sweeps are farther from what is seen
 _SLACK_M = 4.0  # motion of a lidar within a sweep, and of a camera until its exposure
 
 _View = tuple[Camera, Float]
@@ -68,7 +69,8 @@ class Road:
         sweeps: Reader of the raw sweeps.
         cameras: Cameras that must see a point for it to be kept.
         settings: Settings of registration.
-        far_m: Distance along the road on each side of the window.
+        far_m: Distance along the road on each side of the window where a camera looks. Half of
+            it is covered where no camera looks.
     """
 
     timeline: Timeline
@@ -110,7 +112,9 @@ class Road:
         last = near.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
         begin_m = 0.0 if side < 0 else _travel_m(near)[-1]
         found, last_m, travel_m = list[_Passed](), 0.0, 0.0
-        for sweep, T_world_lidar, twist in self._sweeps_beyond(near, side):
+        seen_m = self.far_m if self._is_seen(near, views, side) else _UNSEEN_SHARE * self.far_m
+        road = replace(self, far_m=seen_m)
+        for sweep, T_world_lidar, twist in road._sweeps_beyond(near, side):
             travel_m += float(np.linalg.norm(T_world_lidar[:3, 3] - last))
             last = T_world_lidar[:3, 3]
             if travel_m - last_m < _LEAST_STEP_M:
@@ -121,6 +125,19 @@ class Road:
             registered = RegisteredSweep(seen, T_world_lidar, twist, twist)
             found.append(_Passed(registered, sample, begin_m + side * travel_m, known=False))
         return found
+
+    def _is_seen(self, near: Stretch, views: Sequence[_View], side: int) -> bool:
+        """Return True if a camera may see the road's end before (side -1) or after the window.
+
+        It is True for both sides of a window in which the vehicle stands.
+        """
+        first, last = (near.sweeps[row].T_world_lidar[:3, 3] for row in (0, -1))
+        length_m = float(np.linalg.norm(last - first))
+        if length_m < _LEAST_STEP_M:
+            return True
+        way = side * self.far_m * (last - first) / length_m
+        end = ((last if side > 0 else first) + way)[None].astype(np.float32)
+        return any(far.may_see(*view, end, _SLACK_M).any() for view in views)
 
     def _views(self, near: Stretch, keys: Sequence[int]) -> list[_View]:
         """Return the views of all cameras at the keys. Keys less than 3 m apart share a view."""
