@@ -55,14 +55,14 @@ class HeightMap:
             clouds: Clouds of (N,3) points in metres, z up, with at least one point in all.
         """
         low, shape = _grid(clouds)
-        lowest, second = np.full((2, *shape), np.inf)
-        for points in clouds:
-            np.minimum.at(lowest, _cells(points, low), points[:, 2])
-        for points in clouds:
-            cells = _cells(points, low)
-            rows = np.flatnonzero(points[:, 2] > lowest[cells])
-            np.minimum.at(second, (cells[0][rows], cells[1][rows]), points[rows, 2])
-        heights = np.where(np.isfinite(second), second, lowest)
+        cells = [_cells(points, low, shape[1]) for points in clouds]
+        lowest, second = np.full((2, shape[0] * shape[1]), np.inf)
+        for points, cell in zip(clouds, cells, strict=True):
+            np.minimum.at(lowest, cell, points[:, 2])
+        for points, cell in zip(clouds, cells, strict=True):
+            rows = np.flatnonzero(points[:, 2] > lowest[cell])
+            np.minimum.at(second, cell[rows], points[rows, 2])
+        heights = np.where(np.isfinite(second), second, lowest).reshape(shape)
 
         known = np.isfinite(heights)
         nearest = ndimage.distance_transform_edt(
@@ -72,7 +72,7 @@ class HeightMap:
         heights = np.where(known & (heights < around - rise_m * (_WINDOW // 2)), around, heights)
         heights = _slope_limited(heights, rise_m)
         hull = HeightMap(_without_humps(heights[tuple(nearest)]), low, CELL_M)
-        return HeightMap(_averaged(hull, clouds), low, CELL_M)
+        return HeightMap(_averaged(hull, clouds, cells), low, CELL_M)
 
     def under(self, points: Float) -> Float:
         """Return the (N,) ground height in metres at points (N,2) or (N,3).
@@ -91,32 +91,32 @@ class HeightMap:
 
 def _grid(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
     """Return the (2,) lower corner of a grid around all points, and its numbers of cells."""
-    low = np.min([p[:, :2].min(axis=0, initial=np.inf) for p in clouds], axis=0)
-    high = np.max([p[:, :2].max(axis=0, initial=-np.inf) for p in clouds], axis=0)
+    low = np.array([min(p[:, i].min(initial=np.inf) for p in clouds) for i in (0, 1)])
+    high = np.array([max(p[:, i].max(initial=-np.inf) for p in clouds) for i in (0, 1)])
     low = np.floor(low / CELL_M) * CELL_M
     num_x, num_y = ((high - low) / CELL_M).astype(np.int64) + 1
     return low, (int(num_x), int(num_y))
 
 
-def _cells(points: Float, low_m: Float) -> tuple[Int, Int]:
-    """Return the (N,) row and the (N,) column of each point's grid cell."""
-    x, y = ((points[:, :2] - low_m) / CELL_M).astype(np.int64).T
-    return x, y
+def _cells(points: Float, low_m: Float, num_y: int) -> Int:
+    """Return the (N,) number of each point's grid cell; a row of the grid has ``num_y`` cells."""
+    x, y = (((points[:, i] - low_m[i]) / CELL_M).astype(np.int64) for i in (0, 1))
+    return x * num_y + y
 
 
-def _averaged(hull: HeightMap, clouds: Sequence[Float]) -> Float:
+def _averaged(hull: HeightMap, clouds: Sequence[Float], cells: Sequence[Int]) -> Float:
     """Return the (X,Y) mean height of the points close to the hull around each cell.
 
     The hull itself is lower where more points were measured, and an object driving there would seem
-    to climb.
+    to climb. cells: (N,) number of the cell of each point of each cloud.
     """
-    total, number = np.zeros((2, *hull.heights_m.shape))
-    for points in clouds:
+    total, number = np.zeros((2, hull.heights_m.size))
+    for points, cell in zip(clouds, cells, strict=True):
         over_m = points[:, 2] - hull.under(points)
         rows = np.flatnonzero(np.abs(over_m) < MAX_SLOPE * CELL_M)
-        cells = _cells(points[rows], hull.low_m)
-        np.add.at(number, cells, 1)
-        np.add.at(total, cells, over_m[rows])
+        np.add.at(number, cell[rows], 1)
+        np.add.at(total, cell[rows], over_m[rows])
+    total, number = (n.reshape(hull.heights_m.shape) for n in (total, number))
     total, number = (ndimage.uniform_filter(n, 3, mode="constant") * 9 for n in (total, number))
     mean: Float = hull.heights_m + total / np.maximum(number, 1)
     return mean
