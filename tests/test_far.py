@@ -14,6 +14,7 @@ from densify.geometry import poses
 from densify.geometry.nearest import thinned
 from densify.readers.timeline import Timeline
 from densify.registration import road_poses
+from densify.registration.alignment import Surface
 from densify.registration.road_poses import follow_road
 from densify.scores.depth_metrics import depth_scores
 from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
@@ -132,16 +133,17 @@ def test_the_chain_finds_the_true_poses(side, monkeypatch):
     stamp_ns = np.array([timeline.stamp_of(f) for f in frames])
 
     read = sequence.__getitem__
-    found = follow_road(known, list(frames), stamp_ns, read, lambda _: None, 12.0, 2.0)
-    first = list(found)
-    steps = np.diff([s.frame for s, *_ in first])
+    surfaces = [Surface.of_sweep(s.sweep) for s in known]
+    found = follow_road(known, surfaces, list(frames), stamp_ns, read, lambda _: None, 12.0, 2.0)
+    first = [one for one, _ in found]
+    steps = np.diff([one.frame for one in first])
     assert set(np.abs(steps[:-1])) <= {2, 3} and len(first) >= 4
     T_world_true = stretch[KEY].T_world_lidar @ poses.inverse(sequence.T_world_lidar(KEY))
-    for sweep, T_world_lidar, *_ in first:
-        T_true = T_world_true @ sequence.T_world_lidar(sweep.frame)
-        error = poses.log(poses.inverse(T_true) @ T_world_lidar)
-        assert np.linalg.norm(error[3:]) < 0.03, sweep.frame
-        assert np.rad2deg(np.linalg.norm(error[:3])) < 0.1, sweep.frame
+    for one in first:
+        T_true = T_world_true @ sequence.T_world_lidar(one.frame)
+        error = poses.log(poses.inverse(T_true) @ one.T_world_lidar)
+        assert np.linalg.norm(error[3:]) < 0.03, one.frame
+        assert np.rad2deg(np.linalg.norm(error[:3])) < 0.1, one.frame
 
 
 def test_thinning_keeps_the_first_of_each_cell():

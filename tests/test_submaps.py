@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from densify.geometry import poses
 from densify.geometry.types import Sweep
 from densify.registration import road_poses
-from densify.registration.alignment import Alignment, subsample
+from densify.registration.alignment import Alignment, Surface, subsample
 from densify.registration.road_poses import relax_poses
 from tests.scenes import Arc, Scanner, Scene, World, street
 
@@ -22,12 +22,12 @@ EGO = Arc(0, -1.5, 0, 8.0, 0.02)
 
 @cache
 def true():
-    """Frames 1.6 m apart, points as if the lidar stood still, and true poses."""
+    """Frames 1.6 m apart, surfaces as if the lidar stood still, and true poses."""
     scene = Scene(World(street(60.0)), EGO, Scanner(48, 720, sigma_m=0.01))
     stretch = scene.stretch(NUM, NUM)
     sweeps = stretch.sweeps[: 2 * NUM : 2]
     T_world_lidar = np.stack([s.T_world_lidar for s in sweeps])
-    return [s.frame for s in sweeps], [s.sweep.points for s in sweeps], T_world_lidar
+    return [s.frame for s in sweeps], [Surface.of_sweep(s.sweep) for s in sweeps], T_world_lidar
 
 
 def displaced(step_m: float, begin: int = 9):
@@ -54,9 +54,9 @@ def errors(T_world_lidar):
 
 @pytest.mark.parametrize("num_sweeps", [1, 2])
 def test_drift_is_mended(num_sweeps):
-    _, points, _ = true()
+    _, surfaces, _ = true()
     given = displaced(0.0)
-    found = relax_poses(points, given, KNOWN, num_sweeps)
+    found = relax_poses(surfaces, given, KNOWN, num_sweeps)
     before, after = errors(given), errors(found.T_world_lidar)
     if num_sweeps == 1:
         assert before[0].max() > 0.08 and after[0].max() < 0.02
@@ -68,15 +68,15 @@ def test_drift_is_mended(num_sweeps):
 
 
 def test_a_step_is_corrected():
-    _, points, _ = true()
-    found = relax_poses(points, displaced(0.7), KNOWN, 1)
+    _, surfaces, _ = true()
+    found = relax_poses(surfaces, displaced(0.7), KNOWN, 1)
     assert errors(found.T_world_lidar)[0].max() < 0.02
     assert found.holds.all()
 
 
 def test_what_cannot_be_mended_is_left_out():
-    _, points, _ = true()
-    found = relax_poses(points, displaced(7.0), KNOWN, 1)
+    _, surfaces, _ = true()
+    found = relax_poses(surfaces, displaced(7.0), KNOWN, 1)
     assert found.holds[:9].all() and not found.holds[9:].any()
     assert errors(found.T_world_lidar)[0][:9].max() < 0.02
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,18 +18,16 @@ from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import (
-    Bool,
     Camera,
     Float,
     RegisteredSweep,
     StandingWorld,
     Stretch,
-    Sweep,
     Trajectory,
 )
 from densify.pipeline.sweeps import Sweeps
 from densify.readers.timeline import Timeline
-from densify.registration.alignment import subsample
+from densify.registration.alignment import Surface
 from densify.registration.deskew import deskew_sweep, twists
 from densify.registration.road_poses import follow_road, num_in_submap, relax_poses
 
@@ -49,13 +47,13 @@ class _Passed(NamedTuple):
 
     Attributes:
         registered: Returns in view of a camera, with the pose; deskewed if ``known``, else raw.
-        sample: (N,3) deskewed positions of a sample of all returns, metres, lidar frame.
+        surface: Surface of all returns, deskewed, in the lidar frame; None with recorded poses.
         travel_m: Distance along the road from the window's first sweep, negative before it.
         known: True if the sweep is in the window, where poses are known.
     """
 
     registered: RegisteredSweep
-    sample: Float
+    surface: Surface | None
     travel_m: float
     known: bool
 
@@ -88,10 +86,15 @@ class Road:
             with_near: Include the points of ``near``.
         """
         sensors, views = Sensors.of(near.sweeps), self._views(near, keys)
-        with ThreadPoolExecutor(2) as pool:
-            behind, ahead = pool.map(partial(self._beyond, near, views), (-1, 1))
-        passed, left_out = [*behind[::-1], *_within(near, views), *ahead], frozenset[int]()
-        if self.settings.source != "dataset" and len(passed) > 1:
+        is_recorded, surfaces = self.settings.source == "dataset", dict[int, Surface]()
+        with ThreadPoolExecutor(num_threads()) as pool:
+            if not is_recorded:
+                found = pool.map(Surface.of_sweep, (s.sweep for s in near.sweeps))
+                surfaces = dict(zip(near.frames, found, strict=True))
+            behind, ahead = pool.map(partial(self._beyond, near, surfaces, views), (-1, 1))
+        inside = _within(near, surfaces, views)
+        passed, left_out = [*behind[::-1], *inside, *ahead], frozenset[int]()
+        if not is_recorded and len(passed) > 1:
             passed, left_out = _relaxed(passed, near)
         used = [
             p for p in passed if (with_near or not p.known) and p.registered.frame not in left_out
@@ -104,26 +107,31 @@ class Road:
             parts = list(pool.map(standing, deskewed, travel_m.tolist(), gone))
         return replace(far.joined(parts), left_out=tuple(sorted(left_out)))
 
-    def _beyond(self, near: Stretch, views: Sequence[_View], side: int) -> list[_Passed]:
+    def _beyond(
+        self,
+        near: Stretch,
+        surfaces: Mapping[int, Surface],
+        views: Sequence[_View],
+        side: int,
+    ) -> list[_Passed]:
         """Return the sweeps before (side -1) or after (side 1) the window, nearest first.
 
-        near: registered sweeps of the window. views: cameras that must see a return to keep it.
+        near: registered sweeps of the window. surfaces: their surfaces by frame number. views:
+        cameras that must see a return to keep it.
         """
         last = near.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
         begin_m = 0.0 if side < 0 else _travel_m(near)[-1]
         found, last_m, travel_m = list[_Passed](), 0.0, 0.0
         seen_m = self.far_m if self._is_seen(near, views, side) else _UNSEEN_SHARE * self.far_m
         road = replace(self, far_m=seen_m)
-        for sweep, T_world_lidar, twist in road._sweeps_beyond(near, side):
-            travel_m += float(np.linalg.norm(T_world_lidar[:3, 3] - last))
-            last = T_world_lidar[:3, 3]
+        for one, surface in road._sweeps_beyond(near, surfaces, side):
+            travel_m += float(np.linalg.norm(one.T_world_lidar[:3, 3] - last))
+            last = one.T_world_lidar[:3, 3]
             if travel_m - last_m < _LEAST_STEP_M:
                 continue
             last_m = travel_m
-            seen = sweep.select(_in_view(sweep, T_world_lidar, views))
-            sample = deskew_sweep(subsample(sweep), T_world_lidar, twist, twist).sweep.points
-            registered = RegisteredSweep(seen, T_world_lidar, twist, twist)
-            found.append(_Passed(registered, sample, begin_m + side * travel_m, known=False))
+            at_m = begin_m + side * travel_m
+            found.append(_Passed(_in_view(one, views), surface, at_m, known=False))
         return found
 
     def _is_seen(self, near: Stretch, views: Sequence[_View], side: int) -> bool:
@@ -153,8 +161,10 @@ class Road:
             for T in chosen
         ]
 
-    def _sweeps_beyond(self, near: Stretch, side: int) -> Iterator[tuple[Sweep, Float, Float]]:
-        """Yield (raw sweep, ``T_world_lidar``, (6,) velocity in rad/s, m/s), nearest first."""
+    def _sweeps_beyond(
+        self, near: Stretch, surfaces: Mapping[int, Surface], side: int
+    ) -> Iterator[tuple[RegisteredSweep, Surface | None]]:
+        """Yield each raw sweep with its pose, and its surface, nearest first."""
         known = near.sweeps[::side]
         beside = self.timeline.before if side < 0 else self.timeline.after
         frames = beside(known[-1].frame, self._most_sweeps(near))[::side]
@@ -162,7 +172,8 @@ class Road:
             return self._recorded(known[-1], frames)
         stamp_ns = np.array([self.timeline.stamp_of(f) for f in frames], np.int64)
         read, prepare = self.sweeps.read, self.sweeps.prepare
-        return follow_road(known, frames, stamp_ns, read, prepare, self.far_m, _STEP_M)
+        own = [surfaces[s.frame] for s in known]
+        return follow_road(known, own, frames, stamp_ns, read, prepare, self.far_m, _STEP_M)
 
     def _most_sweeps(self, near: Stretch) -> int:
         """Return the number of sweeps that cover ``far_m`` at half the speed of the window."""
@@ -176,7 +187,7 @@ class Road:
 
     def _recorded(
         self, known: RegisteredSweep, frames: Sequence[int]
-    ) -> Iterator[tuple[Sweep, Float, Float]]:
+    ) -> Iterator[tuple[RegisteredSweep, None]]:
         """Yield the values of `_sweeps_beyond` from the recording's own poses."""
         travel_m, last_m, last, last_ns = 0.0, 0.0, known.T_world_lidar, known.sweep.stamp_ns
         try:
@@ -191,7 +202,7 @@ class Road:
                     return
                 if travel_m - last_m >= _LEAST_STEP_M:
                     last_m = travel_m
-                    yield self.sweeps.read(frame), T, twist
+                    yield RegisteredSweep(self.sweeps.read(frame), T, twist, twist), None
         except InputError:  # the road ends without a pose or a sweep
             return
 
@@ -214,14 +225,15 @@ def _travel_m(near: Stretch) -> Float:
     return np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
 
 
-def _within(near: Stretch, views: Sequence[_View]) -> list[_Passed]:
+def _within(
+    near: Stretch, surfaces: Mapping[int, Surface], views: Sequence[_View]
+) -> list[_Passed]:
     """Return the window's sweeps, thinned to at least 1 m between sweeps."""
     found, last_m = list[_Passed](), -np.inf
     for s, at_m in zip(near.sweeps, _travel_m(near).tolist(), strict=True):
         if at_m - last_m >= _LEAST_STEP_M:
             last_m = at_m
-            seen = replace(s, sweep=s.sweep.select(_in_view(s.sweep, s.T_world_lidar, views)))
-            found.append(_Passed(seen, subsample(s.sweep).points, at_m, known=True))
+            found.append(_Passed(_in_view(s, views), surfaces.get(s.frame), at_m, known=True))
     return found
 
 
@@ -238,7 +250,7 @@ def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], f
     """
     frames = tuple(p.registered.frame for p in passed)
     found = relax_poses(
-        [p.sample for p in passed],
+        [p.surface for p in passed if p.surface is not None],
         np.stack([p.registered.T_world_lidar for p in passed]),
         np.array([p.known for p in passed]),
         num_in_submap(float(np.median([len(s.sweep) for s in near.sweeps]))),
@@ -253,11 +265,12 @@ def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], f
     return moved, frozenset(f for f, holds in zip(frames, found.holds, strict=True) if not holds)
 
 
-def _in_view(sweep: Sweep, T_world_lidar: Float, views: Sequence[_View]) -> Bool:
-    """Return (N,) True for returns of a raw sweep that one of the cameras may see.
+def _in_view(registered: RegisteredSweep, views: Sequence[_View]) -> RegisteredSweep:
+    """Return a sweep with only those returns that one of the cameras may see.
 
-    T_world_lidar: (4,4) pose of the sweep. views: cameras and their poses in the same world.
+    views: cameras and their poses in the world of the sweep.
     """
+    sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     keep = np.zeros(len(sweep), bool)
     rows = np.flatnonzero(far.in_reach(sweep))
     points = sweep.points[rows].astype(np.float32)
@@ -265,4 +278,4 @@ def _in_view(sweep: Sweep, T_world_lidar: Float, views: Sequence[_View]) -> Bool
         inside = far.may_see(camera, T_cam_world @ T_world_lidar, points, _SLACK_M)
         keep[rows[inside]] = True
         rows, points = rows[~inside], points[~inside]
-    return keep
+    return replace(registered, sweep=sweep.select(keep))

@@ -8,6 +8,7 @@ point cloud registration", JOSS 2024.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,6 +59,19 @@ class Surface(NamedTuple):
         import small_gicp
 
         return Surface(*small_gicp.preprocess_points(points, voxel_m, num_neighbors, 1))
+
+    @staticmethod
+    def of_sweep(sweep: Sweep) -> Surface:
+        """Return the surface of a deskewed sweep, in its lidar frame."""
+        return Surface.of(subsample(sweep).points)
+
+    @staticmethod
+    def joined(surfaces: Sequence[Surface], T_joined_surface: Float) -> Surface:
+        """Return the surface of n surfaces, each with its pose (n,4,4) in the joint frame."""
+        moved = zip(T_joined_surface, surfaces, strict=True)
+        return Surface.of(
+            np.concatenate([poses.transform(T, s.points.points()[:, :3]) for T, s in moved])
+        )
 
 
 class Alignment(NamedTuple):
@@ -155,7 +169,7 @@ class Misfit(NamedTuple):
 
 def find_misfit(target: RegisteredSweep, source: RegisteredSweep) -> Misfit:
     """Return the error of the given relative pose of two deskewed sweeps, found by alignment."""
-    onto, moved = (Surface.of(subsample(s.sweep).points) for s in (target, source))
+    onto, moved = (Surface.of_sweep(s.sweep) for s in (target, source))
     T = poses.inverse(target.T_world_lidar) @ source.T_world_lidar
     found = align(onto, moved, T, _MISFIT_M)
     off = poses.log(poses.inverse(T) @ found.T_target_source)

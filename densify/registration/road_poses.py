@@ -26,13 +26,14 @@ from densify.registration.deskew import deskew_sweep
 from densify.registration.trajectory import MIN_NUM_POINTS, MIN_OVERLAP, find_jump
 
 _CHAIN_MATCH_M = 2.0
+_FEW_POINTS = 15_000  # of a sweep, which find its pose in the chain
 _MAP_NS = 550_000_000  # known sweeps within this time make the first map
 _LONGEST_GAP_S = 0.4  # greatest time between two sweeps of the chain
 _TOGETHER = 6  # sweeps that are chosen together, at one speed
 
 _LEAST_POINTS = 80_000  # points of a submap; rings of fewer points slide onto each other
 _MOST_SWEEPS = 5
-_APART = (1, 2, 4, 8)  # distances of the pairs, in submaps
+_APART = (1, 4, 8)  # distances of the pairs, in submaps
 _MATCH_M = 0.6
 _USUAL_M = 0.02  # usual error of a pair; a pair with a much larger error has less weight
 _MOST_STEPS, _CONVERGED = 10, 1e-6
@@ -41,14 +42,15 @@ _LEAST_OVERLAP, _MOST_LEFT_M, _MOST_WRONG = 0.5, 0.1, 0.25
 
 def follow_road(
     known: Sequence[RegisteredSweep],
+    surfaces: Sequence[Surface],
     frames: Sequence[int],
     stamp_ns: Int,
     read: Callable[[int], Sweep],
     prepare: Callable[[Sequence[int]], None],
     reach_m: float,
     step_m: float,
-) -> Iterator[tuple[Sweep, Float, Float]]:
-    """Register raw sweeps along the road one after another, and yield each with its pose.
+) -> Iterator[tuple[RegisteredSweep, Surface]]:
+    """Register raw sweeps along the road one after another, and yield each with its surface.
 
     Each sweep is aligned with a map of the sweeps before it, starting at constant velocity. The
     chain ends at a sweep that cannot be read, is too sparse, does not fit the map, or would need an
@@ -56,6 +58,7 @@ def follow_road(
 
     Args:
         known: Registered sweeps of the window, the sweep next to ``frames`` last.
+        surfaces: Surface of each known sweep, in its lidar frame.
         frames: Frame numbers along the road, ascending or descending in time, nearest first.
         stamp_ns: (n,) reference times of ``frames``.
         read: Returns the raw sweep of a frame.
@@ -64,10 +67,10 @@ def follow_road(
         step_m: Approximate distance between sweeps. Sweeps in between are not read.
 
     Yields:
-        The raw sweep, its ``T_world_lidar`` (4,4), and the (6,) velocity (rad/s, m/s) of the lidar.
+        The raw sweep with its pose, and its surface, deskewed, in its lidar frame.
     """
     backwards = len(frames) > 0 and int(stamp_ns[0]) < known[-1].sweep.stamp_ns
-    end, travel_m, row = _ChainEnd(known, backwards), 0.0, 0
+    end, travel_m, row = _ChainEnd(known, surfaces, backwards), 0.0, 0
     while travel_m < reach_m and row < len(frames):
         rows = _next_rows(stamp_ns, row, end.stamp_ns, step_m, end.speed_m_s)
         prepare([frames[r] for r in rows])
@@ -77,10 +80,11 @@ def follow_road(
             except InputError:
                 return
             before_ns = end.stamp_ns
-            if not end.move_to(sweep):
+            surface = end.move_to(sweep)
+            if surface is None:
                 return
             travel_m += end.speed_m_s * abs(end.stamp_ns - before_ns) * 1e-9
-            yield sweep, end.T_world_lidar, end.twist
+            yield RegisteredSweep(sweep, end.T_world_lidar, end.twist, end.twist), surface
             if travel_m >= reach_m:
                 return
         row = rows[-1] + 1
@@ -89,12 +93,14 @@ def follow_road(
 class _ChainEnd:
     """The map of all sweeps registered so far, and pose, time and velocity of the last sweep."""
 
-    def __init__(self, known: Sequence[RegisteredSweep], backwards: bool) -> None:
+    def __init__(
+        self, known: Sequence[RegisteredSweep], surfaces: Sequence[Surface], backwards: bool
+    ) -> None:
         """Begin with the ``known`` sweeps; ``backwards`` if the chain goes back in time."""
         self._map, last = SurfaceMap(), known[-1]
-        for s in known:
+        for s, surface in zip(known, surfaces, strict=True):
             if abs(s.sweep.stamp_ns - last.sweep.stamp_ns) <= _MAP_NS:
-                self._map.insert(Surface.of(subsample(s.sweep).points), s.T_world_lidar)
+                self._map.insert(surface, s.T_world_lidar)
         self.T_world_lidar, self.stamp_ns = last.T_world_lidar, last.sweep.stamp_ns
         self.twist = last.twist_before if backwards else last.twist_after
 
@@ -102,22 +108,26 @@ class _ChainEnd:
     def speed_m_s(self) -> float:
         return float(np.linalg.norm(self.twist[3:]))
 
-    def move_to(self, sweep: Sweep) -> bool:
-        """Align the next sweep with the map and add it; return False if that fails."""
+    def move_to(self, sweep: Sweep) -> Surface | None:
+        """Align the next sweep with the map, add it, and return its surface; None if that fails."""
         if len(sweep) < MIN_NUM_POINTS:
-            return False
+            return None
         step_s = (sweep.stamp_ns - self.stamp_ns) * 1e-9
-        deskewed = deskew_sweep(subsample(sweep), self.T_world_lidar, self.twist, self.twist)
-        surface = Surface.of(deskewed.sweep.points)
         guess = self.T_world_lidar @ poses.exp(self.twist * step_s)
+        surface = _surface(subsample(sweep, _FEW_POINTS), self.twist)
         found = self._map.align(surface, guess, _CHAIN_MATCH_M)
         twist = poses.twist_between(self.T_world_lidar, found.T_target_source, step_s)
         if found.overlap < MIN_OVERLAP or find_jump(twist, self.twist, abs(step_s)):
-            return False
+            return None
         self.T_world_lidar, self.stamp_ns = found.T_target_source, sweep.stamp_ns
-        self.twist = twist
+        self.twist, surface = twist, _surface(subsample(sweep), twist)
         self._map.insert(surface, self.T_world_lidar)
-        return True
+        return surface
+
+
+def _surface(sweep: Sweep, twist: Float) -> Surface:
+    """Return the surface of a raw sweep, deskewed by a (6,) velocity (rad/s, m/s)."""
+    return Surface.of(deskew_sweep(sweep, np.eye(4), twist, twist).sweep.points)
 
 
 def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: float) -> list[int]:
@@ -164,7 +174,7 @@ def num_in_submap(num_points: float) -> int:
 
 
 def relax_poses(
-    points: Sequence[Float], T_world_lidar: Float, known: Bool, num_sweeps: int
+    surfaces: Sequence[Surface], T_world_lidar: Float, known: Bool, num_sweeps: int
 ) -> Relaxed:
     """Return poses of n consecutive sweeps, corrected until their surfaces agree.
 
@@ -174,7 +184,7 @@ def relax_poses(
     road without landmarks cannot be detected.
 
     Args:
-        points: (N,3) of each sweep, deskewed, lidar frame; a sample suffices.
+        surfaces: Surface of each sweep, in its lidar frame.
         T_world_lidar: (n,4,4) approximate poses.
         known: (n,) True for poses that stay fixed; at least one, and consecutive.
         num_sweeps: Number of sweeps in a submap. Relative poses within a submap stay fixed.
@@ -189,18 +199,20 @@ def relax_poses(
     ]
     used = sorted({i for pair in pairs for i in pair})
 
-    def surface(i: int) -> Surface:
-        T_submap_world = poses.inverse(T[i])
+    def submap(i: int) -> Surface:
         rows = np.flatnonzero(member == i).tolist()
-        parts = [poses.transform(T_submap_world @ T_world_lidar[r], points[r]) for r in rows]
-        return Surface.of(np.concatenate(parts))
+        if len(rows) == 1:
+            return surfaces[rows[0]]
+        return Surface.joined(
+            [surfaces[r] for r in rows], poses.inverse(T[i]) @ T_world_lidar[rows]
+        )
 
     with ThreadPoolExecutor(num_threads()) as pool:
-        surfaces = dict(zip(used, pool.map(surface, used), strict=True))
+        submaps = dict(zip(used, pool.map(submap, used), strict=True))
 
         def aligned(pair: tuple[int, int]) -> Alignment:
             i, j = pair
-            return align(surfaces[i], surfaces[j], poses.inverse(T[i]) @ T[j], _MATCH_M)
+            return align(submaps[i], submaps[j], poses.inverse(T[i]) @ T[j], _MATCH_M)
 
         graph = _Graph(np.array(pairs, int).reshape(-1, 2), fixed, list(pool.map(aligned, pairs)))
     relaxed = graph.relaxed(T)
