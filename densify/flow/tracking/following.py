@@ -21,7 +21,7 @@ from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 MIN_POINTS = 8  # to start a track
-_MIN_SEED_SHARE = 0.5
+_MIN_SEED_SHARE = 0.4
 _AROUND_S = 0.5  # farther than this from both ends of the recording, starts are equally good
 _NEARER_END, _NEARER_END_S = 0.7, 0.1  # closer to an end, a start is worth 0.7 per 0.1 s
 _BESIDE_M = 1.0  # from a towing vehicle to what it tows
