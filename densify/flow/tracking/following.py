@@ -124,9 +124,7 @@ class Follower:
                     last = n
                     state, seen_s, rows, points = found
                     track.add(n, self.batches[n], state, seen_s, rows)
-                    moves = self.batches[n].obstacles.cluster[rows] >= 0
-                    if moves.any():  # other points may be of a wall beside the object
-                        model.add(undo(state, points[moves], track.centre))
+                    model.add(undo(state, points, track.centre))
                 n += direction
         return track
 
