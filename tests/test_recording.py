@@ -239,6 +239,12 @@ def test_a_cache_gives_the_same_bytes_and_saves_the_work(
         assert_same_maps(made[which]["flow"].depth, made["none"]["flow"].depth)
 
 
+def test_a_method_named_twice_is_made_once(long_street) -> None:
+    made = pipeline.compare(long_street, 5, 2, config=GIVEN, methods=["icp", "none", "icp"])
+    assert list(made) == ["icp", "none"]
+    assert made["icp"].frames == (3, 4, 5, 6, 7) and made["none"].frames == (5,)
+
+
 def test_of_two_sweeps_the_pair_alone_tells_what_moves() -> None:
     """A track shows itself in three."""
 

@@ -118,13 +118,8 @@ def result_of_method(
 
     far = _see_far(scene, method)
     cloud, flow, tracks = moments.pop(name)
-    with watch.stage("project"):
-        seen = views.see(cloud, visible)
-        if visible:
-            seen = seen._replace(bodies=views.bodies(cloud))
-        seen = seen.joined(far)
-        cloud = seen.cloud
-    held_out = None
+    seen = _see_window(scene, cloud, visible).joined(far)
+    cloud, held_out = seen.cloud, None
     if scene.held_out is not None:
         with watch.stage("held out"):
             held_out = scene.held_out.scores(seen, visible)
@@ -164,6 +159,13 @@ def result_of_method(
         far_frames=() if far is None else tuple(np.unique(far.cloud.frame).tolist()),
         far_left_out=scene.beyond.standing.left_out if far and scene.beyond else (),
     )
+
+
+def _see_window(scene: KeyScene, cloud: Cloud, visible: bool) -> SeenCloud:
+    """Return the accumulated points as the cameras see them, with the bodies of moving objects."""
+    with scene.watch.stage("project"):
+        seen = scene.views.see(cloud, visible)
+        return seen._replace(bodies=scene.views.bodies(cloud)) if visible else seen
 
 
 def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:

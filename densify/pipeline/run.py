@@ -44,7 +44,7 @@ from densify.pipeline.key_result import (
     methods_of_run,
     result_of_method,
 )
-from densify.pipeline.recording import Beyond, Recording
+from densify.pipeline.recording import Beyond, Moment, Recording
 from densify.pipeline.warnings import add_warnings
 from densify.readers.timeline import choose_cameras
 
@@ -223,6 +223,7 @@ def densify(
         InputError: As in `run`.
         ComputationError: As in `run`.
     """
+    methods = tuple(dict.fromkeys(methods))
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
     recording.window(key)  # raises its errors before an image is read
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
@@ -232,18 +233,12 @@ def densify(
     with ThreadPoolExecutor(num_threads()) as pool:
         wants_far = any(METHODS[name].far for name in methods)
         far = pool.submit(recording.standing, key) if wants_far else None
-        moments = {}
-        for name in methods:
-            method = METHODS[name]
-            moments[name] = recording.moment(
-                key, method.all_sweeps, method.engine, settings.output.flow != "none"
-            )
+        moments = _moments(recording, key, methods)
         beyond = far.result() if far is not None else None
-        if len(recording.cut.blocks) == 1:  # no other block needs them
+        if key == max(recording.cut.number_of):  # no later key needs them
             recording.forget_raw()
         scene = _scene_of(
-            *(recording, key, shots, images, beyond, moments[methods[-1]].cloud),
-            *(with_images, watch),
+            recording, key, shots, images, beyond, moments[methods[-1]].cloud, with_images, watch
         )
         filled = [settings.is_scored or name == methods[-1] for name in methods]
         make = partial(result_of_method, scene, moments)
@@ -259,6 +254,15 @@ def densify(
     for result in made:
         results[result.method] = replace(result, costs=watch.costs(), baselines=dict(results))
     return add_warnings(results, recording, key, shots)
+
+
+def _moments(recording: Recording, key: int, methods: Sequence[str]) -> dict[str, Moment]:
+    """Return the points at the key's time by method, as each method accumulates them."""
+    moments, with_flow = {}, recording.settings.output.flow != "none"
+    for name in methods:
+        method = METHODS[name]
+        moments[name] = recording.moment(key, method.all_sweeps, method.engine, with_flow)
+    return moments
 
 
 def _scene_of(
