@@ -8,14 +8,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from densify.free_space import range_image
 from densify.free_space.range_image import RangeImage
-from densify.free_space.rings import Aimed, _find_peaks, aimed, find_rings, fires_by_azimuth
+from densify.free_space.rings import Aimed, aimed, find_rings, fires_by_azimuth
 from densify.free_space.sensor import SensorModel, Sensors
 from densify.geometry.types import RegisteredSweep
 from densify.readers import checks
@@ -242,12 +239,3 @@ def test_cells_follow_the_sensor(num_beams, num_azimuths):
     assert image.sees_through(hung, *MARGIN).mean() > 0.995
     wall = on_sphere(rng.uniform(-40, 40, 500), rng.uniform(-3, 3, 500), 1.0)
     assert not image.sees_through(wall * (20 / wall[:, :1]), *MARGIN).any()
-
-
-@given(st.lists(st.integers(0, 9), min_size=3, max_size=60))
-def test_peaks_are_those_of_scipy(values):
-    values = np.array(values, float)
-    peaks, found = signal.find_peaks(values, prominence=0)
-    ours, prominence = _find_peaks(values)
-    np.testing.assert_array_equal(ours, peaks)
-    np.testing.assert_array_equal(prominence, found["prominences"])

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, signal
 
 from densify.free_space.rays import aim
-from densify.geometry.arrays import Float, Float32, Int
+from densify.geometry.arrays import Float, Float32
 from densify.geometry.types import RegisteredSweep
 
 FEW_POINTS = 200  # too few to measure anything
@@ -155,8 +155,8 @@ def find_rings(elevation: Float32) -> Float | None:
     of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
     returns = np.bincount(of_return, minlength=int(np.pi / _RING_BIN_RAD) + 2).astype(float)
     count = ndimage.gaussian_filter1d(returns, 1.0)
-    peaks, prominence = _find_peaks(count)
-    peaks = peaks[prominence >= _MIN_PROMINENCE * count[peaks]]
+    peaks, found = signal.find_peaks(count, prominence=0)
+    peaks = peaks[found["prominences"] >= _MIN_PROMINENCE * count[peaks]]
     if not 3 <= len(peaks) <= len(elevation) / _MIN_RETURNS_PER_RING:
         return None
     rings: Float = (peaks + 0.5) * _RING_BIN_RAD - 0.5 * np.pi
@@ -166,31 +166,6 @@ def find_rings(elevation: Float32) -> Float | None:
         return None
     total = np.bincount(nearest[close], elevation[close].astype(float), len(rings))
     return total / np.bincount(nearest[close], minlength=len(rings))
-
-
-def _find_peaks(values: Float) -> tuple[Int, Float]:
-    """Return the (P,) positions of the peaks of values (N,), and their (P,) prominences.
-
-    They are those of ``scipy.signal.find_peaks``, whose import takes longer than a range image.
-    """
-    end = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)  # of runs of equal values
-    start, level = np.append(0, end[:-1] + 1), values[end]
-    peak = 1 + np.flatnonzero((level[1:-1] > level[:-2]) & (level[1:-1] > level[2:]))
-    height = level[peak]
-    valleys = np.minimum.reduceat(level, np.append(0, peak)) if len(level) else level
-
-    def base(valleys: Float, height: Float) -> Float:
-        """Return the (P,) lowest values on the way back from each peak to a higher one."""
-        passed, lowest = list[tuple[float, float]](), []
-        for low, high in zip(valleys.tolist(), height.tolist(), strict=True):
-            while passed and passed[-1][0] <= high:
-                low = min(low, passed.pop()[1])
-            passed.append((high, low))
-            lowest.append(low)
-        return np.array(lowest)
-
-    before, after = base(valleys[:-1], height), base(valleys[:0:-1], height[::-1])[::-1]
-    return (start[peak] + end[peak]) // 2, height - np.maximum(before, after)
 
 
 def fires_by_azimuth(rays: Aimed) -> bool:
