@@ -17,8 +17,8 @@ from scipy.interpolate import BSpline, PPoly
 from densify.geometry.types import Float
 
 _KNOT_S = 0.1
-# (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03, 2 and 10 m/s³.
-_STIFFNESSES = (1e6, 200.0, 10.0)
+# (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03 and 10 m/s³.
+_STIFFNESSES = (1e6, 10.0)
 _WORTH_SOFTENING = 0.8  # a softer path must lower the leave-one-out error to this share
 # Fewer states, or a shorter time, determine no acceleration, or no jerk.
 _ACCELERATION_STATES, _ACCELERATION_S = 5, 0.35

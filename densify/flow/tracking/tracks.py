@@ -8,7 +8,7 @@ in time. It is confirmed only if the smooth motion explains the measurements.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,15 +17,9 @@ from scipy import ndimage
 from densify.flow.surface_matching import Model
 from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles
 from densify.flow.tracking.extent import NUM_COLUMNS, columns_apart_m
-from densify.flow.tracking.following import (
-    FIT_M,
-    MIN_POINTS,
-    Follower,
-    find_starts,
-    velocities_beside,
-)
+from densify.flow.tracking.following import MIN_POINTS, Follower, find_starts
 from densify.flow.tracking.likelihood import Judge, Verdict, judge
-from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track
+from densify.flow.tracking.objects import FIT_M, LANE_M, MovingObject, Shape, Track
 from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
@@ -36,6 +30,7 @@ from densify.geometry.linking import link
 from densify.geometry.types import Bool, Float, Int
 
 _NEAR_S = 0.3
+_BESIDE_M = 1.0  # from a towing vehicle to what it tows
 _REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: standard deviation of the smooth motion
 _AS_WHOLE = 0.9  # share of the known track's points that a better track must keep
 _GAPS_IN_LINE_M = (1.5, 4.0)
@@ -142,7 +137,7 @@ class _Search:
         along itself.
         """
         best = self._follow(members, n, self._velocity_of(members, n))
-        for velocity in velocities_beside(self.batches[n], members, self._objects):
+        for velocity in self._velocities_beside(members, n):
             if best[1].is_clearly_below(best[1].at_most):
                 best = _better(best, self._follow(members, n, velocity))
         track, verdict = best
@@ -154,6 +149,15 @@ class _Search:
                     if found[0].total_points() >= _AS_WHOLE * track.total_points():
                         best = _better(best, found)
         return best
+
+    def _velocities_beside(self, members: Int, n: int) -> Iterator[Float]:
+        """Yield the velocity (3,), m/s, of each object beside a cluster, as of a towing vehicle."""
+        batch = self.batches[n]
+        points = batch.obstacles.points[members]
+        for track, shape in self._objects:
+            at_s = track.seen_at(batch.time_ns)
+            if shape.near(track.undo(points, at_s), _BESIDE_M).any():
+                yield track.velocity_m_s(points.mean(axis=0, keepdims=True), at_s)[0]
 
     def _follow(self, members: Int, n: int, velocity: Float) -> tuple[Track, Verdict]:
         track = self._follower.follow(members, n, velocity)
