@@ -25,9 +25,8 @@ Instance = NDArray[np.int32]
 _REACH = 1.5  # of candidates to an object, in neighbour distances (`near_m`)
 _LEAST_HEIGHT_M = 0.1
 _WALKS_M_S = 2.0
-NUM_COLUMNS = 2.0
-"""Columns of rays that may be missing along a side that recedes from the scanner."""
-_LONGEST_HOLE_M = 2.0
+# Columns of rays that may be missing along a side that recedes from the scanner.
+_NUM_COLUMNS, _LONGEST_HOLE_M = 2.0, 2.0
 _PREDICTED_S = 0.2  # an object is known so long before the first and after the last observation
 
 
@@ -184,12 +183,17 @@ def lengthen(
         fits = lane.holds(at_once)
         rows, along = rows[fits], at_once[fits, :2] @ lane.ahead
         own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ lane.ahead
-        columns_m = columns_apart_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
-        hole_m = float(np.clip(NUM_COLUMNS * columns_m, LINK_M, _LONGEST_HOLE_M))
+        hole_m = longest_hole_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
         linked = _is_linked(along, own, hole_m)
         if linked.any():
             rows, along = rows[linked], along[linked] - np.median(own)
             instance[rows[_is_free_of_violations(track, seen, rows, along, i, space)]] = k
+
+
+def longest_hole_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
+    """Return the longest hole in the side of one object; arguments as in `columns_apart_m`."""
+    columns_m = columns_apart_m(place, ahead, T_lidar_world, sensors)
+    return float(np.clip(_NUM_COLUMNS * columns_m, LINK_M, _LONGEST_HOLE_M))
 
 
 def columns_apart_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles
-from densify.flow.tracking.extent import NUM_COLUMNS, columns_apart_m
+from densify.flow.tracking.extent import find_shape, longest_hole_m
 from densify.flow.tracking.following import MIN_POINTS, Follower, find_starts
 from densify.flow.tracking.likelihood import Judge, Verdict, judge
 from densify.flow.tracking.objects import FIT_M, LANE_M, MovingObject, Shape, Track
@@ -29,18 +29,17 @@ from densify.geometry.types import Bool, Float, Int
 
 _NEAR_S = 0.3
 _BESIDE_M = 1.0  # from a towing vehicle to what it tows
-_GAPS_IN_LINE_M = (1.5, 4.0)
 _ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of a single ring or column, in steps
 
 
-def find_tracks(
+def find_objects(
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
     ground: HeightMap,
     velocities_m_s: Sequence[Float] | None = None,
     judged: Judge | None = None,
-) -> list[Track]:
-    """Return the confirmed tracks of all moving objects in the stretch (consecutive sweeps).
+) -> list[MovingObject]:
+    """Return all moving objects in the stretch (consecutive sweeps).
 
     Args:
         obstacles: Points above the ground of each sweep.
@@ -48,7 +47,7 @@ def find_tracks(
             clusters start. None lets the neighbouring sweeps vote.
         judged: Function called with each track that was tried, and its evidence.
     """
-    return _Search(obstacles, space, ground, velocities_m_s, judged).tracks()
+    return _Search(obstacles, space, ground, velocities_m_s, judged).objects()
 
 
 class _Search:
@@ -82,8 +81,8 @@ class _Search:
     def _all_points(self) -> list[Bool]:
         return [np.ones(len(c.points), bool) for c in self._obstacles]
 
-    def tracks(self) -> list[Track]:
-        """Return the confirmed tracks; tracks from the best starting clusters come first."""
+    def objects(self) -> list[MovingObject]:
+        """Return the confirmed objects; those from the best starting clusters come first."""
         untried = self._all_points()
         for n, cluster in find_starts([batch.obstacles for batch in self.batches], self.clock):
             batch = self.batches[n]
@@ -96,7 +95,7 @@ class _Search:
                 untried[j][rows] = False
             if verdict.moves:
                 self._keep(track)
-        return [track for track, _ in self._objects]
+        return self._objects
 
     def _keep(self, track: Track) -> None:
         """Keep a confirmed track, with all points that its motion explains."""
@@ -107,7 +106,7 @@ class _Search:
         self._objects.append(MovingObject(track, self._shape_of(track)))
 
     def _shape_of(self, track: Track) -> Shape:
-        return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
+        return find_shape(track, self._obstacles, self._space.clock)
 
     def _velocity_of(self, members: Int, n: int) -> Float:
         """Return the likely velocity (3,), m/s, world frame, of a cluster.
@@ -165,10 +164,7 @@ class _Search:
         """
         shape = self._shape_of(track)
         for j, own in track.claimed.items():
-            c = self._obstacles[j]
-            there = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
-            rows = c.strips.rows_inside(there.min(0) - LINK_M, there.max(0) + LINK_M)
-            rows = self._unclaimed(j, rows, own)
+            c, rows = self._obstacles[j], self._unclaimed(track, shape, j, LINK_M)
             rows = rows[shape.near(track.undo(c.points[rows], c.time_s[rows]), FIT_M)]
             track.claimed[j] = np.concatenate([own, self._without_violations(track, j, rows)])
 
@@ -182,33 +178,29 @@ class _Search:
         at_s = next(iter(track.observations.values())).seen_s
         lane = MovingObject(track, shape).lane(at_s)
         found, parts = {}, [track.place(shape.points, at_s)]
-        for j, own in track.claimed.items():
-            c = self._obstacles[j]
-            there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
-            rows = c.strips.rows_inside(there.min(0) - LANE_M, there.max(0) + LANE_M)
-            rows = self._unclaimed(j, rows, own)
+        for j in track.claimed:
+            c, rows = self._obstacles[j], self._unclaimed(track, shape, j, LANE_M)
             rows = rows[_few_rays(c, rows, space.T_lidar_world[j], space.sensors)]
             rows = rows[lane.holds(track.carry(c.points[rows], c.time_s[rows], at_s))]
             found[j] = rows = self._without_violations(track, j, rows)
             parts.append(track.carry(c.points[rows], c.time_s[rows], at_s))
-        j = next(iter(track.claimed))
-        columns_m = columns_apart_m(track.centre, lane.ahead, space.T_lidar_world[j], space.sensors)
-        gap_m = float(np.clip(NUM_COLUMNS * columns_m, *_GAPS_IN_LINE_M))
+        T_lidar_world = space.T_lidar_world[next(iter(track.claimed))]
+        hole_m = longest_hole_m(track.centre, lane.ahead, T_lidar_world, space.sensors)
         points = np.concatenate(parts)
-        points[:, :2] -= (1 - LINK_M / gap_m) * (points[:, :2] @ lane.ahead)[:, None] * lane.ahead
+        points[:, :2] -= (1 - LINK_M / hole_m) * (points[:, :2] @ lane.ahead)[:, None] * lane.ahead
         _, group = link(points, LINK_M)
         linked = np.isin(group, group[: len(shape.points)])
         ends = np.cumsum([len(part) for part in parts])
         for (j, rows), together in zip(found.items(), np.split(linked, ends)[1:-1], strict=True):
             track.claimed[j] = np.concatenate([track.claimed[j], rows[together]])
 
-    def _unclaimed(self, j: int, rows: Int, own: Int) -> Int:
-        """Return those ``rows`` of sweep j that are free candidates, without ``own``.
-
-        Both are indices into the obstacles of sweep j; ``own`` belong to the track already.
-        """
-        rows = rows[self._free[j][rows] & (self._obstacles[j].cluster[rows] >= 0)]
-        return np.setdiff1d(rows, own, assume_unique=True)
+    def _unclaimed(self, track: Track, shape: Shape, j: int, reach_m: float) -> Int:
+        """Return the free candidates of sweep j around the object that it does not have yet."""
+        c = self._obstacles[j]
+        there = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
+        rows = c.strips.rows_inside(there.min(0) - reach_m, there.max(0) + reach_m)
+        rows = rows[self._free[j][rows] & (c.cluster[rows] >= 0)]
+        return np.setdiff1d(rows, track.claimed[j], assume_unique=True)
 
     def _without_violations(self, track: Track, j: int, rows: Int) -> Int:
         """Return those ``rows`` of sweep j that, moved with the track, are never seen through.
