@@ -25,7 +25,6 @@ from densify.free_space.rings import FEW_POINTS, Aimed, aimed, fires_by_azimuth,
 from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
 
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
-_CELLS_PER_LINE = 1.14  # the even step of lines is 1 % longer than the usual one
 _MIN_ROW_RAD = np.deg2rad(0.45)
 # Closer rings always share a row. Other rings have their own rows from the range at
 # which three rings span more than the error of registration.
@@ -268,8 +267,8 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     if layout.rings_rad is not None:
         return _cells_of_rings(layout.rings_rad, _CELLS_PER_STEP * step, by_ring)
     if not layout.unordered:
-        row_step = _CELLS_PER_LINE * float(np.median(layout.table.along))
-        return [_grid(_uniform_edges(rays.elevation, row_step), _CELLS_PER_LINE * step)]
+        row_step = _CELLS_PER_STEP * float(np.median(layout.table.along))
+        return [_grid(_uniform_edges(rays.elevation, row_step), _CELLS_PER_STEP * step)]
     spacing = layout.table.at(rays.azimuth, rays.elevation)[:, 1]
     finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
     flatten = float(np.cos(np.median(rays.elevation)))
