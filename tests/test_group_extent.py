@@ -66,7 +66,7 @@ def test_the_wall_behind_a_walker_is_no_part_of_the_shape():
         state = np.array([0.12 * i, 0.0, 0.0, 0.0])
         points = np.concatenate([body + state[:3], wall])
         beside = np.abs(wall[:, 0] - state[0]) < 1.3
-        track.observations[i] = Observation(state, 0.1 * i, i * 100_000_000)
+        track.observations[i] = Observation(state, 0.1 * i, i * 100_000_000, (i,))
         track.claimed[i] = np.flatnonzero(np.append(np.ones(120, bool), beside))
         seed, time_s = np.arange(len(points)) < 120, np.full(len(points), 0.1 * i)
         obstacles.append(SimpleNamespace(points=points, time_s=time_s, seed=seed))

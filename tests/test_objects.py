@@ -29,7 +29,7 @@ def track() -> Track:
     t = 0.1 * np.arange(6)
     track = Track(CENTRE)
     states = np.stack([1 + 3 * t - 0.5 * t**2, 0 * t, 0 * t, 0.2 * t], 1)
-    track.path = Path.fit(t, states)
+    track.path = Path.fit(t, states, np.ones(6))
     return track
 
 

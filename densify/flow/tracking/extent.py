@@ -23,10 +23,11 @@ from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 Instance = NDArray[np.int32]
 
 _REACH = 1.5  # of candidates to an object, in neighbour distances (`near_m`)
-_LEAST_HEIGHT_M = 0.1
+_LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M = 0.08, 0.1
 _WALKS_M_S = 2.0
 # Columns of rays that may be missing along a side that recedes from the scanner.
 _NUM_COLUMNS, _LONGEST_HOLE_M = 2.0, 2.0
+_MAX_VIOLATIONS = 0.05  # share of an extension's points that a sweep may see through
 _PREDICTED_S = 0.2  # an object is known so long before the first and after the last observation
 
 
@@ -52,7 +53,7 @@ class SweepPoints:
     def of(
         stretch: Stretch, i: int, ground: HeightMap, obstacles: Obstacles, sensors: Sensors
     ) -> SweepPoints:
-        """Return the points of the sweep with index i that are over 0.1 m above the ground."""
+        """Return the points of the sweep with index i that are over 0.08 m above the ground."""
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
@@ -127,7 +128,7 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
     """Return (N,) the index in ``objects`` of the object near each point of ``seen``, -1 for none.
 
     A point belongs to an object if it is close to the object's accumulated points or within their
-    outline.
+    outline. The ground below a walker does not belong to the walker.
     """
     instance = np.full(len(seen.points), -1, np.int32)
     least_m = np.full(len(seen.points), np.inf)
@@ -144,6 +145,8 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
         distance_m, _ = nearest(shape.tree, in_object)
         belongs = (distance_m < seen.reach_m[rows]) & (seen.height_m[rows] >= ABOVE_GROUND_M)
         belongs |= shape.within_outline(in_object)
+        if _speed_m_s(track, i, clock) <= _WALKS_M_S:
+            belongs &= seen.height_m[rows] >= _LEAST_HEIGHT_OF_WALKERS_M
         closer = belongs & (distance_m < least_m[rows])
         instance[rows[closer]] = k
         least_m[rows[closer]] = distance_m[closer]
@@ -223,19 +226,28 @@ def _is_linked(along: Float, own: Float, hole_m: float) -> Bool:
 def _is_free_of_violations(
     track: Track, seen: SweepPoints, rows: Int, along: Float, i: int, space: FreeSpace
 ) -> Bool:
-    """Return (N,) True for extension points up to the first violation, ahead and behind.
+    """Return (N,) True for extension points up to the first violations, ahead and behind.
+
+    The extension ends where another sweep sees through more than 5 % of the moved points so far.
 
     Args:
         rows: (N,) rows in ``seen`` of the extension.
         along: (N,) metres ahead of the object's middle, negative behind.
     """
+    step = np.floor(np.abs(along) / LINK_M).astype(np.int64)
+    num_steps = int(step.max(initial=0)) + 1
+    step += num_steps * (along < 0)  # steps ahead, then steps behind
+
+    def up_to(steps: Int) -> Int:
+        return np.bincount(steps, minlength=2 * num_steps).reshape(2, num_steps).cumsum(axis=1)
+
+    ends = np.zeros((2, num_steps), bool)
     in_object = track.undo(seen.points[rows], seen.time_s[rows])
-    violated = np.zeros(len(rows), bool)
     for j in space.others(i):
-        violated |= track.seen_through(in_object, j, space)
-    ahead_m = along[violated & (along >= 0)].min(initial=np.inf)
-    behind_m = along[violated & (along < 0)].max(initial=-np.inf)
-    return (along > behind_m) & (along < ahead_m)
+        violations = up_to(step[track.seen_through(in_object, j, space)])
+        ends |= violations > _MAX_VIOLATIONS * up_to(step)
+    kept: Bool = ~np.logical_or.accumulate(ends, axis=1).ravel()[step]
+    return kept
 
 
 def is_known_at(track: Track, i: int, clock: Clock) -> bool:

@@ -27,7 +27,9 @@ _SHARE_UNSEEN = 0.5  # least share of the object's usual number of points
 # Standard deviation (m, m, rad) of a prediction over 0.25 s; it grows with longer times.
 _PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
 _RECENT_S = 0.4  # age of the states that the rate is fitted to
-_GIVEN_S2 = 0.02  # the rate at the start weighs as much as states with this sum of squared times
+# The given velocity weighs as much as states with this sum of squared times; it has no turn rate.
+_GIVEN_S2 = np.array([0.02, 0.02, 0.02, 0.0])
+_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # factor of the rate: turns level out
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
@@ -124,7 +126,7 @@ class Follower:
         inside = inside[batch.gather(self.free)[inside]]
         rows, enough = inside[c.cluster[inside] >= 0], float(MIN_FIT)
         if len(rows) < MIN_FIT:  # no sweep saw through the object, but it may be there
-            usual = track.total_points() / len(track.observations)
+            usual = float(np.median([track.num_points(m) for m in track.observations]))
             rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * usual)
         if len(rows) < enough:
             return None
@@ -171,7 +173,7 @@ def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float,
     if len(t) > 1:
         t -= middle_s
         given_s2 = _GIVEN_S2 * (next(iter(track.observations)) in known)
-        rate = (t @ states + given_s2 * rate) / (t @ t + given_s2)
+        rate = (t @ states + given_s2 * rate) / (t @ t + given_s2) * _STEADY
     std = _PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
     on_the_way = _turned(rate, time_s - 0.5 * ahead_s - middle_s)
     return states[0] + on_the_way * ahead_s, _turned(rate, time_s - middle_s), std

@@ -19,6 +19,7 @@ from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _NEAR_M, _NEAR_GAPS = 0.2, 0.5
+_MANY_POINTS = 100  # more points do not locate an object better
 _BESIDE_M = 1.0
 _OUTLINE_M = 0.05
 FIT_M = 0.3
@@ -45,11 +46,13 @@ class Observation:
             z follows the ground.
         seen_s: Mean firing time of the object's points, since the first sweep of the stretch.
         time_ns: Middle time of the batch, ns since the first sweep of the stretch.
+        sweeps: Indices of the sweeps of the batch in which the object has points.
     """
 
     state: Float
     seen_s: float
     time_ns: int
+    sweeps: tuple[int, ...]
 
 
 @dataclass
@@ -80,15 +83,17 @@ class Track:
             seen_s: Mean firing time of the object's points.
             rows: Ascending indices of the object's points in the batch's obstacles.
         """
-        self.observations[n] = Observation(state, seen_s, batch.time_ns)
-        self.claimed |= batch.split(rows)
+        mine = batch.split(rows)
+        self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(mine))
+        self.claimed |= mine
 
     def smooth(self) -> None:
-        """Fit ``path`` to the states, in place."""
+        """Fit ``path`` to the states, in place; observations with more points weigh more."""
         batches = sorted(self.observations)
         times_s = np.array([self.observations[n].seen_s for n in batches])
         states = np.stack([self.observations[n].state for n in batches])
-        self.path = Path.fit(times_s, states)
+        weights = np.array([min(self.num_points(n), _MANY_POINTS) for n in batches], float)
+        self.path = Path.fit(times_s, states, weights)
 
     def place(self, points: Float, time_s: float | Float) -> Float:
         """Move (N,3) points from the object's frame to the world at a time or (N,) times."""
@@ -133,9 +138,17 @@ class Track:
         own = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
         return np.concatenate([np.zeros(0, np.int64), *own])  # all may have been taken away
 
+    def num_points(self, n: int) -> int:
+        """Return the number of the object's points in batch index n."""
+        return sum(len(self.claimed[j]) for j in self.observations[n].sweeps)
+
     def total_points(self) -> int:
         """Return the number of the object's points in all sweeps."""
         return sum(map(len, self.claimed.values()))
+
+    def duration_s(self) -> float:
+        """Return the time between the first and the last observation."""
+        return float(np.ptp([seen.seen_s for seen in self.observations.values()]))
 
     def rise_m(self, ground: HeightMap, state: Float) -> float:
         """Return how much higher (m) the ground is below the object at a state (4,) than at first.
@@ -146,7 +159,7 @@ class Track:
         way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
         start = self.centre[:2] + np.outer([-_BESIDE_M, 0.0, _BESIDE_M], [-way[1], way[0]])
         before_m, there_m = ground.under(np.concatenate([start, start + state[:2]])).reshape(2, -1)
-        return float(np.median(there_m - before_m))
+        return float(np.sort(there_m - before_m)[len(start) // 2])
 
     def seen_at(self, time_ns: int) -> float:
         """Estimate when (s) the sweep with a reference time ``time_ns`` measures the object.
