@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from densify.config import cache as cache_module
-from densify.config.cache import Cache, digest
+from densify.config.cache import Cache, code_digest, digest
 from densify.config.errors import InputError
 from tests.command import exit_code
 
@@ -126,9 +126,23 @@ def test_once_for_everybody_and_each_version(tmp_path: Path, monkeypatch) -> Non
     assert [get(Cache(LIMIT, tmp_path)) for _ in range(3)] == [1, 0, 0]
     assert get(Cache(LIMIT, tmp_path), 2) == 1
     assert get(Cache(LIMIT, tmp_path / "other")) == 1
-    raised = f"{cache_module._STEP_VERSIONS}, more 1"
-    monkeypatch.setattr(cache_module, "_STEP_VERSIONS", raised)
+    monkeypatch.setattr(cache_module, "__version__", "0.0.0")
     assert [get(Cache(LIMIT, tmp_path)) for _ in range(2)] == [1, 0]
+
+
+def test_code_that_makes_other_results_has_another_digest(tmp_path: Path, monkeypatch) -> None:
+    package = tmp_path / "densify"
+    for name in ("config/cache.py", "flow/tracking/vote.py", "outputs/plots.py"):
+        (package / name).parent.mkdir(parents=True)
+        (package / name).write_text("one\n")
+    monkeypatch.setattr(cache_module, "__file__", str(package / "config/cache.py"))
+    digests = []
+    for changed in ("outputs/plots.py", "flow/tracking/vote.py"):
+        (package / changed).write_text("two\n")
+        code_digest.cache_clear()
+        digests.append(code_digest())
+    code_digest.cache_clear()
+    assert digests[0] != digests[1]
 
 
 class Planted:

@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,9 +29,16 @@ from densify.config.errors import InputError
 
 T = TypeVar("T")
 _log = logging.getLogger("densify")
-# Raise a step's number when its result for the same inputs changes. Steps build on each other,
-# and an entry depends on all of them.
-_STEP_VERSIONS = "digests 1, registration 2, motion 12, far 4"
+_STEP_ROOMS = (
+    "readers/**/*.py",
+    "registration/*.py",
+    "free_space/*.py",
+    "flow/**/*.py",
+    "flow/**/*.json",
+    "geometry/**/*.py",
+    "pipeline/*.py",
+    "depth/far.py",
+)
 _MOST_ENTRIES = 10_000
 
 
@@ -61,7 +69,7 @@ class Cache:
             inputs: Everything the result depends on, as `digest` accepts.
             make: Computes the result.
         """
-        path = self._folder / f"{step}-{digest((__version__, _STEP_VERSIONS, inputs))}.npz"
+        path = self._folder / f"{step}-{digest((__version__, inputs))}.npz"
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 value: T = _unpacked(json.loads(arrays["json"].tobytes()), arrays)
@@ -88,6 +96,15 @@ class Cache:
                 if left > self._limit_bytes or len(entries) - number > _MOST_ENTRIES:
                     entry.unlink()
                     left -= num_bytes
+
+
+@lru_cache(maxsize=1)
+def code_digest() -> str:
+    """Return a hash of the code that makes the pipeline's cached results."""
+    state, package = hashlib.blake2b(digest_size=20), Path(__file__).parents[1]
+    for path in sorted(path for room in _STEP_ROOMS for path in package.glob(room)):
+        state.update(path.read_bytes())
+    return state.hexdigest()
 
 
 def kept(cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:

@@ -362,31 +362,39 @@ class HeldOut:
         bodies = without_sweep(seen.bodies, cloud, self.views.key)
         return SeenCloud(cloud, surface, self.views.in_view(cloud), bodies)
 
+    def maps(self, seen: SeenCloud, visible: bool) -> dict[str, tuple[DepthMap, Float32, Bool]]:
+        """Return each map made without the key sweep, its (H,W) truth, and (H,W) moving pixels.
+
+        Returns from far inside a moving body are no ground truth: they passed its windows, but the
+        map shows the glass. The result is empty if no points remain.
+        """
+        others = self.without_key(seen)
+        if not len(others.cloud):
+            return {}
+        made = {}
+        for name, depth in self.views.depth(others, visible).items():
+            moving, truth_m = self.moving[name], self.key_alone[name].depth_m
+            inside = moving & far_inside(seen.bodies.values(), self.views.exposures[name], truth_m)
+            made[name] = depth, np.where(inside, np.float32(0), truth_m), moving & ~inside
+        return made
+
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Return the scores of each map made without the key sweep, None if no points remain.
 
         Besides `depth_metrics.depth_scores` each has the ``curve`` of precision over density,
         ``reliability``, and the share ``unjudged`` of filled pixels without a return of the key
-        sweep within a ray spacing. Returns from far inside a moving body are no ground truth: they
-        passed its windows, but the map shows the glass.
+        sweep within a ray spacing.
         """
-        others = self.without_key(seen)
-        if not len(others.cloud):
-            return None
-        made = self.views.depth(others, visible)
         scores: dict[str, Any] = {}
-        for name, maps in made.items():
-            exposure, moving = self.views.exposures[name], self.moving[name]
-            camera, truth_m = exposure.camera, self.key_alone[name].depth_m
-            inside = moving & far_inside(seen.bodies.values(), exposure, truth_m)
-            truth_m = np.where(inside, np.float32(0), truth_m)
+        for name, (depth, truth_m, moving) in self.maps(seen, visible).items():
+            camera = self.views.exposures[name].camera
             scores[name] = {
-                **depth_metrics.depth_scores(maps, truth_m, moving & ~inside, camera),
-                "curve": depth_metrics.precision_density(maps, truth_m, camera),
-                "reliability": reliability(maps, truth_m, camera),
-                "unjudged": self._unjudged(name, maps, seen.bodies),
+                **depth_metrics.depth_scores(depth, truth_m, moving, camera),
+                "curve": depth_metrics.precision_density(depth, truth_m, camera),
+                "reliability": reliability(depth, truth_m, camera),
+                "unjudged": self._unjudged(name, depth, seen.bodies),
             }
-        return scores
+        return scores or None
 
     def _unjudged(
         self, name: str, maps: DepthMap, bodies: Mapping[int, MovingBody]

@@ -161,6 +161,15 @@ def result_of_method(
     )
 
 
+def see(scene: KeyScene, name: str, cloud: Cloud) -> SeenCloud:
+    """Return the points of the method ``name`` as the cameras see them.
+
+    cloud: Points at the key's time, as the method accumulates them.
+    """
+    visible = METHODS[name].visible and scene.settings.project.visibility
+    return _see_window(scene, cloud, visible).joined(_see_far(scene, METHODS[name]))
+
+
 def _see_window(scene: KeyScene, cloud: Cloud, visible: bool) -> SeenCloud:
     """Return the accumulated points as the cameras see them, with the bodies of moving objects."""
     with scene.watch.stage("project"):

@@ -237,7 +237,7 @@ def densify(
         beyond = far.result() if far is not None else None
         if key == max(recording.cut.number_of):  # no later key needs them
             recording.forget_raw()
-        scene = _scene_of(
+        scene = scene_of(
             recording, key, shots, images, beyond, moments[methods[-1]].cloud, with_images, watch
         )
         filled = [settings.is_scored or name == methods[-1] for name in methods]
@@ -265,7 +265,7 @@ def _moments(recording: Recording, key: int, methods: Sequence[str]) -> dict[str
     return moments
 
 
-def _scene_of(
+def scene_of(
     recording: Recording,
     key: int,
     shots: Mapping[str, Shot],
