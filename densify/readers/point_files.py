@@ -26,6 +26,10 @@ Columns = dict[str, NDArray[Any]]
 _UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most data sets follow
 _ALIKE = 0.5  # largest median step between rows, as a share of the coordinates
 _FEWEST_ROWS = 20  # for this test
+_NAME_COLUMNS = (
+    "name all of them in densify.yaml beside the sweeps' folder, such as "
+    "sweeps: {columns: [x, y, z, intensity, time]}"
+)
 _MOST_COLUMNS = 100  # a wider array is probably transposed
 _ROWS_LOOKED_AT = 4000
 
@@ -114,13 +118,13 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
     if len(data) % (4 * num_columns):
         raise ValueError(
             f"got {len(data)} bytes, expected a multiple of {4 * num_columns} "
-            f"({num_columns} float32 columns); it is cut off, or has another number of columns"
+            f"({num_columns} float32 columns); it is cut off, or has other columns: {_NAME_COLUMNS}"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, num_columns)
     if names is None and not _are_scanned(rows[:_ROWS_LOOKED_AT, :3]):
         raise ValueError(
             "read as rows of 4 little-endian float32 columns, neighbouring points are not alike; "
-            "in a plain folder name the columns in densify.yaml: sweeps.columns"
+            f"if it has other columns, {_NAME_COLUMNS}"
         )
     return PointTable(_matrix(rows, names, path))
 
