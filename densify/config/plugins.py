@@ -91,11 +91,7 @@ class Table:
             )
 
     def row(self, name: str, where: str) -> Plugin:
-        """Return the plug-in of this name; the module of another package is imported.
-
-        Raises:
-            InputError: No plug-in has the name, or its package is broken.
-        """
+        """Return the plug-in of this name; the module of another package is imported."""
         self.require(name, where)
         rows = {row.name: row for row in self.built_in}
         return rows[name] if name in rows else self._load(self._added()[name])
@@ -153,11 +149,7 @@ ENGINES = Table(
 
 
 def check_engine_spec(spec: str) -> tuple[str, str]:
-    """Return name and argument of an engine's ``NAME[:ARGUMENT]``, without importing it.
-
-    Raises:
-        InputError: The engine does not exist, lacks its argument, or takes no argument.
-    """
+    """Return name and argument of an engine's ``NAME[:ARGUMENT]``, without importing it."""
     name, _, argument = spec.partition(":")
     ENGINES.require(name, "flow.engine")
     for row in ENGINES.built_in:
@@ -167,11 +159,7 @@ def check_engine_spec(spec: str) -> tuple[str, str]:
 
 
 def engine(spec: str) -> tuple[Plugin, str]:
-    """Return the plug-in and the argument of an engine's ``NAME[:ARGUMENT]``.
-
-    Raises:
-        InputError: As in `check_engine_spec`.
-    """
+    """Return the plug-in and the argument of an engine's ``NAME[:ARGUMENT]``."""
     name, argument = check_engine_spec(spec)
     return ENGINES.row(name, "flow.engine"), argument
 
@@ -203,10 +191,7 @@ _BESIDE = re.compile(r"\..*|(timestamps?|times|stamps|poses?|trajectory)\.\w+", 
 
 
 def _holds_sweeps(path: Path) -> bool:
-    """Return True if a folder has sweep files, at most two folders deep.
-
-    Tables of numbers count as sweeps only if the folder has no other files.
-    """
+    """Return True for sweep files at most two folders deep, or for tables of numbers alone."""
     near = (found for pattern in ("*", "*/*", "*/*/*") for found in path.glob(pattern))
     if (path / "densify.yaml").is_file() or any(_SWEEP.fullmatch(found.name) for found in near):
         return True

@@ -107,11 +107,7 @@ def _made(job: Job, key: int) -> KeyRecord:
 
 
 def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scores for a manifest line from the metrics of a result.
-
-    The scores are ``num_points``, ``num_moving`` and ``ghost``. By camera there are ``density``,
-    ``density_filled``, and ``outliers`` and ``mae_m`` against the held-out key sweep.
-    """
+    """Return the scores for a manifest line from the metrics of a result."""
     held_out = metrics["held_out"] or {}
     errors = {name: scores["measured"]["all"] for name, scores in held_out.items()}
     return {

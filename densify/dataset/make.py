@@ -146,11 +146,7 @@ def make_dataset(
 
 
 def status(out: Path) -> Summary:
-    """Return the progress of a training set from its files.
-
-    Raises:
-        InputError: The folder holds no training set.
-    """
+    """Return the progress of a training set from its files."""
     table = read_plan(out)
     if table is None:
         raise InputError(f"--status {out}: no dataset.json in it; expected a set's folder")
@@ -208,10 +204,8 @@ def _finished(blocks: Sequence[Block], out: Path, verify: bool) -> dict[Key, Key
 def _jobs(
     blocks: Sequence[Block], done: Collection[Key], recipe: Recipe, out: Path, num_workers: int
 ) -> list[list[tuple[Job, int]]]:
-    """Return the key sweeps to make, in a group for each block.
-
-    The first key sweep of a group computes the results that the group shares.
-    """
+    """Return the key sweeps to make, in a group for each block."""
+    # The first key sweep of a group computes the results that the group shares.
     run, groups = uuid4().hex, []
     for drive, keys in blocks:
         cameras, place = tuple(drive.cameras), out.absolute()
@@ -230,12 +224,7 @@ def _record(
     num_keys: int,
     report: Callable[[Summary], None] | None,
 ) -> Summary:
-    """Record and report every key sweep, and return the final progress.
-
-    ``made`` has the items and outcomes of `call_all`. New records are added to ``records`` in
-    place. On an error the number of finished key sweeps is logged. A full disk is a
-    ComputationError.
-    """
+    """Record and report the outcomes of `call_all` as they come; return the final progress."""
     start_s = time.monotonic()
     summary = Summary(records, num_keys)
     try:

@@ -143,18 +143,7 @@ class Drive:
 
 
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]:
-    """Open every recording and choose its key sweeps.
-
-    Args:
-        data: Recordings, as ``--data`` takes them.
-        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step`` in every recording,
-            None for all.
-        recipe: Settings of the training set.
-
-    Raises:
-        InputError: A recording cannot be opened, two have equal names, or a camera or frame is
-            unknown.
-    """
+    """Open every recording and choose its key sweeps; arguments as in `make_dataset`."""
     drives: dict[str, Drive] = {}
     for spec in data:
         sequence = open_sequence(spec)
@@ -202,12 +191,7 @@ def check_place(out: Path) -> None:
 
 
 def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
-    """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe.
-
-    Raises:
-        InputError: The folder holds a different training set.
-        OutputError: The file cannot be written.
-    """
+    """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe."""
     table = _table(recipe, drives)
     before = read_plan(out)
     if before is not None:
@@ -219,11 +203,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
-    """Return the content of dataset.json, None if the file does not exist.
-
-    Raises:
-        InputError: The file is damaged or of another version.
-    """
+    """Return the content of dataset.json, None if the file does not exist."""
     path = out / _FILE
     if not path.is_file():
         return None

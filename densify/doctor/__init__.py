@@ -105,9 +105,6 @@ def examine(sequence: LidarSequence, config: Config) -> Diagnosis:
     """Run all checks on a recording.
 
     At most 15 sweeps and about 40 images are read, whatever the length of the recording.
-
-    Raises:
-        InputError: No sweep of the sample can be read.
     """
     sample = Sample.of(sequence, config.register)
     return Diagnosis(sample, tuple(found for check in CHECKS for found in check(sample)))

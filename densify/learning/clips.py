@@ -70,12 +70,7 @@ class ClipMaker:
     teacher: str = "objective"
 
     def __call__(self, number: int) -> Clip:
-        """Make the clip of a number.
-
-        Raises:
-            InputError: A recording cannot be read or lacks the required ground truth.
-            ComputationError: No neighbouring sweeps could be registered at 8 random places.
-        """
+        """Make the clip of a number."""
         rng = np.random.default_rng([self.seed, number])
         spec = self.data[int(rng.integers(len(self.data)))]
         sequence: LidarSequence = (
@@ -115,10 +110,8 @@ def _new_street(spec: str, rng: np.random.Generator) -> Street:
 def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
     """Return the clip of up to 7 sweeps around a key frame.
 
-    Args:
-        key: Frame number of the middle sweep.
-        teacher: Source of the labels: "truth" for the recording's ground truth, "engine" for the
-            scene flow of the engine ``groups``. Other words give no labels.
+    The ``teacher`` gives the labels: "truth" the recording's ground truth, "engine" the scene flow
+    of the engine ``groups``. Other words give no labels.
     """
     stretch = Recording(sequence, settings, NUM_SWEEPS // 2, [key]).window(key)
     heights, frames = ground(stretch), stretch.frames

@@ -67,12 +67,7 @@ def on_device(value: Any, device: torch.device) -> Any:
 
 
 def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
-    """Yield samples without end.
-
-    Args:
-        make: Maker of clips (short series of sweeps), called with 0, 1, 2 and so on.
-        num_wanted: Number of sweeps that the network takes.
-    """
+    """Yield samples without end, of clips from ``make``, for a network of ``num_wanted`` sweeps."""
     for group in count():
         mixed = [make(group * _NUM_MIXED + n) for n in range(_NUM_MIXED)]
         rng = np.random.default_rng([make.seed, group, 1])
@@ -101,9 +96,7 @@ def sample_of(
 ) -> Sample:
     """Return the sample of two neighbouring sweeps of a clip, given by their indices.
 
-    Args:
-        rng: Generator that turns, mirrors, scales and draws at random. None changes nothing and
-            draws evenly.
+    ``rng`` turns, mirrors, scales and draws at random. None changes nothing and draws evenly.
     """
     here, there = clip[source], clip[target]
     change = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)

@@ -89,9 +89,6 @@ def write_depth(result: Result, context: Context, folder: Path) -> None:
 
     Age is the time between the image's exposure and the sweep that measured the pixel. A filled
     pixel has the age of the nearest measured pixel.
-
-    Raises:
-        ValueError: The maps have no ages.
     """
     for camera, depth in result.depth.items():
         if depth.age_s is None:

@@ -34,11 +34,7 @@ class SceneFile:
 
 
 def read_scene(path: Path) -> SceneFile:
-    """Read scene.json.
-
-    Raises:
-        InputError: The file is missing or damaged.
-    """
+    """Read scene.json."""
     with damage_named(path):
         table = read_json(path)
         poses = {sweep["frame"]: sweep["T_key_lidar"] for sweep in table["sweeps"]}
@@ -50,11 +46,7 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def read_tracks(path: Path) -> list[ObjectTrack]:
-    """Return the tracks of moving objects in movers.json.
-
-    Raises:
-        InputError: The file is missing or damaged, or an object has no pose at the key sweep.
-    """
+    """Return the tracks of moving objects in movers.json."""
     with damage_named(path):
         table = read_json(path)
         tracks = [_track(entry) for entry in table["objects"]]

@@ -85,9 +85,6 @@ def pair_depth_files(
         truth: Path of a true map, or of a folder. Two files are paired whatever their names.
         mask: Folder of masks of moving objects, or one file beside two files; None for no masks.
         filled: True pairs densify's filled maps, False its maps of measured pixels.
-
-    Raises:
-        InputError: A path does not exist, the names are ambiguous, or no files can be paired.
     """
     found = _product(_found(predicted, "PREDICTED"), predicted, filled)
     true = _found(truth, "TRUTH")
@@ -164,10 +161,7 @@ def _product(files: Sequence[_File], place: Path, filled: bool) -> list[_File]:
 def _match(
     left: Sequence[_File], right: Sequence[_File], left_place: Path, right_place: Path
 ) -> dict[Path, Path]:
-    """Return the left path by right path of each pair with equal frame.
-
-    Drive and camera must be equal too if all paths name them.
-    """
+    """Return right -> left path where frames agree, and drive and camera too if all name them."""
     everything = (*left, *right)
     told = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in everything)]
     here = _keyed(left, ["frame", *told], left_place)

@@ -67,21 +67,13 @@ def pose_of(record: Record, where: str) -> Float:
 
 
 def read_table(path: Path) -> dict[str, Record]:
-    """Return all records of a JSON table, by their tokens.
-
-    Raises:
-        InputError: The file is missing, or is no table of nuScenes.
-    """
+    """Return all records of a JSON table, by their tokens."""
     with described_in(path, _EXPECTED):
         return {str(record["token"]): record for record in read_json(_existing(path))}
 
 
 def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Record]:
-    """Return the records of a JSON table whose field ``key`` is in ``wanted``, by their tokens.
-
-    Raises:
-        InputError: The file is missing or cut off, or a wanted record is malformed.
-    """
+    """Return the records of a JSON table whose field ``key`` is in ``wanted``, by their tokens."""
     pattern = re.compile(rb'"%s"\s*:\s*"([^"]*)"' % key.encode())
     names = frozenset(name.encode() for name in wanted)
     found = []
@@ -142,15 +134,7 @@ class Annotations:
 
     @staticmethod
     def read(tables: Path, scene: str) -> Annotations | None:
-        """Return the boxes of a scene; None if the table is missing or has no box in the scene.
-
-        Args:
-            tables: Folder of the JSON tables.
-            scene: Token of the scene.
-
-        Raises:
-            InputError: A record is malformed, or an object has two boxes in a key frame.
-        """
+        """Return the boxes of a scene (a token); None if the table is missing or has none of it."""
         path = tables / "sample_annotation.json"
         if not path.is_file():
             return None
@@ -205,12 +189,7 @@ class Annotations:
 
 
 def open_recording(path: Path, scene: str | None) -> NuScenes:
-    """Open a scene of nuScenes, as `densify.readers.ReaderModule` specifies.
-
-    Args:
-        path: Folder of the JSON tables, or its parent with the tables of one or more versions.
-        scene: Name such as ``scene-0061``; None if there is only one scene.
-    """
+    """Open a scene, such as ``scene-0061``, by the folder of the JSON tables or by its parent."""
     folders = [path] if (path / "sample_data.json").is_file() else []
     folders = folders or sorted(found.parent for found in path.glob("v*/sample_data.json"))
     if not folders:
@@ -273,11 +252,7 @@ class Scene:
 
     @staticmethod
     def read(tables: Path, token: str, name: str) -> Scene:
-        """Read the sensors and the vehicle's path of a scene, without sweeps and images.
-
-        Raises:
-            InputError: A table is missing or malformed, or the scene has no sweeps.
-        """
+        """Read the sensors and the vehicle's path of a scene, without sweeps and images."""
         file, poses_file = tables / "sample_data.json", tables / "ego_pose.json"
         with described_in(file, _EXPECTED):
             samples = find_records(tables / "sample.json", "scene_token", {token})
@@ -330,11 +305,7 @@ class NuScenes(FileSequence):
     """A nuScenes scene as a `LidarSequence`; the lidar frame is the scanner's own frame."""
 
     def __init__(self, scene: Scene) -> None:
-        """Prepare a scene for reading its sweeps and images on demand.
-
-        Raises:
-            InputError: No sweep is on the disk, or a camera's calibration is malformed.
-        """
+        """Prepare a scene for reading its sweeps and images on demand."""
         self._scene, self._lidar = scene, next(iter(scene.lidars.values()))
         self._T_ego_lidar, track = self._lidar.T_ego_sensor[0], scene.track
         self._stamps_ns = self._lidar.stamps_ns
@@ -369,11 +340,7 @@ class NuScenes(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the lidar frame; None if not annotated, as in the test split.
-
-        Raises:
-            InputError: The annotation table is malformed.
-        """
+        """Return a sweep's boxes in the lidar frame; None if not annotated (test split)."""
         self.check_frame(frame)
         if self._annotations is None:
             return None

@@ -67,9 +67,6 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     Args:
         path: Point file.
         names: Names of the columns if the file has none. By default they are those of `unnamed`.
-
-    Raises:
-        InputError: The file is missing, damaged, of another format, or has no rows.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -130,11 +127,8 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _are_scanned(points: NDArray[Any]) -> bool:
-    """Return True if consecutive (N,3) points are close to each other, as in a scan.
-
-    Rows read with a wrong number of columns mix x with y, and consecutive points lie far apart. The
-    test compares the median step with the coordinates.
-    """
+    """Return True if consecutive (N,3) points are close to each other, as in a scan."""
+    # Rows read with a wrong number of columns mix x with y: then points lie far apart.
     with np.errstate(invalid="ignore"):  # wrongly read bytes may be signalling NaN
         near = np.nan_to_num(points.astype(np.float64), posinf=0, neginf=0)
     step, size = np.abs(np.diff(near, axis=0)).sum(axis=1), np.abs(near).sum(axis=1)
@@ -179,10 +173,7 @@ def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[str], str | None]:
-    """Return the number of header lines, the column names and the delimiter (None: whitespace).
-
-    Comments before the names are skipped.
-    """
+    """Return the number of header lines, the column names and the delimiter (None: whitespace)."""
     for number, line in enumerate(lines, 1):
         text = line.strip().lstrip("#").strip()
         if not text:
@@ -208,11 +199,7 @@ def _are_numbers(words: Sequence[str]) -> bool:
 
 
 def _pcd_header(file: Any) -> list[str]:
-    """Read the header lines up to DATA, without comments; the file is left at the first point.
-
-    The header is normalised for the parser: padding fields with a COUNT of 0 are removed, and
-    missing COUNT, VERSION, HEIGHT and POINTS are added.
-    """
+    """Read the header up to DATA for the parser: no padding fields, nothing optional missing."""
     lines: list[str] = []
     while len(lines) < 20:
         raw = file.readline(65536)

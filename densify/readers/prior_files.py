@@ -51,11 +51,7 @@ class PriorFiles:
 
     @staticmethod
     def open(place: Path, cameras: Sequence[str]) -> PriorFiles:
-        """Find the priors of the given cameras in a folder, or take a single file.
-
-        Raises:
-            InputError: No prior is found, or a file could belong to several cameras.
-        """
+        """Find the priors of the given cameras in a folder, or take a single file."""
         where, example = f"--prior {place}", "0000000120.npy, .exr or .png"
         if not place.exists():
             raise InputError(f"{where}: no such folder or file; expected DIR/CAMERA/{example}")
@@ -86,9 +82,6 @@ class PriorFiles:
         """Return the prior of an image at the camera's size (H,W); None if the image has no prior.
 
         A prior of another size is resized if its aspect ratio agrees to 2 %.
-
-        Raises:
-            InputError: A file is unreadable, has another aspect ratio, or holds no depth.
         """
         path = self.values[camera.name].get(number)
         if path is None:

@@ -51,11 +51,7 @@ class PoseTrack:
             )
 
     def at(self, time_ns: int) -> Float:
-        """Return the pose T_world_ego (4,4) at a time, inter- or extrapolated at constant velocity.
-
-        Raises:
-            InputError: The time is more than 0.2 s before the first pose or after the last.
-        """
+        """Return T_world_ego (4,4) at a time, up to 0.2 s beyond the ends of the path."""
         begin, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
         beyond_ns = max(begin - time_ns, time_ns - end)
         if beyond_ns > _MAX_BEYOND_NS:
@@ -69,16 +65,13 @@ class PoseTrack:
         return poses.interpolate(self.T_world_ego[i], self.T_world_ego[i + 1], fraction)
 
     def as_fired(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Undo ego-motion compensation: move points to the vehicle frame at their firing times.
+        """Undo ego-motion compensation: return points in the vehicle frame at their firing times.
 
         Args:
             points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``. Points at 0 0 0
                 (padding) stay unchanged.
             stamp_ns: Reference time of the sweep.
             offset_ns: (N,) firing times since ``stamp_ns``.
-
-        Returns:
-            (N,3) metres, each point in the vehicle frame at its own firing time.
         """
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
@@ -123,15 +116,7 @@ class PoseFile:
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
-        """Read a file with one pose on each line, in any of the supported formats.
-
-        Args:
-            path: Text file of KITTI, 4x4 or TUM lines, or a table with named columns.
-            unit: Unit of the times (s, ms, us or ns), "" to find the unit.
-
-        Raises:
-            InputError: The file is malformed. The message names file and line.
-        """
+        """Read a file with one pose on each line; ``unit`` of the times, "" to find it."""
         table = TextTable.read(path, [name for names in _TURNS for name in names])
         width, time = len(table.rows[0]), None
         columns = [i for names in (*_TURNS, *_PLACES) if (i := table.column(names)) is not None]
@@ -158,11 +143,7 @@ class PoseFile:
 
     @staticmethod
     def read_each(paths: Sequence[Path]) -> PoseFile:
-        """Read files with one pose each: 3x4 or 4x4 matrices, or x y z qx qy qz qw.
-
-        Raises:
-            InputError: A file is malformed.
-        """
+        """Read files with one pose each: 3x4 or 4x4 matrices, or x y z qx qy qz qw."""
         T = []
         for path in paths:
             count = len(read_text(path).split())

@@ -108,10 +108,7 @@ class Bag:
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Index the messages of the topics: entries by topic, with ascending stamps.
-
-        The method also counts the messages without stamps in ``num_unstamped``.
-        """
+        """Index the messages of the topics by ascending stamp, and count those without a stamp."""
         found: dict[str, list[Entry]] = {topic: [] for topic in topics}
         for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
             before = found[topic][-1] if found[topic] else None
@@ -193,10 +190,7 @@ def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
 
 
 def _bag_files(path: Path) -> list[Path]:
-    """Return the paths to open: a file, a ROS 2 bag's folder, or all .bag files in a folder.
-
-    Raises InputError for a path without a bag.
-    """
+    """Return the paths to open: a file, a ROS 2 bag's folder, or all .bag files in a folder."""
     suffixes = (".bag", ".db3", ".mcap")
     if (path.is_file() and path.suffix in suffixes) or (path / "metadata.yaml").is_file():
         return [path]
@@ -242,15 +236,7 @@ class Topics:
 
     @staticmethod
     def choose(bag: Bag, options: str | None) -> Topics:
-        """Choose the topics to read, by the user's options and the message types.
-
-        Args:
-            options: Text after ``#`` in ``--data``, such as ``points=/lidar&poses=tf``.
-
-        Raises:
-            InputError: A named topic does not exist or has another type, or not exactly one topic
-                of point clouds exists and the user named no topic.
-        """
+        """Choose the topics to read, by the user's options (after ``#``) and the message types."""
         given = dict(parse_qsl(options or "", keep_blank_values=True))
         wrong = [key for key in given if key not in ("points", "images", "poses")]
         if wrong or (options and not given):

@@ -45,11 +45,7 @@ def named(path: Path, unit: str = "") -> Named:
     """Find the frame number or the time in the name of a file.
 
     ``0000000120`` and ``cloud_12`` are numbers. ``1317042651.468569638``, ``1317042651_468569638``
-    and ``1317042651468`` are times since 1970.
-
-    Args:
-        unit: Unit of the last number in the name (s, ms, us or ns), which is then a time; "" to
-            recognise times since 1970 only.
+    and ``1317042651468`` are times since 1970. With a ``unit`` the last number is a time.
     """
     words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
     if unit:
@@ -118,15 +114,7 @@ class TextTable(NamedTuple):
 
     @staticmethod
     def read(path: Path, known: Collection[str]) -> TextTable:
-        """Read the table of a file.
-
-        Args:
-            known: Possible names of columns. The first line names the columns if it contains one of
-                these names or starts with ``#``.
-
-        Raises:
-            InputError: The file has no rows, or a row has fewer words than the first row.
-        """
+        """Read a file; its first line names columns if it has a known name or begins with #."""
         names: list[str] = []
         lines: list[int] = []
         rows: list[list[str]] = []
@@ -157,12 +145,7 @@ class TextTable(NamedTuple):
     def times_ns(self, column: int, unit: str) -> tuple[tuple[int, ...], str]:
         """Return the times of a column in nanoseconds, and the unit in the file ("date" for dates).
 
-        Args:
-            column: Index of the column.
-            unit: Unit of the numbers; "" to find the unit of times since 1970, else use seconds.
-
-        Raises:
-            InputError: A word is no time, or the median step is too long for assumed seconds.
+        Without a ``unit`` ("") the unit of times since 1970 is found; else it is seconds.
         """
         times = [words[column] for words in self.rows]
         dates = "-" in times[0][1:] and ":" in times[0]
@@ -203,13 +186,8 @@ class StampFile(NamedTuple):
     def read(path: Path, unit: str = "") -> StampFile:
         """Read the times of a file with a time on each line, among other columns or alone.
 
-        Times are numbers, or dates such as 2011-09-26 13:10:51.158069617.
-
-        Args:
-            unit: Unit of the numbers, "" to find the unit as in `TextTable.times_ns`.
-
-        Raises:
-            InputError: The file is malformed. The message names file and line.
+        Times are numbers of a ``unit`` (as in `TextTable.times_ns`), or dates such as 2011-09-26
+        13:10:51.158069617.
         """
         table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
         at_time, at_name = table.column(TIME_COLUMNS), table.column(_FILE_COLUMNS)

@@ -145,9 +145,6 @@ def read_boxes(parts: Components) -> dict[int, Boxes]:
     """Return the boxes of all annotated frames, by ``frame_timestamp_micros``.
 
     Boxes are in the vehicle's frame at the frame's ``vehicle_pose``.
-
-    Raises:
-        InputError: The component ``lidar_box`` is missing or malformed.
     """
     numbers = (*BOX_CENTRE, *BOX_SIZE, BOX_HEADING)
     rows = parts.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
@@ -165,11 +162,7 @@ def read_boxes(parts: Components) -> dict[int, Boxes]:
 
 
 def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]]:
-    """Return times and poses of the images, without pixels, by camera name and frame number.
-
-    Args:
-        starts_us: ``frame_timestamp_micros`` of the n frames, ascending.
-    """
+    """Return times and poses of images by camera name and frame number; ``starts_us`` is (n,)."""
     head = "[CameraImageComponent]"
     pose, shutter = f"{head}.pose.transform", f"{head}.rolling_shutter_params"
     times = [f"{shutter}.{name}" for name in ("camera_trigger_time", "camera_readout_done_time")]
@@ -225,12 +218,7 @@ def _whole_us(seconds: float) -> int:
 
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
-    """Open a segment of Waymo, as `densify.readers.ReaderModule` specifies.
-
-    Args:
-        path: Folder of a split, such as ``training``.
-        scene: Name of the segment (CONTEXT); None if there is only one segment.
-    """
+    """Open a segment (CONTEXT) of the folder of a split, such as ``training``."""
     files = sorted((path / "lidar").glob("*.parquet"))
     if not files:
         raise InputError(
@@ -247,11 +235,7 @@ class Waymo(FileSequence):
     """
 
     def __init__(self, root: Path, context: str) -> None:
-        """Read stamps and calibrations; sweeps, images and poses are read on demand.
-
-        Raises:
-            InputError: A component is missing or malformed.
-        """
+        """Read stamps and calibrations; sweeps, images and poses are read on demand."""
         parts = self._parts = Components(root, context)
         self._starts_us = np.unique(parts.read("lidar", {STAMP: "i"})[STAMP])
         if not len(self._starts_us):
@@ -282,11 +266,7 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the vehicle's frame; None if not annotated (test split).
-
-        Raises:
-            InputError: The boxes are malformed.
-        """
+        """Return a sweep's boxes in the vehicle's frame; None if not annotated (test split)."""
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))
 

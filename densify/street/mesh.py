@@ -62,11 +62,9 @@ class Mesh:
 
     @staticmethod
     def quads(corners: Float, material: Material, tint: Tint | Float = WHITE) -> Mesh:
-        """Return a mesh of (K,4,3) quads.
+        """Return a mesh of (K,4,3) quads, with corners in order around each quad.
 
-        Args:
-            corners: (K,4,3) metres, in order around each quad. Texture coordinates run along the
-                first side and away from it.
+        Texture coordinates run along the first side and away from it.
         """
         k = len(corners)
         side, away = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]

@@ -130,10 +130,7 @@ class Driving:
 def on_ground(
     terrain: Terrain, rear: Float, front: Float, lift_m: Float, upright: bool = False
 ) -> Poses:
-    """Return the N poses of bodies that touch the ground at a rear and a front point.
-
-    ``rear`` and ``front`` (N,2) are x, y in the world, ``lift_m`` (N,) heights above the ground.
-    """
+    """Return the N poses of bodies that touch the ground at (N,2) rear and front points."""
     a = np.column_stack([rear, terrain.height(rear) + lift_m])
     b = np.column_stack([front, terrain.height(front) + lift_m])
     middle = (a + b) / 2
@@ -151,12 +148,7 @@ class Towed:
     def __init__(
         self, tractor: Driving, kingpin_m: float, wheelbase_m: float, first_s: float, last_s: float
     ) -> None:
-        """Build the trailer.
-
-        Args:
-            kingpin_m: Position of the kingpin along the x axis of the tractor.
-            wheelbase_m: Distance from the kingpin back to the axle.
-        """
+        """Build the trailer; the kingpin is ``kingpin_m`` along the x axis of the tractor."""
         self._tractor, self._kingpin_m = tractor, kingpin_m
         times = np.arange(first_s, last_s, 0.01)
         pin = self._pin(times)
@@ -222,10 +214,7 @@ class Rectangles(NamedTuple):
 
     @staticmethod
     def of(mesh: Mesh, poses: Poses, slack_m: float = 0.0) -> Rectangles:
-        """Return the N footprints of a mesh at N poses: its bounding box seen from above.
-
-        Each side is moved outwards by ``slack_m``.
-        """
+        """Return the N footprints of a mesh at N poses: its bounds from above, plus ``slack_m``."""
         low, high = mesh.bounds
         n = len(poses.position)
         middle = np.append((low + high)[:2] / 2, 0.0)
@@ -245,10 +234,8 @@ class Rectangles(NamedTuple):
 
 
 def overlap(a: Rectangles, b: Rectangles) -> Bool:
-    """Return (...) True for pairs of rectangles that touch; leading shapes are broadcast.
-
-    Two rectangles are apart if a side of either of them separates the two (separating axes).
-    """
+    """Return (...) True for pairs of rectangles that touch; leading shapes are broadcast."""
+    # Two rectangles are apart if a side of either of them separates the two (separating axes).
     away = b.centre - a.centre
     apart = np.zeros(away.shape[:-1], bool)
     for p, q in ((a, b), (b, a)):

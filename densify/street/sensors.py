@@ -250,13 +250,7 @@ class Firings:
 
 
 def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
-    """Return all pulses of the sweep that lasts ``period_ns`` around ``time_s``.
-
-    The pulses of each scanner are evenly spaced in time.
-
-    Args:
-        time_s: Reference time of the sweep, in seconds since frame 0.
-    """
+    """Return all pulses of the sweep that lasts ``period_ns`` around ``time_s``, evenly in time."""
     parts = []
     for index, scanner in enumerate(sensor.scanners):
         num = scanner.pattern.num_pulses(period_ns * 1e-9)

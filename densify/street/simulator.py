@@ -30,10 +30,7 @@ PRESETS = {"street": street, "static": static_street, "crossing": crossing, "hig
 
 @lru_cache(maxsize=2)
 def build_scene(preset: str, seed: int) -> Scene:
-    """Return the scene of a preset and seed, always the same one.
-
-    Building takes 1 to 2 s. The last two scenes are kept, for all sensors and sweep rates.
-    """
+    """Return the scene of a preset and seed, always the same one. Building takes 1 to 2 s."""
     return PRESETS[preset](np.random.default_rng([seed, 0]))
 
 
@@ -52,12 +49,7 @@ class Bodies:
     moving: Bool
 
     def place(self, frame: int, body: NDArray[np.int32], points: Float) -> Float:
-        """Return the (N,3) world positions, at a frame's reference time, of points fixed to bodies.
-
-        Args:
-            body: (N,) index of the body of each point.
-            points: (N,3) metres, each in the frame of its body.
-        """
+        """Return (N,3) world positions, at a frame's stamp, of points in body frames."""
         T_world_body = self.T_world_body[frame][body]
         placed: Float = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points)
         return placed + T_world_body[:, :3, 3]
@@ -75,10 +67,7 @@ class Bodies:
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
     ) -> Float:
-        """Return (N,3) true scene flow, as in `densify.geometry.types.Truth.displacement`.
-
-        It is exactly 0 in the static world. Arguments are as in `place`.
-        """
+        """Return (N,3) true scene flow, as in `densify.geometry.types.Truth.displacement`."""
         self.check(target)
         there, here = (self.place(f, body, points) for f in (target, frame))
         return (there - here) @ self.T_world_lidar[frame][:3, :3]
@@ -164,8 +153,7 @@ class Simulator:
     def bodies_at(self, stamps_ns: Sequence[int], which: Sequence[int] | None = None) -> Bodies:
         """Return the poses of bodies at these times.
 
-        Args:
-            which: Indices of bodies, all bodies of an object together; None for all bodies.
+        ``which`` has indices of bodies, all bodies of an object together; None for all bodies.
         """
         times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
@@ -183,11 +171,8 @@ class Simulator:
         )
 
     def in_bodies(self, frame: int, returns: Returns) -> Float:
-        """Return the (N,3) measured points, each in the frame of the body it was measured on.
-
-        A raw point is transformed to the world by the scanner's pose at its firing time, and from
-        there to its body by the body's pose at the same time.
-        """
+        """Return the (N,3) measured points, each in the frame of the body it was measured on."""
+        # To the world and from there to the body by the poses at the point's firing time.
         times = at_offsets(seconds(self.stamp_ns(frame)), returns.offset_ns)
         points = transform(T_ego_lidar(self.tilt_deg), returns.points.astype(np.float64))
         points = self.scene.ego.poses(times).apply(points)

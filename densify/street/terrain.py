@@ -31,11 +31,7 @@ class Curve:
     """
 
     def __init__(self, xy: Float) -> None:
-        """Build the curve.
-
-        Args:
-            xy: (N,2) metres, neighbours about half a metre apart.
-        """
+        """Build the curve through (N,2) points in metres, neighbours about half a metre apart."""
         chord_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
         self.length_m = float(chord_m[-1])
         self.knots_m: Float = chord_m
@@ -70,12 +66,9 @@ class Curve:
     def bending(
         length_m: float, curvature: Callable[[Float], Float], origin_m: float = 0.0
     ) -> Curve:
-        """Return a curve of this length with a given curvature.
+        """Return a curve of this length and curvature (1/m, positive to the left, by arc length).
 
         At arc length ``origin_m`` it passes the origin with heading +x.
-
-        Args:
-            curvature: Function from arc length to curvature in 1/m, positive to the left.
         """
         step = 0.05
         station = np.arange(0.0, length_m + step, step)
@@ -100,11 +93,7 @@ class Lane:
     def __init__(
         self, road: Curve, offset_m: float | Callable[[Float], Float], forward: bool = True
     ) -> None:
-        """Build the lane.
-
-        Args:
-            offset_m: Metres to the left of the road's direction, constant or a function of station.
-        """
+        """Build the lane, ``offset_m`` (a number, or a function of station) to the left."""
         stations = road.knots_m
         offset = offset_m(stations) if callable(offset_m) else np.full(len(stations), offset_m)
         xy = road(stations) + road.normal(stations) * offset[:, None]
@@ -254,10 +243,9 @@ class Ground:
         return self.terrain.height(xy) + self.kerb_m * (self.distance(xy) > 0)
 
     def mesh(self, margin_m: float, cell_m: float, far_m: float = 200.0) -> Mesh:
-        """Return fine triangles near the roads and coarse ones beyond.
+        """Return fine triangles up to ``margin_m`` from the roads and coarse ones up to ``far_m``.
 
-        Fine triangles reach ``margin_m`` from the roads, coarse ones ``far_m``. Coarse triangles
-        are sunk where fine ones cover them.
+        Coarse triangles are sunk where fine ones cover them.
         """
         centre = np.concatenate([r.curve(r.curve.knots_m) for r in self.roads])
         low, high = centre.min(axis=0) - margin_m - 4, centre.max(axis=0) + margin_m + 4

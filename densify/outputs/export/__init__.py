@@ -60,15 +60,11 @@ def export_run(
         to: Name of a format in `densify.config.plugins.EXPORTS`.
         out: Folder to write into, None for ``RUN/export/FORMAT``.
         min_confidence: Least confidence of an exported pixel or point, 0 to 1.
-        max_age_ms: Greatest age in ms of an exported pixel or point, None for any. Age is the time
-            from the image's exposure (pixels) or the key sweep (points) to the sweep that measured
-            it. A filled pixel has the age of the nearest measured pixel.
+        max_age_ms: Greatest time in ms from the image's exposure (pixels) or the key sweep (points)
+            to the sweep that measured it, None for any. A filled pixel has the age of the nearest
+            measured pixel.
         cameras: Names of the cameras, None for all.
         overwrite: Replace an earlier export.
-
-    Raises:
-        InputError: A threshold is out of range, a file is missing, damaged or inconsistent, the
-            format cannot hold the run, or ``out`` holds an export or a run.
     """
     if not 0 <= min_confidence <= 1:
         raise InputError(f"--min-confidence {min_confidence}: expected a number from 0 to 1")

@@ -65,11 +65,7 @@ class FinishedRun:
         max_age_ms: float | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
-        """Open a folder. Arguments as in `densify.outputs.export.export_run`.
-
-        Raises:
-            InputError: The folder holds no run.
-        """
+        """Open a folder. Arguments as in `densify.outputs.export.export_run`."""
         path = folder / "run.yaml"
         if not path.is_file():
             raise InputError(
@@ -154,11 +150,7 @@ class FinishedRun:
         return {kind: stored * keep for kind, stored in maps.items()}
 
     def full_m(self, camera: str) -> Float32:
-        """Return (H,W) filled depth in metres, completed with a prior if given, 0 for no depth.
-
-        Raises:
-            InputError: The map holds ranges instead of camera z.
-        """
+        """Return (H,W) filled depth in metres, completed with a prior if given, 0 for no depth."""
         if self.measure(camera) != "z":
             raise InputError(
                 f"{camera}: its depth is the range from the lens, and the form takes camera z; "
@@ -274,15 +266,7 @@ class Timeline(NamedTuple):
 
 
 def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
-    """Yield one run with all sweeps of its window, or several runs with their key sweeps.
-
-    Args:
-        runs: Finished runs, ascending by frame number.
-
-    Raises:
-        InputError: Neither of two consecutive key sweeps is in the window of the other, so their
-            relative pose is unknown.
-    """
+    """Yield one run with all sweeps of its window, or several runs with their key sweeps."""
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
         cloud, sweeps = run.cloud(), []
         for sweep in run.scene.table["sweeps"]:
@@ -298,8 +282,7 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
 def key_poses(runs: Sequence[FinishedRun]) -> Iterator[Float]:
     """Yield ``T_world_key`` (4,4) of each run. The world is the first key sweep's lidar frame.
 
-    Raises:
-        InputError: A relative pose is unknown as in `timelines`.
+    Of two consecutive key sweeps, one must be in the window of the other.
     """
     T_world_key = np.eye(4)
     for before, run in zip([None, *runs], runs, strict=False):

@@ -62,10 +62,7 @@ def _names(value: Any) -> tuple[str, ...]:
 
 
 def _axes(value: Any) -> Float:
-    """Return the (3,3) rotation from stored to lidar axes, by three names such as [z, -x, -y].
-
-    The names are the stored axes along the lidar's x, y and z axis.
-    """
+    """Return the (3,3) rotation that puts three stored axes, as [z, -x, -y], along x, y and z."""
     R = np.array([_AXES[name] for name in _names(value)])
     if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3)):
         raise ValueError
@@ -232,13 +229,7 @@ class _File(NamedTuple):
         return self.error(key, f"got {shown}, expected {expected}")
 
     def mapping(self, key: str, value: Any, known: Collection[str] | None) -> dict[str, Any]:
-        """Return the mapping that is the value of a YAML key, empty for None.
-
-        Args:
-            key: Dotted name of the YAML key.
-            value: Value of the YAML key.
-            known: Names allowed in the mapping, None for any name.
-        """
+        """Return a YAML key's mapping, {} for None, if all its names are among ``known``."""
         value = {} if value is None else value
         if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
             raise self.unfit(key, value, "a mapping of keys to values")
@@ -284,11 +275,7 @@ class FolderConfig:
 
     @staticmethod
     def read(folder: Path) -> FolderConfig:
-        """Read the densify.yaml of a folder; return the defaults if the folder has none.
-
-        Raises:
-            InputError: A key or a value is wrong. The message names file, line and key.
-        """
+        """Read the densify.yaml of a folder; return the defaults if the folder has none."""
         path = folder / NAME
         if not path.is_file():
             return FolderConfig()

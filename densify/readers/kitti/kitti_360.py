@@ -43,12 +43,7 @@ _HALF_VIEW_DEG = 90.0
 
 
 def open_recording(path: Path, scene: str | None) -> Kitti360:
-    """Open a KITTI-360 drive; sweeps and images are read later, on request.
-
-    Args:
-        path: Folder that contains data_3d_raw/.
-        scene: Name of a drive, ``2013_05_28_drive_0000_sync``; None if there is a single drive.
-    """
+    """Open a drive, by its name, of the folder that contains data_3d_raw/."""
     names = sorted(p.parent.name for p in (path / "data_3d_raw").glob("*/velodyne_points"))
     if not names:
         raise InputError(
@@ -61,16 +56,7 @@ class Kitti360(Drive):
     """A KITTI-360 drive as a `LidarSequence`."""
 
     def __init__(self, path: Path, drive: str) -> None:
-        """Read stamps and calibration of a drive.
-
-        Args:
-            path: Folder that contains data_3d_raw/.
-            drive: Name of the drive, such as ``2013_05_28_drive_0000_sync``.
-
-        Raises:
-            InputError: The drive has no sweeps, or its stamps or the calibration of cameras with
-                images are missing or malformed.
-        """
+        """Read stamps and calibration of a drive, in the folder that contains data_3d_raw/."""
         velodyne = path / "data_3d_raw" / drive / "velodyne_points"
         around = path / "data_2d_raw" / drive
         images = {name: around / name / folder for name, folder in _FOLDERS.items()}
