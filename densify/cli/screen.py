@@ -25,18 +25,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer of a verb.
+    """The answer of a verb."""
 
-    Attributes:
-        text: Text for people.
-        facts: Values for programs (``--json``). Lists of several answers are concatenated.
-        files: Written files.
-        first: File that the user may open first -> its content.
-    """
-
-    text: str = ""
+    text: str = ""  # text for people
+    # Values for programs (``--json``). Lists of several answers are concatenated.
     facts: Mapping[str, Any] = field(default_factory=dict)
-    files: Sequence[Path] = ()
+    files: Sequence[Path] = ()  # written files
+    # File that the user may open first -> its content
     first: Mapping[Path, str] = field(default_factory=dict)
 
     def lines(self) -> list[str]:

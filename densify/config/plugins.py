@@ -63,19 +63,12 @@ class Plugin:
 
 @dataclass(frozen=True)
 class Table:
-    """The plug-ins of one kind.
+    """The plug-ins of one kind."""
 
-    Attributes:
-        kind: Name of the kind, for messages.
-        group: Entry-point group through which packages add plug-ins.
-        members: Names of functions that a plug-in's module must have.
-        built_in: Plug-ins of densify.
-    """
-
-    kind: str
-    group: str
-    members: tuple[str, ...]
-    built_in: tuple[Plugin, ...]
+    kind: str  # name of the kind, for messages
+    group: str  # entry-point group through which packages add plug-ins
+    members: tuple[str, ...]  # names of functions that a plug-in's module must have
+    built_in: tuple[Plugin, ...]  # plug-ins of densify
 
     def names(self) -> list[str]:
         """Return the built-in names, then the names from other packages."""
@@ -244,17 +237,11 @@ READERS = Table(
 
 
 class Form(NamedTuple):
-    """An export format.
+    """An export format."""
 
-    Attributes:
-        module: Module of `densify.outputs.export` with the function ``write_NAME``.
-        owned: Files and folders that the format writes.
-        of_drive: True if an export can cover several keys of a drive.
-    """
-
-    module: str
-    owned: tuple[str, ...]
-    of_drive: bool = False
+    module: str  # module of `densify.outputs.export` with the function ``write_NAME``
+    owned: tuple[str, ...]  # files and folders that the format writes
+    of_drive: bool = False  # True if an export can cover several keys of a drive
 
 
 EXPORTS = {

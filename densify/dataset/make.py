@@ -50,19 +50,13 @@ Block = tuple[Drive, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class Summary:
-    """The progress of a training set, or of one shard.
+    """The progress of a training set, or of one shard."""
 
-    Attributes:
-        records: Records of the key sweeps tried so far, by drive and frame number.
-        num_keys: Number of wanted key sweeps.
-        num_made: Number of key sweeps made in this run.
-        seconds: Duration of this run.
-    """
-
+    # Records of the key sweeps tried so far, by drive and frame number
     records: Mapping[Key, KeyRecord]
-    num_keys: int
-    num_made: int = 0
-    seconds: float = 0.0
+    num_keys: int  # number of wanted key sweeps
+    num_made: int = 0  # number of key sweeps made in this run
+    seconds: float = 0.0  # duration of this run
 
     def count(self, status: str) -> int:
         """Return the number of key sweeps with this status: done, aside or failed."""

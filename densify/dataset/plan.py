@@ -120,20 +120,13 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Drive:
-    """A recording of a training set.
+    """A recording of a training set."""
 
-    Attributes:
-        name: Name of the recording's folder.
-        data: Text of ``--data``, with an absolute path.
-        folder: Folder of the recording's files, relative to the training set.
-        cameras: The wanted cameras, by name.
-        blocks: Key frame numbers, ascending. The key sweeps of a block share pipeline stages.
-    """
-
-    name: str
-    data: str
-    folder: str
-    cameras: Mapping[str, Camera]
+    name: str  # name of the recording's folder
+    data: str  # text of ``--data``, with an absolute path
+    folder: str  # folder of the recording's files, relative to the training set
+    cameras: Mapping[str, Camera]  # the wanted cameras, by name
+    # Key frame numbers, ascending. The key sweeps of a block share pipeline stages.
     blocks: tuple[tuple[int, ...], ...]
 
     @property

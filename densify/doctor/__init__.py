@@ -85,15 +85,10 @@ CHECKS: tuple[Callable[[Sample], list[Finding]], ...] = (
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The findings about a recording.
+    """The findings about a recording."""
 
-    Attributes:
-        sample: Sweeps that were examined.
-        findings: Findings in the order of `CHECKS`.
-    """
-
-    sample: Sample
-    findings: tuple[Finding, ...]
+    sample: Sample  # sweeps that were examined
+    findings: tuple[Finding, ...]  # findings in the order of `CHECKS`
 
     @property
     def worst(self) -> Verdict:

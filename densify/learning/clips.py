@@ -32,24 +32,17 @@ _POSES_GIVEN = {"register": {"source": "dataset"}}
 
 @dataclass(frozen=True)
 class ClipSweep:
-    """The n points of a sweep above the ground.
+    """The n points of a sweep above the ground."""
 
-    Attributes:
-        points: (n,3) metres, world axes, origin at the scanner's position in the clip's key frame.
-        height_m: (n,) height above the ground.
-        origin_m: (3,) position of the scanner, in the coordinates of ``points``.
-        time_s: Time since the clip's first sweep.
-        flow: (2,n,3) metres, world axes, ego-motion removed: flow to the previous sweep and to the
-            next sweep, 0 where that sweep is missing. None without labels.
-        moving: (n,) bool, None without labels.
-    """
-
+    # (n,3) metres, world axes, origin at the scanner's position in the clip's key frame
     points: Float32
-    height_m: Float32
-    origin_m: Float32
-    time_s: float
+    height_m: Float32  # (n,) height above the ground
+    origin_m: Float32  # (3,) position of the scanner, in the coordinates of ``points``
+    time_s: float  # time since the clip's first sweep
+    # (2,n,3) metres, world axes, ego-motion removed: flow to the previous sweep and to the next
+    # sweep, 0 where that sweep is missing. None without labels.
     flow: Float32 | None = None
-    moving: Bool | None = None
+    moving: Bool | None = None  # (n,) bool, None without labels
 
 
 Clip = tuple[ClipSweep, ...]
@@ -58,16 +51,11 @@ Clip = tuple[ClipSweep, ...]
 
 @dataclass(frozen=True)
 class ClipMaker:
-    """Make clips by number: the same number gives the same clip, in any process.
+    """Make clips by number: the same number gives the same clip, in any process."""
 
-    Attributes:
-        data: Specifications of recordings, or `STREETS`.
-        teacher: Source of the labels, as in `make_clip`.
-    """
-
-    data: tuple[str, ...]
+    data: tuple[str, ...]  # specifications of recordings, or `STREETS`
     seed: int
-    teacher: str = "objective"
+    teacher: str = "objective"  # source of the labels, as in `make_clip`
 
     def __call__(self, number: int) -> Clip:
         """Make the clip of a number."""

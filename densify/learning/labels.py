@@ -22,19 +22,13 @@ from densify.pipeline.recording import Recording
 
 @dataclass(frozen=True)
 class Label:
-    """The scene flow label of one sweep with N points.
-
-    Attributes:
-        after: The next sweep.
-        field: Flow to the next sweep, in the sweep's lidar frame, ego-motion removed.
-        sure: (N,) True for points whose flow is certain.
-        T_next_here: (4,4) from the lidar frame of the sweep to the lidar frame of the next sweep.
-    """
+    """The scene flow label of one sweep with N points."""
 
     registered: RegisteredSweep
-    after: RegisteredSweep
-    field: FlowField
-    sure: Bool
+    after: RegisteredSweep  # the next sweep
+    field: FlowField  # flow to the next sweep, in the sweep's lidar frame, ego-motion removed
+    sure: Bool  # (N,) True for points whose flow is certain
+    # (4,4) from the lidar frame of the sweep to the lidar frame of the next sweep
     T_next_here: np.ndarray
 
 

@@ -51,29 +51,19 @@ _LARGEST_HEIGHT_M = 4.0
 
 
 class NetworkCloud(NamedTuple):
-    """One sweep of n points as input of the network.
+    """One sweep of n points as input of the network."""
 
-    Attributes:
-        points: (n,3) float32 metres, world axes (z up), origin at the *source* sweep's scanner.
-        height_m: (n,) float32 height above the ground.
-    """
-
+    # (n,3) float32 metres, world axes (z up), origin at the *source* sweep's scanner
     points: Tensor
-    height_m: Tensor
+    height_m: Tensor  # (n,) float32 height above the ground
 
 
 class AboveGround(NamedTuple):
-    """The n points of a sweep above the ground.
+    """The n points of a sweep above the ground."""
 
-    Attributes:
-        row: (n,) index into the sweep's points.
-        points: (n,3) metres, world.
-        height_m: (n,) height above the ground.
-    """
-
-    row: Int
-    points: Float
-    height_m: Float32
+    row: Int  # (n,) index into the sweep's points
+    points: Float  # (n,3) metres, world
+    height_m: Float32  # (n,) height above the ground
 
     @staticmethod
     def of(registered: RegisteredSweep, ground: HeightMap, row: Int | None = None) -> AboveGround:
@@ -246,13 +236,10 @@ _HEADER, _WEIGHTS = "header", "weights/"
 
 @dataclass(frozen=True)
 class Model:
-    """A network with its weights.
-
-    Attributes:
-        made: How the network was trained, plain values for JSON.
-    """
+    """A network with its weights."""
 
     network: Voxels
+    # How the network was trained, plain values for JSON
     made: Mapping[str, Any] = field(default_factory=dict)
 
     def flow(self, sweeps: Sweeps) -> Float:

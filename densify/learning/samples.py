@@ -36,24 +36,16 @@ _SCALES = (0.95, 1.05)
 
 
 class Sample(NamedTuple):
-    """One pair of sweeps to train on; the source has n points.
+    """One pair of sweeps to train on; the source has n points."""
 
-    Attributes:
-        sweeps: Source, target, and sweeps before the source; augmented coordinates.
-        drawn: (d,) rows of the source points that the objective uses.
-        drawn_target: (e,3) target points that the objective uses.
-        in_reach: (n,) mask of the source points within the network's grid, which count in the loss.
-        flow: (n,3) known flow to the target, m, without ego-motion; None without labels.
-        moving: (n,) bool tensor, None without labels.
-    """
-
-    sweeps: Sweeps
-    drawn: Tensor
-    drawn_target: Tensor
+    sweeps: Sweeps  # source, target, and sweeps before the source; augmented coordinates
+    drawn: Tensor  # (d,) rows of the source points that the objective uses
+    drawn_target: Tensor  # (e,3) target points that the objective uses
+    # (n,) mask of the source points within the network's grid, which count in the loss
     in_reach: Tensor
     duration_s: float
-    flow: Any = None
-    moving: Any = None
+    flow: Any = None  # (n,3) known flow to the target, m, without ego-motion; None without labels
+    moving: Any = None  # (n,) bool tensor, None without labels
 
 
 def on_device(value: Any, device: torch.device) -> Any:

@@ -29,20 +29,13 @@ _NUM_AVERAGED = 50  # number of losses
 
 @dataclass(frozen=True)
 class Training:
-    """The settings of a training.
+    """The settings of a training."""
 
-    Attributes:
-        data: Specifications of recordings.
-        steps: Number of training steps, each with one pair of sweeps.
-        teacher: Source of supervision: "objective", "engine" or "truth".
-        device: Device to train on, "auto", "cpu" or "cuda".
-    """
-
-    data: tuple[str, ...]
-    steps: int
-    teacher: str = "objective"
+    data: tuple[str, ...]  # specifications of recordings
+    steps: int  # number of training steps, each with one pair of sweeps
+    teacher: str = "objective"  # source of supervision: "objective", "engine" or "truth"
     seed: int = 0
-    device: str = "auto"
+    device: str = "auto"  # device to train on, "auto", "cpu" or "cuda"
 
 
 def train(training: Training, out: Path, progress: Progress | None = None) -> float:

@@ -19,17 +19,11 @@ from densify.readers import checks
 
 @dataclass(frozen=True)
 class SceneFile:
-    """The content of scene.json.
+    """The content of scene.json."""
 
-    Attributes:
-        table: The parsed JSON of the whole file.
-        views: Name of the depth map -> its camera and pose.
-        T_key_lidar: Frame number of a sweep of the window -> (4,4) pose in the key sweep's lidar
-            frame.
-    """
-
-    table: Mapping[str, Any]
-    views: Mapping[str, CameraView]
+    table: Mapping[str, Any]  # the parsed JSON of the whole file
+    views: Mapping[str, CameraView]  # name of the depth map -> its camera and pose
+    # Frame number of a sweep of the window -> (4,4) pose in the key sweep's lidar frame
     T_key_lidar: Mapping[int, Float]
 
 

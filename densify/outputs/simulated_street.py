@@ -92,16 +92,11 @@ def write_street(
 
 @dataclass(frozen=True)
 class Excerpt:
-    """Chosen frames and cameras of a simulated street.
-
-    Attributes:
-        frames: Frame numbers, ascending.
-        cameras: Names of the cameras.
-    """
+    """Chosen frames and cameras of a simulated street."""
 
     street: Street
-    frames: tuple[int, ...]
-    cameras: tuple[str, ...]
+    frames: tuple[int, ...]  # frame numbers, ascending
+    cameras: tuple[str, ...]  # names of the cameras
 
     @classmethod
     def of(

@@ -47,18 +47,12 @@ class DepthPair:
 
 @dataclass(frozen=True)
 class DepthPairs:
-    """Pairs of estimated and true depth maps, and the files that could not be paired.
+    """Pairs of estimated and true depth maps, and the files that could not be paired."""
 
-    Attributes:
-        pairs: One or more pairs, ordered by the path of the true map.
-        without_truth: Paths of estimated maps without a true map.
-        without_prediction: Paths of true maps without an estimated map.
-        without_mask: Paths of paired true maps without a mask; empty if no masks are given.
-    """
-
-    pairs: tuple[DepthPair, ...]
-    without_truth: tuple[Path, ...] = ()
-    without_prediction: tuple[Path, ...] = ()
+    pairs: tuple[DepthPair, ...]  # one or more pairs, ordered by the path of the true map
+    without_truth: tuple[Path, ...] = ()  # paths of estimated maps without a true map
+    without_prediction: tuple[Path, ...] = ()  # paths of true maps without an estimated map
+    # Paths of paired true maps without a mask; empty if no masks are given
     without_mask: tuple[Path, ...] = ()
 
 

@@ -200,17 +200,12 @@ _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 @dataclass(frozen=True)
 class LabelledFlow:
-    """The ground-truth flow of the N points of a registered sweep.
+    """The ground-truth flow of the N points of a registered sweep."""
 
-    Attributes:
-        flow: (N,3) metres to the next sweep, ego-motion removed, in the sweep's lidar frame.
-        classes: (N,) uint8 index in `densify.scores.challenge.CLASSES`, or its ``IGNORED``.
-        valid: (N,) bool, the ground-truth flow of the point is known.
-    """
-
-    flow: Float
+    flow: Float  # (N,3) metres to the next sweep, ego-motion removed, in the sweep's lidar frame
+    # (N,) uint8 index in `densify.scores.challenge.CLASSES`, or its ``IGNORED``
     classes: NDArray[np.uint8]
-    valid: Bool
+    valid: Bool  # (N,) bool, the ground-truth flow of the point is known
 
 
 def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:

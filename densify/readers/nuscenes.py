@@ -103,15 +103,10 @@ def _existing(path: Path) -> Path:
 
 
 class KeyBox(NamedTuple):
-    """The annotated box of one object in one key frame.
+    """The annotated box of one object in one key frame."""
 
-    Attributes:
-        T_world_box: (4,4) pose of the box in the world: origin in its middle, x front, z up.
-        size_m: (3,) length, width, height.
-    """
-
-    T_world_box: Float
-    size_m: Float
+    T_world_box: Float  # (4,4) pose of the box in the world: origin in its middle, x front, z up
+    size_m: Float  # (3,) length, width, height
 
 
 @dataclass(frozen=True)
@@ -121,16 +116,11 @@ class Annotations:
     Between key frames, boxes are interpolated at constant velocity and turn rate, as in the devkit.
     An object in only one of two consecutive key frames is extrapolated from its nearest motion. Its
     box then has no track name, because the real position is unknown.
-
-    Attributes:
-        where: Path of the table, for messages.
-        key_ns: (n,) ascending times of the key frames.
-        boxes: Boxes of each key frame, by the token of the object.
     """
 
-    where: str
-    key_ns: Int
-    boxes: tuple[Mapping[str, KeyBox], ...]
+    where: str  # path of the table, for messages
+    key_ns: Int  # (n,) ascending times of the key frames
+    boxes: tuple[Mapping[str, KeyBox], ...]  # boxes of each key frame, by the token of the object
 
     @staticmethod
     def read(tables: Path, scene: str) -> Annotations | None:
@@ -210,21 +200,13 @@ def open_recording(path: Path, scene: str | None) -> NuScenes:
 
 @dataclass(frozen=True)
 class Channel:
-    """One sensor of a scene, with R records (sweeps or images).
+    """One sensor of a scene, with R records (sweeps or images)."""
 
-    Attributes:
-        stamps_ns: R times of the records, ascending.
-        files: R paths of the records' files; a file may be missing on the disk.
-        T_ego_sensor: R poses (4,4) of the sensor in the vehicle's frame.
-        size_px: Width and height of the images; zeros for a lidar.
-        intrinsics: Camera matrix (3 x 3) of the first record as parsed from JSON.
-    """
-
-    stamps_ns: Sequence[int]
-    files: Sequence[Path]
-    T_ego_sensor: Sequence[Float]
-    size_px: tuple[int, int]
-    intrinsics: Any
+    stamps_ns: Sequence[int]  # R times of the records, ascending
+    files: Sequence[Path]  # R paths of the records' files; a file may be missing on the disk
+    T_ego_sensor: Sequence[Float]  # R poses (4,4) of the sensor in the vehicle's frame
+    size_px: tuple[int, int]  # width and height of the images; zeros for a lidar
+    intrinsics: Any  # camera matrix (3 x 3) of the first record as parsed from JSON
 
     def on_disk(self) -> dict[int, Path]:
         """Return the existing files, by the index of their records."""
@@ -233,22 +215,14 @@ class Channel:
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene with its sensors.
-
-    Attributes:
-        tables: Folder of the JSON tables.
-        token: Token of the scene, its key in the tables.
-        lidars: Lidars by the name of their channel, sorted.
-        cameras: Cameras by the name of their channel, sorted.
-        track: Poses T_world_ego of the vehicle over time.
-    """
+    """A scene with its sensors."""
 
     name: str
-    tables: Path
-    token: str
-    lidars: Mapping[str, Channel]
-    cameras: Mapping[str, Channel]
-    track: PoseTrack
+    tables: Path  # folder of the JSON tables
+    token: str  # token of the scene, its key in the tables
+    lidars: Mapping[str, Channel]  # lidars by the name of their channel, sorted
+    cameras: Mapping[str, Channel]  # cameras by the name of their channel, sorted
+    track: PoseTrack  # poses T_world_ego of the vehicle over time
 
     @staticmethod
     def read(tables: Path, token: str, name: str) -> Scene:

@@ -72,26 +72,17 @@ def find_fields(names: Collection[str]) -> Fields:
 
 @dataclass(frozen=True)
 class PointTimes:
-    """How to convert a field of point times to nanoseconds since the stamp of the sweep.
+    """How to convert a field of point times to nanoseconds since the stamp of the sweep."""
 
-    Attributes:
-        field: Name of the field.
-        unit: Unit of the times, one of `UNIT_NS`.
-        absolute: True if times count from an epoch, False if from the stamp of the sweep.
-        other_clock: True if the epoch of absolute times is not the epoch of the stamps.
-        middle_ns: Typical middle of a sweep's times, since its stamp. It is not used with
-            ``other_clock``, where the middle is computed for each sweep.
-        reach_ns: Largest accepted distance of a time from the middle of its sweep.
-        reference: Part of the sweep measured at its stamp, one of `REFERENCES`; "" to use the
-            times as they are.
-    """
-
-    field: str
-    unit: str
-    absolute: bool
-    other_clock: bool
+    field: str  # name of the field
+    unit: str  # unit of the times, one of `UNIT_NS`
+    absolute: bool  # True if times count from an epoch, False if from the stamp of the sweep
+    other_clock: bool  # True if the epoch of absolute times is not the epoch of the stamps
+    # Typical middle of a sweep's times, since its stamp. It is not used with ``other_clock``, where
+    # the middle is computed for each sweep.
     middle_ns: int
-    reach_ns: int
+    reach_ns: int  # largest accepted distance of a time from the middle of its sweep
+    # Part of the sweep measured at its stamp, one of `REFERENCES`; "" to use the times as they are
     reference: str
 
     def offset_ns(self, values: NDArray[Any], stamp_ns: int) -> tuple[Int, Bool]:
@@ -282,18 +273,12 @@ def scaled(intensity: NDArray[Any], scale: float) -> Float32:
 
 @dataclass(frozen=True)
 class PointLayout:
-    """The meaning of the fields in a sensor's sweeps.
-
-    Attributes:
-        times: Meaning of the point times, None without usable times.
-        time_words: Description of the times, or the reason why there are none.
-        intensity_scale: Divisor that scales intensities to 0 to 1.
-    """
+    """The meaning of the fields in a sensor's sweeps."""
 
     fields: Fields
-    times: PointTimes | None
-    time_words: str
-    intensity_scale: float
+    times: PointTimes | None  # meaning of the point times, None without usable times
+    time_words: str  # description of the times, or the reason why there are none
+    intensity_scale: float  # divisor that scales intensities to 0 to 1
 
     @staticmethod
     def find(

@@ -36,15 +36,12 @@ _ROWS_LOOKED_AT = 4000
 
 @dataclass(frozen=True)
 class PointTable:
-    """The N points of a file.
+    """The N points of a file."""
 
-    Attributes:
-        columns: Values (N,) of each column as stored, by name. Columns that have no name in the
-            file get the names of `unnamed`.
-        beside: Further arrays of an .npz file, by name.
-    """
-
+    # Values (N,) of each column as stored, by name. Columns that have no name in the file get the
+    # names of `unnamed`.
     columns: Columns
+    # Further arrays of an .npz file, by name
     beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __len__(self) -> int:

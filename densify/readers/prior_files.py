@@ -37,17 +37,11 @@ _SAME_ASPECT = 0.02
 
 @dataclass(frozen=True)
 class PriorFiles:
-    """The files of the user's depth priors.
+    """The files of the user's depth priors."""
 
-    Attributes:
-        place: Folder or file that the user named.
-        values: Depth files, by camera name and image number.
-        sky: Files of sky masks, by camera name and image number.
-    """
-
-    place: Path
-    values: Mapping[str, Mapping[int, Path]]
-    sky: Mapping[str, Mapping[int, Path]]
+    place: Path  # folder or file that the user named
+    values: Mapping[str, Mapping[int, Path]]  # depth files, by camera name and image number
+    sky: Mapping[str, Mapping[int, Path]]  # files of sky masks, by camera name and image number
 
     @staticmethod
     def open(place: Path, cameras: Sequence[str]) -> PriorFiles:

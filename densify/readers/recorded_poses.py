@@ -31,17 +31,11 @@ _TURNS = tuple((f"q{a}", f"q_{a}", f"rot_{a}", f"orientation_{a}") for a in "wxy
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """The path of a vehicle as n poses over time.
+    """The path of a vehicle as n poses over time."""
 
-    Attributes:
-        where: File of the poses, for messages.
-        stamp_ns: (n,) int64 times of the poses, ascending.
-        T_world_ego: (n,4,4) poses of the vehicle (in some readers of the lidar) in the world.
-    """
-
-    where: str
-    stamp_ns: Int
-    T_world_ego: Float
+    where: str  # file of the poses, for messages
+    stamp_ns: Int  # (n,) int64 times of the poses, ascending
+    T_world_ego: Float  # (n,4,4) poses of the vehicle (in some readers of the lidar) in the world
 
     def __post_init__(self) -> None:
         if len(self.stamp_ns) < 2 or np.any(np.diff(self.stamp_ns) <= 0):
@@ -100,19 +94,12 @@ class PoseTrack:
 
 @dataclass(frozen=True)
 class PoseFile:
-    """The n poses of a text file, in the frames that the file uses (usually T_world_body).
+    """The n poses of a text file, in the frames that the file uses (usually T_world_body)."""
 
-    Attributes:
-        path: File of the poses; the first file if each sweep has its own.
-        form: Name of the file's format, for messages.
-        T: (n,4,4) poses in file order.
-        stamps_ns: n times of the poses, None for a file without times.
-    """
-
-    path: Path
-    form: str
-    T: Float
-    stamps_ns: tuple[int, ...] | None = None
+    path: Path  # file of the poses; the first file if each sweep has its own
+    form: str  # name of the file's format, for messages
+    T: Float  # (n,4,4) poses in file order
+    stamps_ns: tuple[int, ...] | None = None  # n times of the poses, None for a file without times
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:

@@ -54,20 +54,13 @@ def open_recording(path: Path, scene: str | None) -> RosBag:
 
 
 class Lidar(NamedTuple):
-    """A lidar of the bag.
-
-    Attributes:
-        frame: Frame in the header of the messages.
-        entries: Index of the messages, by ascending stamp.
-        T_first_lidar: (4,4) pose of this lidar in the frame of the first lidar.
-        period_ns: Median time between consecutive messages.
-    """
+    """A lidar of the bag."""
 
     topic: str
-    frame: str
-    entries: list[Entry]
-    T_first_lidar: Float
-    period_ns: int
+    frame: str  # frame in the header of the messages
+    entries: list[Entry]  # index of the messages, by ascending stamp
+    T_first_lidar: Float  # (4,4) pose of this lidar in the frame of the first lidar
+    period_ns: int  # median time between consecutive messages
     layout: PointLayout
 
 

@@ -48,28 +48,18 @@ _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
 
 
 class Entry(NamedTuple):
-    """Index entry that finds one message of a topic.
+    """Index entry that finds one message of a topic."""
 
-    Attributes:
-        stamp_ns: Time in the header of the message; the time of recording if the header has 0.
-        log_ns: Time at which the message was recorded.
-        turn: Index of the message among the topic's messages with the same ``log_ns``.
-    """
-
-    stamp_ns: int
-    log_ns: int
-    turn: int
+    stamp_ns: int  # time in the header of the message; the time of recording if the header has 0
+    log_ns: int  # time at which the message was recorded
+    turn: int  # index of the message among the topic's messages with the same ``log_ns``
 
 
 class Topic(NamedTuple):
-    """A topic of a bag.
-
-    Attributes:
-        type: Message type in ROS 2 notation, such as sensor_msgs/msg/PointCloud2.
-    """
+    """A topic of a bag."""
 
     name: str
-    type: str
+    type: str  # message type in ROS 2 notation, such as sensor_msgs/msg/PointCloud2
     num_messages: int
 
 
@@ -219,19 +209,13 @@ def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
 
 @dataclass(frozen=True)
 class Topics:
-    """The topics of a bag that are used.
+    """The topics of a bag that are used."""
 
-    Attributes:
-        points: Topics of the lidars. Each message of the first topic is a sweep.
-        images: Topics of the cameras' images.
-        poses: Topic of the poses, ``tf`` for /tf, or "" to read no poses.
-        named: Options that the user gave (points, images, poses). A problem with a named topic is
-            an error; other unusable topics are skipped.
-    """
-
-    points: tuple[str, ...]
-    images: tuple[str, ...]
-    poses: str
+    points: tuple[str, ...]  # topics of the lidars. Each message of the first topic is a sweep.
+    images: tuple[str, ...]  # topics of the cameras' images
+    poses: str  # topic of the poses, ``tf`` for /tf, or "" to read no poses
+    # Options that the user gave (points, images, poses). A problem with a named topic is an error;
+    # other unusable topics are skipped.
     named: Collection[str]
 
     @staticmethod

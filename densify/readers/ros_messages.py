@@ -172,16 +172,12 @@ def _binned(camera: Camera, info: Any) -> Camera:
 
 @dataclass(frozen=True)
 class Transforms:
-    """The tree of coordinate frames of a bag.
+    """The tree of coordinate frames of a bag."""
 
-    Attributes:
-        where: Path of the bag, for messages.
-        fixed: Name of the parent frame and the constant pose T_parent_child (4,4), by child frame.
-        moving: Name of the parent frame and the path T_parent_child over time, by child frame.
-    """
-
-    where: str
+    where: str  # path of the bag, for messages
+    # Name of the parent frame and the constant pose T_parent_child (4,4), by child frame
     fixed: dict[str, tuple[str, Float]] = field(default_factory=dict)
+    # Name of the parent frame and the path T_parent_child over time, by child frame
     moving: dict[str, tuple[str, PoseTrack]] = field(default_factory=dict)
 
     @staticmethod

@@ -29,16 +29,11 @@ _MOST_NS = 2**63
 
 
 class Named(NamedTuple):
-    """A file and the number or time in its name.
-
-    Attributes:
-        number: Number in the name; None for a name with a time or without digits.
-        stamp_ns: Time in the name in nanoseconds; None for a name without a time.
-    """
+    """A file and the number or time in its name."""
 
     path: Path
-    number: int | None
-    stamp_ns: int | None
+    number: int | None  # number in the name; None for a name with a time or without digits
+    stamp_ns: int | None  # time in the name in nanoseconds; None for a name without a time
 
 
 def named(path: Path, unit: str = "") -> Named:
@@ -99,18 +94,12 @@ def _epoch_unit(text: str) -> str:
 
 
 class TextTable(NamedTuple):
-    """Table of a text file, with columns separated by blanks, commas, semicolons or tabs.
-
-    Attributes:
-        names: Names of the columns in lower case; empty without a line of names.
-        lines: Line number of each row in the file, from 1.
-        rows: Words of each row.
-    """
+    """Table of a text file, with columns separated by blanks, commas, semicolons or tabs."""
 
     path: Path
-    names: list[str]
-    lines: list[int]
-    rows: list[list[str]]
+    names: list[str]  # names of the columns in lower case; empty without a line of names
+    lines: list[int]  # line number of each row in the file, from 1
+    rows: list[list[str]]  # words of each row
 
     @staticmethod
     def read(path: Path, known: Collection[str]) -> TextTable:
@@ -169,17 +158,12 @@ class TextTable(NamedTuple):
 
 
 class StampFile(NamedTuple):
-    """The times of a text file, line by line.
-
-    Attributes:
-        stamp_ns: Time of each line in nanoseconds.
-        unit: Unit of the times in the file: s, ms, us, ns or date.
-        names: Name of the sweep or image file of each line; None if lines have only times.
-    """
+    """The times of a text file, line by line."""
 
     path: Path
-    stamp_ns: tuple[int, ...]
-    unit: str
+    stamp_ns: tuple[int, ...]  # time of each line in nanoseconds
+    unit: str  # unit of the times in the file: s, ms, us, ns or date
+    # Name of the sweep or image file of each line; None if lines have only times
     names: tuple[str, ...] | None
 
     @staticmethod

@@ -25,14 +25,10 @@ _NOMINAL_PERIOD_NS = 100_000_000  # period of a recording with one sweep
 
 
 class WindowFrames(NamedTuple):
-    """The window of sweeps around a key frame.
+    """The window of sweeps around a key frame."""
 
-    Attributes:
-        frames: Frame numbers in the window, ascending, including the key frame.
-        cuts: Reasons why the window is smaller than requested, a clause for each cut side.
-    """
-
-    frames: tuple[int, ...]
+    frames: tuple[int, ...]  # frame numbers in the window, ascending, including the key frame
+    # Reasons why the window is smaller than requested, a clause for each cut side
     cuts: tuple[str, ...]
 
 
@@ -72,19 +68,12 @@ def check_key(key: int) -> None:
 
 @dataclass(frozen=True)
 class Timeline:
-    """The reference times of a recording.
+    """The reference times of a recording."""
 
-    Attributes:
-        name: Name of the recording.
-        frames: Numbers of all n sweeps, ascending.
-        stamp_ns: (n,) int64 reference times of the sweeps; interpolated for ``unknown`` sweeps.
-        unknown: Reason why a stamp is unknown or out of order, by frame number.
-    """
-
-    name: str
-    frames: tuple[int, ...]
-    stamp_ns: Int
-    unknown: Mapping[int, str]
+    name: str  # name of the recording
+    frames: tuple[int, ...]  # numbers of all n sweeps, ascending
+    stamp_ns: Int  # (n,) int64 reference times of the sweeps; interpolated for ``unknown`` sweeps
+    unknown: Mapping[int, str]  # reason why a stamp is unknown or out of order, by frame number
 
     @staticmethod
     def of(sequence: LidarSequence) -> Timeline:

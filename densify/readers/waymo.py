@@ -80,17 +80,13 @@ class Components:
 
 
 class Laser(NamedTuple):
-    """The calibration of a lidar.
+    """The calibration of a lidar."""
 
-    Attributes:
-        T_vehicle_laser: (4,4) pose of the lidar in the vehicle's frame.
-        inclinations_rad: (H,) inclinations of the beams, from the lowest beam up; None for beams
-            spread evenly between ``bounds_rad``.
-        bounds_rad: Inclinations of the lower and upper limit of the field of view.
-    """
-
-    T_vehicle_laser: Float
+    T_vehicle_laser: Float  # (4,4) pose of the lidar in the vehicle's frame
+    # (H,) inclinations of the beams, from the lowest beam up; None for beams spread evenly between
+    # ``bounds_rad``
     inclinations_rad: Float | None
+    # Inclinations of the lower and upper limit of the field of view
     bounds_rad: tuple[float, float]
 
     def directions(self, size: tuple[int, ...]) -> Float:
@@ -108,19 +104,12 @@ class Laser(NamedTuple):
 
 
 class Image(NamedTuple):
-    """The times and the pose of an image.
+    """The times and the pose of an image."""
 
-    Attributes:
-        pose_ns: Time of the pose ``T_world_vehicle``.
-        exposed_ns: Exposure time of the middle row or column.
-        readout_s: Time between the exposures of the first and the last row or column.
-        T_world_vehicle: (4,4) pose of the vehicle in the world.
-    """
-
-    pose_ns: int
-    exposed_ns: int
-    readout_s: float
-    T_world_vehicle: Float
+    pose_ns: int  # time of the pose ``T_world_vehicle``
+    exposed_ns: int  # exposure time of the middle row or column
+    readout_s: float  # time between the exposures of the first and the last row or column
+    T_world_vehicle: Float  # (4,4) pose of the vehicle in the world
 
 
 def read_lasers(parts: Components) -> dict[int, Laser]:

@@ -39,15 +39,10 @@ T_FISHEYE_LIDAR = np.array(  # on the left of the roof, facing left
 
 
 class Shutter(NamedTuple):
-    """The exposure times of a camera.
+    """The exposure times of a camera."""
 
-    Attributes:
-        delay_ns: Exposure of the first image minus frame 0's reference time.
-        period_ns: Time between images; None for one image per sweep.
-    """
-
-    delay_ns: int
-    period_ns: int | None = None
+    delay_ns: int  # exposure of the first image minus frame 0's reference time
+    period_ns: int | None = None  # time between images; None for one image per sweep
 
 
 def _pinhole(name: str, right_m: float, share: float = 1.0, row_time_s: float = 0.0) -> Camera:
@@ -105,18 +100,13 @@ _SUN = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
 
 @dataclass(frozen=True)
 class Picture:
-    """One exposure of (H,W) pixels.
+    """One exposure of (H,W) pixels."""
 
-    Attributes:
-        image: (H,W,3) uint8 RGB.
-        depth_m: (H,W) float32 depth of the nearest surface, glass included, by the camera's
-            ``measure``. 0 for pixels without a surface within 120 m, or outside the lens's view.
-        body: (H,W) int32 index of the visible body, -1 for sky.
-    """
-
-    image: NDArray[np.uint8]
+    image: NDArray[np.uint8]  # (H,W,3) uint8 RGB
+    # (H,W) float32 depth of the nearest surface, glass included, by the camera's ``measure``. 0 for
+    # pixels without a surface within 120 m, or outside the lens's view.
     depth_m: Float32
-    body: NDArray[np.int32]
+    body: NDArray[np.int32]  # (H,W) int32 index of the visible body, -1 for sky
 
 
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:

@@ -17,15 +17,10 @@ from densify.street.terrain import Curve, Speed, Terrain, left_of
 
 
 class Poses(NamedTuple):
-    """N poses ``T_world_body``.
+    """N poses ``T_world_body``."""
 
-    Attributes:
-        rotation: (N,3,3) rotation matrices.
-        position: (N,3) metres.
-    """
-
-    rotation: Float
-    position: Float
+    rotation: Float  # (N,3,3) rotation matrices
+    position: Float  # (N,3) metres
 
     def apply(self, points: Float) -> Float:
         """Return (N,3) body-frame points in the world, row by row."""
@@ -93,25 +88,17 @@ class Driving:
     """The trajectory of a vehicle that follows a curve on the ground with both axles.
 
     The origin is midway between the axles, x forward, z up.
-
-    Attributes:
-        curve: Path of both axles.
-        speed: Speed along the path.
-        station_m: Arc length along the path at time ``at_s``.
-        at_s: Time of ``station_m``, seconds since frame 0.
-        wheelbase_m: Distance of the two axles.
-        lift_m: Function from (N,) arc lengths to (N,) heights above the ground.
-        upright: Stay vertical on slopes, as a pedestrian does.
     """
 
-    curve: Curve
-    speed: Speed
-    station_m: float
-    at_s: float
+    curve: Curve  # path of both axles
+    speed: Speed  # speed along the path
+    station_m: float  # arc length along the path at time ``at_s``
+    at_s: float  # time of ``station_m``, seconds since frame 0
     terrain: Terrain
-    wheelbase_m: float
+    wheelbase_m: float  # distance of the two axles
+    # Function from (N,) arc lengths to (N,) heights above the ground
     lift_m: Callable[[Float], Float] | None = None
-    upright: bool = False
+    upright: bool = False  # stay vertical on slopes, as a pedestrian does
 
     def station(self, times_s: Float) -> Float:
         """Return (N,) arc lengths along the curve at (N,) seconds."""
@@ -171,21 +158,14 @@ class Towed:
 
 @dataclass(frozen=True)
 class Limb:
-    """A limb that swings about a horizontal hinge of its parent, in step with the distance walked.
+    """A limb that swings about a horizontal hinge of its parent, in step with its walk."""
 
-    Attributes:
-        parent: Trajectory of the body that carries the limb.
-        hinge_m: (3,) position of the hinge in the parent's frame; origin of the limb.
-        swing: Amplitude in rad.
-        stride_m: Distance walked in one full swing.
-        phase: Phase of the swing in rad.
-    """
-
-    parent: Driving
+    parent: Driving  # trajectory of the body that carries the limb
+    # (3,) position of the hinge in the parent's frame; origin of the limb
     hinge_m: tuple[float, float, float]
-    swing: float
-    stride_m: float
-    phase: float
+    swing: float  # amplitude in rad
+    stride_m: float  # distance walked in one full swing
+    phase: float  # phase of the swing in rad
 
     def poses(self, times_s: Float) -> Poses:
         """Return N poses at (N,) seconds."""
@@ -201,16 +181,11 @@ class Rectangles(NamedTuple):
     """Footprints of bodies: rectangles in the horizontal x-y plane of the world.
 
     The arrays may have any leading shape, written "...".
-
-    Attributes:
-        centre: (...,2) x, y of the centre, metres, world.
-        forward: (...,2) unit vector along the length, world.
-        half_m: (...,2) half length and half width, metres.
     """
 
-    centre: Float
-    forward: Float
-    half_m: Float
+    centre: Float  # (...,2) x, y of the centre, metres, world
+    forward: Float  # (...,2) unit vector along the length, world
+    half_m: Float  # (...,2) half length and half width, metres
 
     @staticmethod
     def of(mesh: Mesh, poses: Poses, slack_m: float = 0.0) -> Rectangles:

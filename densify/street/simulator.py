@@ -36,17 +36,11 @@ def build_scene(preset: str, seed: int) -> Scene:
 
 @dataclass(frozen=True)
 class Bodies:
-    """Poses of B bodies at the reference times of F frames.
+    """Poses of B bodies at the reference times of F frames."""
 
-    Attributes:
-        T_world_lidar: (F,4,4) poses of the lidar.
-        T_world_body: (F,B,4,4) poses of the bodies. Body 0 is the static world.
-        moving: (F,B) bool, True if the body's object moves around that time.
-    """
-
-    T_world_lidar: Float
-    T_world_body: Float
-    moving: Bool
+    T_world_lidar: Float  # (F,4,4) poses of the lidar
+    T_world_body: Float  # (F,B,4,4) poses of the bodies. Body 0 is the static world.
+    moving: Bool  # (F,B) bool, True if the body's object moves around that time
 
     def place(self, frame: int, body: NDArray[np.int32], points: Float) -> Float:
         """Return (N,3) world positions, at a frame's stamp, of points in body frames."""
@@ -88,19 +82,15 @@ _MOVING_M, _MOVING_S = 0.05, 0.5
 
 @dataclass(frozen=True)
 class Simulator:
-    """A scene with a sensor. Its fields and the frame number determine all random values.
-
-    Attributes:
-        hz: Sweeps per second, such as 5, 10 or 20. The period is a whole number of nanoseconds.
-            The scene at a given time does not depend on it.
-        tilt_deg: Pitch of the mount, as in `densify.street.lidar.T_ego_lidar`.
-    """
+    """A scene with a sensor. Its fields and the frame number determine all random values."""
 
     preset: str
     seed: int
     sensor: Sensor
+    # Sweeps per second, such as 5, 10 or 20. The period is a whole number of nanoseconds. The scene
+    # at a given time does not depend on it.
     hz: int = 10
-    tilt_deg: float = 0.0
+    tilt_deg: float = 0.0  # pitch of the mount, as in `densify.street.lidar.T_ego_lidar`
 
     @property
     def period_ns(self) -> int:

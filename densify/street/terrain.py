@@ -151,17 +151,11 @@ _COARSE_M = 8.0  # cells of the ground far from roads
 
 @dataclass(frozen=True)
 class Terrain:
-    """Height of the bare ground as a sum of W waves, ``sum a sin(k·xy + phase)``.
+    """Height of the bare ground as a sum of W waves, ``sum a sin(k·xy + phase)``."""
 
-    Attributes:
-        wave: (W,2) wave vectors k in rad/m.
-        amplitude_m: (W,) amplitudes a.
-        phase: (W,) phases in rad.
-    """
-
-    wave: Float
-    amplitude_m: Float
-    phase: Float
+    wave: Float  # (W,2) wave vectors k in rad/m
+    amplitude_m: Float  # (W,) amplitudes a
+    phase: Float  # (W,) phases in rad
 
     @staticmethod
     def hilly(rng: np.random.Generator, max_slope: float, scale_m: float = 1.0) -> Terrain:
@@ -215,17 +209,12 @@ class Road:
 
 @dataclass(frozen=True)
 class Ground:
-    """Terrain with roads on it.
-
-    Attributes:
-        kerb_m: Height of the kerb, by which everything outside the roads is raised.
-        pavement_m: Width of the pavement beside the roads.
-    """
+    """Terrain with roads on it."""
 
     terrain: Terrain
     roads: tuple[Road, ...]
-    kerb_m: float
-    pavement_m: float
+    kerb_m: float  # height of the kerb, by which everything outside the roads is raised
+    pavement_m: float  # width of the pavement beside the roads
 
     def distance(self, xy: Float) -> Float:
         """Return (N,) signed metres to the kerb, negative on the carriageway."""

@@ -32,17 +32,13 @@ Recipe = Callable[[np.random.Generator], Actor]
 
 @dataclass(frozen=True)
 class Scene:
-    """A world and its moving actors.
-
-    Attributes:
-        footprints: Rectangles of the static objects that traffic must not touch.
-    """
+    """A world and its moving actors."""
 
     world: World
     ground: Ground
     ego: Driving
     actors: tuple[Actor, ...]
-    footprints: Rectangles
+    footprints: Rectangles  # rectangles of the static objects that traffic must not touch
 
 
 def tracks(actor: Actor, times_s: Float) -> list[Rectangles]:

@@ -29,72 +29,43 @@ _TINY = 1e-9
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body.
+    """A rigid body."""
 
-    Attributes:
-        mesh: Mesh in the frame of the body.
-        trajectory: Pose of the body over time.
-        instance: Number of the object it is part of; -1 if its triangles have object numbers.
-    """
-
-    mesh: Mesh
-    trajectory: Trajectory
+    mesh: Mesh  # mesh in the frame of the body
+    trajectory: Trajectory  # pose of the body over time
+    # Number of the object it is part of; -1 if its triangles have object numbers
     instance: int = -1
 
 
 class Rays(NamedTuple):
-    """N rays.
+    """N rays."""
 
-    Attributes:
-        origin: (N,3) metres, world.
-        direction: (N,3) unit vectors, world.
-        time_s: (N,) seconds since frame 0.
-    """
-
-    origin: Float
-    direction: Float
-    time_s: Float
+    origin: Float  # (N,3) metres, world
+    direction: Float  # (N,3) unit vectors, world
+    time_s: Float  # (N,) seconds since frame 0
 
 
 class Hits(NamedTuple):
-    """The hits of N rays.
+    """The hits of N rays."""
 
-    Attributes:
-        range_m: (N,) distances, inf without a hit.
-        triangle: (N,) index over the triangles of all bodies, -1 without a hit.
-        barycentric: (N,2) u and v, as in ``(1-u-v) a + u b + v c``.
-        absorbed: (N,) True if the ray ends at a surface without a return. Its range is inf.
-        normal: (N,3) normal of the triangle, world axes, of either sign.
-    """
-
-    range_m: Float
-    triangle: Int
-    barycentric: Float32
-    absorbed: Bool
-    normal: Float
+    range_m: Float  # (N,) distances, inf without a hit
+    triangle: Int  # (N,) index over the triangles of all bodies, -1 without a hit
+    barycentric: Float32  # (N,2) u and v, as in ``(1-u-v) a + u b + v c``
+    absorbed: Bool  # (N,) True if the ray ends at a surface without a return. Its range is inf.
+    normal: Float  # (N,3) normal of the triangle, world axes, of either sign
 
 
 class Meeting(NamedTuple):
-    """K rays that meet a surface of a body, for which `Optics` decides whether they end there.
+    """K rays that meet a surface of a body, for which `Optics` decides whether they end there."""
 
-    Attributes:
-        ray: (K,) ray indices.
-        triangle: (K,) triangle indices.
-        layer: Number of surfaces that the rays have passed before.
-        origin: (K,3) origins of the rays in the frame of the body.
-        direction: (K,3) unit vectors in the frame of the body.
-        distance_m: (K,) distances from the origins.
-        facing: (K,) inner products of directions and normals.
-        passed: (K,) object number of the previous surface that the ray passed, -1 for none.
-    """
-
-    ray: Int
-    triangle: Int
-    layer: int
-    origin: Float
-    direction: Float
-    distance_m: Float
-    facing: Float
+    ray: Int  # (K,) ray indices
+    triangle: Int  # (K,) triangle indices
+    layer: int  # number of surfaces that the rays have passed before
+    origin: Float  # (K,3) origins of the rays in the frame of the body
+    direction: Float  # (K,3) unit vectors in the frame of the body
+    distance_m: Float  # (K,) distances from the origins
+    facing: Float  # (K,) inner products of directions and normals
+    # (K,) object number of the previous surface that the ray passed, -1 for none
     passed: NDArray[np.int32]
 
     def place(self, rows: Int) -> Float:

@@ -29,18 +29,13 @@ _RECORD = "export.yaml"
 
 @dataclass(frozen=True)
 class Export:
-    """The written files, and the pixels and points within the thresholds.
+    """The written files, and the pixels and points within the thresholds."""
 
-    Attributes:
-        paths: Paths of the files.
-        density: Camera -> ``measured`` and ``filled`` -> share of the pixels with a depth, for
-            formats with maps.
-        num_points: Number of points, for formats with a cloud.
-    """
-
-    paths: list[Path]
+    paths: list[Path]  # paths of the files
+    # Camera -> ``measured`` and ``filled`` -> share of the pixels with a depth, for formats with
+    # maps
     density: Mapping[str, Mapping[str, Kept]]
-    num_points: Kept | None = None
+    num_points: Kept | None = None  # number of points, for formats with a cloud
 
 
 def export_run(

@@ -39,23 +39,14 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class Picture(NamedTuple):
-    """An image of a finished run, with its camera and pose.
+    """An image of a finished run, with its camera and pose."""
 
-    Attributes:
-        name: Name of the image's files.
-        run: The finished run.
-        map: Name of the depth map in the run that shows this image.
-        camera: The camera.
-        T_cam_world: (4,4) pose from the world, the first key sweep's lidar frame.
-        jpeg: Bytes of the image file.
-    """
-
-    name: str
-    run: FinishedRun
-    map: str
-    camera: Camera
-    T_cam_world: Float
-    jpeg: bytes
+    name: str  # name of the image's files
+    run: FinishedRun  # the finished run
+    map: str  # name of the depth map in the run that shows this image
+    camera: Camera  # the camera
+    T_cam_world: Float  # (4,4) pose from the world, the first key sweep's lidar frame
+    jpeg: bytes  # bytes of the image file
 
 
 def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:

@@ -36,15 +36,10 @@ _UNOBSERVED = np.array([140, 140, 140], np.uint8)
 
 
 class Kept(NamedTuple):
-    """A share of pixels with a depth, or a number of points, and how much the thresholds keep.
+    """A share of pixels with a depth, or a number of points, and how much the thresholds keep."""
 
-    Attributes:
-        before: Value without thresholds on confidence and age.
-        after: Value within the thresholds.
-    """
-
-    before: float
-    after: float
+    before: float  # value without thresholds on confidence and age
+    after: float  # value within the thresholds
 
 
 class FinishedRun:
@@ -211,58 +206,36 @@ def finished_runs(
 
 
 class ShownSweep(NamedTuple):
-    """A sweep as measured, for display, with its registered pose.
+    """A sweep as measured, for display, with its registered pose."""
 
-    Attributes:
-        frame: Frame number.
-        stamp_ns: Reference time in ns since 1970.
-        T_key_lidar: (4,4) pose in the key sweep's lidar frame.
-        points: Points of the sweep. ``points.rigid_points`` are the measured positions.
-    """
-
-    frame: int
-    stamp_ns: int
-    T_key_lidar: Float
-    points: StoredCloud
+    frame: int  # frame number
+    stamp_ns: int  # reference time in ns since 1970
+    T_key_lidar: Float  # (4,4) pose in the key sweep's lidar frame
+    points: StoredCloud  # points of the sweep. ``points.rigid_points`` are the measured positions.
 
 
 class Shot(NamedTuple):
-    """An image of a camera (name and exposure time), with its depth maps.
+    """An image of a camera (name and exposure time), with its depth maps."""
 
-    Attributes:
-        name: Name of the map.
-        view: Camera and pose.
-        stamp_ns: Time of the exposure in ns since 1970.
-        jpeg: Bytes of the image file, None without an image.
-        maps_m: "depth" and "depth_filled" -> (H,W) float32 metres, 0 for no depth.
-        is_pinhole: True if the camera has no distortion and depth is along its axis.
-    """
-
-    name: str
-    view: CameraView
-    stamp_ns: int
-    jpeg: bytes | None
-    maps_m: dict[str, Float32]
-    is_pinhole: bool
+    name: str  # name of the map
+    view: CameraView  # camera and pose
+    stamp_ns: int  # time of the exposure in ns since 1970
+    jpeg: bytes | None  # bytes of the image file, None without an image
+    maps_m: dict[str, Float32]  # "depth" and "depth_filled" -> (H,W) float32 metres, 0 for no depth
+    is_pinhole: bool  # True if the camera has no distortion and depth is along its axis
 
 
 class Timeline(NamedTuple):
-    """All that a viewer shows of one densified key sweep: cloud, sweeps and camera images.
+    """All that a viewer shows of one densified key sweep: cloud, sweeps and camera images."""
 
-    Attributes:
-        run: The finished run of this key sweep.
-        T_world_key: (4,4) pose of the key sweep. The world is the first key sweep's lidar frame.
-        cloud: Accumulated points at the key sweep's time, key sweep's lidar frame.
-        sweeps: Sweeps of the window as measured, ascending in time; the key sweep alone if the
-            viewer shows several runs.
-        shots: Camera images with their depth maps, one `Shot` for each chosen map.
-    """
-
-    run: FinishedRun
+    run: FinishedRun  # the finished run of this key sweep
+    # (4,4) pose of the key sweep. The world is the first key sweep's lidar frame.
     T_world_key: Float
-    cloud: StoredCloud
+    cloud: StoredCloud  # accumulated points at the key sweep's time, key sweep's lidar frame
+    # Sweeps of the window as measured, ascending in time; the key sweep alone if the viewer shows
+    # several runs
     sweeps: list[ShownSweep]
-    shots: list[Shot]
+    shots: list[Shot]  # camera images with their depth maps, one `Shot` for each chosen map
 
 
 def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:

@@ -41,19 +41,12 @@ _MAPS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
 
 @dataclass
 class KeyFiles:
-    """The files of one key sweep.
+    """The files of one key sweep."""
 
-    Attributes:
-        maps: Folder of depth maps, cloud and scene.
-        about: Content of run.yaml, or the same fields of compare.json.
-        methods: Method -> its scores. The last method made the maps.
-        missing: A sentence for each file that cannot be read.
-    """
-
-    maps: Path
-    about: Mapping[str, Any]
-    methods: Mapping[str, Mapping[str, Any]]
-    missing: list[str] = field(default_factory=list)
+    maps: Path  # folder of depth maps, cloud and scene
+    about: Mapping[str, Any]  # content of run.yaml, or the same fields of compare.json
+    methods: Mapping[str, Mapping[str, Any]]  # method -> its scores. The last method made the maps.
+    missing: list[str] = field(default_factory=list)  # a sentence for each file that cannot be read
 
     @staticmethod
     def of_run(folder: Path) -> KeyFiles:

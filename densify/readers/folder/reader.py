@@ -53,17 +53,11 @@ _UNTIMED = (
 
 @dataclass(frozen=True)
 class SweepColumns:
-    """The columns of the sweeps of a folder, and their meaning.
+    """The columns of the sweeps of a folder, and their meaning."""
 
-    Attributes:
-        series: Files and stamps of the sweeps.
-        settings: Section ``sweeps`` of densify.yaml.
-        config: Path of densify.yaml, None if the folder has none.
-    """
-
-    series: Series
-    settings: SweepFiles
-    config: Path | None
+    series: Series  # files and stamps of the sweeps
+    settings: SweepFiles  # section ``sweeps`` of densify.yaml
+    config: Path | None  # path of densify.yaml, None if the folder has none
     _own_stamps_ns: dict[int, int] = field(default_factory=dict)
 
     def returns(self, frame: int, stamp_ns: int) -> Returns:

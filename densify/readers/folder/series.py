@@ -27,17 +27,12 @@ _POSE_FILES = [
 
 @dataclass(frozen=True)
 class Series:
-    """Files of sweeps or images in the order of time.
+    """Files of sweeps or images in the order of time."""
 
-    Attributes:
-        paths: Path of each file, by its number.
-        stamps_ns: Stamp of each file, by its number; None if neither names nor a file state it.
-        told_by: Source of the stamps, for people; "" without stamps.
-    """
-
-    paths: Mapping[int, Path]
+    paths: Mapping[int, Path]  # path of each file, by its number
+    # Stamp of each file, by its number; None if neither names nor a file state it
     stamps_ns: Mapping[int, int] | None
-    told_by: str
+    told_by: str  # source of the stamps, for people; "" without stamps
 
 
 def find_sweeps(folder: Path, files: str) -> list[Path]:
