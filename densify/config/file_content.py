@@ -6,6 +6,8 @@ Every error of malformed content becomes one InputError.
 
 from __future__ import annotations
 
+import gzip
+import io
 import json
 import os
 import stat
@@ -54,14 +56,14 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
     """Return decompressed gzip data, ``most_bytes`` at most; errors begin with ``where``."""
-    unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
-        content = unpack.decompress(data, most_bytes + 1)
-    except zlib.error as error:
+        with gzip.open(io.BytesIO(data)) as file:
+            content = file.read(most_bytes + 1)
+        if not data:
+            raise EOFError("it is empty")
+    except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{where}: not a whole gzip file: {error}; fetch it again") from error
     check_size(len(content), where, most_bytes)
-    if not unpack.eof:
-        raise InputError(f"{where}: not a whole gzip file: it is cut off; fetch it again")
     return content
 
 

@@ -49,12 +49,8 @@ def open_recording(path: Path, scene: str | None) -> Argoverse2:
     places = (path, path / "train", path / "val", path / "test")
     found = [file.parent for place in places for file in place.glob(f"*/{_POSES}")]
     logs = {log.name: log for log in found}
-    if not logs:
-        raise InputError(
-            f"{path}: no Argoverse 2 log; expected {_POSES} and sensors/lidar in it, or in folders "
-            f"within it"
-        )
-    return Argoverse2(logs[checks.chosen_scene("argoverse2", path, scene, sorted(logs))])
+    none = f"no Argoverse 2 log; expected {_POSES} and sensors/lidar in it, or in folders within it"
+    return Argoverse2(logs[checks.chosen_scene("argoverse2", path, scene, sorted(logs), none)])
 
 
 class Argoverse2(FileSequence):

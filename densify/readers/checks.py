@@ -98,8 +98,12 @@ def pinhole(
     return Camera(name, *size_px, K, T_cam_lidar, **lens)
 
 
-def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str]) -> str:
-    """Return the requested scene, or for None the only scene; ``names`` are those that exist."""
+def chosen_scene(
+    reader: str, path: Path, scene: str | None, names: Sequence[str], none: str
+) -> str:
+    """Return the requested scene, or for None the only one of ``names``; say ``none`` without."""
+    if not names:
+        raise InputError(f"{path}: {none}")
     if scene in names or (scene is None and len(names) == 1):
         return scene or names[0]
     shown = ", ".join(names[:4]) + f", ... {names[-1]} ({len(names)} in all)" * (len(names) > 4)

@@ -45,9 +45,8 @@ def open_recording(path: Path, scene: str | None) -> Dgp:
     if scene is None and find_scene(path):
         return Dgp(path)
     names = sorted(folder.name for folder in path.glob("*/") if find_scene(folder))
-    if not names:
-        raise InputError(f"{path}: no DGP scene; expected a folder with scene_<hash>.json")
-    return Dgp(path / checks.chosen_scene("dgp", path, scene, names))
+    none = "no DGP scene; expected a folder with scene_<hash>.json"
+    return Dgp(path / checks.chosen_scene("dgp", path, scene, names, none))
 
 
 def find_scene(folder: Path) -> Path | None:

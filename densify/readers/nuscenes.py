@@ -191,11 +191,8 @@ def open_recording(path: Path, scene: str | None) -> NuScenes:
     for folder in folders:
         for token, record in read_table(folder / "scene.json").items():
             scenes.setdefault(str(record.get("name")), (folder, token))
-    name = checks.chosen_scene("nuscenes", path, scene, list(scenes))
-    found = Scene.read(*scenes[name], name)
-    if len(found.lidars) > 1:
-        raise InputError(f"{path}: {name} has the lidars {', '.join(found.lidars)}, expected one")
-    return NuScenes(found)
+    name = checks.chosen_scene("nuscenes", path, scene, list(scenes), "no scene in scene.json")
+    return NuScenes(*scenes[name], name)
 
 
 @dataclass(frozen=True)
@@ -213,43 +210,25 @@ class Channel:
         return {i: file for i, file in enumerate(self.files) if isfile(file)}
 
 
-@dataclass(frozen=True)
-class Scene:
-    """A scene with its sensors."""
-
-    name: str
-    tables: Path  # folder of the JSON tables
-    token: str  # token of the scene, its key in the tables
-    lidars: Mapping[str, Channel]  # lidars by the name of their channel, sorted
-    cameras: Mapping[str, Channel]  # cameras by the name of their channel, sorted
-    track: PoseTrack  # poses T_world_ego of the vehicle over time
-
-    @staticmethod
-    def read(tables: Path, token: str, name: str) -> Scene:
-        """Read the sensors and the vehicle's path of a scene, without sweeps and images."""
-        file, poses_file = tables / "sample_data.json", tables / "ego_pose.json"
-        with described_in(file, _EXPECTED):
-            samples = find_records(tables / "sample.json", "scene_token", {token})
-            data = find_records(file, "sample_token", set(samples))
-            records = sorted(data.values(), key=stamp_ns)
-            wanted = {record["ego_pose_token"] for record in records}
-            poses = find_records(poses_file, "token", wanted)
-            if not data or len(poses) < len(wanted):
-                raise InputError(
-                    f"{poses_file}: got {len(poses)} poses for {name}, expected the {len(wanted)} "
-                    f"of its {len(data)} records in sample_data.json"
-                )
-            lidars, cameras = (_channels(tables, records, kind) for kind in ("lidar", "camera"))
-            T_world_ego = {
-                stamp_ns(record): pose_of(record, f"{poses_file}: record {token}")
-                for token, record in poses.items()
-            }
-        if not lidars:
-            raise InputError(f"{file}: no lidar data of {name}")
-        stamps_ns = sorted(T_world_ego)
-        T = np.stack([T_world_ego[ns] for ns in stamps_ns])
-        track = PoseTrack(str(poses_file), np.array(stamps_ns, np.int64), T)
-        return Scene(name, tables, token, lidars, cameras, track)
+def _read_path(tables: Path, token: str, name: str) -> tuple[list[Record], PoseTrack]:
+    """Return a scene's sample data in the order of time, and the vehicle's path T_world_ego."""
+    file, poses_file = tables / "sample_data.json", tables / "ego_pose.json"
+    samples = find_records(tables / "sample.json", "scene_token", {token})
+    records = sorted(find_records(file, "sample_token", samples).values(), key=stamp_ns)
+    wanted = {record["ego_pose_token"] for record in records}
+    poses = find_records(poses_file, "token", wanted)
+    if not records or len(poses) < len(wanted):
+        raise InputError(
+            f"{poses_file}: got {len(poses)} poses for {name}, expected the {len(wanted)} of its "
+            f"{len(records)} records in sample_data.json"
+        )
+    T_world_ego = {
+        stamp_ns(record): pose_of(record, f"{poses_file}: record {token}")
+        for token, record in poses.items()
+    }
+    stamps_ns = sorted(T_world_ego)
+    T = np.stack([T_world_ego[ns] for ns in stamps_ns])
+    return records, PoseTrack(str(poses_file), np.array(stamps_ns, np.int64), T)
 
 
 def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[str, Channel]:
@@ -278,32 +257,39 @@ def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[st
 class NuScenes(FileSequence):
     """A nuScenes scene as a `LidarSequence`; the lidar frame is the scanner's own frame."""
 
-    def __init__(self, scene: Scene) -> None:
-        """Prepare a scene for reading its sweeps and images on demand."""
-        self._scene, self._lidar = scene, next(iter(scene.lidars.values()))
-        self._T_ego_lidar, track = self._lidar.T_ego_sensor[0], scene.track
-        self._stamps_ns = self._lidar.stamps_ns
-        self._track = PoseTrack(track.where, track.stamp_ns, track.T_world_ego @ self._T_ego_lidar)
-        root, there = scene.tables.parent, self._lidar.on_disk()
-        if not there:
+    def __init__(self, tables: Path, token: str, name: str) -> None:
+        """Read the sensors and the vehicle's path; sweeps and images are read on demand."""
+        self._tables, self._token, root = tables, token, tables.parent
+        with described_in(tables / "sample_data.json", _EXPECTED):
+            records, self._ego = _read_path(tables, token, name)
+            lidars, self._channels = (_channels(tables, records, k) for k in ("lidar", "camera"))
+        if len(lidars) != 1:
+            there = ", ".join(lidars) or "none"
+            raise InputError(f"{root}: got the lidars {there} of {name}, expected one")
+        (lidar,) = lidars.values()
+        self._T_ego_lidar, self._stamps_ns = lidar.T_ego_sensor[0], lidar.stamps_ns
+        T_world_lidar = self._ego.T_world_ego @ self._T_ego_lidar
+        self._track = PoseTrack(self._ego.where, self._ego.stamp_ns, T_world_lidar)
+        sweeps, channels = lidar.on_disk(), self._channels
+        if not sweeps:
             raise InputError(
-                f"{root}: none of the {len(self._lidar.files)} sweeps of {scene.name} are there; "
-                f"expected files such as {self._lidar.files[0]}"
+                f"{root}: none of the {len(lidar.files)} sweeps of {name} are there; expected "
+                f"files such as {lidar.files[0]}"
             )
-        images = {name: channel.on_disk() for name, channel in scene.cameras.items()}
+        images = {name: channel.on_disk() for name, channel in channels.items()}
         super().__init__(
-            scene.name,
+            name,
             root,
-            list(there),
-            {name: self._camera(name, channel) for name, channel in scene.cameras.items()},
-            {n: {i: scene.cameras[n].stamps_ns[i] for i in files} for n, files in images.items()},
+            list(sweeps),
+            {name: self._camera(name, channel) for name, channel in channels.items()},
+            {n: {i: channels[n].stamps_ns[i] for i in files} for n, files in images.items()},
             checks.truth_beside(root),
-            there,
+            sweeps,
             images,
         )
 
     def _camera(self, name: str, channel: Channel) -> Camera:
-        where = f"{self._scene.tables / 'calibrated_sensor.json'}: {name}"
+        where = f"{self._tables / 'calibrated_sensor.json'}: {name}"
         with described_in(where, "camera_intrinsic of 3 x 3 numbers"):
             K = np.array(channel.intrinsics, np.float64).reshape(3, 3)
         T_cam_lidar = inverse(channel.T_ego_sensor[0]) @ self._T_ego_lidar
@@ -322,12 +308,12 @@ class NuScenes(FileSequence):
 
     @cached_property
     def _annotations(self) -> Annotations | None:
-        return Annotations.read(self._scene.tables, self._scene.token)
+        return Annotations.read(self._tables, self._token)
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """Return the (4,4) pose T_world_cam at the exposure of image ``number`` of a camera."""
-        T_world_ego = self._scene.track.at(self.image_stamps_ns(camera)[number])
-        return T_world_ego @ self._scene.cameras[camera].T_ego_sensor[number]
+        T_world_ego = self._ego.at(self.image_stamps_ns(camera)[number])
+        return T_world_ego @ self._channels[camera].T_ego_sensor[number]
 
     def _returns(self, frame: int) -> Returns:
         data = read_bytes(self._files[frame])

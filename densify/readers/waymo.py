@@ -208,13 +208,11 @@ def _whole_us(seconds: float) -> int:
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
     """Open a segment (CONTEXT) of the folder of a split, such as ``training``."""
-    files = sorted((path / "lidar").glob("*.parquet"))
-    if not files:
-        raise InputError(
-            f"{path / 'lidar'}: no segments; expected files such as "
-            f"10017090168044687777_6380_000_6400_000.parquet"
-        )
-    return Waymo(path, checks.chosen_scene("waymo", path, scene, [file.stem for file in files]))
+    names = sorted(file.stem for file in (path / "lidar").glob("*.parquet"))
+    none = (
+        "no segments; expected files such as lidar/10017090168044687777_6380_000_6400_000.parquet"
+    )
+    return Waymo(path, checks.chosen_scene("waymo", path, scene, names, none))
 
 
 class Waymo(FileSequence):

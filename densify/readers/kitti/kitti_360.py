@@ -25,7 +25,6 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.config.errors import InputError
 from densify.config.file_content import described_in, parse_yaml, read_text
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
@@ -45,11 +44,8 @@ _HALF_VIEW_DEG = 90.0
 def open_recording(path: Path, scene: str | None) -> Kitti360:
     """Open a drive, by its name, of the folder that contains data_3d_raw/."""
     names = sorted(p.parent.name for p in (path / "data_3d_raw").glob("*/velodyne_points"))
-    if not names:
-        raise InputError(
-            f"{path}: no KITTI-360; expected data_3d_raw/ with drives that hold velodyne_points/"
-        )
-    return Kitti360(path, checks.chosen_scene("kitti-360", path, scene, names))
+    none = "no KITTI-360; expected data_3d_raw/ with drives that hold velodyne_points/"
+    return Kitti360(path, checks.chosen_scene("kitti-360", path, scene, names, none))
 
 
 class Kitti360(Drive):

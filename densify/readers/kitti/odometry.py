@@ -50,12 +50,8 @@ def open_recording(path: Path, scene: str | None) -> KittiOdometry:
         return KittiOdometry(path)
     folder = path / "sequences" if (path / "sequences").is_dir() else path
     names = sorted(found.parent.name for found in folder.glob("*/velodyne"))
-    if not names:
-        raise InputError(
-            f"{path}: no KITTI odometry; expected a folder with velodyne/, or sequences/ with such "
-            f"folders"
-        )
-    return KittiOdometry(folder / checks.chosen_scene("kitti-odometry", path, scene, names))
+    none = "no KITTI odometry; expected a folder with velodyne/, or sequences/ with such folders"
+    return KittiOdometry(folder / checks.chosen_scene("kitti-odometry", path, scene, names, none))
 
 
 class KittiOdometry(Drive):

@@ -25,7 +25,6 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.config.errors import InputError
 from densify.config.file_content import read_text
 from densify.geometry import poses
 from densify.geometry.types import Bool, Boxes, BoxView, Camera, Float
@@ -49,9 +48,8 @@ _T_CAM_UPRIGHT = np.array(  # from x right, y forward, z up
 def open_recording(path: Path, scene: str | None) -> KittiTracking:
     """Open a sequence, by its name such as ``0000``, of the folder that contains velodyne/."""
     names = sorted(p.name for p in (path / "velodyne").glob("*") if p.is_dir())
-    if not names:
-        raise InputError(f"{path}: no KITTI tracking; expected folders such as velodyne/0000 in it")
-    return KittiTracking(path, checks.chosen_scene("kitti-tracking", path, scene, names))
+    none = "no KITTI tracking; expected folders such as velodyne/0000 in it"
+    return KittiTracking(path, checks.chosen_scene("kitti-tracking", path, scene, names, none))
 
 
 class KittiTracking(Drive):
