@@ -94,7 +94,7 @@ def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
 
 
 def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
-    """Return the specs of the recordings that a command names; without one log the ``default``."""
+    """Return the specs of the recordings that a command names, else log and return ``default``."""
     given = options.recording or []
     specs = [*([given] if isinstance(given, str) else given), *options.data]
     if not specs:

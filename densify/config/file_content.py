@@ -144,7 +144,7 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
 
 
 def needed(module: str, extra: str, what: str) -> Any:
-    """Import and return an optional module of an extra; the message names ``what`` needs it."""
+    """Import and return an optional module; the error says that ``what`` needs the ``extra``."""
     package = module.partition(".")[0]
     try:
         return import_module(module)

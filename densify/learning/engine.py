@@ -48,7 +48,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
 def flows_of(model: Model, standing: list[AboveGround], origins: list[Float]) -> list[Float]:
     """Return for each sweep the flow (n,3) to the next sweep, metres, world, ego-motion removed.
 
-    The last sweep has its flow to the previous sweep. ``origins`` are the scanner's positions.
+    The last sweep has its flow to the previous sweep. ``origins`` are (3,) scanner positions.
     """
     flows = []
     for i, own in enumerate(standing):

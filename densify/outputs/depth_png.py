@@ -114,7 +114,7 @@ def read_depth_png(path: Path) -> Float32:
 
 
 def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -> NDArray[Any]:
-    """Return the (H,W) pixel values of ``what``, a map of a ``kind`` of pixels, as stored."""
+    """Return the (H,W) pixel values as stored; ``kind`` is their type, ``what`` names the map."""
     image = read_image(path, as_stored=True)
     if image.dtype != kind or image.ndim != 2:
         got = f"{image.dtype} of shape {image.shape}"

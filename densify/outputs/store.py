@@ -92,8 +92,8 @@ def write_result(
 ) -> list[Path]:
     """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
 
-    Other files in the folder are kept. ``config`` is the merged configuration, ``data`` the
-    recording as the user named it.
+    Other files in the folder are kept. ``config`` is the merged configuration as plain mappings,
+    ``data`` the recording as the user named it.
     """
     context = Context(config, data)
     with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:

@@ -101,7 +101,7 @@ def pinhole(
 def chosen_scene(
     reader: str, path: Path, scene: str | None, names: Sequence[str], none: str
 ) -> str:
-    """Return the requested scene, or for None the only one of ``names``; say ``none`` without."""
+    """Return the requested scene, for None the only one; ``none`` is the error without any."""
     if not names:
         raise InputError(f"{path}: {none}")
     if scene in names or (scene is None and len(names) == 1):

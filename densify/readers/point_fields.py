@@ -191,12 +191,12 @@ def find_times(
     """Find the unit, epoch, middle and span of point times from several sweeps of a recording.
 
     The unit is the most frequent unit. The middle and the span are medians over the sweeps.
+    Known values of ``unit``, ``absolute`` and ``reference`` are kept, "" or None is found.
 
     Args:
         sweeps: Values (N,) of the field for each sweep; N differs between sweeps.
         period_ns: Time between consecutive sweeps.
         stamps_ns: Stamps of the given sweeps, None without stamps.
-        unit: Known value of `PointTimes`, as ``absolute`` and ``reference``; "" or None to find it.
 
     Returns:
         The meaning of the times and its description; or None and the reason of the failure.
@@ -293,7 +293,6 @@ class PointLayout:
         """Find the layout from the columns of several sweeps; ``where`` begins error messages.
 
         Args:
-            period_ns: Time between consecutive sweeps, as ``stamps_ns`` of `find_times`.
             named: Names of fields that the user gave, by the attributes of `Fields`.
             intensity_scale: Known divisor of intensities, 0 to find the divisor.
             times: Known ``unit``, ``absolute`` or ``reference`` of `find_times`.
