@@ -52,6 +52,7 @@ def test_only_ordinary_files_of_bounded_size_are_read(tmp_path: Path) -> None:
 def test_a_gzip_bomb_is_not_unpacked() -> None:
     data = gzip.compress(bytes(1 << 20))
     assert gunzipped(data, "x") == bytes(1 << 20)
+    assert gunzipped(data + gzip.compress(b"more"), "x") == bytes(1 << 20) + b"more"
     refused(gunzipped, data, "x", 1 << 16, says="expected 65,536 at most", where="x")
     for damaged in (data[:-9], b"", b"text"):
         refused(gunzipped, damaged, "x", says="not a whole gzip file", where="x")

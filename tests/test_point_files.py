@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from densify.config.errors import InputError
+from densify.readers import open_sequence
 from densify.readers.point_files import read_table
 
 rng = np.random.default_rng(5)
@@ -226,5 +228,21 @@ OTHER_BYTES = {
 @pytest.mark.parametrize("kind", OTHER_BYTES)
 def test_a_scan_of_other_bytes_is_refused(kind: str, tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(OTHER_BYTES[kind].tobytes())
-    with pytest.raises(InputError, match=r"not alike; .*name the columns .*sweeps\.columns"):
+    with pytest.raises(InputError, match=r"not alike; .*densify\.yaml .*sweeps: {columns: "):
         read_table(tmp_path / "a.bin")
+
+
+@pytest.mark.parametrize("num_points", [2517, 2518, 2519, 2520])  # rows of 4 fit, or do not
+def test_the_error_of_five_columns_holds_the_setting_that_reads_them(
+    num_points: int, tmp_path: Path
+) -> None:
+    rows = ring(5)[:num_points].astype("<f4")
+    (tmp_path / "lidar").mkdir()
+    rows.tofile(tmp_path / "lidar" / "000000.bin")
+    with pytest.raises(InputError) as error:
+        open_sequence(f"folder:{tmp_path}")[0]
+    setting = re.search(r"sweeps: \{.*\}", str(error.value))
+    assert setting is not None and "\n" not in str(error.value), error.value
+    (tmp_path / "densify.yaml").write_text(setting.group())
+    sweep = open_sequence(f"folder:{tmp_path}")[0]
+    np.testing.assert_array_equal(sweep.points, rows[:, :3])

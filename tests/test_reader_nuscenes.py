@@ -107,7 +107,7 @@ def test_a_real_key_frame(test_data):
     assert sequence.image_stamps_ns("CAM_FRONT")[0] == 1_532_402_927_612_460_000
     assert sequence.image("CAM_FRONT", 0).shape == (900, 1600, 3)
     # the scanner stands 0.94 m ahead of and 1.84 m above the rear axle, and looks to the right
-    T_world_ego = sequence._scene.track.T_world_ego[-1]
+    T_world_ego = sequence._ego.T_world_ego[-1]
     T_ego_lidar = inverse(T_world_ego) @ sequence.T_world_lidar(0)
     np.testing.assert_allclose(T_ego_lidar[:3, 3], [0.943713, 0, 1.84023], atol=1e-6)
     assert T_ego_lidar[0, 1] > 0.999

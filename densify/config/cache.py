@@ -46,15 +46,7 @@ class Cache:
     """A folder of cached results."""
 
     def __init__(self, limit_bytes: int = 10 * 1024**3, folder: Path | None = None) -> None:
-        """Open a cache.
-
-        Args:
-            limit_bytes: Greatest total size, enforced by `trim`.
-            folder: Folder of the entries; None for the user's cache directory.
-
-        Raises:
-            InputError: Other users can write to the folder.
-        """
+        """Open the folder of entries, by default the user's; `trim` keeps ``limit_bytes`` of it."""
         self._folder, self._limit_bytes = folder or own_folder("steps"), limit_bytes
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -62,13 +54,7 @@ class Cache:
             _log.warning("%s: %s; nothing is kept for later", self._folder, error.strerror or error)
 
     def get(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
-        """Return the cached result for these inputs, or else compute and cache it.
-
-        Args:
-            step: Name of the pipeline step.
-            inputs: Everything the result depends on, as `digest` accepts.
-            make: Computes the result.
-        """
+        """Return a step's cached result for these inputs (as `digest` accepts), else make it."""
         path = self._folder / f"{step}-{digest((__version__, inputs))}.npz"
         try:
             with np.load(path, allow_pickle=False) as arrays:
@@ -135,10 +121,7 @@ def digest(value: Any) -> str:
 
 
 def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
-    """Return the value as JSON, and its arrays by the names used there.
-
-    Types that JSON lacks are written as ``{KIND: content}``. Raises TypeError for other types.
-    """
+    """Return the value as JSON, types it lacks as ``{KIND: content}``, and its arrays by name."""
     arrays: dict[str, np.ndarray] = {}
 
     def tree(value: Any) -> Any:
@@ -160,11 +143,7 @@ def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
 
 
 def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the value that `_packed` converted.
-
-    Only dataclasses and named tuples of already imported modules are built, without calling their
-    code.
-    """
+    """Return the value that `_packed` converted, with classes of imported modules alone."""
     if isinstance(tree, list):
         return [_unpacked(part, arrays) for part in tree]
     if not isinstance(tree, dict):
@@ -185,14 +164,7 @@ def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 
 def own_folder(name: str) -> Path:
-    """Return the folder of this name in the user's cache directory.
-
-    The environment variable DENSIFY_CACHE_DIR replaces that directory. The folder is created with
-    mode 0700 if possible.
-
-    Raises:
-        InputError: Other users can write to the folder.
-    """
+    """Return the folder of this name in DENSIFY_CACHE_DIR, else in the user's cache directory."""
     named = os.environ.get("DENSIFY_CACHE_DIR")
     root = Path(named or platformdirs.user_cache_dir("densify"))
     for folder in (root, root / name):

@@ -60,11 +60,7 @@ def presets() -> dict[str, Path]:
 
 
 def parse_override(override: str) -> dict[str, dict[str, Any]]:
-    """Return ``{section: {key: value}}`` from the text ``section.key=value``.
-
-    Raises:
-        InputError: The text has another form.
-    """
+    """Return ``{section: {key: value}}`` from the text ``section.key=value``."""
     name, equals, text = override.partition("=")
     section, dot, key = name.strip().partition(".")
     if not (equals and dot and section and key):
@@ -89,15 +85,9 @@ def apply_changes(
     where: str,
     sections: Mapping[str, type[Section]] = _SECTIONS,
 ) -> None:
-    """Overwrite settings in place with checked changes.
+    """Overwrite settings ``{section: {key: value}}`` in place with checked changes of that form.
 
-    Args:
-        values: ``{section: {key: value}}`` with every setting; changed in place.
-        changes: ``{section: {key: value}}`` with some settings.
-        where: File or option that gave the changes; begins error messages.
-
-    Raises:
-        InputError: As in `resolve`.
+    ``where``, the file or option that gave the changes, begins error messages.
     """
     for name, keys in _mapping(changes, where, "sections"):
         if name not in values:

@@ -120,20 +120,13 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Drive:
-    """A recording of a training set.
+    """A recording of a training set."""
 
-    Attributes:
-        name: Name of the recording's folder.
-        data: Text of ``--data``, with an absolute path.
-        folder: Folder of the recording's files, relative to the training set.
-        cameras: The wanted cameras, by name.
-        blocks: Key frame numbers, ascending. The key sweeps of a block share pipeline stages.
-    """
-
-    name: str
-    data: str
-    folder: str
-    cameras: Mapping[str, Camera]
+    name: str  # name of the recording's folder
+    data: str  # text of ``--data``, with an absolute path
+    folder: str  # folder of the recording's files, relative to the training set
+    cameras: Mapping[str, Camera]  # the wanted cameras, by name
+    # Key frame numbers, ascending. The key sweeps of a block share pipeline stages.
     blocks: tuple[tuple[int, ...], ...]
 
     @property
@@ -143,18 +136,7 @@ class Drive:
 
 
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]:
-    """Open every recording and choose its key sweeps.
-
-    Args:
-        data: Recordings, as ``--data`` takes them.
-        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step`` in every recording,
-            None for all.
-        recipe: Settings of the training set.
-
-    Raises:
-        InputError: A recording cannot be opened, two have equal names, or a camera or frame is
-            unknown.
-    """
+    """Open every recording and choose its key sweeps; arguments as in `make_dataset`."""
     drives: dict[str, Drive] = {}
     for spec in data:
         sequence = open_sequence(spec)
@@ -202,12 +184,7 @@ def check_place(out: Path) -> None:
 
 
 def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
-    """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe.
-
-    Raises:
-        InputError: The folder holds a different training set.
-        OutputError: The file cannot be written.
-    """
+    """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe."""
     table = _table(recipe, drives)
     before = read_plan(out)
     if before is not None:
@@ -219,11 +196,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
-    """Return the content of dataset.json, None if the file does not exist.
-
-    Raises:
-        InputError: The file is damaged or of another version.
-    """
+    """Return the content of dataset.json, None if the file does not exist."""
     path = out / _FILE
     if not path.is_file():
         return None

@@ -47,15 +47,7 @@ def write_report(place: Path, overwrite: bool = False) -> list[Path]:
     """Write the HTML pages of a folder and return their paths.
 
     The page is ``report.html`` for a run or a training set, and ``compare.html`` for a comparison.
-
-    Args:
-        place: Folder of a key sweep, its parent folder if it holds no other, or a training set.
-        overwrite: Replace existing pages.
-
-    Raises:
-        InputError: The folder has no run, comparison or training set, its main files are damaged,
-            or a page exists.
-        OutputError: A page cannot be written.
+    ``place`` may also be the parent folder of a single key sweep.
     """
     pages = _pages(place)
     for path in pages:
@@ -93,10 +85,7 @@ def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
 
 
 def _set_page(root: Path) -> bytes:
-    """Return the bytes of a training set's page.
-
-    The table starts with the failed key sweeps, then has the highest ghost rates first.
-    """
+    """Return the bytes of a training set's page: failed keys first, then the most ghosts."""
     table, records = read_plan(root) or {}, read_manifests(root)
     counts = Counter[str](record.status for record in records.values())
     counts["to make"] = len(planned_keys(table) - records.keys())

@@ -142,10 +142,7 @@ def check_deskewing(sample: Sample) -> list[Finding]:
 
 
 def _apart_m(spot: Spot) -> float:
-    """Return the median distance (m) between the first and the last registered sweep of a spot.
-
-    Only near points above the ground count. It is 1 m if the sweeps cannot be registered.
-    """
+    """Return the median distance (m) of near points above ground between a spot's end sweeps."""
     if spot.trajectory is None:
         return _CLOSE_M
     ends = spot.stretch.sweeps[0], spot.stretch.sweeps[-1]

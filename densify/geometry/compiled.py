@@ -68,10 +68,8 @@ def inlined(function: _Function) -> _Function:
 
 
 def _imported_code(function: Callable[..., Any]) -> str:
-    """Return a digest of the source files of the inlined functions, "" if all are in the same file.
-
-    Numba's cache detects changes of the function's own file only.
-    """
+    """Return a digest of the source files of inlined functions, "" if all are in the same file."""
+    # Numba's cache detects changes of the function's own file only.
     files = {
         f.__code__.co_filename for f in function.__globals__.values() if isinstance(f, Dispatcher)
     }
@@ -124,13 +122,7 @@ class Kernel:
             return self._compiled(*arguments)
 
     def over_rows(self, num_rows: int, *arguments: Any) -> None:
-        """Call the kernel as ``kernel(begin, end, *arguments)`` for row ranges, on all cores.
-
-        Args:
-            num_rows: Number of rows; the ranges cover 0 to ``num_rows``.
-            arguments: Arrays that the kernel reads and writes. Its result for a row must depend on
-                that row alone.
-        """
+        """Call ``kernel(begin, end, *arguments)`` for row ranges, on all cores, as `over_rows`."""
         over_rows(self, num_rows, *arguments)
 
     def _do_without_cache(self, error: Exception | str) -> None:
@@ -147,11 +139,8 @@ def num_threads() -> int:
 def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> None:
     """Call ``function(begin, end, *arguments)`` on all cores, for ranges that cover all rows.
 
-    Args:
-        function: Writes its result into the argument arrays. Its result for a row must depend on
-            that row alone. It must not call `over_rows`.
-        num_rows: Number of rows; the ranges cover 0 to ``num_rows``.
-        arguments: Passed on to each call.
+    The function writes its result into the arguments and must not call `over_rows`. Its result for
+    a row must depend on that row alone.
     """
     num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
     if num_parts <= 1:

@@ -49,9 +49,6 @@ def write_figure(path: Path, results: Mapping[str, Result]) -> None:
 
     With a prior, the figure also shows the completed depth of the last method. Without a camera no
     file is written.
-
-    Args:
-        results: Method -> result for the same key sweep.
     """
     method, last = list(results.items())[-1]
     if not last.depth:
@@ -87,11 +84,8 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
     """Return a picture (h,w,3), as blue, green, red, of panels with depth over a camera's image.
 
     Each depth covers 3 x 3 pixels. Where they overlap, the nearest depth is drawn. Colours run from
-    red at 3 m to blue at 80 m on a logarithmic scale.
-
-    Args:
-        image: (H,W,3) uint8 RGB image, drawn in gray.
-        panels: Title -> (H,W) depth in metres, 0 for no depth.
+    red at 3 m to blue at 80 m on a logarithmic scale. ``image`` is (H,W,3) RGB, drawn in gray.
+    ``panels`` has title -> (H,W) depth in metres, 0 for no depth.
     """
     kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
     gray = (_BRIGHTNESS * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8)
@@ -160,10 +154,7 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
     """Draw the share of outliers over the density, one point for each confidence threshold.
 
     Each camera has its own axes, two in a row. Thin lines show measured pixels, thick lines the
-    filled map.
-
-    Args:
-        curves: Camera -> method -> points of `densify.scores.depth_metrics.precision_density`.
+    filled map. ``curves`` has camera -> method -> `precision_density`.
     """
     from matplotlib.figure import Figure
 

@@ -48,29 +48,14 @@ def check_writable(
     overwrite: bool = False,
     verb: Literal["run", "compare"] = "run",
 ) -> None:
-    """Raise InputError if a result cannot be written. No file is changed.
-
-    Reasons are missing permissions, and existing files of ``verb`` that must not be overwritten.
-
-    Args:
-        out: Folder of ``--out``, which need not exist.
-        key: Frame number of the key sweep.
-    """
+    """Raise InputError if a result of ``verb`` cannot be written. No file is changed."""
     owned = _RUN if verb == "run" else _COMPARISON
     _check_place(_key_folder(out, key), owned, out, overwrite)
 
 
 @contextmanager
 def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
-    """Yield a folder to write into, which becomes ``folder`` if the block ends without an error.
-
-    Args:
-        owned: Names of the entries that the block writes, see `staged_folder`.
-        out: Folder of ``--out``, for error messages.
-
-    Raises:
-        InputError: As in `check_writable`.
-    """
+    """Yield a folder for the entries ``owned`` (as `staged_folder`), after `check_writable`."""
     _check_place(folder, owned, out, overwrite)
     with staged_folder(folder, owned) as staging:
         yield staging
@@ -107,17 +92,8 @@ def write_result(
 ) -> list[Path]:
     """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
 
-    Other files in the folder are kept.
-
-    Args:
-        result: Result for one key sweep.
-        out: Parent folder.
-        config: The merged configuration, as plain mappings.
-        data: Specification of the recording, as the user gave it.
-        overwrite: Replace an earlier result.
-
-    Raises:
-        InputError: The folder cannot be written to, or holds a result.
+    Other files in the folder are kept. ``config`` is the merged configuration as plain mappings,
+    ``data`` the recording as the user named it.
     """
     context = Context(config, data)
     with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:
@@ -134,13 +110,10 @@ def write_comparison(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write the results of several methods and return the paths of the files.
+    """Write the results of several methods, by method, and return the paths of the files.
 
     The files are ``out/KEY/compare.json`` and ``compare.png``. The folder ``compare/`` has the
-    maps, cloud and scene of the last method.
-
-    Args:
-        results: Method -> result for the same key sweep. Other arguments as in `write_result`.
+    maps, cloud and scene of the last method. Other arguments as in `write_result`.
     """
     last = list(results.values())[-1]
     key, context = last.key, Context(config, data)

@@ -32,11 +32,7 @@ _RECORD_BYTES = 54  # smallest size of a variable length record
 
 
 def read_array(path: Path) -> NDArray[Any]:
-    """Return the array of a .npy file.
-
-    Raises:
-        InputError: The file is missing, too large, damaged, or holds Python objects.
-    """
+    """Return the array of a .npy file."""
     data = read_bytes(path)
     try:
         return _array(data)
@@ -47,16 +43,7 @@ def read_array(path: Path) -> NDArray[Any]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
 ) -> Arrays:
-    """Return the arrays of a .npz file by name.
-
-    Args:
-        path: Path of the .npz file.
-        names: Names of the arrays to read, if the file has them; None reads all.
-        most_bytes: Largest total size of the uncompressed arrays.
-
-    Raises:
-        InputError: The file is missing or damaged, contains Python objects, or is too large.
-    """
+    """Return the arrays of a .npz file by name: those in ``names``, None for all."""
     data = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -92,13 +79,7 @@ def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
 def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDArray[Any]:
     """Decode the bytes of a PNG or JPEG file to (H,W,3) uint8 pixels in blue, green, red.
 
-    Args:
-        data: Content of the image file.
-        where: Name of the file, with which error messages begin.
-        as_stored: True keeps the file's data type and channels, such as (H,W) uint16.
-
-    Raises:
-        InputError: The data are no complete PNG or JPEG file, or exceed `MOST_PIXELS`.
+    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16.
     """
     import cv2
 
@@ -133,20 +114,13 @@ def _checked_format(data: bytes, where: Path | str) -> str:
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
-    """Return the width and height (px) of an image file after decoding all pixels.
-
-    Raises:
-        InputError: The file is not a complete PNG or JPEG image.
-    """
+    """Return the width and height (px) of an image file after decoding all pixels."""
     height, width = read_image(path).shape[:2]
     return width, height
 
 
 def stated_size_px(path: Path) -> tuple[int, int] | None:
-    """Return the width and height (px) stated in an image file's header, None without a header.
-
-    Damage in the rest of the file is not detected.
-    """
+    """Return the width and height (px) that an image's header states, None without a header."""
     from PIL import Image
 
     try:
@@ -167,11 +141,7 @@ def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
 
 
 def read_las(path: Path) -> Any:
-    """Return a `laspy.LasData` with all points of a LAS or LAZ file.
-
-    Raises:
-        InputError: The file is missing, too large or damaged.
-    """
+    """Return a `laspy.LasData` with all points of a LAS or LAZ file."""
     import laspy
 
     data = read_bytes(path)

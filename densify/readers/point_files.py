@@ -26,21 +26,22 @@ Columns = dict[str, NDArray[Any]]
 _UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most data sets follow
 _ALIKE = 0.5  # largest median step between rows, as a share of the coordinates
 _FEWEST_ROWS = 20  # for this test
+_NAME_COLUMNS = (
+    "name all of them in densify.yaml beside the sweeps' folder, such as "
+    "sweeps: {columns: [x, y, z, intensity, time]}"
+)
 _MOST_COLUMNS = 100  # a wider array is probably transposed
 _ROWS_LOOKED_AT = 4000
 
 
 @dataclass(frozen=True)
 class PointTable:
-    """The N points of a file.
+    """The N points of a file."""
 
-    Attributes:
-        columns: Values (N,) of each column as stored, by name. Columns that have no name in the
-            file get the names of `unnamed`.
-        beside: Further arrays of an .npz file, by name.
-    """
-
+    # Values (N,) of each column as stored, by name. Columns that have no name in the file get the
+    # names of `unnamed`.
     columns: Columns
+    # Further arrays of an .npz file, by name
     beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -63,9 +64,6 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     Args:
         path: Point file.
         names: Names of the columns if the file has none. By default they are those of `unnamed`.
-
-    Raises:
-        InputError: The file is missing, damaged, of another format, or has no rows.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -114,23 +112,20 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
     if len(data) % (4 * num_columns):
         raise ValueError(
             f"got {len(data)} bytes, expected a multiple of {4 * num_columns} "
-            f"({num_columns} float32 columns); it is cut off, or has another number of columns"
+            f"({num_columns} float32 columns); it is cut off, or has other columns: {_NAME_COLUMNS}"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, num_columns)
     if names is None and not _are_scanned(rows[:_ROWS_LOOKED_AT, :3]):
         raise ValueError(
             "read as rows of 4 little-endian float32 columns, neighbouring points are not alike; "
-            "in a plain folder name the columns in densify.yaml: sweeps.columns"
+            f"if it has other columns, {_NAME_COLUMNS}"
         )
     return PointTable(_matrix(rows, names, path))
 
 
 def _are_scanned(points: NDArray[Any]) -> bool:
-    """Return True if consecutive (N,3) points are close to each other, as in a scan.
-
-    Rows read with a wrong number of columns mix x with y, and consecutive points lie far apart. The
-    test compares the median step with the coordinates.
-    """
+    """Return True if consecutive (N,3) points are close to each other, as in a scan."""
+    # Rows read with a wrong number of columns mix x with y: then points lie far apart.
     with np.errstate(invalid="ignore"):  # wrongly read bytes may be signalling NaN
         near = np.nan_to_num(points.astype(np.float64), posinf=0, neginf=0)
     step, size = np.abs(np.diff(near, axis=0)).sum(axis=1), np.abs(near).sum(axis=1)
@@ -175,10 +170,7 @@ def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[str], str | None]:
-    """Return the number of header lines, the column names and the delimiter (None: whitespace).
-
-    Comments before the names are skipped.
-    """
+    """Return the number of header lines, the column names and the delimiter (None: whitespace)."""
     for number, line in enumerate(lines, 1):
         text = line.strip().lstrip("#").strip()
         if not text:
@@ -204,11 +196,7 @@ def _are_numbers(words: Sequence[str]) -> bool:
 
 
 def _pcd_header(file: Any) -> list[str]:
-    """Read the header lines up to DATA, without comments; the file is left at the first point.
-
-    The header is normalised for the parser: padding fields with a COUNT of 0 are removed, and
-    missing COUNT, VERSION, HEIGHT and POINTS are added.
-    """
+    """Read the header up to DATA for the parser: no padding fields, nothing optional missing."""
     lines: list[str] = []
     while len(lines) < 20:
         raw = file.readline(65536)

@@ -48,28 +48,18 @@ _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
 
 
 class Entry(NamedTuple):
-    """Index entry that finds one message of a topic.
+    """Index entry that finds one message of a topic."""
 
-    Attributes:
-        stamp_ns: Time in the header of the message; the time of recording if the header has 0.
-        log_ns: Time at which the message was recorded.
-        turn: Index of the message among the topic's messages with the same ``log_ns``.
-    """
-
-    stamp_ns: int
-    log_ns: int
-    turn: int
+    stamp_ns: int  # time in the header of the message; the time of recording if the header has 0
+    log_ns: int  # time at which the message was recorded
+    turn: int  # index of the message among the topic's messages with the same ``log_ns``
 
 
 class Topic(NamedTuple):
-    """A topic of a bag.
-
-    Attributes:
-        type: Message type in ROS 2 notation, such as sensor_msgs/msg/PointCloud2.
-    """
+    """A topic of a bag."""
 
     name: str
-    type: str
+    type: str  # message type in ROS 2 notation, such as sensor_msgs/msg/PointCloud2
     num_messages: int
 
 
@@ -108,10 +98,7 @@ class Bag:
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Index the messages of the topics: entries by topic, with ascending stamps.
-
-        The method also counts the messages without stamps in ``num_unstamped``.
-        """
+        """Index the messages of the topics by ascending stamp, and count those without a stamp."""
         found: dict[str, list[Entry]] = {topic: [] for topic in topics}
         for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
             before = found[topic][-1] if found[topic] else None
@@ -193,10 +180,7 @@ def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
 
 
 def _bag_files(path: Path) -> list[Path]:
-    """Return the paths to open: a file, a ROS 2 bag's folder, or all .bag files in a folder.
-
-    Raises InputError for a path without a bag.
-    """
+    """Return the paths to open: a file, a ROS 2 bag's folder, or all .bag files in a folder."""
     suffixes = (".bag", ".db3", ".mcap")
     if (path.is_file() and path.suffix in suffixes) or (path / "metadata.yaml").is_file():
         return [path]
@@ -225,32 +209,18 @@ def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
 
 @dataclass(frozen=True)
 class Topics:
-    """The topics of a bag that are used.
+    """The topics of a bag that are used."""
 
-    Attributes:
-        points: Topics of the lidars. Each message of the first topic is a sweep.
-        images: Topics of the cameras' images.
-        poses: Topic of the poses, ``tf`` for /tf, or "" to read no poses.
-        named: Options that the user gave (points, images, poses). A problem with a named topic is
-            an error; other unusable topics are skipped.
-    """
-
-    points: tuple[str, ...]
-    images: tuple[str, ...]
-    poses: str
+    points: tuple[str, ...]  # topics of the lidars. Each message of the first topic is a sweep.
+    images: tuple[str, ...]  # topics of the cameras' images
+    poses: str  # topic of the poses, ``tf`` for /tf, or "" to read no poses
+    # Options that the user gave (points, images, poses). A problem with a named topic is an error;
+    # other unusable topics are skipped.
     named: Collection[str]
 
     @staticmethod
     def choose(bag: Bag, options: str | None) -> Topics:
-        """Choose the topics to read, by the user's options and the message types.
-
-        Args:
-            options: Text after ``#`` in ``--data``, such as ``points=/lidar&poses=tf``.
-
-        Raises:
-            InputError: A named topic does not exist or has another type, or not exactly one topic
-                of point clouds exists and the user named no topic.
-        """
+        """Choose the topics to read, by the user's options (after ``#``) and the message types."""
         given = dict(parse_qsl(options or "", keep_blank_values=True))
         wrong = [key for key in given if key not in ("points", "images", "poses")]
         if wrong or (options and not given):

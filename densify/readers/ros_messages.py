@@ -54,9 +54,6 @@ def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
     """Return the fields of a PointCloud2 or Livox CustomMsg by name, an array (N,) each as stored.
 
     Fields with several numbers for a point are left out.
-
-    Raises:
-        InputError: A field lies outside the bytes of a point, or data is too short.
     """
     if not hasattr(message, "point_step"):
         rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
@@ -93,11 +90,7 @@ def _rows(message: Any, step: int, item_bytes: int, where: str) -> NDArray[np.ui
 
 
 def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
-    """Return an Image or CompressedImage message as (H,W,3) uint8 RGB.
-
-    Raises:
-        InputError: The encoding is not supported, or the data is damaged.
-    """
+    """Return an Image or CompressedImage message as (H,W,3) uint8 RGB."""
     import cv2
 
     if hasattr(message, "format"):
@@ -123,13 +116,8 @@ def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
 def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, where: str) -> Camera:
     """Convert a CameraInfo message to a camera, adjusted for binning and region of interest.
 
-    Args:
-        T_optical_lidar: (4,4) pose of the lidar in the optical frame named by the message.
-        rectified: True for rectified images, which use P and the rotation R; False for raw images,
-            which use K and the distortion D.
-
-    Raises:
-        InputError: The distortion model is unknown, or the calibration is not valid.
+    ``T_optical_lidar`` is the (4,4) pose of the lidar in the message's optical frame. Rectified
+    images use P and the rotation R, raw images K and the distortion D.
     """
     matrix = {  # ROS 1 writes K, ROS 2 k
         key: np.asarray(getattr(info, key if hasattr(info, key) else key.upper()), np.float64)
@@ -168,10 +156,8 @@ def _lens(named: str, distortion: tuple[float, ...], where: str) -> tuple[str, t
 
 
 def _binned(camera: Camera, info: Any) -> Camera:
-    """Adjust a camera to the region of interest and the binning of a CameraInfo.
-
-    Binning averages several sensor pixels, which moves pixel centres relative to the corner.
-    """
+    """Adjust a camera to the region of interest and the binning of a CameraInfo."""
+    # Binning averages sensor pixels, which moves pixel centres relative to the corner.
     roi, by = info.roi, np.array([max(1, info.binning_x), max(1, info.binning_y)])
     size = [roi.width or camera.width_px, roi.height or camera.height_px]
     K = camera.K.copy()
@@ -186,25 +172,17 @@ def _binned(camera: Camera, info: Any) -> Camera:
 
 @dataclass(frozen=True)
 class Transforms:
-    """The tree of coordinate frames of a bag.
+    """The tree of coordinate frames of a bag."""
 
-    Attributes:
-        where: Path of the bag, for messages.
-        fixed: Name of the parent frame and the constant pose T_parent_child (4,4), by child frame.
-        moving: Name of the parent frame and the path T_parent_child over time, by child frame.
-    """
-
-    where: str
+    where: str  # path of the bag, for messages
+    # Name of the parent frame and the constant pose T_parent_child (4,4), by child frame
     fixed: dict[str, tuple[str, Float]] = field(default_factory=dict)
+    # Name of the parent frame and the path T_parent_child over time, by child frame
     moving: dict[str, tuple[str, PoseTrack]] = field(default_factory=dict)
 
     @staticmethod
     def read(bag: Bag) -> Transforms:
-        """Read all transforms of /tf_static and /tf. A frame that never moves in /tf is fixed.
-
-        Raises:
-            InputError: A transform is not a rigid motion.
-        """
+        """Read all transforms of /tf_static and /tf. A frame that never moves in /tf is fixed."""
         found = Transforms(str(bag.path))
         heard: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
         for topic in bag.of_type("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
@@ -242,13 +220,9 @@ class Transforms:
         return found.get(target)
 
     def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
-        """Return the path of a frame over time, from /tf; None if the frame never moves.
+        """Return a frame's moving parent and its path in it, T_parent_frame; None if it is fixed.
 
-        The path is relative to the nearest moving parent in the tree: usually ``odom``, not
-        ``map``, which jumps at loop closures.
-
-        Returns:
-            Name of this parent, and the poses T_parent_frame over time.
+        The nearest moving parent is usually ``odom``, not ``map``, which jumps at loop closures.
         """
         T_body_frame, body, passed = np.eye(4), frame, {frame}
         while body in self.fixed and body not in self.moving:
@@ -264,17 +238,10 @@ class Transforms:
 
 
 def recorded_track(bag: Bag, topic: str, transforms: Transforms, lidar: str) -> PoseTrack:
-    """Read the path T_world_lidar from a topic of odometry or poses.
+    """Read the path T_world_lidar from a topic of odometry or poses; ``lidar`` names the frame.
 
     Odometry gives the pose of its child frame, which fixed transforms join to the lidar. Poses
     without a child frame are assumed to be poses of the lidar itself.
-
-    Args:
-        lidar: Name of the lidar's frame.
-
-    Raises:
-        InputError: No fixed frames join the child frame to the lidar, or the topic has fewer than
-            two poses.
     """
     found, where = dict[int, Float](), f"{bag.path}: {topic}"
     for message in bag.messages(topic):

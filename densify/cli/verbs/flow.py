@@ -101,11 +101,7 @@ def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
 
 
 def read_points(path: Path) -> Float:
-    """Return the (N,3) float64 points of a file in metres, in the order of the file.
-
-    Raises:
-        InputError: The file has another form, no points, or points that are not finite.
-    """
+    """Return the (N,3) float64 points of a file in metres, in the order of the file."""
     import numpy as np
 
     from densify.readers.point_files import read_table

@@ -51,14 +51,7 @@ class KittiRaw(Drive):
     """
 
     def __init__(self, path: Path | str) -> None:
-        """Read calibration and stamps; everything else is read on request.
-
-        Args:
-            path: Folder of the drive, ``.../2011_09_26/2011_09_26_drive_0013_sync``.
-
-        Raises:
-            InputError: The drive has no sweeps, or calibration or stamps are malformed.
-        """
+        """Read calibration and stamps of a drive's folder; everything else is read on request."""
         drive = Path(path)
         velodyne = drive / "velodyne_points"
         cameras = _read_cameras(drive)
@@ -106,11 +99,7 @@ class KittiRaw(Drive):
         return Returns(points, intensity, offset_ns)
 
     def _exposures_ns(self, camera: str) -> dict[int, int]:
-        """Return the exposure times of the camera's existing images, by frame number.
-
-        The exposure time is the recorded stamp minus `KITTI_TRIGGER_LATENCY_NS`, or the reference
-        time of the sweep if no stamp is recorded.
-        """
+        """Return the exposure times of the camera's existing images, by frame number."""
         path, numbers = self.where / camera / "timestamps.txt", self._image_files[camera]
         exposed_ns = self._recorded.get("", {f: f * NOMINAL_PERIOD_NS for f in numbers})
         if path.exists():
@@ -119,11 +108,8 @@ class KittiRaw(Drive):
         return {frame: exposed_ns[frame] for frame in numbers if frame in exposed_ns}
 
     def _pose(self, frame: int) -> Float:
-        """Return the (4,4) T_world_lidar, interpolated between oxts records.
-
-        The oxts record of a frame number is up to 20 ms away from the sweep, 0.3 m at 15 m/s.
-        Without usable stamps the record's own pose is returned.
-        """
+        """Return the (4,4) T_world_lidar, between oxts records if they have stamps."""
+        # The frame's own record is up to 20 ms away from the sweep, 0.3 m at 15 m/s.
         if not self._oxts:
             return super()._pose(frame)
         checks.of_frame(self._oxts, frame, "oxts record", self.where)
@@ -157,10 +143,7 @@ class KittiRaw(Drive):
 
 
 def _beside(drive: Path) -> Path:
-    """Return the folder of the calibration files, the parent of the drive.
-
-    If the drive is a link and its parent has no calibration, return the parent of its target.
-    """
+    """Return the folder of the calibration: the drive's parent, or that of the target of a link."""
     named, target = drive.absolute().parent, drive.resolve().parent
     return named if any(named.glob("calib_*.txt")) else target
 
@@ -170,11 +153,7 @@ def _camera_folders(drive: Path) -> list[str]:
 
 
 def _read_cameras(drive: Path) -> dict[str, Camera]:
-    """Return the rectified cameras, by name, that have images and a calibration.
-
-    A drive without folders of images gets all calibrated cameras. ``T_cam_lidar`` is the product of
-    the camera's offset in ``P_rect``, camera 0's rectification and ``calib_velo_to_cam``.
-    """
+    """Return the calibrated cameras with images by name; all if there are no folders of images."""
     folder, names = _beside(drive), _camera_folders(drive)
     files = [folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"]
     if not names and not all(file.is_file() for file in files):
