@@ -38,6 +38,7 @@ from densify.geometry.types import (
     Progress,
     Sweep,
     Trajectory,
+    Truth,
 )
 from densify.outputs.atomic import write_file
 from densify.pipeline.costs import Watch
@@ -225,7 +226,7 @@ class _Still:
     ) -> None:
         self._key, self._whole, self._folder = key, sequence, folder
         self._sequence = Without(sequence, 1) if key.truth == "scanner" else sequence
-        self._recording = self._recorded(self._sequence, cache)
+        self._recording, self._cache = self._recorded(self._sequence, cache), cache
         self._truth = self._true_map() if key.truth != "held out" else None
 
     def _recorded(self, sequence: Any, cache: Cache | None = None) -> Recording:
@@ -264,7 +265,9 @@ class _Still:
             camera = self._whole.cameras[key.camera]
             return stereo_truth(cast(Path, self._folder) / _STEREO, key.key, camera)
         if key.truth == "scanner":
-            return scanner_truth(1, self._whole, key.key, _WINDOW, shots, config)[key.camera]
+            return scanner_truth(1, self._whole, key.key, _WINDOW, shots, config, self._cache)[
+                key.camera
+            ]
         key_sweep = recording.window(key.key)[key.key].sweep
         return exact_truth(self._sequence, key_sweep, shots, config)[key.camera]
 
@@ -348,8 +351,7 @@ def _curve_of(
 
 def _flow_figures(recording: Recording, key: int) -> dict[str, float]:
     """Return recall, false positives, and errors of the moving points of all sweeps of a window."""
-    truth, motion = recording.sequence.truth, recording.motion(key)
-    assert truth is not None
+    truth, motion = cast(Truth, recording.sequence.truth), recording.motion(key)
     moving, called, one_m, to_key_m = list[Bool](), list[Bool](), list[Float](), list[Float]()
     for registered in recording.window(key).sweeps:
         frame, row = registered.frame, registered.sweep.row
@@ -406,10 +408,9 @@ def _pairs(sequence: LidarSequence, key: GateKey) -> Iterator[tuple[Any, Float, 
         moving, static = near & (points[:, 2] > 0), np.zeros(len(points), bool)
         true_m: Float = np.broadcast_to(_CAR_FLOW_M, points.shape)
     else:
-        assert sequence.truth is not None
-        row = source.sweep.row
-        true_m = sequence.truth.displacement(key.key, key.key + 1)[row]
-        moving = sequence.truth.sweep(key.key).moving[row]
+        truth, row = cast(Truth, sequence.truth), source.sweep.row
+        true_m = truth.displacement(key.key, key.key + 1)[row]
+        moving = truth.sweep(key.key).moving[row]
         static = ~moving
         moving = moving & (np.linalg.norm(points[:, :2], axis=1) < 35)
     T_source_target = poses.inverse(source.T_world_lidar) @ target.T_world_lidar

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from densify.config import Config
+from densify.config.cache import Cache
 from densify.depth.exposure import Exposure, Shot
 from densify.geometry import poses
 from densify.geometry.cameras import converted, depth_along, rays
@@ -73,9 +74,10 @@ def scanner_truth(
     window: int,
     shots: Mapping[str, Shot],
     config: Config,
+    cache: Cache | None = None,
 ) -> dict[str, TruthMap]:
     """Return the depth measured by one scanner in the key sweep, by name of the map."""
-    recording = Recording(sequence, config, window, [key], looks_around=True)
+    recording = Recording(sequence, config, window, [key], cache, looks_around=True)
     cloud = recording.moment(key, all_sweeps=True, engine="").cloud
     cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
     stretch = recording.window(key)
