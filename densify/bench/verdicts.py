@@ -52,7 +52,7 @@ def coverage(of: Curve) -> float:
 def outliers_at(of: Curve, covered_percent: float) -> float:
     """Return the share of outliers in percent among the most certain pixels of this coverage."""
     num = covered_percent / 100 * of["num"]
-    steps = np.linspace(0, of["covered"], _NUM_STEPS + 1)
+    steps = np.linspace(0, of["covered"], len(of["outliers"]))
     return float(100 * np.interp(num, steps, of["outliers"]) / max(num, 1))
 
 
