@@ -29,6 +29,7 @@ from densify.config.sections import Section, one_of, within
 from densify.geometry.types import Camera, LidarSequence
 from densify.outputs.atomic import plain, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
+from densify.outputs.recording_folder import is_same
 from densify.pipeline.sweeps import Cut
 from densify.readers import Spec, open_sequence
 from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, runs
@@ -276,6 +277,11 @@ def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str,
     united = dict(before)
     for name, drive in now.items():
         old = before.get(name, drive)
+        if not is_same(name, drive["data"], name, old["data"]):
+            raise InputError(
+                f"--out {out}: {name} in the set is another recording, {old['data']}; got "
+                f"{drive['data']}; choose another --out"
+            )
         for part in ("folder", "cameras"):
             if old[part] != drive[part]:
                 raise InputError(

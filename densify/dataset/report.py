@@ -79,8 +79,8 @@ def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
         return _pages(inside[0])
     found = f"{len(inside)} keys; name one of them" if inside else "none of these"
     raise InputError(
-        f"{place}: holds {found}; expected the folder of a key, such as densify-out/000120, or a "
-        f"training set"
+        f"{place}: holds {found}; expected the folder of a key, such as "
+        f"densify-out/street/000120, or a training set"
     )
 
 

@@ -252,7 +252,12 @@ def densify(
             made[-1] = complete_with_prior(made[-1], priors, shots, scene.truth, kind)
     results: dict[str, Result] = {}
     for result in made:
-        results[result.method] = replace(result, costs=watch.costs(), baselines=dict(results))
+        results[result.method] = replace(
+            result,
+            costs=watch.costs(),
+            baselines=dict(results),
+            recording=sequence.name,
+        )
     return add_warnings(results, recording, key, shots)
 
 
