@@ -164,11 +164,16 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]
 def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, ...]:
     if keys is None:
         return tuple(sequence.frames)
-    wanted = range(keys.start, keys.stop, keys.step or 1)
     first, last = min(sequence.frames), max(sequence.frames)
+    start = first if keys.start is None else keys.start
+    stop = last + 1 if keys.stop is None else keys.stop
+    step = 1 if keys.step is None else keys.step
+    if not all(isinstance(number, int) for number in (start, stop, step)) or step < 1:
+        raise InputError(f"keys: got {keys}, expected whole numbers and a step of 1 or more")
+    wanted = range(start, stop, step)
     chosen = tuple(f for f in sequence.frames if f in wanted)
-    if not chosen or (keys.start < first or wanted[-1] > last):
-        text = f"{keys.start}:{keys.stop}" + ("" if keys.step in (None, 1) else f":{keys.step}")
+    if not chosen or (start < first or wanted[-1] > last):
+        text = f"{start}:{stop}" + ("" if step == 1 else f":{step}")
         raise InputError(
             f"--keys {text}: {sequence.name} ({spec}) has {format_frames(sequence.frames)}; "
             f"expected A:B within {first}:{last + 1}, or all"
