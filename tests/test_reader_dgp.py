@@ -60,7 +60,7 @@ def test_no_file_outside_of_the_folder_is_read(broken):
     name = min((broken / "point_cloud/LIDAR").iterdir()).relative_to(broken).as_posix()
     assert name in text
     scene.write_text(text.replace(name, "../../secret.npz"))
-    with pytest.raises(InputError, match="names the file '../../secret.npz', outside of"):
+    with pytest.raises(InputError, match=r"names the file '../../secret\.npz', outside of"):
         Dgp(broken)
 
 

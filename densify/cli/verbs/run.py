@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ from densify.config.errors import ComputationError, InputError
 from densify.config.plugins import ENGINES
 
 if TYPE_CHECKING:
-    from densify.geometry.types import LidarSequence
+    from densify.geometry.types import LidarSequence, Result
 
 
 def add_run(commands: Any) -> None:
@@ -115,7 +115,7 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
             paths = write_result(
                 result, out, config=as_mapping(config), data=spec, overwrite=options.overwrite
             )
-            first = first_of(paths, FIRST_OF_RUN)
+            first = first_of(_front_first(paths, result), FIRST_OF_RUN)
             yield Answer(summary(result), {"keys": [key_facts(result)]}, paths, first)
             doubts += [(warning, "", key) for warning in result.warnings]
             if result.depth and not any(maps.filled_m.any() for maps in result.depth.values()):
@@ -129,6 +129,15 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     if failed:
         told = "; ".join(f"key {key}: {error}" for key, error in failed.items())
         raise ComputationError(f"{len(failed)} of {len(keys)} keys not made: {told}")
+
+
+def _front_first(paths: Sequence[Path], result: Result) -> list[Path]:
+    """Return the paths, those of the map that looks ahead first."""
+    from densify.outputs.front_view import front_first
+
+    names = front_first([*result.depth], result.views, result.T_key_lidar)
+    front = [p for p in paths if names and p.with_suffix("").as_posix().endswith(f"/{names[0]}")]
+    return [*front, *(path for path in paths if path not in front)]
 
 
 def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:

@@ -45,9 +45,10 @@ class KittiRaw(Drive):
     """A KITTI raw drive as a `LidarSequence`.
 
     The stamp of a sweep is the middle of the revolution (``velodyne_points/timestamps.txt``, or
-    from its start and end, or k times 100 ms). The firing time of a point follows from its azimuth, ``timestamps_start.txt`` and
-    ``timestamps_end.txt``; if a stamp file is missing, ``offset_ns`` is None. Poses come from
-    ``oxts/``. The world is the frame of the GPS/IMU unit at the first oxts file.
+    from its start and end, or k times 100 ms). The firing time of a point follows from its azimuth,
+    ``timestamps_start.txt`` and ``timestamps_end.txt``; if one of them is missing, ``offset_ns`` is
+    None. Poses come from ``oxts/``. The world is the frame of the GPS/IMU unit at the first oxts
+    file.
     """
 
     def __init__(self, path: Path | str) -> None:
