@@ -20,6 +20,7 @@ undone. Missing returns then lie at the origin and are left out.
 
 from __future__ import annotations
 
+import codecs
 import mmap
 import re
 from collections import defaultdict
@@ -82,7 +83,8 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
             open_file(_existing(path)) as file,
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
         ):
-            if data[:4096].lstrip()[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
+            begin = data[:4096].removeprefix(codecs.BOM_UTF8).lstrip()
+            if begin[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
                 raise ValueError("it does not begin with [ or end with ]")
             for match in _RECORD.finditer(data):
                 of = pattern.search(match[0])
