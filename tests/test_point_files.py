@@ -283,6 +283,13 @@ def test_six_other_columns_are_not_guessed(tmp_path: Path) -> None:
         read_table(tmp_path / "a.bin")
 
 
+def test_values_that_fit_two_layouts_are_not_guessed(tmp_path: Path) -> None:
+    rows = 3 + np.random.default_rng(0).integers(0, 2, (400, 5))  # alike however they are read
+    rows.astype("<f4").tofile(tmp_path / "a.bin")
+    with pytest.raises(InputError, match=r"fits 4 and 5 float32 columns alike; .*densify\.yaml"):
+        read_table(tmp_path / "a.bin")
+
+
 def test_organised_arrays_are_read(tmp_path: Path) -> None:
     image = np.column_stack([POINTS, INTENSITY]).astype("f4").reshape(6, 10, 4)
     np.save(tmp_path / "a.npy", image)

@@ -126,7 +126,7 @@ class Kernel:
         self._function = function
         try:
             self._compiled = numba.njit(function, **_OPTIONS)
-            self._compiled._cache = _Kept(function)
+            self._compiled._cache = _Kept(function)  # type: ignore[attr-defined]
         except RuntimeError as error:  # no place for a cache
             self._do_without_cache(error)
             return

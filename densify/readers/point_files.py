@@ -99,9 +99,10 @@ def unnamed(num_columns: int) -> tuple[str, ...]:
 
 def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Columns:
     """Return the k columns of an (N,k) array, or the fields of a structured array, by name."""
-    if array.dtype.names and array.ndim in (1, 2):
+    fields = array.dtype.names
+    if fields and array.ndim in (1, 2):
         array = array.ravel()
-        return {name: array[name] for name in array.dtype.names if array[name].ndim == 1}
+        return {name: array[name] for name in fields if array[name].ndim == 1}
     if array.size == 0:
         return {}
     if array.ndim == 3 and array.shape[2] <= _MOST_ORGANISED:  # (H,W,C): rings, columns, values
@@ -124,7 +125,10 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
     data = read_bytes(path)
     if names is None:
         fitting = [known for num, known in _BIN_LAYOUTS.items() if _fits(data, num)]
-        names = fitting[0] if len(fitting) == 1 else None
+        if len(fitting) > 1:
+            counts = " and ".join(str(len(known)) for known in fitting)
+            raise ValueError(f"it fits {counts} float32 columns alike; {_NAME_COLUMNS}")
+        names = fitting[0] if fitting else None
     num_columns = len(_UNNAMED) if names is None else len(names)
     if len(data) % (4 * num_columns):
         raise ValueError(
