@@ -6,7 +6,9 @@ from __future__ import annotations
 import os
 import pickle
 import random
+import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -186,6 +188,37 @@ def test_what_was_used_longest_ago_goes_first(tmp_path: Path) -> None:
     assert [get(cache, inputs) for inputs in (0, 3, 1)] == [0, 0, 1]
     Cache(0, tmp_path).trim()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_one_of_several_at_once_makes_it(tmp_path: Path) -> None:
+    made: list[int] = []
+
+    def make() -> dict[str, Any]:
+        made.append(1)
+        time.sleep(0.2)
+        return VALUE
+
+    with ThreadPoolExecutor(4) as pool:
+        futures = [pool.submit(Cache(LIMIT, tmp_path).get, "s", 1, make) for _ in range(4)]
+        assert all(np.array_equal(f.result()["few"], VALUE["few"]) for f in futures)
+    assert len(made) == 1
+    assert [path.suffix for path in tmp_path.iterdir()] == [".npz"]
+
+
+def test_one_vanished_entry_does_not_stop_the_trimming(tmp_path: Path, monkeypatch) -> None:
+    for inputs in range(4):
+        get(Cache(LIMIT, tmp_path), inputs)
+    gone, unlink = min(tmp_path.iterdir()), Path.unlink
+    os.utime(gone, (1, 1))  # the first to go
+
+    def vanished(path: Path, missing_ok: bool = False) -> None:
+        if path == gone:
+            raise FileNotFoundError(path)
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", vanished)
+    Cache(0, tmp_path).trim()
+    assert list(tmp_path.iterdir()) == [gone]
 
 
 # Folders

@@ -79,6 +79,20 @@ def test_what_is_not_on_the_disk_leaves_a_gap(broken):
         sequence[1]
 
 
+def test_no_file_outside_of_the_folder_is_read(broken):
+    table = broken / VERSION / "sample_data.json"
+    name = next((broken / "samples").glob("*/*")).relative_to(broken).as_posix()
+    text = table.read_text()
+    assert name in text
+    for other in ("../secret.bin", "/etc/hostname"):
+        table.write_text(text.replace(name, other))
+        with pytest.raises(InputError, match="outside of") as caught:
+            open_sequence(broken)
+        assert other in str(caught.value) and str(table) in str(caught.value)
+    table.write_text(text.replace(name, f"../{broken.name}/{name}"))
+    open_sequence(broken)
+
+
 def test_of_millions_of_records_few_are_parsed(tmp_path):
     record = '{"token": "%d", "sample_token": "s%d", "filename": "x"}'
     lines = ",\n".join(record % (i, i // 10) for i in range(50_000))

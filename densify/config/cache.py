@@ -7,6 +7,7 @@ entry is computed again. Only the user can write to the folder.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import logging
@@ -14,12 +15,12 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import platformdirs
@@ -56,32 +57,64 @@ class Cache:
     def get(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
         """Return a step's cached result for these inputs (as `digest` accepts), else make it."""
         path = self._folder / f"{step}-{digest((__version__, inputs))}.npz"
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                value: T = _unpacked(json.loads(arrays["json"].tobytes()), arrays)
-            os.utime(path)  # the entry was used
+        if (entry := _read(path)) is not None:
+            return cast(T, entry[0])
+        with _only_maker(path):
+            if (entry := _read(path)) is not None:  # another thread or process made it
+                return cast(T, entry[0])
+            value = make()
+            try:
+                text, arrays = _packed(value)
+                save_arrays(path, {"json": np.frombuffer(text, np.uint8), **arrays})
+            except (OSError, TypeError) as error:
+                _log.debug("%s: not kept: %s", path, error)
             return value
-        except FileNotFoundError:
-            pass
-        except Exception as error:  # a damaged file raises anything
-            _log.debug("%s: made again: %s", path, error)
-        value = make()
-        try:
-            text, arrays = _packed(value)
-            save_arrays(path, {"json": np.frombuffer(text, np.uint8), **arrays})
-        except (OSError, TypeError) as error:
-            _log.debug("%s: not kept: %s", path, error)
-        return value
 
     def trim(self) -> None:
         """Delete the least recently used entries until the size is within the limit."""
-        with suppress(OSError):  # another process deletes too
-            entries = [(e.stat().st_mtime_ns, e, e.stat().st_size) for e in self._folder.iterdir()]
-            left = sum(num_bytes for *_, num_bytes in entries)
-            for number, (_, entry, num_bytes) in enumerate(sorted(entries)):
-                if left > self._limit_bytes or len(entries) - number > _MOST_ENTRIES:
-                    entry.unlink()
-                    left -= num_bytes
+        entries: list[tuple[int, Path, int]] = []
+        for path in self._folder.iterdir() if self._folder.is_dir() else ():
+            with suppress(OSError):  # another process deletes too
+                found = path.stat()
+                entries.append((found.st_mtime_ns, path, found.st_size))
+        left = sum(num_bytes for *_, num_bytes in entries)
+        for number, (_, path, num_bytes) in enumerate(sorted(entries)):
+            if left > self._limit_bytes or len(entries) - number > _MOST_ENTRIES:
+                with suppress(OSError):
+                    path.unlink()
+                left -= num_bytes
+
+
+def _read(path: Path) -> tuple[Any] | None:
+    """Return the value of an entry, None if the file is missing or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            value = _unpacked(json.loads(arrays["json"].tobytes()), arrays)
+        os.utime(path)  # the entry was used
+        return (value,)
+    except FileNotFoundError:
+        return None
+    except Exception as error:  # a damaged file raises anything
+        _log.debug("%s: made again: %s", path, error)
+        return None
+
+
+@contextmanager
+def _only_maker(path: Path) -> Iterator[None]:
+    """Hold a lock file, so that one thread or process at a time makes the entry."""
+    lock, number = path.with_suffix(".lock"), None
+    with suppress(OSError):  # where nothing can be written or locked, each makes its own
+        number = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
+        fcntl.flock(number, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        if number is not None:
+            with suppress(OSError):
+                lock.unlink()
+            with suppress(OSError):  # a forked process has the file open, too
+                fcntl.flock(number, fcntl.LOCK_UN)
+            os.close(number)
 
 
 @lru_cache(maxsize=1)

@@ -6,6 +6,7 @@ Every error of malformed content becomes one InputError.
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import io
 import json
@@ -82,11 +83,19 @@ def reason(error: BaseException) -> str:
 
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
-    """Return the text of a UTF-8 file."""
+    """Return the text of a UTF-8 file, without a byte order mark."""
+    return decode_text(read_bytes(path, most_bytes), path)
+
+
+def decode_text(data: bytes, where: Path | str) -> str:
+    """Return UTF-8 text without a byte order mark; errors begin with ``where``."""
+    # Every second byte of plain words in UTF-16 is zero.
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or data[:2].count(0) == 1:
+        raise InputError(f"{where}: is text in UTF-16, expected UTF-8; save it as UTF-8")
     try:
-        return read_bytes(path, most_bytes).decode("utf-8")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: cannot be read: not a text file") from error
+        raise InputError(f"{where}: cannot be read: not a text file") from error
 
 
 def read_json(path: Path) -> Any:

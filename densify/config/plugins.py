@@ -165,7 +165,7 @@ def _any(*patterns: str) -> Callable[[Path], bool]:
 def _suffix(*suffixes: str) -> Callable[[Path], bool]:
     """Return a function that recognises a file with the suffix, or a folder with such files."""
     inside = _any(*(f"*{suffix}" for suffix in suffixes))
-    return lambda path: path.suffix in suffixes if path.is_file() else inside(path)
+    return lambda path: path.name.endswith(suffixes) if path.is_file() else inside(path)
 
 
 def _capture(with_metadata: bool) -> Callable[[Path], bool]:
@@ -221,7 +221,8 @@ READERS = Table(
         Plugin("kitti-odometry", "densify.readers.kitti.odometry", _is_odometry,
                "KITTI odometry or SemanticKITTI (sequences/, or a folder in it with velodyne/)",
                scenes=True),
-        Plugin("ros", "densify.readers.ros", _suffix(".bag", ".db3", ".mcap"),
+        Plugin("ros", "densify.readers.ros",
+               _suffix(".bag", ".db3", ".mcap", ".db3.zstd", ".mcap.zstd"),
                "a ROS bag (.bag, .db3, .mcap, or a folder of them)", scenes=True),
         Plugin("dgp", "densify.readers.dgp", _any(_DGP, f"*/{_DGP}"),
                "a DGP scene such as DDAD's (with scene_<hash>.json)", scenes=True),

@@ -96,7 +96,8 @@ def make_dataset(
     Args:
         data: Recordings, as `densify.open_sequence` takes them.
         out: Folder of the training set.
-        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``, None for all.
+        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``, None for all. A
+            slice without start or stop begins at the first frame or ends at the last one.
         recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
         num_workers: Number of processes, as many as possible if None. More than one needs ``if
             __name__ == "__main__"`` in a script.

@@ -29,6 +29,7 @@ from densify.config.sections import Section, one_of, within
 from densify.geometry.types import Camera, LidarSequence
 from densify.outputs.atomic import plain, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
+from densify.outputs.recording_folder import is_same
 from densify.pipeline.sweeps import Cut
 from densify.readers import Spec, open_sequence
 from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, runs
@@ -163,11 +164,16 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]
 def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, ...]:
     if keys is None:
         return tuple(sequence.frames)
-    wanted = range(keys.start, keys.stop, keys.step or 1)
     first, last = min(sequence.frames), max(sequence.frames)
+    start = first if keys.start is None else keys.start
+    stop = last + 1 if keys.stop is None else keys.stop
+    step = 1 if keys.step is None else keys.step
+    if not all(isinstance(number, int) for number in (start, stop, step)) or step < 1:
+        raise InputError(f"keys: got {keys}, expected whole numbers and a step of 1 or more")
+    wanted = range(start, stop, step)
     chosen = tuple(f for f in sequence.frames if f in wanted)
-    if not chosen or (keys.start < first or wanted[-1] > last):
-        text = f"{keys.start}:{keys.stop}" + ("" if keys.step in (None, 1) else f":{keys.step}")
+    if not chosen or (start < first or wanted[-1] > last):
+        text = f"{start}:{stop}" + ("" if step == 1 else f":{step}")
         raise InputError(
             f"--keys {text}: {sequence.name} ({spec}) has {format_frames(sequence.frames)}; "
             f"expected A:B within {first}:{last + 1}, or all"
@@ -276,6 +282,11 @@ def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str,
     united = dict(before)
     for name, drive in now.items():
         old = before.get(name, drive)
+        if not is_same(name, drive["data"], name, old["data"]):
+            raise InputError(
+                f"--out {out}: {name} in the set is another recording, {old['data']}; got "
+                f"{drive['data']}; choose another --out"
+            )
         for part in ("folder", "cameras"):
             if old[part] != drive[part]:
                 raise InputError(

@@ -125,7 +125,8 @@ def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
             off = poses.log(poses.inverse(_between([track.at(ns) for ns in ends_ns])) @ step)
             cost[row] += np.sum((off[3:] / _NOISE_M) ** 2) + np.sum((off[:3] / _NOISE_RAD) ** 2)
     if not num_used:
-        return []
+        text = "the recording has too few poses before and after the sweeps looked at"
+        return [finding("clock of poses", UNKNOWN, text)]
     good = late_s[cost < cost.min() + _EVEN_COST]
     low_s, high_s, best_s = float(good.min()), float(good.max()), float(late_s[np.argmin(cost)])
     text = (

@@ -168,7 +168,7 @@ def check_sensors(sample: Sample) -> list[Finding]:
     """Describe each scanner as the pipeline models it: rings, field of view, number of returns."""
     spot = sample.fastest
     if spot is None:
-        return []
+        return [finding("scanners", UNKNOWN, "no sweeps could be registered")]
     findings = []
     used = [replace(s, sweep=in_range(s.sweep, sample.settings)) for s in spot.stretch.sweeps]
     for number, model in Sensors.of(used).models.items():

@@ -26,6 +26,7 @@ from typing import Any, TypeVar
 
 import numba
 from numba.core import event
+from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 
 from densify.config.cache import others_can_write
@@ -91,6 +92,25 @@ def _is_open(folder: Path) -> bool:
     return found is not None
 
 
+class _Kept(FunctionCache):
+    """Numba's cache of one function on disk. If it fails, the function is compiled in every run."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the compiled function for these types, None if none can be loaded."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # a damaged file: unpickling can raise anything
+            _log.debug("%s: compiled code cannot be loaded: %s", self.cache_path, error)
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep the compiled function for these types, if possible."""
+        try:
+            super().save_overload(sig, data)
+        except Exception as error:  # a full disk, a damaged index
+            _log.debug("%s: compiled code cannot be kept: %s", self.cache_path, error)
+
+
 class Kernel:
     """A function compiled by numba at the first call with new types, and cached for later runs.
 
@@ -105,7 +125,8 @@ class Kernel:
         function.__qualname__ += _imported_code(function)  # part of the name of the cache file
         self._function = function
         try:
-            self._compiled = numba.njit(function, cache=True, **_OPTIONS)
+            self._compiled = numba.njit(function, **_OPTIONS)
+            self._compiled._cache = _Kept(function)  # type: ignore[attr-defined]
         except RuntimeError as error:  # no place for a cache
             self._do_without_cache(error)
             return
@@ -115,11 +136,7 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the compiled function."""
-        try:
-            return self._compiled(*arguments)
-        except Exception as error:  # a full disk, a damaged file: unpickling can raise anything
-            self._do_without_cache(error)
-            return self._compiled(*arguments)
+        return self._compiled(*arguments)
 
     def over_rows(self, num_rows: int, *arguments: Any) -> None:
         """Call ``kernel(begin, end, *arguments)`` for row ranges, on all cores, as `over_rows`."""

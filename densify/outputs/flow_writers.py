@@ -64,19 +64,26 @@ flow to the previous sweep instead."""
 def write_flow(result: Result, context: Context, folder: Path) -> None:
     """Write the flow files ``flow/*.npz`` if ``output.flow`` asks for flow."""
     if result.flow is not None:
-        write_flow_npz(folder / "flow", result.flow)
+        write_flow_npz(folder / "flow", result.flow, result.recording)
 
 
-def write_flow_npz(folder: Path, flow: StretchFlow) -> list[Path]:
+def write_flow_npz(folder: Path, flow: StretchFlow, recording: str) -> list[Path]:
     """Write ``folder/000119_000120.npz`` for the flow from sweep 119 to 120, and all other steps.
 
-    Return the paths of the files.
+    The array ``recording`` in each file is the name of the recording. Return the paths of the
+    files.
     """
     paths = []
     for (frame, target), field in flow.steps.items():
         sweep = flow.stretch[frame].sweep
         total_flow = _total_flow(flow, frame, target)
-        data = flow_npz(field, row=sweep.row, total_flow=total_flow, object=field.instance)
+        data = flow_npz(
+            field,
+            row=sweep.row,
+            total_flow=total_flow,
+            object=field.instance,
+            recording=np.array(recording),
+        )
         paths.append(folder / f"{frame:06d}_{target:06d}.npz")
         write_file(paths[-1], data)
     return paths
@@ -187,7 +194,7 @@ def flow_writer(
             elif form == "doc-depth":
                 _write_classes(paths[frame], frame, flow)
             else:
-                write_flow_npz(out, ahead)
+                write_flow_npz(out, ahead, sequence.name)
             return paths[frame].parent if form == "semantickitti" else _place(form, out, name)
 
         yield write

@@ -169,8 +169,8 @@ def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
 def record(result: Result, context: Context) -> dict[str, Any]:
     """Return a mapping that says how a result was made.
 
-    The mapping has data, key, frames, cameras, warnings, configuration, cost of each stage, and
-    versions. A package of unknown version, as in system builds, has None.
+    The mapping has recording (its name), data, key, frames, cameras, warnings, configuration, cost
+    of each stage, and versions. A package of unknown version, as in system builds, has None.
     """
     versions: dict[str, str | None] = {"densify": __version__, "python": platform.python_version()}
     versions["platform"] = platform.platform()
@@ -179,6 +179,7 @@ def record(result: Result, context: Context) -> dict[str, Any]:
         with suppress(PackageNotFoundError):
             versions[package] = version(package)
     return {
+        "recording": result.recording,
         "data": context.data,
         "key": result.key,
         "stamp_ns": result.stamp_ns,

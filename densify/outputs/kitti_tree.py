@@ -50,6 +50,7 @@ _VALIDATION = {
 }
 _KITTI_DRIVE = re.compile(r"(\d{4}_\d\d_\d\d_drive_\d{4})(?:_sync|_extract)?", re.ASCII)
 _PUNCTUATION = str.maketrans({":": "-", "?": "_", "=": "-", "&": "_"})
+_DEFAULT_STREET = "street:street?seed=0&sensor=hdl64"
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 
 
@@ -66,10 +67,13 @@ def split_of(drive: str) -> Split:
 def drive_folder(name: str) -> str:
     """Return a valid, unique folder name for a recording.
 
-    A valid name, such as KITTI's names, is kept. ``street:street?seed=0&sensor=hdl64`` becomes
-    ``street-street_seed-0_sensor-hdl64``. Any other name is reduced to ASCII letters and digits. A
+    A valid name, such as KITTI's names, is kept. The simulated street with default options is
+    ``street``; ``street:highway?seed=0&sensor=hdl64`` becomes
+    ``street-highway_seed-0_sensor-hdl64``. Any other name is reduced to ASCII letters and digits. A
     hash at its end keeps the name unique.
     """
+    if name == _DEFAULT_STREET:
+        return "street"
     folder = name.translate(_PUNCTUATION)
     if _FOLDER_NAME.fullmatch(folder):
         return folder

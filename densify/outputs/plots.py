@@ -18,6 +18,7 @@ import numpy as np
 from densify.geometry.types import METHOD_NAMES, Float32, Result
 from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import Picture, encode_png
+from densify.outputs.front_view import front_first
 from densify.outputs.key_outputs import Context
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def write_key_figure(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_figure(path: Path, results: Mapping[str, Result]) -> None:
-    """Write a figure with the measured depth of each method in the first camera.
+    """Write a figure with the measured depth of each method in the camera that looks ahead.
 
     With a prior, the figure also shows the completed depth of the last method. Without a camera no
     file is written.
@@ -53,14 +54,15 @@ def write_figure(path: Path, results: Mapping[str, Result]) -> None:
     method, last = list(results.items())[-1]
     if not last.depth:
         return
-    camera = next(iter(last.depth))
+    camera = front_first([*last.depth], last.views, last.T_key_lidar)[0]
     panels = [(METHOD_NAMES.get(m, m), r, "measured") for m, r in results.items()]
     if camera in last.full:
         panels.append((f"{METHOD_NAMES.get(method, method)} and prior", last, "full"))
     drawn = {}
     for title, result, product in panels:
         depth_m = (result.full if product == "full" else result.depth)[camera].depth_m
-        text = f"{title}: {np.count_nonzero(depth_m) / depth_m.size:.1%} of pixels"
+        named = f", {camera}" * (len(last.depth) > 1)
+        text = f"{title}{named}: {np.count_nonzero(depth_m) / depth_m.size:.1%} of pixels"
         drawn[text + _error(result, camera, product)] = depth_m
     write_file(path, encode_png(draw_figure(_image(last, camera), drawn)))
 

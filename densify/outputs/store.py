@@ -17,6 +17,7 @@ from densify.geometry.types import Result
 from densify.outputs import flow_writers, key_outputs, plots
 from densify.outputs.atomic import staged_folder, write_json
 from densify.outputs.key_outputs import Context
+from densify.outputs.recording_folder import check_recording
 from densify.outputs.report.key_page import write_report
 
 _OUTPUTS: Mapping[tuple[str, ...], Callable[[Result, Context, Path], None]] = {
@@ -96,6 +97,7 @@ def write_result(
     ``data`` the recording as the user named it.
     """
     context = Context(config, data)
+    check_recording(out, result.recording, data, [result.key])
     with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:
         for write in _OUTPUTS.values():
             write(result, context, folder)
@@ -123,6 +125,7 @@ def write_comparison(
         "methods": {m: {"frames": r.frames, **r.metrics} for m, r in results.items()},
         "warnings": list(dict.fromkeys(w for r in results.values() for w in r.warnings)),
     }
+    check_recording(out, last.recording, data, [key])
     with writing(_key_folder(out, key), _COMPARISON, out, overwrite) as folder:
         write_json(folder / "compare.json", table)
         plots.write_figure(folder / "compare.png", results)

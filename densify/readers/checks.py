@@ -6,6 +6,7 @@ Each check raises InputError with a message that begins with the file or folder.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,15 +25,36 @@ _ORTHONORMAL_TOLERANCE = 1e-3  # far above the rounding of text and float32 file
 
 
 def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
-    """Return the files of a folder named by a number, such as ``0000000120.bin``, ascending."""
+    """Return the files of a folder named by a number, such as ``0000000120.bin``, ascending.
+
+    Of files whose names differ in the suffix alone, the one with the first of ``suffixes`` is
+    taken.
+    """
     if not folder.is_dir():
         return {}
-    found = {
-        int(path.stem): path
-        for path in folder.iterdir()
-        if path.stem.isdecimal() and path.suffix.lower() in suffixes
-    }
+    files = [p for p in folder.iterdir() if p.stem.isdecimal() and p.suffix.lower() in suffixes]
+    found: dict[int, Path] = {}
+    for path in sorted(files, key=lambda p: (suffixes.index(p.suffix.lower()), p.name)):
+        before = found.setdefault(int(path.stem), path)
+        if before.stem != path.stem:
+            raise InputError(
+                f"{path}: has the number {int(path.stem)}, as {before.name} has; expected one file "
+                f"of each number; move one of them away"
+            )
     return dict(sorted(found.items()))
+
+
+def file_within(root: Path, name: str, where: Path | str) -> Path:
+    """Return the path of a file that a table names relative to a data set's folder.
+
+    Raise InputError, starting with ``where``, if the name leads out of the folder.
+    """
+    path = root / name
+    if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)):
+        raise InputError(
+            f"{where}: names the file {name!r}, outside of {root}; expected a path within it"
+        )
+    return path
 
 
 def drive_around(path: Path) -> Path | None:

@@ -8,6 +8,7 @@ a library is raised as InputError.
 from __future__ import annotations
 
 import io
+import logging
 import math
 import struct
 import zipfile
@@ -20,10 +21,13 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.config.file_content import MOST_BYTES, check_size, open_file, read_bytes, reason
+from densify.readers.stray_bytes import decode_strictly
 
 Arrays = dict[str, NDArray[Any]]
 
 MOST_PIXELS = 1 << 27
+_log = logging.getLogger("densify")
+_folders_told: set[Path] = set()
 # Offset of the points, number of records, bytes per point, number of points.
 _LAS_HEADER = struct.Struct("<96xIIxHI")
 # LAS 1.4 only: offset and number of extended records, number of points.
@@ -85,10 +89,10 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
 
     try:
         if _checked_format(data, where) == "JPEG" and not as_stored:
-            import simplejpeg
-
-            # OpenCV and Pillow decode damaged JPEG data to wrong colours.
-            return simplejpeg.decode_jpeg(data, "BGR", strict=True)
+            pixels, mended = decode_strictly(data)
+            if mended:
+                _tell_mended(where, mended)
+            return pixels
         flags = cv2.IMREAD_UNCHANGED if as_stored else cv2.IMREAD_COLOR
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         if image is None:
@@ -101,6 +105,18 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
             f"{where}: not a complete image, or damaged ({len(data)} bytes); expected a PNG or "
             f"JPEG file"
         ) from error
+
+
+def _tell_mended(where: Path | str, mended: str) -> None:
+    """Warn of an image that breaks the rules of its format; once for a folder or topic."""
+    if (folder := Path(where).parent) not in _folders_told:
+        _folders_told.add(folder)
+        _log.warning(
+            "%s: %s; all of its pixels are there and are read. Others like it in %s are not named",
+            where,
+            mended,
+            folder,
+        )
 
 
 def _checked_format(data: bytes, where: Path | str) -> str:

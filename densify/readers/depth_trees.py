@@ -9,6 +9,7 @@ The folder of estimated maps and the folder of true maps each have one of these 
     000005/depth/image_02/000007.png                        its maps of single images, by number
     [image_02/]0000000005.png, scene_a.png                  plain folders; the name is the frame
 
+Folders that `densify export` wrote into PREDICTED are left out, because they hold copies.
 The sets of `densify dataset` have the first or the third layout. A drive is KITTI's dated name
 anywhere in a path, or the folder that holds proj_depth.
 """
@@ -115,6 +116,9 @@ def _found(place: Path, what: str) -> list[_File]:
     paths = sorted(place.rglob("*.png"))
     # Hidden files are unfinished results.
     paths = [p for p in paths if "/." not in f"/{p.relative_to(place).as_posix()}"]
+    # Exported maps are copies of the maps beside them.
+    exported = {p.parent for p in place.rglob("export.yaml")} - {place}
+    paths = [p for p in paths if not exported.intersection(p.parents)]
     if not paths:
         raise InputError(
             f"{what} {place}: no such file or folder with PNG files, expected depth maps"

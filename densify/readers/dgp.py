@@ -144,13 +144,14 @@ def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
     if not found["point_cloud"]:
         raise InputError(f"{file}: none of its sweeps is there; expected point_cloud/LIDAR/*.npz")
     images = dict(sorted(found["image"].items()))
-    return found["point_cloud"], images, file.parent / "calibration" / f"{key}.json"
+    calibration = checks.file_within(file.parent, f"calibration/{key}.json", file)
+    return found["point_cloud"], images, calibration
 
 
 def _datum(file: Path, kind: str, entry: Mapping[str, Any]) -> _Datum:
     datum, where = entry["datum"][kind], f"{file}: datum {entry['key']}"
     return _Datum(
-        file.parent / datum["filename"],
+        checks.file_within(file.parent, datum["filename"], where),
         _stamp_ns(entry["id"]["timestamp"]),
         _read_pose(datum["pose"], where),
         tuple(datum.get("point_format", ())),

@@ -20,6 +20,7 @@ undone. Missing returns then lie at the origin and are left out.
 
 from __future__ import annotations
 
+import codecs
 import mmap
 import re
 from collections import defaultdict
@@ -82,7 +83,8 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
             open_file(_existing(path)) as file,
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
         ):
-            if data[:4096].lstrip()[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
+            begin = data[:4096].removeprefix(codecs.BOM_UTF8).lstrip()
+            if begin[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
                 raise ValueError("it does not begin with [ or end with ]")
             for match in _RECORD.finditer(data):
                 of = pattern.search(match[0])
@@ -233,7 +235,7 @@ def _read_path(tables: Path, token: str, name: str) -> tuple[list[Record], PoseT
 
 def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[str, Channel]:
     """Return the sensors of a modality by channel, from sample data records in order of time."""
-    path = tables / "calibrated_sensor.json"
+    path, table = tables / "calibrated_sensor.json", tables / "sample_data.json"
     calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
     found: dict[str, list[Record]] = defaultdict(list)
     for record in records:
@@ -246,7 +248,7 @@ def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[st
         T = {t: pose_of(calibrated[t], f"{path}: record {t}") for t in dict.fromkeys(tokens)}
         channels[name] = Channel(
             [stamp_ns(record) for record in of],
-            [tables.parent / record["filename"] for record in of],
+            [checks.file_within(tables.parent, record["filename"], table) for record in of],
             [T[token] for token in tokens],
             (int(of[0].get("width") or 0), int(of[0].get("height") or 0)),
             calibrated[tokens[0]].get("camera_intrinsic"),

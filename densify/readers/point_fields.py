@@ -33,11 +33,10 @@ _NAMES = {
     "x": "x",
     "y": "y",
     "z": "z",
-    "intensity": "intensity intensities reflectance reflectivity remission i signal "
-    "scalar_intensity amplitude",
+    "intensity": "intensity intensities reflectance reflectivity remission i signal amplitude",
     "time": "time t timestamp time_stamp offset_time time_offset timeoffset offset_ns offset_us "
-    "time_us time_ns stamp gps_time scalar_time",
-    "ring": "ring line channel laser_id laser_number laserid beam scalar_ring",
+    "time_us time_ns stamp gps_time gpstime",
+    "ring": "ring line channel laser_id laser_number laserid beam",
     "lidar": "lidar lidar_id scanner sensor_id scanner_channel",
 }
 _SHORTEST_SHARE, _LONGEST_SHARE = 0.08, 4.0  # accepted span of a sweep's times, in periods
@@ -61,8 +60,11 @@ class Fields:
 
 
 def find_fields(names: Collection[str]) -> Fields:
-    """Find the field of each quantity by name, in any case; the order of `_NAMES` decides."""
-    lower = {name.lower(): name for name in reversed(list(names))}
+    """Find the field of each quantity by name, in any case; the order of `_NAMES` decides.
+
+    CloudCompare puts ``scalar_`` before the names of fields.
+    """
+    lower = {name.lower().removeprefix("scalar_"): name for name in reversed(list(names))}
     found = {
         part: next((lower[name] for name in known.split() if name in lower), "")
         for part, known in _NAMES.items()

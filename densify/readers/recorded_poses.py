@@ -21,7 +21,7 @@ from densify.config.file_content import read_text
 from densify.geometry import poses
 from densify.geometry.types import Float, Int
 from densify.readers import checks
-from densify.readers.stamp_files import TIME_COLUMNS, TextTable
+from densify.readers.stamp_files import TIME_COLUMNS, TextTable, check_digits
 
 _MAX_BEYOND_NS = 200_000_000  # longest extrapolation of a pose, at constant velocity
 
@@ -125,7 +125,10 @@ class PoseFile:
         values = _numbers(table, columns)
         lines = zip(values, table.lines, strict=True)
         T = np.stack([checks.quaternion_pose(v[:4], v[4:], f"{path}: line {n}") for v, n in lines])
-        stamps_ns = None if time is None else table.times_ns(time, unit)[0]
+        stamps_ns = None
+        if time is not None:
+            stamps_ns, _ = table.times_ns(time, unit)
+            check_digits(stamps_ns, table.rows[0][time], path)
         return PoseFile(path, form, T, stamps_ns)
 
     @staticmethod

@@ -39,6 +39,7 @@ from densify.readers.ros_bag import POSES, Bag, Entry, Topics, place_of
 from densify.readers.ros_messages import (
     Transforms,
     camera_of,
+    check_encoding,
     cloud_columns,
     image_rgb,
     plain,
@@ -237,6 +238,7 @@ class RosBag(FileSequence):
         if not self._index[topic]:
             raise InputError(f"{where}: holds no images")
         image = self._bag.message(topic, self._index[topic][0])
+        check_encoding(image, where)
         frame, lidar = plain(image.header.frame_id), self._lidars[0].frame
         T = self._transforms.between(frame, lidar)
         if T is None:

@@ -21,6 +21,7 @@ from urllib.parse import parse_qsl
 from densify.config.errors import InputError
 from densify.config.file_content import needed, open_file, reason
 
+_MCAP = b"\x89MCAP0\r\n"  # begins and ends a file
 _MEND = "a bag that was cut off can be mended: rosbag reindex, ros2 bag reindex, mcap recover"
 
 _DRIVERS = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
@@ -151,6 +152,14 @@ class Bag:
             ) from error
 
     def _unreadable(self, error: Exception) -> InputError:
+        for file in self._files:
+            profile = _mcap_profile(file)
+            if profile is not None and profile != "ros2":
+                written = f"messages of {profile}" if profile else "messages of other programs"
+                return InputError(
+                    f"{file}: is a whole MCAP file with {written}, as densify export writes it; "
+                    f"expected a bag that ROS 2 recorded (profile ros2)"
+                )
         return InputError(f"{self.path}: not a whole bag: {reason(error)}; {_MEND}")
 
 
@@ -166,6 +175,20 @@ def message_types(is_ros2: bool) -> Any:
         if name not in types.types:
             types.register(typesys.get_types_from_msg(text, name))
     return types
+
+
+def _mcap_profile(file: Path) -> str | None:
+    """Return the profile that a whole MCAP file states, "" for none; None for other files."""
+    if not file.is_file():
+        return None
+    with open_file(file) as opened:
+        begin = opened.read(4096)
+        opened.seek(max(0, opened.seek(0, 2) - len(_MCAP)))
+        if not begin.startswith(_MCAP) or opened.read() != _MCAP or len(begin) < 21:
+            return None
+    # The header record follows: its kind (1 byte) and length (8), then length and text of a string.
+    (num_bytes,) = struct.unpack_from("<I", begin, 17)
+    return begin[21 : 21 + num_bytes].decode("utf-8", "replace")
 
 
 def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
@@ -184,6 +207,12 @@ def _bag_files(path: Path) -> list[Path]:
     suffixes = (".bag", ".db3", ".mcap")
     if (path.is_file() and path.suffix in suffixes) or (path / "metadata.yaml").is_file():
         return [path]
+    packed = [path] if path.suffix == ".zstd" and path.is_file() else sorted(path.glob("*.zstd"))
+    if packed:
+        raise InputError(
+            f"{packed[0]}: is compressed as a whole; name the bag's folder with its metadata.yaml, "
+            f"or decompress it by zstd -d {packed[0].name} and name {packed[0].stem}"
+        )
     for suffix in suffixes:
         found = sorted(path.glob(f"*{suffix}")) if path.is_dir() else []
         if found and (suffix == ".bag" or len(found) == 1):

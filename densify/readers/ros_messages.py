@@ -47,6 +47,7 @@ _PACKED = {  # channels, and OpenCV's conversion to RGB
     "yuv422_yuy2": (2, "COLOR_YUV2RGB_YUYV"),
     "yuyv": (2, "COLOR_YUV2RGB_YUYV"),
 }
+_GRAY_16 = ("mono16", "16uc1")
 _FIXED_M = 1e-6  # frames that move less, in metres or radians, are fixed
 
 
@@ -72,7 +73,9 @@ def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
         layout[entry.name] = (order + kind, entry.offset)
     formats, offsets = [kind for kind, _ in layout.values()], [at for _, at in layout.values()]
     spec: Any = {"names": [*layout], "formats": formats, "offsets": offsets}
-    points_of_rows = _rows(message, message.row_step, message.point_step, where)
+    # Some drivers leave the step of an only row at zero.
+    step = message.row_step or message.width * message.point_step * (message.height == 1)
+    points_of_rows = _rows(message, step, message.point_step, where)
     points = points_of_rows.reshape(-1).view(np.dtype(spec | {"itemsize": message.point_step}))
     return {name: points[name] for name in layout}
 
@@ -89,23 +92,35 @@ def _rows(message: Any, step: int, item_bytes: int, where: str) -> NDArray[np.ui
     return np.ascontiguousarray(rows[:, :used])
 
 
-def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
-    """Return an Image or CompressedImage message as (H,W,3) uint8 RGB."""
-    import cv2
-
+def check_encoding(message: Any, where: str) -> None:
+    """Raise InputError for an Image or CompressedImage message in an encoding that is not read."""
     if hasattr(message, "format"):
-        bgr = decode_image(np.ascontiguousarray(message.data, np.uint8).tobytes(), where)
-        return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
-    encoding, size = message.encoding.lower(), (message.height, message.width)
-    if encoding in ("mono16", "16uc1"):
-        order = ">u2" if message.is_bigendian else "<u2"
-        gray = _rows(message, message.step, 2, where).view(order).reshape(size) >> 8
-        return cv2.cvtColor(gray.astype(np.uint8), cv2.COLOR_GRAY2RGB).astype(np.uint8)
-    if encoding not in _PACKED:
+        begin = bytes(np.asarray(message.data[:8], np.uint8))
+        if not begin.startswith((b"\xff\xd8", b"\x89PNG")):
+            raise InputError(
+                f"{where}: got images of the format {message.format!r}, expected JPEG or PNG; "
+                f"leave the camera out: name others with #images="
+            )
+    elif message.encoding.lower() not in (*_PACKED, *_GRAY_16):
         raise InputError(
             f"{where}: got the encoding {message.encoding}, expected one of "
             f"{', '.join(_PACKED)}, mono16; leave the camera out: name others with #images="
         )
+
+
+def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
+    """Return an Image or CompressedImage message as (H,W,3) uint8 RGB."""
+    import cv2
+
+    check_encoding(message, where)
+    if hasattr(message, "format"):
+        bgr = decode_image(np.ascontiguousarray(message.data, np.uint8).tobytes(), where)
+        return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
+    encoding, size = message.encoding.lower(), (message.height, message.width)
+    if encoding in _GRAY_16:
+        order = ">u2" if message.is_bigendian else "<u2"
+        gray = _rows(message, message.step, 2, where).view(order).reshape(size) >> 8
+        return cv2.cvtColor(gray.astype(np.uint8), cv2.COLOR_GRAY2RGB).astype(np.uint8)
     channels, conversion = _PACKED[encoding]
     pixels = _rows(message, message.step, channels, where).reshape(*size, channels)
     if conversion is None:

@@ -26,6 +26,7 @@ _FILE_COLUMNS = ("filename", "file", "name", "image", "sweep", "path")
 TIME_COLUMNS = ("timestamp", "time", "stamp", "t")
 _MAX_NUMBER_DIGITS = 18  # a longer number is no frame number
 _MOST_NS = 2**63
+_MOST_EQUAL = 1 / 3  # share of the steps; a recorder repeats single stamps
 
 
 class Named(NamedTuple):
@@ -91,6 +92,21 @@ def _epoch_unit(text: str) -> str:
         except ValueError:
             continue
     return ""
+
+
+def check_digits(stamps_ns: Collection[int], text: str, where: Path) -> None:
+    """Raise InputError if times in file order are equal because they were rounded.
+
+    ``text`` is the first time as the file has it.
+    """
+    steps_ns = np.diff(np.array([*stamps_ns], np.int64))
+    num_equal = int((steps_ns == 0).sum())
+    if num_equal > _MOST_EQUAL * len(steps_ns):
+        raise InputError(
+            f"{where}: {num_equal} of {len(steps_ns)} times are equal to the time before, such as "
+            f"{text}: they have lost digits; write them anew with all digits, in nanoseconds or "
+            f"with %.9f"
+        )
 
 
 class TextTable(NamedTuple):
@@ -182,4 +198,6 @@ class StampFile(NamedTuple):
             at_time = next((i for i in range(len(words)) if i != at_name), 0)
         stamps_ns, unit = table.times_ns(at_time, unit)
         files = None if at_name is None else tuple(Path(row[at_name]).name for row in table.rows)
+        if files is None:  # files of several cameras may have one time
+            check_digits(stamps_ns, words[at_time], path)
         return StampFile(path, stamps_ns, unit, files)

@@ -49,8 +49,8 @@ class FinishedRun:
         key: Frame number of the key sweep.
         stamp_ns: Reference time of the key sweep in ns since 1970.
         data: Specification of the recording.
+        recording: Name of the recording.
         density: Camera -> ``measured``, ``filled`` -> share of pixels, for the maps read so far.
-        num_points: Number of points in the clouds read so far, None before the first cloud.
     """
 
     def __init__(
@@ -64,18 +64,20 @@ class FinishedRun:
         path = folder / "run.yaml"
         if not path.is_file():
             raise InputError(
-                f"{folder}: no run.yaml in it; expected the folder of a finished run and key, such "
-                f"as densify-out/000120"
+                f"{folder}: {_what_is_there(folder)}; expected the folder of a finished run and "
+                f"key, such as densify-out/street/000120"
             )
         with damage_named(path):
             record = read_yaml(path)[0]
             self.key, self.stamp_ns = int(record["key"]), int(record["stamp_ns"])
             self.data = str(record["data"])
+            last = self.data.rstrip("/").rpartition("/")[2]
+            self.recording = str(record.get("recording") or last)
         self.folder, self._chosen = folder, cameras
         self._min_confidence = stored_confidence(min_confidence)
         self._max_age = stored_age(np.inf if max_age_ms is None else max_age_ms / 1000)
         self.density: dict[str, dict[str, Kept]] = {}
-        self.num_points: Kept | None = None
+        self._num_points: dict[Path, Kept] = {}
 
     @cached_property
     def cameras(self) -> list[str]:
@@ -102,6 +104,12 @@ class FinishedRun:
     def tracks(self) -> list[ObjectTrack]:
         """The tracks of moving objects, each with a pose at the key sweep."""
         return read_tracks(self.folder / "movers.json")
+
+    @property
+    def num_points(self) -> Kept | None:
+        """The number of points in the clouds read so far, None before the first cloud."""
+        counts = self._num_points.values()
+        return Kept(sum(k.before for k in counts), sum(k.after for k in counts)) if counts else None
 
     def measure(self, camera: str) -> str:
         """Return ``z`` (depth along the camera's axis) or ``range`` (distance from the lens)."""
@@ -163,20 +171,20 @@ class FinishedRun:
 
     def cloud(self) -> StoredCloud:
         """Return the accumulated points within the thresholds."""
-        return self._select(read_cloud(self.folder / "cloud.laz"))
+        return self._read(self.folder / "cloud.laz")
 
     def mover_clouds(self) -> list[StoredCloud]:
         """Return a cloud for each separated object (``movers=separate``), within the thresholds."""
         paths = sorted(self.folder.glob("movers/*/cloud.laz"))
-        return [self._select(read_cloud(path)) for path in paths]
+        return [self._read(path) for path in paths]
 
-    def _select(self, cloud: StoredCloud) -> StoredCloud:
+    def _read(self, path: Path) -> StoredCloud:
+        cloud = read_cloud(path)
         age = stored_age(1e-9 * np.abs(cloud.stamp_ns - self.stamp_ns))
         keep = (stored_confidence(cloud.confidence) >= self._min_confidence) & (
             age <= self._max_age
         )
-        before = self.num_points or Kept(0, 0)
-        self.num_points = Kept(before.before + len(keep), before.after + int(keep.sum()))
+        self._num_points[path] = Kept(len(keep), int(keep.sum()))
         return cloud.select(keep)
 
 
@@ -203,6 +211,16 @@ def finished_runs(
         places = [folder]
     runs = [FinishedRun(place, min_confidence, max_age_ms, cameras) for place in places]
     return sorted(runs, key=lambda run: (run.folder.parent, run.key))
+
+
+def _what_is_there(folder: Path) -> str:
+    """Return what a folder without run.yaml is, as a clause for an error."""
+    if (folder / "dataset.json").is_file():
+        return (
+            "holds a training set of maps alone (--layout kitti-depth), and the other formats need "
+            "clouds, ages and images; make the set with --layout densify to export it"
+        )
+    return "no run.yaml in it"
 
 
 class ShownSweep(NamedTuple):

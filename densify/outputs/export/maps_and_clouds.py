@@ -74,10 +74,9 @@ def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
     """
     files: list[dict[str, Any]] = []
     for run in runs:
-        name = run.data.rstrip("/").rpartition("/")[2]
-        if not name:
-            raise InputError(f"{run.folder}/run.yaml: data: expected the recording's name")
-        drive = folder / split_of(name) / drive_folder(name)
+        if not run.recording:
+            raise InputError(f"{run.folder}/run.yaml: recording: expected the recording's name")
+        drive = folder / split_of(run.recording) / drive_folder(run.recording)
         for view in run.cameras:
             files += _write_view(run, view, drive, folder)
     lines = [f"{file['rgb']} {file['depth']} {file['depth_filled']}\n" for file in files]

@@ -53,7 +53,7 @@ def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
         )
     modalities = {name: {"frame_key": name, "format": name} for name in ("image", "depth")}
     meta = {
-        "scene_name": drive_folder(f"{runs[0].data}-{runs[0].key:06d}".rpartition("/")[2]),
+        "scene_name": f"{drive_folder(runs[0].recording)}-{runs[0].key:06d}",
         "dataset_name": "densify",
         "version": "0.1",
         "shared_intrinsics": False,
@@ -75,7 +75,7 @@ def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
     """
     names = []
     for run in runs:
-        drive = drive_folder(run.data.rstrip("/").rpartition("/")[2])
+        drive = drive_folder(run.recording)
         for picture in pictures_of([run], flat=True):
             picture.run.full_m(picture.map)
             _require_pinhole(picture, "moge")

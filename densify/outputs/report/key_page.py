@@ -21,6 +21,7 @@ from densify.outputs.atomic import write_file
 from densify.outputs.cloud_laz import read_cloud
 from densify.outputs.depth_png import read_stored
 from densify.outputs.export.finished_run import map_names
+from densify.outputs.front_view import front_first
 from densify.outputs.key_outputs import Context
 from densify.outputs.report.page_file import Blobs, packed_camera, packed_cloud, page_file
 from densify.outputs.scene_file import read_scene, read_tracks
@@ -129,7 +130,8 @@ def key_page(files: KeyFiles, folder: str) -> bytes:
     views, sweeps = (scene.table["views"], scene.table["sweeps"]) if scene else ({}, [])
     focal_px = {name: view.camera.focal_px for name, view in (scene.views if scene else {}).items()}
     blobs, cameras = Blobs(), {}
-    for name in map_names(files.maps / "depth", files.maps / "depth_filled"):
+    names = map_names(files.maps / "depth", files.maps / "depth_filled")
+    for name in front_first(names, scene.views, scene.T_key_lidar) if scene else names:
         if maps := files.camera(name):
             cameras[name] = packed_camera(blobs, maps, files.image(name), focal_px.get(name))
     stored = files.read(read_cloud, "cloud.laz")

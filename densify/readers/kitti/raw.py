@@ -44,10 +44,11 @@ def open_recording(path: Path, scene: str | None) -> KittiRaw:
 class KittiRaw(Drive):
     """A KITTI raw drive as a `LidarSequence`.
 
-    The stamp of a sweep is the middle of the revolution (``velodyne_points/timestamps.txt``, or k
-    times 100 ms). The firing time of a point follows from its azimuth, ``timestamps_start.txt`` and
-    ``timestamps_end.txt``; if a stamp file is missing, ``offset_ns`` is None. Poses come from
-    ``oxts/``. The world is the frame of the GPS/IMU unit at the first oxts file.
+    The stamp of a sweep is the middle of the revolution (``velodyne_points/timestamps.txt``, or
+    from its start and end, or k times 100 ms). The firing time of a point follows from its azimuth,
+    ``timestamps_start.txt`` and ``timestamps_end.txt``; if one of them is missing, ``offset_ns`` is
+    None. Poses come from ``oxts/``. The world is the frame of the GPS/IMU unit at the first oxts
+    file.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -61,14 +62,22 @@ class KittiRaw(Drive):
             name: velodyne / f"timestamps{name}.txt" for name in ("", "_start", "_end")
         }
         self._recorded = {n: read_stamps(p) for n, p in self._stamp_files.items() if p.exists()}
+        self._missing = [p.name for n, p in self._stamp_files.items() if n not in self._recorded]
+        if self._missing == [self._stamp_files[""].name]:
+            ends_ns = self._recorded["_end"]
+            self._recorded[""] = {
+                frame: (start_ns + ends_ns[frame]) // 2
+                for frame, start_ns in self._recorded["_start"].items()
+                if frame in ends_ns
+            }
         self._oxts = checks.numbered_files(drive / "oxts" / "data", ".txt")
         self.cameras = cameras
         self._exposed_ns = {name: self._exposures_ns(name) for name in self._image_files}
 
     def gaps(self) -> list[str]:
         """Return missing files and what is assumed instead, a sentence each."""
-        missing = [p.name for n, p in self._stamp_files.items() if n not in self._recorded]
-        told = [f"{self.where / 'velodyne_points'} has no {', '.join(missing)}"] * bool(missing)
+        velodyne = self.where / "velodyne_points"
+        told = [f"{velodyne} has no {', '.join(self._missing)}"] * bool(self._missing)
         if "" not in self._recorded:
             told.append(f"{self.where}: sweeps are taken for 100 ms apart")
         left_out = [name for name in _camera_folders(self.where) if name not in self.cameras]
@@ -79,7 +88,7 @@ class KittiRaw(Drive):
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep; raise InputError if the frame has no stamp."""
-        return self._recorded_ns("", frame) if self._recorded else frame * NOMINAL_PERIOD_NS
+        return self._recorded_ns("", frame) if "" in self._recorded else frame * NOMINAL_PERIOD_NS
 
     def _recorded_ns(self, kind: str, frame: int) -> int:
         return checks.of_frame(self._recorded[kind], frame, "stamp", self._stamp_files[kind])
