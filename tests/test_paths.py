@@ -27,7 +27,7 @@ def polynomial(times_s: np.ndarray, degree: int) -> np.ndarray:
 
 
 def fitted(times_s: np.ndarray, states: np.ndarray) -> Path:
-    return Path.fit(times_s, states, np.ones(len(times_s)))
+    return Path.fit(times_s, states)
 
 
 def rms(off: np.ndarray) -> float:

@@ -119,7 +119,7 @@ def test_only_what_moves_along_itself_is_slender(along_deg, slender, monkeypatch
     track, obstacles = Track(np.zeros(3)), []
     for n in range(5):
         state = np.append(2.5 * n * way, 0)
-        track.observations[n] = Observation(state, 0.1 * n, n * PERIOD_NS, (n,))
+        track.observations[n] = Observation(state, 0.1 * n, n * PERIOD_NS)
         track.claimed[n] = np.arange(20)
         line = np.stack([offset_m, 0 * offset_m, 0 * offset_m], 1) + state[:3]
         obstacles.append(SimpleNamespace(points=line, time_s=np.full(20, 0.1 * n)))
@@ -137,7 +137,7 @@ def test_only_what_moves_along_itself_is_slender(along_deg, slender, monkeypatch
 def test_two_states_confirm_nothing():
     track = Track(np.zeros(3))
     for n in range(2):
-        track.observations[n] = Observation(np.zeros(4), 0.1 * n, n * PERIOD_NS, (n,))
+        track.observations[n] = Observation(np.zeros(4), 0.1 * n, n * PERIOD_NS)
     assert not judge(track, [], SimpleNamespace(), []).moves
 
 
@@ -196,7 +196,7 @@ class Seen:
             on = np.isin(scan.box[c.row], np.array(boxes) + len(street()))
             track.claimed[i] = np.flatnonzero(on & (ahead_m > 0) & (ahead_m < 4.4))
             state = np.array([SPEED_M_S * SWEEP_S * i, 0.0, 0.0, 0.0])
-            track.observations[i] = Observation(state, SWEEP_S * i, i * PERIOD_NS, (i,))
+            track.observations[i] = Observation(state, SWEEP_S * i, i * PERIOD_NS)
         track.smooth()
         return track
 

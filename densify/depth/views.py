@@ -146,11 +146,9 @@ class Views:
         Args:
             found: Static points along the road.
             T_key_found: (4,4) from the world of ``found`` to the key sweep's lidar frame.
-            standing_only: True leaves out points that a sweep of the window saw through.
+            standing_only: True leaves out points that the key sweep saw through.
         """
-        cloud, surface = far_cloud(
-            found, T_key_found, stretch, self.key, self.exposures, standing_only
-        )
+        cloud, surface = far_cloud(found, T_key_found, stretch, self.key, self.exposures)
         if self.key_image is not None and standing_only:
             free = seen_through_by_key(cloud.points, cloud.velocity_m_s, self.key_image)
             surface = replace(surface, free=free)

@@ -13,12 +13,11 @@ from densify.geometry.compiled import Kernel
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Int
 
-GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, for each step
+GATES_M = np.geomspace(0.8, 0.2, 10)  # greatest distance of a match, for each step
 MAX_WEIGHT = 60.0  # greatest sum over matches; errors of neighbours on a surface are correlated
 NUM_NEAR = 12  # neighbours that span a surface
 MIN_FIT = 5  # least number of matches
 _SURFACE_M = 0.05  # noise of a surface point
-_RIDGE = 0.02  # share of the mean variance that is added, for points on a line
 _MAX_MODEL_POINTS = 1500
 _LOOSE = 10.0  # factor of the covariance: surface points must not stop a slide along the surface
 
@@ -59,8 +58,7 @@ def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
     away = points[near]
     away -= away.mean(axis=1, keepdims=True)
     covariance = loose / near.shape[1] * (away.transpose(0, 2, 1) @ away)
-    ridge = _SURFACE_M**2 + _RIDGE / 3 * np.trace(covariance, axis1=1, axis2=2)
-    return np.asarray(np.linalg.inv(covariance + ridge[:, None, None] * np.eye(3)))
+    return np.asarray(np.linalg.inv(covariance + _SURFACE_M**2 * np.eye(3)))
 
 
 class Model:

@@ -17,22 +17,17 @@ from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
-from densify.geometry.linking import close_to_seeds
-from densify.geometry.nearest import is_near, nearest, nearest_k, tree_of
+from densify.geometry.nearest import nearest
 from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 
 Instance = NDArray[np.int32]
 
 _REACH = 1.5  # of candidates to an object, in neighbour distances (`near_m`)
-_LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M, _AS_LOW_AS_ROAD_M = 0.08, 0.1, 0.15
+_LEAST_HEIGHT_M = 0.1
 _WALKS_M_S = 2.0
-_LEAST_SEEDS, _WALKER_M = 0.1, 1.5
-_WIDER_M, _MOSTLY = 0.5, 0.5  # least share of moving points within this distance
-_ALONE_GAPS, _NUM_BESIDE = 2.0, 2
 NUM_COLUMNS = 2.0
 """Columns of rays that may be missing along a side that recedes from the scanner."""
 _LONGEST_HOLE_M = 2.0
-_MAX_VIOLATIONS = 0.05
 _PREDICTED_S = 0.2  # an object is known so long before the first and after the last observation
 
 
@@ -45,7 +40,6 @@ class SweepPoints:
         points: (N,3) world.
         time_s: (N,) firing time since the first sweep's reference time.
         height_m: (N,) height above the ground.
-        gap_m: (N,) distance between neighbouring rings at the point.
         reach_m: (N,) greatest distance from the shape of an object that may own the point.
     """
 
@@ -53,14 +47,13 @@ class SweepPoints:
     points: Float
     time_s: Float
     height_m: Float32
-    gap_m: Float
     reach_m: Float
 
     @staticmethod
     def of(
         stretch: Stretch, i: int, ground: HeightMap, obstacles: Obstacles, sensors: Sensors
     ) -> SweepPoints:
-        """Return the points of the sweep with index i that are over 0.08 m above the ground."""
+        """Return the points of the sweep with index i that are over 0.1 m above the ground."""
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
@@ -70,7 +63,7 @@ class SweepPoints:
         candidate[obstacles.row[obstacles.candidate]] = True
         reach_m = np.where(candidate[row], _REACH, 1.0) * near_m(gap_m)
         time_s = firing_times_s(stretch, i, row)
-        return SweepPoints(row, points[row], time_s, height_m[row], gap_m, reach_m)
+        return SweepPoints(row, points[row], time_s, height_m[row], reach_m)
 
     @staticmethod
     def together(parts: Sequence[SweepPoints]) -> SweepPoints:
@@ -84,60 +77,18 @@ class SweepPoints:
         return Strips(self.points)
 
 
-def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Shape:
-    """Return the accumulated shape of a track; shapes of walkers exclude their surroundings.
+def find_shape(track: Track, obstacles: Sequence[Obstacles], clock: Clock) -> Shape:
+    """Return the accumulated shape of a track.
 
-    Objects faster than 2 m/s keep all points. Otherwise three kinds of points are dropped. Echoes
-    merged with the echoes of a wall occur only in even or only in odd sweeps. Points of a bush are
-    static or lie among static points. Points of a wall are hardly ever seen through. The same holds
-    for sides of slow cars: this cut applies only if the rest is shorter than 1.5 m.
+    Objects of at most 2 m/s keep only the points that other sweeps saw through, because a wall
+    beside a walker is hardly ever seen through.
     """
     sweeps = sorted(track.claimed)
-    parts = {j: track.points_in(obstacles, [j]) for j in sweeps}
-    points = np.concatenate(list(parts.values()))
-    if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
-        return Shape.of(points)
-    within_m = near_m(space.gap_m(track.centre, sweeps[0]))
-    of = np.repeat(np.arange(len(sweeps)), [len(part) for part in parts.values()])
-    again = np.zeros(len(points), bool)
-    for odd in (False, True):
-        mine = of % 2 == odd
-        if not mine.all():
-            tree = tree_of(points[~mine])
-            again[mine] = is_near(tree, points[mine], _REACH * within_m)
-    moves = ~_is_static(track, obstacles, parts, of, within_m)
-    again &= moves & close_to_seeds(points, moves, _WIDER_M, _MOSTLY)
-    seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
-    own = again & close_to_seeds(points, seed, _REACH * within_m, _LEAST_SEEDS)
-    if own.any() and np.linalg.norm(np.ptp(points[own, :2], axis=0)) < _WALKER_M:
-        return Shape.of(points[own])
-    return Shape.of(points[again] if again.any() else points)
-
-
-def _is_static(
-    track: Track, obstacles: Sequence[Obstacles], parts: dict[int, Float], of: Int, reach_m: float
-) -> Bool:
-    """Return (N,) True for points that other sweeps confirm as static.
-
-    More of the other sweeps have a return at the measured position of such a point than at its
-    position moved along with the object.
-
-    Args:
-        parts: Points of the object by sweep index, in the object's frame, N in all.
-        of: (N,) position of the point's sweep in ``parts``.
-        reach_m: Greatest distance from a position to a return that occupies it.
-    """
-    in_object = np.concatenate(list(parts.values()))
-    places = np.concatenate([obstacles[j].points[track.claimed[j]] for j in parts])
-    low, high = places.min(0) - reach_m, places.max(0) + reach_m
-    static, moved = np.zeros((2, len(places)), np.int64)
-    for number, (j, own) in enumerate(parts.items()):
-        others, c = of != number, obstacles[j]
-        there = c.points[c.strips.rows_inside(low, high)]
-        for num, asked, among in ((static, places, there), (moved, in_object, own)):
-            if len(among):
-                num[others] += is_near(tree_of(among), asked[others], reach_m)
-    return np.asarray(static > moved)
+    points = track.points_in(obstacles, sweeps)
+    if _speed_m_s(track, sweeps[len(sweeps) // 2], clock) <= _WALKS_M_S:
+        seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
+        points = points[seed] if seed.any() else points
+    return Shape.of(points)
 
 
 def assign_points(
@@ -167,7 +118,6 @@ def assign_points(
     attached = np.split(joined, np.cumsum([len(mine) for mine in attached])[:-1])
     instances = []
     for i, points, mine in zip(batch, parts, attached, strict=True):
-        leave_out_isolated(mine, points, i, objects, space.clock)
         instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
         instance[points.row] = mine
         instances.append(instance)
@@ -178,7 +128,7 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
     """Return (N,) the index in ``objects`` of the object near each point of ``seen``, -1 for none.
 
     A point belongs to an object if it is close to the object's accumulated points or within their
-    outline. The ground below a walker does not belong to the walker.
+    outline.
     """
     instance = np.full(len(seen.points), -1, np.int32)
     least_m = np.full(len(seen.points), np.inf)
@@ -195,34 +145,10 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
         distance_m, _ = nearest(shape.tree, in_object)
         belongs = (distance_m < seen.reach_m[rows]) & (seen.height_m[rows] >= ABOVE_GROUND_M)
         belongs |= shape.within_outline(in_object)
-        if _speed_m_s(track, i, clock) <= _WALKS_M_S:
-            belongs &= seen.height_m[rows] >= _LEAST_HEIGHT_OF_WALKERS_M
         closer = belongs & (distance_m < least_m[rows])
         instance[rows[closer]] = k
         least_m[rows[closer]] = distance_m[closer]
     return instance
-
-
-def leave_out_isolated(
-    instance: Instance, seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock
-) -> None:
-    """Detach isolated points that are low or belong to a slow object (``instance`` = -1).
-
-    They are echoes merged with the echoes of a wall, or the road behind an edge.
-
-    Args:
-        instance: (N,) index of each point's object, -1 for none; changed in place.
-    """
-    low = seen.height_m < _AS_LOW_AS_ROAD_M
-    for k in np.unique(instance[instance >= 0]):
-        mine = np.flatnonzero(instance == k)
-        doubtful = mine
-        if _speed_m_s(objects[k].track, i, clock) > _WALKS_M_S:
-            doubtful = mine[low[mine]]
-        if len(mine) <= _NUM_BESIDE or not len(doubtful):
-            continue
-        away_m, _ = nearest_k(tree_of(seen.points[mine]), seen.points[doubtful], 1 + _NUM_BESIDE)
-        instance[doubtful[away_m[:, -1] > _ALONE_GAPS * seen.gap_m[doubtful]]] = -1
 
 
 def lengthen(
@@ -293,28 +219,19 @@ def _is_linked(along: Float, own: Float, hole_m: float) -> Bool:
 def _is_free_of_violations(
     track: Track, seen: SweepPoints, rows: Int, along: Float, i: int, space: FreeSpace
 ) -> Bool:
-    """Return (N,) True for extension points up to the first violations, ahead and behind.
-
-    The extension ends where another sweep sees through more than 5 % of the moved points so far.
+    """Return (N,) True for extension points up to the first violation, ahead and behind.
 
     Args:
         rows: (N,) rows in ``seen`` of the extension.
         along: (N,) metres ahead of the object's middle, negative behind.
     """
-    step = np.floor(np.abs(along) / LINK_M).astype(np.int64)
-    num_steps = int(step.max(initial=0)) + 1
-    step += num_steps * (along < 0)  # steps ahead, then steps behind
-
-    def up_to(steps: Int) -> Int:
-        return np.bincount(steps, minlength=2 * num_steps).reshape(2, num_steps).cumsum(axis=1)
-
-    ends = np.zeros((2, num_steps), bool)
     in_object = track.undo(seen.points[rows], seen.time_s[rows])
+    violated = np.zeros(len(rows), bool)
     for j in space.others(i):
-        violations = up_to(step[track.seen_through(in_object, j, space)])
-        ends |= violations > _MAX_VIOLATIONS * up_to(step)
-    kept: Bool = ~np.logical_or.accumulate(ends, axis=1).ravel()[step]
-    return kept
+        violated |= track.seen_through(in_object, j, space)
+    ahead_m = along[violated & (along >= 0)].min(initial=np.inf)
+    behind_m = along[violated & (along < 0)].max(initial=-np.inf)
+    return (along > behind_m) & (along < ahead_m)
 
 
 def is_known_at(track: Track, i: int, clock: Clock) -> bool:

@@ -7,33 +7,27 @@ pose that constant speed and turn rate predict. A batch holds consecutive sweeps
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
 from densify.flow.tracking.candidates import Batch, Obstacles
-from densify.flow.tracking.objects import MovingObject, Track
+from densify.flow.tracking.objects import FIT_M, Track
 from densify.free_space.ground import HeightMap
 from densify.geometry.clock import Clock
-from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 MIN_POINTS = 8  # to start a track
 _MIN_SEED_SHARE = 0.4
 _AROUND_S = 0.5  # farther than this from both ends of the recording, starts are equally good
 _NEARER_END, _NEARER_END_S = 0.7, 0.1  # closer to an end, a start is worth 0.7 per 0.1 s
-_BESIDE_M = 1.0  # from a towing vehicle to what it tows
-FIT_M = 0.3
-"""Greatest distance of a point from the object that claims it."""
 _SHARE_UNSEEN = 0.5  # least share of the object's usual number of points
 # Standard deviation (m, m, rad) of a prediction over 0.25 s; it grows with longer times.
 _PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
 _RECENT_S = 0.4  # age of the states that the rate is fitted to
-# The given velocity weighs as much as states with this sum of squared times; it has no turn rate.
-_GIVEN_S2 = np.array([0.02, 0.02, 0.02, 0.0])
-_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # factor of the rate: turns level out
+_GIVEN_S2 = 0.02  # the rate at the start weighs as much as states with this sum of squared times
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
@@ -63,26 +57,6 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
         good = np.flatnonzero((size >= MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
         starts += [(n, np.flatnonzero(c.cluster == k)) for k in good]
     return sorted(starts, key=worth, reverse=True)
-
-
-def velocities_beside(
-    batch: Batch, members: Int, objects: Sequence[MovingObject]
-) -> Iterator[Float]:
-    """Yield the velocity (3,), m/s, of each object within 1 m of a cluster, as of a tow car.
-
-    The measurements alone hardly show how fast a long side slides along itself.
-
-    Args:
-        batch: Batch of the cluster.
-        members: Indices of the cluster's points in the batch's obstacles.
-        objects: Moving objects found so far.
-    """
-    points = batch.obstacles.points[members]
-    tree, middle = tree_of(points), points.mean(0, keepdims=True)
-    for track, shape in objects:
-        at_s = track.seen_at(batch.time_ns)
-        if is_near(tree, track.place(shape.points, at_s), _BESIDE_M).any():
-            yield track.velocity_m_s(middle, at_s)[0]
 
 
 @dataclass(frozen=True)
@@ -150,7 +124,7 @@ class Follower:
         inside = inside[batch.gather(self.free)[inside]]
         rows, enough = inside[c.cluster[inside] >= 0], float(MIN_FIT)
         if len(rows) < MIN_FIT:  # no sweep saw through the object, but it may be there
-            usual = float(np.median([track.num_points(m) for m in track.observations]))
+            usual = track.total_points() / len(track.observations)
             rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * usual)
         if len(rows) < enough:
             return None
@@ -197,7 +171,7 @@ def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float,
     if len(t) > 1:
         t -= middle_s
         given_s2 = _GIVEN_S2 * (next(iter(track.observations)) in known)
-        rate = (t @ states + given_s2 * rate) / (t @ t + given_s2) * _STEADY
+        rate = (t @ states + given_s2 * rate) / (t @ t + given_s2)
     std = _PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
     on_the_way = _turned(rate, time_s - 0.5 * ahead_s - middle_s)
     return states[0] + on_the_way * ahead_s, _turned(rate, time_s - middle_s), std

@@ -131,7 +131,7 @@ def motion_of(
     stretch, space = scene.stretch, scene.space
     obstacles = [Obstacles.of(stretch, i, found) for i, found in enumerate(candidates)]
     tracks = find_tracks(obstacles, space, scene.ground, velocities_m_s)
-    objects = [MovingObject(track, find_shape(track, obstacles, space)) for track in tracks]
+    objects = [MovingObject(track, find_shape(track, obstacles, space.clock)) for track in tracks]
 
     def members(batch: Sequence[int]) -> list[Instance]:
         if any(map(scene.is_asked, batch)):

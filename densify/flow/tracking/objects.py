@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,16 +19,12 @@ from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _NEAR_M, _NEAR_GAPS = 0.2, 0.5
-_MANY_POINTS = 100  # more points do not locate an object better
 _BESIDE_M = 1.0
 _OUTLINE_M = 0.05
-LONG_M = 3.0
-"""Objects shorter than this may bend, and need not move where they point."""
+FIT_M = 0.3
+"""Greatest distance of a point from the object that claims it."""
 LANE_M = 15.0
 """Distance ahead of and behind an object within which its parts are searched."""
-_SIDE_M = 0.1
-_QUARTERS_RAD = np.arange(4) * np.pi / 2
-_SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
 
 
 def near_m(gap_m: Float | float) -> Any:
@@ -50,13 +45,11 @@ class Observation:
             z follows the ground.
         seen_s: Mean firing time of the object's points, since the first sweep of the stretch.
         time_ns: Middle time of the batch, ns since the first sweep of the stretch.
-        sweeps: Indices of the sweeps of the batch in which the object has points.
     """
 
     state: Float
     seen_s: float
     time_ns: int
-    sweeps: tuple[int, ...]
 
 
 @dataclass
@@ -87,17 +80,15 @@ class Track:
             seen_s: Mean firing time of the object's points.
             rows: Ascending indices of the object's points in the batch's obstacles.
         """
-        mine = batch.split(rows)
-        self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(mine))
-        self.claimed |= mine
+        self.observations[n] = Observation(state, seen_s, batch.time_ns)
+        self.claimed |= batch.split(rows)
 
     def smooth(self) -> None:
-        """Fit ``path`` to the states, in place; observations with more points weigh more."""
+        """Fit ``path`` to the states, in place."""
         batches = sorted(self.observations)
         times_s = np.array([self.observations[n].seen_s for n in batches])
         states = np.stack([self.observations[n].state for n in batches])
-        weights = np.array([min(self.num_points(n), _MANY_POINTS) for n in batches], float)
-        self.path = Path.fit(times_s, states, weights)
+        self.path = Path.fit(times_s, states)
 
     def place(self, points: Float, time_s: float | Float) -> Float:
         """Move (N,3) points from the object's frame to the world at a time or (N,) times."""
@@ -142,17 +133,9 @@ class Track:
         own = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
         return np.concatenate([np.zeros(0, np.int64), *own])  # all may have been taken away
 
-    def num_points(self, n: int) -> int:
-        """Return the number of the object's points in batch index n."""
-        return sum(len(self.claimed[j]) for j in self.observations[n].sweeps)
-
     def total_points(self) -> int:
         """Return the number of the object's points in all sweeps."""
         return sum(map(len, self.claimed.values()))
-
-    def duration_s(self) -> float:
-        """Return the time between the first and the last observation."""
-        return float(np.ptp([seen.seen_s for seen in self.observations.values()]))
 
     def rise_m(self, ground: HeightMap, state: Float) -> float:
         """Return how much higher (m) the ground is below the object at a state (4,) than at first.
@@ -163,7 +146,7 @@ class Track:
         way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
         start = self.centre[:2] + np.outer([-_BESIDE_M, 0.0, _BESIDE_M], [-way[1], way[0]])
         before_m, there_m = ground.under(np.concatenate([start, start + state[:2]])).reshape(2, -1)
-        return float(np.sort(there_m - before_m)[len(start) // 2])
+        return float(np.median(there_m - before_m))
 
     def seen_at(self, time_ns: int) -> float:
         """Estimate when (s) the sweep with a reference time ``time_ns`` measures the object.
@@ -219,27 +202,6 @@ class Shape:
         """
         return is_near(self.tree, points, within_m) | self.within_outline(points)
 
-    @cached_property
-    def side_rad(self) -> float:
-        """The direction of one side seen from above, in [0, pi / 2), object's frame.
-
-        The other sides are taken as parallel or perpendicular. The direction makes the histograms
-        of the points along both axes most peaked (greatest sum of squares).
-        """
-        points = self.points[:: len(self.points) // _SOME_POINTS + 1, :2]
-        points = points - points.mean(axis=0)
-        reach_m = float(np.linalg.norm(points, axis=1).max())
-        num = int(2 * reach_m / _BIN_M) + 2
-        angles = np.deg2rad(np.arange(0.0, 90.0, _ANGLE_DEG))
-        score = np.zeros(len(angles))
-        for turned in (angles, angles + np.pi / 2):
-            across = np.outer(np.cos(turned), points[:, 0]) + np.outer(np.sin(turned), points[:, 1])
-            place = ((across + reach_m) / _BIN_M).astype(np.int64)
-            place += num * np.arange(len(angles))[:, None]
-            counts = np.bincount(place.ravel(), minlength=num * len(angles))
-            score += (counts.reshape(-1, num) ** 2).sum(axis=1)
-        return float(angles[np.argmax(score)])
-
 
 class MovingObject(NamedTuple):
     """A confirmed track with its shape."""
@@ -247,35 +209,20 @@ class MovingObject(NamedTuple):
     track: Track
     shape: Shape
 
-    def heading(self, at_s: float) -> Float:
-        """Return (2,) the unit vector along the object at a time, world.
-
-        An object longer than 3 m points along the side closest to its velocity, because a turning
-        trailer does not move where it points. Other objects point along their velocity.
-        """
-        ahead = self.track.path.rate(at_s)[:2]
-        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
-        rim = self.track.place(self.shape.rim, at_s)[:, :2]
-        if np.linalg.norm(np.ptp(rim, axis=0)) < LONG_M:
-            return ahead
-        sides_rad = self.shape.side_rad + float(self.track.path(at_s)[3]) + _QUARTERS_RAD
-        sides = np.stack([np.cos(sides_rad), np.sin(sides_rad)], axis=1)
-        side: Float = sides[np.argmax(sides @ ahead)]
-        return side if np.ptp(rim @ side) >= LONG_M else ahead
-
     def lane(self, at_s: float) -> Lane:
         """Return the space ahead of and behind the object at a time (s), see `Lane`."""
-        ahead = self.heading(at_s)
+        ahead = self.track.path.rate(at_s)[:2]
+        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
         rim = self.track.place(self.shape.rim, at_s)
         aside = rim[:, :2] @ [-ahead[1], ahead[0]]
-        return Lane(ahead, aside.min() - _SIDE_M, aside.max() + _SIDE_M, rim[:, 2].max() + _SIDE_M)
+        return Lane(ahead, aside.min() - FIT_M, aside.max() + FIT_M, rim[:, 2].max() + FIT_M)
 
 
 class Lane(NamedTuple):
     """The space ahead of and behind an object, as wide and as high as the object.
 
     Attributes:
-        ahead: (2,) unit vector of the heading, world.
+        ahead: (2,) unit vector of the horizontal velocity, world.
         right_m: Right border: coordinate along the left normal of ``ahead``, m from the world's
             origin.
         left_m: Left border, as ``right_m``.

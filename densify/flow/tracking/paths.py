@@ -17,12 +17,10 @@ from scipy.interpolate import BSpline, PPoly
 from densify.geometry.types import Float
 
 _KNOT_S = 0.1
-# (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03, 2 and 10 m/s³.
-_STIFFNESSES = (1e6, 200.0, 10.0)
+# (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03 and 10 m/s³.
+_STIFFNESSES = (1e6, 10.0)
 _WORTH_SOFTENING = 0.8  # a softer path must lower the leave-one-out error to this share
-# Fewer states, or a shorter time, determine no acceleration, or no jerk.
-_ACCELERATION_STATES, _ACCELERATION_S = 5, 0.35
-_JERK_STATES, _JERK_S = 8, 0.65
+_ACCELERATION_STATES, _JERK_STATES = 5, 8  # fewer states determine no acceleration, or no jerk
 _DEGREE = 3
 # Powers 3 to 0 of the time since a span began, by the coefficients of the four B-splines on it.
 _CUBIC = np.array([[-1, 3, -3, 1], [3, -6, 3, 0], [-3, 0, 3, 0], [1, 4, 1, 0]]) / 6
@@ -51,7 +49,7 @@ class Path:
     residual_m: float
 
     @staticmethod
-    def fit(times_s: Float, states: Float, weights: Float) -> Path:
+    def fit(times_s: Float, states: Float) -> Path:
         """Fit a path as stiff as the states allow.
 
         A softer path is taken only if its leave-one-out error, in closed form, is at least 20 %
@@ -60,7 +58,6 @@ class Path:
         Args:
             times_s: (m,) ascending times.
             states: (m,d) states at these times.
-            weights: (m,) weight of each state, of any scale.
         """
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
         num_spans = max(1, round((end_s - begin_s) / _KNOT_S))
@@ -68,23 +65,19 @@ class Path:
         knots: Float = begin_s + width_s * np.arange(-_DEGREE, num_spans + _DEGREE + 1.0)
         inside = np.clip(times_s, begin_s, np.nextafter(end_s, begin_s))
         B = BSpline.design_matrix(inside, knots, _DEGREE).toarray()
-        num_states, duration_s = len(times_s), end_s - begin_s
-        accelerates = num_states >= _ACCELERATION_STATES and duration_s >= _ACCELERATION_S
-        D = np.diff(np.eye(B.shape[1]), 3 if accelerates else 2, axis=0)
-        W = weights / weights.mean()
+        num_states = len(times_s)
+        D = np.diff(np.eye(B.shape[1]), 3 if num_states >= _ACCELERATION_STATES else 2, axis=0)
         least, coefficients, residual_m = np.inf, np.zeros(0), np.inf
-        jerks = num_states >= _JERK_STATES and duration_s >= _JERK_S
-        for stiffness in _STIFFNESSES if jerks else _STIFFNESSES[:1]:
-            solve = np.linalg.solve(B.T @ (W[:, None] * B) + stiffness * D.T @ D, B.T * W)
+        for stiffness in _STIFFNESSES if num_states >= _JERK_STATES else _STIFFNESSES[:1]:
+            solve = np.linalg.solve(B.T @ B + stiffness * D.T @ D, B.T)
             leverage = np.einsum("ij,ji->i", B, solve)
             found = solve @ states
             missed_m = np.linalg.norm((states - B @ found)[:, :2], axis=1)
             left_out_m = missed_m / np.maximum(1 - leverage, 1e-3)
-            error_m = float(np.sqrt(np.average(left_out_m**2, weights=W)))
+            error_m = float(np.sqrt(np.mean(left_out_m**2)))
             if error_m < _WORTH_SOFTENING * least:
                 freedom = max(num_states - leverage.sum() - 0.5, 0.5)
-                mean_square = float(np.average(missed_m**2, weights=W))
-                residual_m = float(np.sqrt(mean_square * num_states / freedom))
+                residual_m = float(np.sqrt(np.sum(missed_m**2) / freedom))
                 least, coefficients = error_m, found
         return Path(knots, coefficients, begin_s, end_s, residual_m)
 

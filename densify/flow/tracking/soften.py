@@ -18,7 +18,6 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
-from densify.flow.tracking.objects import LONG_M
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Float, Int
 
@@ -33,6 +32,7 @@ _ANCHOR, _ANCHOR_M = 2.0, 0.02  # weight of the rigid position, and distance at 
 _MAX_PRODUCTS, _RESIDUAL_DROP = 30, 0.02
 _NUM_LOOKED_UP = 3
 _MIN_PARTS, _MIN_SEEN_S, _MIN_POINTS = 5, 0.35, 20
+_LONG_M = 3.0  # longer objects are rigid
 _CAP_M = 0.3  # greatest distance that a stray point counts
 # On eight streets parts of vehicles gained up to 0.045 of the squared distance, walkers within
 # 20 m mostly 0.06 to 0.4.
@@ -138,7 +138,7 @@ def _may_bend(parts: tuple[Part, ...]) -> bool:
     if np.median([len(p.points) for p in parts]) < _MIN_POINTS:
         return False
     lengths_m = [np.linalg.norm(np.ptp(p.points, axis=0)) for p in parts]
-    return bool(np.median(lengths_m) < LONG_M)
+    return bool(np.median(lengths_m) < _LONG_M)
 
 
 def _held_out(parts: tuple[Part, ...]) -> Float:

@@ -8,24 +8,16 @@ in time. It is confirmed only if the smooth motion explains the measurements.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy import ndimage
 
-from densify.flow.surface_matching import Model
 from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles
 from densify.flow.tracking.extent import NUM_COLUMNS, columns_apart_m
-from densify.flow.tracking.following import (
-    FIT_M,
-    MIN_POINTS,
-    Follower,
-    find_starts,
-    velocities_beside,
-)
+from densify.flow.tracking.following import MIN_POINTS, Follower, find_starts
 from densify.flow.tracking.likelihood import Judge, Verdict, judge
-from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track
+from densify.flow.tracking.objects import FIT_M, LANE_M, MovingObject, Shape, Track
 from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
@@ -36,8 +28,7 @@ from densify.geometry.linking import link
 from densify.geometry.types import Bool, Float, Int
 
 _NEAR_S = 0.3
-_REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: standard deviation of the smooth motion
-_AS_WHOLE = 0.9  # share of the known track's points that a better track must keep
+_BESIDE_M = 1.0  # from a towing vehicle to what it tows
 _GAPS_IN_LINE_M = (1.5, 4.0)
 _ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of a single ring or column, in steps
 
@@ -74,7 +65,7 @@ class _Search:
         velocities_m_s: Sequence[Float] | None,
         judged: Judge | None,
     ) -> None:
-        self._obstacles, self._space, self._ground = obstacles, space, ground
+        self._obstacles, self._space = obstacles, space
         self._judged = judged
         self._velocities_m_s = velocities_m_s
         self.batches = [Batch.of(sweeps, obstacles, space.clock) for sweeps in space.batches]
@@ -110,7 +101,6 @@ class _Search:
     def _keep(self, track: Track) -> None:
         """Keep a confirmed track, with all points that its motion explains."""
         self._gather(track)
-        _refine(track, self._obstacles, self._ground)
         self._claim_in_line(track)
         for j, rows in track.claimed.items():
             self._free[j][rows] = False
@@ -142,7 +132,7 @@ class _Search:
         along itself.
         """
         best = self._follow(members, n, self._velocity_of(members, n))
-        for velocity in velocities_beside(self.batches[n], members, self._objects):
+        for velocity in self._velocities_beside(members, n):
             if best[1].is_clearly_below(best[1].at_most):
                 best = _better(best, self._follow(members, n, velocity))
         track, verdict = best
@@ -150,10 +140,17 @@ class _Search:
             for k in sorted({min(track.observations), max(track.observations)} - {n}):
                 rows = track.rows_in(self.batches[k])
                 if len(rows) >= MIN_POINTS:
-                    found = self._follow(rows, k, self._velocity_of(rows, k))
-                    if found[0].total_points() >= _AS_WHOLE * track.total_points():
-                        best = _better(best, found)
+                    best = _better(best, self._follow(rows, k, self._velocity_of(rows, k)))
         return best
+
+    def _velocities_beside(self, members: Int, n: int) -> Iterator[Float]:
+        """Yield the velocity (3,), m/s, of each object beside a cluster, as of a towing vehicle."""
+        batch = self.batches[n]
+        points = batch.obstacles.points[members]
+        for track, shape in self._objects:
+            at_s = track.seen_at(batch.time_ns)
+            if shape.near(track.undo(points, at_s), _BESIDE_M).any():
+                yield track.velocity_m_s(points.mean(axis=0, keepdims=True), at_s)[0]
 
     def _follow(self, members: Int, n: int, velocity: Float) -> tuple[Track, Verdict]:
         track = self._follower.follow(members, n, velocity)
@@ -254,29 +251,3 @@ def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -
     single = spread(np.arcsin(in_lidar[:, 2] / range_m)) < _ONE_RING * np.asarray(ring_rad)
     single |= spread(azimuth_rad) < _ONE_COLUMN * column_rad
     return np.asarray(single[of_row.ravel()])
-
-
-def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> None:
-    """Align every observation again, in place, and keep the result if the motion becomes smoother.
-
-    An object that is followed batch by batch drifts when its other side comes into view. Therefore
-    even batches are aligned with the points of the odd batches, and the other way round.
-    """
-    sweeps: tuple[list[int], list[int]] = [], []
-    for n, seen in sorted(track.observations.items()):
-        sweeps[n % 2].extend(seen.sweeps)
-    points = [track.points_in(obstacles, some) for some in sweeps]
-    if not all(map(len, points)):
-        return
-    models = [Model(x) for x in points]
-    before = dict(track.observations), track.path
-    for n, seen in track.observations.items():
-        target = track.place(track.points_in(obstacles, seen.sweeps), seen.seen_s)
-        predicted = track.path(seen.seen_s)
-        state = models[1 - n % 2].align(target, track.centre, predicted, _REFINED_STD)
-        if state is not None:
-            state[2] = track.rise_m(ground, state)
-            track.observations[n] = replace(seen, state=state)
-    track.smooth()
-    if track.path.residual_m > before[1].residual_m:
-        track.observations, track.path = before
