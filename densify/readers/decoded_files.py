@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Decode arrays, images and LAS files safely with NumPy, OpenCV, simplejpeg and laspy.
+"""Decode arrays, images and LAS files safely with NumPy, OpenCV and laspy.
 
 Each function checks the sizes stated in a file's header before it allocates memory. Every error of
 a library is raised as InputError.
