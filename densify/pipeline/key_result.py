@@ -129,7 +129,7 @@ def result_of_method(
             movers = views.movers(cloud, visible, seen.bodies, scene.images)
         if output.movers != "keep":
             static = cloud.select(~cloud.moving & ~cloud.far)
-            seen = views.see(static, visible).joined(far)
+            seen = views.see(static).joined(far)
         depth = _add_ages(scene, method, views.depth(seen, visible, filled))
         if visible:
             depth = _without_times(scene, depth)
@@ -164,7 +164,7 @@ def result_of_method(
 def _see_window(scene: KeyScene, cloud: Cloud, visible: bool) -> SeenCloud:
     """Return the accumulated points as the cameras see them, with the bodies of moving objects."""
     with scene.watch.stage("project"):
-        seen = scene.views.see(cloud, visible)
+        seen = scene.views.see(cloud)
         return seen._replace(bodies=scene.views.bodies(cloud)) if visible else seen
 
 
