@@ -151,7 +151,7 @@ def test_claims_of_las_headers_are_not_believed(point_format: int, tmp_path: Pat
 
 
 LEVELS = [f"&{b} [{', '.join(['*' + a] * 10)}]" for a, b in zip("abcdef", "bcdefg", strict=True)]
-BOMB = f"{{project: {{support: [&a [1,1,1,1,1,1,1,1,1,1], {', '.join(LEVELS)}]}}}}"
+BOMB = f"{{project: {{fill_reach: [&a [1,1,1,1,1,1,1,1,1,1], {', '.join(LEVELS)}]}}}}"
 
 
 @pytest.mark.parametrize(
@@ -161,8 +161,8 @@ BOMB = f"{{project: {{support: [&a [1,1,1,1,1,1,1,1,1,1], {', '.join(LEVELS)}]}}
 )  # fmt: skip
 def test_yaml_that_is_none(value: str) -> None:
     refused(parse_yaml, value, "x", says="not YAML", where="x")
-    with pytest.raises(InputError, match=r"--set project\.support=") as caught:
-        resolve(None, [f"project.support={value}"])
+    with pytest.raises(InputError, match=r"--set project\.fill_reach=") as caught:
+        resolve(None, [f"project.fill_reach={value}"])
     assert len(str(caught.value)) <= 1000 and "\n" not in str(caught.value)
 
 

@@ -65,7 +65,7 @@ def parse_override(override: str) -> dict[str, dict[str, Any]]:
     section, dot, key = name.strip().partition(".")
     if not (equals and dot and section and key):
         raise InputError(
-            f"--set {override}: expected section.key=value, for example project.support=6"
+            f"--set {override}: expected section.key=value, for example project.fill_reach=1"
         )
     value, _ = parse_yaml(text, f"--set {override}")
     return {section: {key: value if text.strip() else ""}}
@@ -106,7 +106,7 @@ def _mapping(value: Any, where: str, content: str) -> Iterable[tuple[Any, Any]]:
     if not isinstance(value, Mapping):
         raise InputError(
             f"{where}: got {value!r}, expected a mapping of {content}, for example "
-            f"project: {{support: 6}}"
+            f"project: {{fill_reach: 1}}"
         )
     return value.items()
 

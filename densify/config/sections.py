@@ -131,10 +131,8 @@ class ProjectSettings(Section):
     per: str = one_of("sweep", "image")
     depth: str = one_of("auto", "z", "range")
     visibility: bool = True
-    support: int = within(4, 1, 20)
     rims: str = one_of("image", "strict", "keep")
     fill_reach: float = within(1.5, 0.1, 5)
-    glass: str = one_of("plane", "keep")
 
     def __post_init__(self) -> None:
         super().__post_init__()

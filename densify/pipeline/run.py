@@ -286,7 +286,7 @@ def scene_of(
     """Return the shared inputs of a key's methods; ``cloud`` says which points of it move."""
     sequence, settings, stretch = recording.sequence, recording.settings, recording.window(key)
     key_image = RangeImage.of(stretch[key])
-    views = Views.of(sequence, stretch, key, key_image, shots, images, settings)
+    views = Views.of(sequence, stretch, key, shots, images, settings)
     truth = views.truth(sequence.truth) if with_images and sequence.truth else {}
     held_out = None
     if settings.is_scored:
