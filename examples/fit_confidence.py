@@ -32,19 +32,18 @@ CHECKED = """
     street:highway?seed=64&sensor=hdl32@70
 """
 STEPS = np.array([0.0, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.7, 0.8, 0.9])
-NUM_ROUNDS = 300  # of expectation maximization
 
 
 class Evidence(NamedTuple):
-    """One map. shown, compared: (G,2,R) pixels, and those with a truth, see `amounts` in
-    densify.depth.confidence. group, step, contradicted: (B,) of the outliers."""
+    """The (G,R) numbers of pixels of one map, see `num_pixels` in densify.depth.confidence.
+
+    shown: all pixels. compared: those with a truth. outliers: the outliers among the latter.
+    """
 
     where: dict
     shown: np.ndarray
     compared: np.ndarray
-    group: np.ndarray
-    step: np.ndarray
-    contradicted: np.ndarray
+    outliers: np.ndarray
 
 
 def evidence(text, window, changes):
@@ -64,46 +63,21 @@ def evidence(text, window, changes):
         bad[compared] = is_outlier_depth(maps.filled_m[compared], known_m[compared], focal_px)
         yield Evidence(
             {"data": sequence.name, "key": int(key), "camera": camera},
-            *(scale.amounts(found, part) for part in (shown, compared)),
-            found.group[bad].astype(np.int64),
-            scale.steps_of(found.rank[bad]),
-            found.contradicted[bad].astype(np.float64),
+            *(scale.num_pixels(found, part) for part in (shown, compared, bad)),
         )
 
 
 def fit(maps):
-    """Return the (G,2,R) share of outliers by group, cause and step of the rank.
+    """Return the (G,R) share of outliers by group and step of the rank, made to fall with the rank.
 
-    The tables under which the outliers are most likely (expectation maximization: the cause of an
-    outlier is not known), each made to fall with the rank. Every map counts alike.
+    Every map counts alike.
     """
-    weights = [1 / max(e.compared[:, 0].sum(), 1) for e in maps]
-    pixels = sum(w * e.compared for w, e in zip(weights, maps, strict=True))
-    group, step, contradicted = (
-        np.concatenate([getattr(e, name) for e in maps])
-        for name in ("group", "step", "contradicted")
+    weights = [1 / max(e.compared.sum(), 1) for e in maps]
+    num, bad = (
+        sum(w * part for w, part in zip(weights, parts, strict=True))
+        for parts in ([e.compared for e in maps], [e.outliers for e in maps])
     )
-    weight = np.repeat(weights, [len(e.group) for e in maps])
-    causes = np.stack([np.ones_like(contradicted), contradicted])
-    return np.array(
-        [
-            fit_group(num, step[group == g], causes[:, group == g], weight[group == g])
-            for g, num in enumerate(pixels)
-        ]
-    )
-
-
-def fit_group(num, step, causes, weight):
-    """Return (2,R) shares by cause. num: (2,R) pixels, and how much they are contradicted. step,
-    weight: (B,) of outliers. causes: (2,B) factor of each cause's share there."""
-    total = np.maximum(num.sum(axis=1), 1e-30)
-    shares = np.repeat(weight.sum() / total[:, None], scale.NUM_RANKS, 1)
-    for _ in range(NUM_ROUNDS):
-        owed = shares[:, step] * causes
-        owed *= weight / np.maximum(owed.sum(axis=0), 1e-30)
-        counts = [np.bincount(step, part, scale.NUM_RANKS).astype(float) for part in owed]
-        shares = np.array([scale.falling(n, c) for n, c in zip(num, counts, strict=True)])
-    return shares
+    return np.array([scale.falling(n, b) for n, b in zip(num, bad, strict=True)])
 
 
 def knots(shares):
@@ -122,9 +96,8 @@ def check(maps, tables):
     for e in maps:
         log = np.where(is_measured, *scale.curves(e.shown, tables)[:, None])
         step = np.searchsorted(STEPS, np.clip(-log / scale.DECADES, 0, 1), side="right") - 1
-        num, bad = e.compared[:, 0], np.zeros(log.shape)
-        np.add.at(bad, (e.group, e.step), 1)
-        for total, part in zip(sums, (num, num * 10.0**log, bad), strict=True):
+        parts = e.compared, e.compared * 10.0**log, e.outliers
+        for total, part in zip(sums, parts, strict=True):
             total += np.bincount(step.ravel(), part.ravel(), len(STEPS))
     print("confidence from      pixels  expected  outliers")
     for least, num, expected, bad in zip(STEPS, *sums, strict=True):
@@ -144,10 +117,7 @@ def main():
         [e for text in texts for e in evidence(text, given.window, given.changes)]
         for texts in (given.fit, given.check)
     )
-    tables = {
-        group: {cause: knots(share) for cause, share in zip(scale.CAUSES, shares, strict=True)}
-        for group, shares in zip(scale.GROUPS, fit(fitted), strict=True)
-    }
+    tables = {g: knots(share) for g, share in zip(scale.GROUPS, fit(fitted), strict=True)}
     written = {"densify": densify.__version__, "maps": [e.where for e in fitted], "tables": tables}
     given.out.write_text(json.dumps(written, indent=2) + "\n")
     for title, maps in (("fitted to:", fitted), ("others:", checked)):

@@ -27,7 +27,6 @@ def layers_of(
     return Layers(
         depth_m=depth_m.astype(np.float32),
         rim_m=np.asarray(rim_m, np.float32),
-        behind_patch=np.zeros(shape, bool),
         filled_m=filled_m,
         confidence=np.where(known | (rim_m > 0), np.float32(confidence), np.float32(0)),
         point=np.where(depth_m > 0, np.arange(known.size).reshape(shape), -1).astype(np.int32),

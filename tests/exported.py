@@ -109,9 +109,11 @@ def write_views(
     result = replace(
         result_of(cameras=names, measure=dict.fromkeys(names, measure)),
         images=images,
-        views={n: view_of(n.partition("/")[0], lenses[n], i) for i, n in enumerate(names)},
-        T_key_lidar={frame: np.eye(4) for frame in STAMPS_NS},
-        **changes,
+        **{
+            "views": {n: view_of(n.partition("/")[0], lenses[n], i) for i, n in enumerate(names)},
+            "T_key_lidar": {frame: np.eye(4) for frame in STAMPS_NS},
+            **changes,
+        },
     )
     write_result(result, out, config={}, data="street")
     return out / "000120", result

@@ -154,15 +154,22 @@ class Maker:
         message = self.make("nav_msgs/msg/Odometry", self.header(stamp_ns, "odom"), child, *cover)
         self.put(topic, "nav_msgs/msg/Odometry", message, stamp_ns)
 
-    def write(self, folder: Path) -> Path:
-        """The bag: a ROS 2 bag's folder, or a .bag file."""
+    def write(self, folder: Path, compressed: bool = False) -> Path:
+        """The bag: a ROS 2 bag's folder, or a .bag file. compressed: its files as a whole."""
         if self.is_ros2:
-            from rosbags.rosbag2 import StoragePlugin, Writer
+            from rosbags.rosbag2 import (
+                CompressionFormat,
+                CompressionMode,
+                StoragePlugin,
+                Writer,
+            )
 
             mcap = self.suffix == ".mcap"
             plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
             place = folder / "drive"
             writer: Any = Writer(place, version=9, storage_plugin=plugin)
+            if compressed:
+                writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
             serialize: Any = self.types.serialize_cdr
         else:
             from rosbags.rosbag1 import Writer as Writer1

@@ -6,7 +6,9 @@ from __future__ import annotations
 import os
 import pickle
 import random
+import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 
 from densify.config import cache as cache_module
-from densify.config.cache import Cache, digest
+from densify.config.cache import Cache, code_digest, digest
 from densify.config.errors import InputError
 from tests.command import exit_code
 
@@ -126,9 +128,23 @@ def test_once_for_everybody_and_each_version(tmp_path: Path, monkeypatch) -> Non
     assert [get(Cache(LIMIT, tmp_path)) for _ in range(3)] == [1, 0, 0]
     assert get(Cache(LIMIT, tmp_path), 2) == 1
     assert get(Cache(LIMIT, tmp_path / "other")) == 1
-    raised = f"{cache_module._STEP_VERSIONS}, more 1"
-    monkeypatch.setattr(cache_module, "_STEP_VERSIONS", raised)
+    monkeypatch.setattr(cache_module, "__version__", "0.0.0")
     assert [get(Cache(LIMIT, tmp_path)) for _ in range(2)] == [1, 0]
+
+
+def test_code_that_makes_other_results_has_another_digest(tmp_path: Path, monkeypatch) -> None:
+    package = tmp_path / "densify"
+    for name in ("config/cache.py", "flow/tracking/vote.py", "outputs/plots.py"):
+        (package / name).parent.mkdir(parents=True)
+        (package / name).write_text("one\n")
+    monkeypatch.setattr(cache_module, "__file__", str(package / "config/cache.py"))
+    digests = []
+    for changed in ("outputs/plots.py", "flow/tracking/vote.py"):
+        (package / changed).write_text("two\n")
+        code_digest.cache_clear()
+        digests.append(code_digest())
+    code_digest.cache_clear()
+    assert digests[0] != digests[1]
 
 
 class Planted:
@@ -172,6 +188,37 @@ def test_what_was_used_longest_ago_goes_first(tmp_path: Path) -> None:
     assert [get(cache, inputs) for inputs in (0, 3, 1)] == [0, 0, 1]
     Cache(0, tmp_path).trim()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_one_of_several_at_once_makes_it(tmp_path: Path) -> None:
+    made: list[int] = []
+
+    def make() -> dict[str, Any]:
+        made.append(1)
+        time.sleep(0.2)
+        return VALUE
+
+    with ThreadPoolExecutor(4) as pool:
+        futures = [pool.submit(Cache(LIMIT, tmp_path).get, "s", 1, make) for _ in range(4)]
+        assert all(np.array_equal(f.result()["few"], VALUE["few"]) for f in futures)
+    assert len(made) == 1
+    assert [path.suffix for path in tmp_path.iterdir()] == [".npz"]
+
+
+def test_one_vanished_entry_does_not_stop_the_trimming(tmp_path: Path, monkeypatch) -> None:
+    for inputs in range(4):
+        get(Cache(LIMIT, tmp_path), inputs)
+    gone, unlink = min(tmp_path.iterdir()), Path.unlink
+    os.utime(gone, (1, 1))  # the first to go
+
+    def vanished(path: Path, missing_ok: bool = False) -> None:
+        if path == gone:
+            raise FileNotFoundError(path)
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", vanished)
+    Cache(0, tmp_path).trim()
+    assert list(tmp_path.iterdir()) == [gone]
 
 
 # Folders

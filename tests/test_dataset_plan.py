@@ -48,9 +48,14 @@ def test_keys_that_are_chosen(border_drive: Path, tmp_path: Path) -> None:
         (slice(36, 45), [*FRAMES]),
         (slice(38, 45, 3), [38, 41, 44]),
         (slice(40, 41), [40]),
+        (slice(39), [36, 37, 38]),
+        (slice(43, None), [43, 44]),
     ):
         (planned,) = plan([str(border_drive)], keys, Recipe())
         assert list(planned.keys) == chosen
+    for keys in (slice(36, 40, 0), slice(36.5, 40), slice(-3, None)):
+        with pytest.raises(InputError, match="keys"):
+            plan([str(border_drive)], keys, Recipe())
     assert planned.folder == f"val/{DRIVE}"
     assert tuple(planned.cameras) == ("image_02",)
     drive, out = copy_drive(border_drive, tmp_path / "2011_09_26"), tmp_path / "out"

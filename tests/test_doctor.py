@@ -209,6 +209,21 @@ def test_a_sweep_that_cannot_be_read_is_named_and_the_rest_looked_at(street: Fau
         Sample.of(Faulty(street, frames=range(112, 117), unreadable=FRAMES), CONFIG.register)
 
 
+def test_checks_that_cannot_be_made_are_named(street: Faulty) -> None:
+    """One sweep tells no rate, no motion and no calibration."""
+    one = findings(Sample.of(Faulty(street, frames=range(118, 119)), CONFIG.register))
+    unknown = ("stamps", "point times", "registration", "deskewing", "scanners", "own vehicle")
+    for check in (*unknown, "motion compensation", "poses", "fast: calibration", "fast: clock"):
+        assert one[check] == Verdict.UNKNOWN, check
+
+
+def test_points_without_times_are_named(good: Sample) -> None:
+    untimed = with_sweeps(good, lambda sweep: replace(sweep, offset_ns=None))
+    for check in (clocks.check_point_times, clocks.check_deskewing):
+        (found,) = check(untimed)
+        assert found.verdict == Verdict.UNKNOWN and "no times" in found.evidence
+
+
 def test_the_command_on_a_real_drive(test_data, capsys: pytest.CaptureFixture[str]) -> None:
     drive = test_data / "kitti/2011_09_26/2011_09_26_drive_0002_sync"
     assert exit_code("doctor", drive, "--json") == 0

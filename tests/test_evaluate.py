@@ -205,6 +205,20 @@ def test_scores_are_means_over_the_images(tmp_path: Path) -> None:
     assert scores["without_mask"] == [str(tmp_path / "t" / "2.png")]
 
 
+@pytest.mark.parametrize("side", ["predicted", "truth"])
+def test_maps_in_millimetres_are_named(side: str, tmp_path: Path) -> None:
+    """As ScanNet, the RealSense and many networks store depth: 1000 x metres."""
+    depth_m = np.linspace(3, 60, 200)
+    noisy_m = depth_m * np.random.default_rng(0).normal(1, 0.03, 200)
+    right, other = put(tmp_path / "right.png", *depth_m), tmp_path / "other.png"
+    put(other, *(1000 / 256 * noisy_m))
+    pair = (other, right) if side == "predicted" else (right, other)
+    with pytest.raises(InputError, match=r"other\.png: .* 1000 x metres .* expected 256 x metres"):
+        evaluate(pair_depth_files(*pair))
+    put(other, *(3.4 * noisy_m))  # wrong, but of no known unit
+    assert evaluate(pair_depth_files(*pair))["num_images"] == 1
+
+
 def test_maps_of_another_size_are_refused(tmp_path: Path) -> None:
     a, b = put(tmp_path / "a.png", 1.0, 2.0), put(tmp_path / "b.png", 1.0, 2.0, 3.0)
     with pytest.raises(InputError, match=r"a\.png: got 2 x 1 px, expected 3 x 1, .*b\.png"):

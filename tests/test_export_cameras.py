@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from plyfile import PlyData
 from scipy.ndimage import map_coordinates
 
@@ -207,6 +208,9 @@ def test_splats_keep_objects_apart_in_their_own_frames(tracked) -> None:
     rest = cloud.moving & ~of_tracks
     np.testing.assert_array_equal(others["x"], cloud.points[rest, 0].astype(np.float32))
     assert (folder / "tracks.json").read_bytes() == (run / "movers.json").read_bytes()
+    # The cloud is read for the static world and for the objects, and counted once.
+    record = yaml.safe_load((folder / "export.yaml").read_text("utf-8"))
+    assert record["num_points"]["before"] == len(cloud.points)
 
 
 def test_depths_by_the_reader_of_gaussian_splatting(put) -> None:

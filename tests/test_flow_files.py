@@ -29,7 +29,7 @@ def ours(tmp_path_factory) -> tuple[Result, Path]:
     """A run with the flow it found, and the folder of its flow files."""
     result = by_flow(one_car(), KEY, 1, config=PLAIN | {"output": {"flow": "npz"}})
     folder = tmp_path_factory.mktemp("flow")
-    write_flow_npz(folder, result.flow)
+    write_flow_npz(folder, result.flow, "tiny")
     return result, folder
 
 
@@ -147,7 +147,7 @@ def test_total_flow_holds_the_way_to_the_reference_time_once(stretch, tmp_path):
     sweep = stretch[STEP[0]].sweep
     one = np.ones((10, 3))
     field = FlowField(2 * one, one[:, 0] > 0, np.zeros(10, np.int32), one[:, 0] < 0, 0.25 * one)
-    write_flow_npz(tmp_path, StretchFlow(stretch, {STEP: field}))
+    write_flow_npz(tmp_path, StretchFlow(stretch, {STEP: field}), "tiny")
     path = tmp_path / f"{STEP[0]:06d}_{STEP[1]:06d}.npz"
     with np.load(path) as arrays:
         known = {name: arrays[name] for name in ("total_flow", "to_reference", "row")}

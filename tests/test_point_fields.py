@@ -18,6 +18,10 @@ DRIVERS = {  # names, and what plays intensity, time, ring
     "hesai": ("x y z intensity timestamp ring", ("intensity", "timestamp", "ring")),
     "livox": ("x y z reflectivity tag line offset_time", ("reflectivity", "offset_time", "line")),
     "autoware": ("X Y Z I RETURN_TYPE CHANNEL TIME_STAMP", ("I", "TIME_STAMP", "CHANNEL")),
+    "cloudcompare": (
+        "x y z scalar_Intensity scalar_GpsTime scalar_Ring",
+        ("scalar_Intensity", "scalar_GpsTime", "scalar_Ring"),
+    ),
     "bare": ("x y z", ("", "", "")),
 }
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from densify.config.errors import InputError
+from densify.readers import open_sequence
 from densify.readers.point_files import read_table
 
 rng = np.random.default_rng(5)
@@ -219,12 +221,96 @@ OTHER_BYTES = {
     "doubles": ring(4).astype("<f8"),
     "big-endian": ring(4).astype(">f4"),
     "text": np.frombuffer(b"not a scan. " * 4000, "u1"),
-    "5 columns": ring(5).astype("<f4"),
+    "5 columns": (ring(5) * [1, 1, 1, 1, 0.3]).astype("<f4"),  # which are no rings
 }
 
 
 @pytest.mark.parametrize("kind", OTHER_BYTES)
 def test_a_scan_of_other_bytes_is_refused(kind: str, tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(OTHER_BYTES[kind].tobytes())
-    with pytest.raises(InputError, match=r"not alike; .*name the columns .*sweeps\.columns"):
+    with pytest.raises(InputError, match=r"not alike; .*densify\.yaml .*sweeps: {columns: "):
         read_table(tmp_path / "a.bin")
+
+
+@pytest.mark.parametrize("num_points", [2517, 2518, 2519, 2520])  # rows of 4 fit, or do not
+def test_the_error_of_five_columns_holds_the_setting_that_reads_them(
+    num_points: int, tmp_path: Path
+) -> None:
+    rows = (ring(5)[:num_points] * [1, 1, 1, 1, 0.3]).astype("<f4")  # which are no rings
+    (tmp_path / "lidar").mkdir()
+    rows.tofile(tmp_path / "lidar" / "000000.bin")
+    with pytest.raises(InputError) as error:
+        open_sequence(f"folder:{tmp_path}")[0]
+    setting = re.search(r"sweeps: \{.*\}", str(error.value))
+    assert setting is not None and "\n" not in str(error.value), error.value
+    (tmp_path / "densify.yaml").write_text(setting.group())
+    sweep = open_sequence(f"folder:{tmp_path}")[0]
+    np.testing.assert_array_equal(sweep.points, rows[:, :3])
+
+
+def test_columns_of_nuscenes_and_waymo_are_recognised(test_data: Path, tmp_path: Path) -> None:
+    (path,) = (test_data / "nuscenes/samples/LIDAR_TOP").iterdir()
+    rows = np.fromfile(path, "<f4").reshape(-1, 5)
+    columns = read_table(path).columns
+    assert list(columns) == ["x", "y", "z", "intensity", "ring"]
+    np.testing.assert_array_equal(np.column_stack([*columns.values()]), rows)
+
+
+@pytest.mark.parametrize("num_points", [2517, 2518, 2519, 2520])
+@pytest.mark.parametrize("num_columns", [4, 5, 6])
+def test_as_many_columns_as_size_and_values_say(
+    num_columns: int, num_points: int, tmp_path: Path
+) -> None:
+    rows = ring(6)[:num_points]
+    rows[:, 3] = np.random.default_rng(0).uniform(0, 300, num_points)
+    if num_columns == 6:  # elongation, and the time of the frame in microseconds
+        rows[:, 4] = np.random.default_rng(1).uniform(0, 1.5, num_points)
+        rows[:, 5] = 1_550_083_467_346_370
+    rows = rows[:, :num_columns].astype("<f4")
+    rows.tofile(tmp_path / "a.bin")
+    columns = read_table(tmp_path / "a.bin").columns
+    names = ["x", "y", "z", "intensity", "ring"][:num_columns]
+    assert list(columns) == (names if num_columns < 6 else [*names[:4], "elongation", "timestamp"])
+    np.testing.assert_array_equal(np.column_stack([*columns.values()]), rows)
+
+
+def test_six_other_columns_are_not_guessed(tmp_path: Path) -> None:
+    """A time within the sweep, and the number of the scanner."""
+    rows = ring(6)
+    rows[:, 4], rows[:, 5] = np.linspace(0, 0.1, len(rows)), 0
+    rows.astype("<f4").tofile(tmp_path / "a.bin")
+    with pytest.raises(InputError, match=r"densify\.yaml"):
+        read_table(tmp_path / "a.bin")
+
+
+def test_values_that_fit_two_layouts_are_not_guessed(tmp_path: Path) -> None:
+    rows = 3 + np.random.default_rng(0).integers(0, 2, (400, 5))  # alike however they are read
+    rows.astype("<f4").tofile(tmp_path / "a.bin")
+    with pytest.raises(InputError, match=r"fits 4 and 5 float32 columns alike; .*densify\.yaml"):
+        read_table(tmp_path / "a.bin")
+
+
+def test_organised_arrays_are_read(tmp_path: Path) -> None:
+    image = np.column_stack([POINTS, INTENSITY]).astype("f4").reshape(6, 10, 4)
+    np.save(tmp_path / "a.npy", image)
+    np.savez(tmp_path / "a.npz", points=ROWS.reshape(6, 10))
+    for name in ("a.npy", "a.npz"):
+        columns = read_table(tmp_path / name).columns
+        read = np.stack([columns[axis] for axis in "xyz"], axis=1)
+        np.testing.assert_array_equal(read, POINTS)
+        np.testing.assert_array_equal(columns["intensity"], INTENSITY)
+    np.save(tmp_path / "b.npy", np.zeros((4, 64, 1024), "f4"))  # channels first
+    with pytest.raises(InputError, match=r"shape \(4, 64, 1024\)"):
+        read_table(tmp_path / "b.npy")
+
+
+def test_byte_order_marks_are_skipped_and_utf_16_is_named(tmp_path: Path) -> None:
+    for name in ("words.pcd", "comma.csv"):
+        WRITERS[name](tmp_path / name)
+        data = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + data)
+        np.testing.assert_array_equal(read_table(tmp_path / name).columns["intensity"], INTENSITY)
+    for text in ("x,y,z\n1,2,3\n".encode("utf-16"), "x,y,z\n1,2,3\n".encode("utf-16-le")):
+        (tmp_path / "comma.csv").write_bytes(text)
+        with pytest.raises(InputError, match=r"comma\.csv: is text in UTF-16, expected UTF-8"):
+            read_table(tmp_path / "comma.csv")

@@ -54,6 +54,16 @@ def test_what_is_not_on_the_disk_leaves_a_gap(broken):
         sequence[0]
 
 
+def test_no_file_outside_of_the_folder_is_read(broken):
+    (scene,) = broken.glob("scene_*.json")
+    text = scene.read_text()
+    name = min((broken / "point_cloud/LIDAR").iterdir()).relative_to(broken).as_posix()
+    assert name in text
+    scene.write_text(text.replace(name, "../../secret.npz"))
+    with pytest.raises(InputError, match=r"names the file '../../secret\.npz', outside of"):
+        Dgp(broken)
+
+
 # A real scene
 
 

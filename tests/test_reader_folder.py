@@ -126,6 +126,23 @@ def test_stamps_in_a_file(text, step_ns, tmp_path):
     assert sequence.stamp_ns(3) - sequence.stamp_ns(2) == step_ns
 
 
+def test_byte_order_marks_are_skipped(tmp_path):
+    """In every text file of the folder, with the line ends of Windows too."""
+    plain = Folder(config(bare(tmp_path / "a", ["0.bin", "1.bin"]), "sweeps: {scale_m: 2}\n"))
+    marked = bare(tmp_path / "b", ["0.bin", "1.bin"])
+    texts = {
+        "densify.yaml": "sweeps: {scale_m: 2}\n",
+        "timestamps.txt": "0.0\n0.1\n",
+        "poses.txt": "0.0 1 2 3 0 0 0 1\n0.1 1 2 4 0 0 0 1\n",
+    }
+    for name, text in texts.items():
+        (marked / name).write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    sequence = Folder(marked)
+    np.testing.assert_array_equal(sequence[0].points, plain[0].points)
+    assert sequence.stamp_ns(1) - sequence.stamp_ns(0) == 100_000_000
+    np.testing.assert_array_equal(sequence.T_world_lidar(1)[:3, 3], [1, 2, 4])
+
+
 # --- poses ----------------------------------------------------------------------------------------
 
 POSE = np.eye(4)
@@ -254,6 +271,9 @@ CAMERA_EDITS = [
 ]
 WRONG_FILES = [
     ("timestamps.txt", "1317042661.1\n", "got 1 times for 2 files"),
+    ("timestamps.txt", "1.31704e+09\n1.31704e+09\n", "1 of 1 times are equal .* lost digits"),
+    ("timestamps.txt", "\x000\x00.\x001", "is text in UTF-16, expected UTF-8"),
+    ("poses.txt", "1e9 0 0 0 0 0 0 1\n1e9 0 0 0 0 0 0 1\n", "lost digits; write them anew"),
     ("timestamps.txt", "0.1\nnoon\n", "line 2: got 'noon', expected a time in s"),
     ("timestamps.txt", "100\n200\n", "too far apart for seconds.*stamps_unit"),
     ("poses.txt", "0.1 0 0 0 0 0 0 1\n0.2 0", "line 2: got 2 columns, expected 8"),

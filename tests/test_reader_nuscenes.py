@@ -79,6 +79,20 @@ def test_what_is_not_on_the_disk_leaves_a_gap(broken):
         sequence[1]
 
 
+def test_no_file_outside_of_the_folder_is_read(broken):
+    table = broken / VERSION / "sample_data.json"
+    name = next((broken / "samples").glob("*/*")).relative_to(broken).as_posix()
+    text = table.read_text()
+    assert name in text
+    for other in ("../secret.bin", "/etc/hostname"):
+        table.write_text(text.replace(name, other))
+        with pytest.raises(InputError, match="outside of") as caught:
+            open_sequence(broken)
+        assert other in str(caught.value) and str(table) in str(caught.value)
+    table.write_text(text.replace(name, f"../{broken.name}/{name}"))
+    open_sequence(broken)
+
+
 def test_of_millions_of_records_few_are_parsed(tmp_path):
     record = '{"token": "%d", "sample_token": "s%d", "filename": "x"}'
     lines = ",\n".join(record % (i, i // 10) for i in range(50_000))
@@ -107,7 +121,7 @@ def test_a_real_key_frame(test_data):
     assert sequence.image_stamps_ns("CAM_FRONT")[0] == 1_532_402_927_612_460_000
     assert sequence.image("CAM_FRONT", 0).shape == (900, 1600, 3)
     # the scanner stands 0.94 m ahead of and 1.84 m above the rear axle, and looks to the right
-    T_world_ego = sequence._scene.track.T_world_ego[-1]
+    T_world_ego = sequence._ego.T_world_ego[-1]
     T_ego_lidar = inverse(T_world_ego) @ sequence.T_world_lidar(0)
     np.testing.assert_allclose(T_ego_lidar[:3, 3], [0.943713, 0, 1.84023], atol=1e-6)
     assert T_ego_lidar[0, 1] > 0.999

@@ -13,6 +13,7 @@ from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.ros import RosBag
+from tests.command import exit_code
 from tests.reader_checks import check_cameras, check_refused, check_sweeps, check_truth
 
 pytest.importorskip("rosbags")
@@ -311,7 +312,7 @@ BAGS = {
     "unknown option": (bad_cloud(), "#topic=/a", r"got topic, expected #points="),
     "unknown topic": (bad_cloud(), "#points=/other", r"no such topic; topics that fit: /points"),
     "cut data": (bad_cloud(data=np.zeros(99, np.uint8)), "", "got 99 bytes and rows of"),
-    "encoding": (lambda: with_camera("32FC1"), "", "got the encoding 32FC1, expected one of rgb8"),
+    "encoding": (lambda: with_camera("32FC1"), RAW, "got the encoding 32FC1, expected one of rgb8"),
     "lens": (
         lambda: with_camera(info={"model": "ftheta", "d": [1.0]}),
         RAW,
@@ -336,6 +337,56 @@ def test_a_camera_that_cannot_be_placed_is_left_out_with_a_word(tmp_path):
     assert "joins the camera's frame front_optical" in dict(sequence.findings())["no camera"]
     with pytest.raises(InputError, match="joins the camera's frame front_optical"):
         open_sequence(f"ros:{place}#images=/front/image_raw")
+
+
+def test_encodings_that_cannot_be_read_are_named_by_info(tmp_path, capsys):
+    place = with_camera("bayer_rggb16").write(tmp_path)
+    assert exit_code("info", place) == 0
+    assert "got the encoding bayer_rggb16, expected one of rgb8" in capsys.readouterr().out
+    (tmp_path / "video").mkdir()
+    maker = Maker()
+    maker.sweeps(2)
+    maker.compressed(b"\x00\x00\x00\x01video", topic="/front/image_raw/compressed")
+    maker.info()
+    maker.transform("lidar", "front_optical", inverse(T_CAM_LIDAR))
+    sequence = open_sequence(maker.write(tmp_path / "video"))
+    assert "expected JPEG or PNG" in dict(sequence.findings())["no camera"]
+
+
+def test_an_only_row_needs_no_step(tmp_path):
+    sequence = open_sequence(bad_cloud(row_step=0)().write(tmp_path))
+    np.testing.assert_array_equal(sequence[1].points[:, 0].astype("f4"), scan()["x"])
+
+
+@pytest.mark.parametrize("suffix", [".db3", ".mcap"])
+def test_files_compressed_as_a_whole(suffix, tmp_path):
+    """The folder is read by its metadata; a file alone cannot be."""
+    maker = Maker(suffix)
+    maker.sweeps(2)
+    place = maker.write(tmp_path, compressed=True)
+    (file,) = place.glob("*.zstd")
+    sequence = open_sequence(place)
+    np.testing.assert_array_equal(sequence[1].points[:, 0].astype("f4"), scan()["x"])
+    with pytest.raises(InputError, match=rf"decompress it by zstd -d {file.name} and name"):
+        open_sequence(file)
+    (place / "metadata.yaml").unlink()
+    with pytest.raises(InputError, match="name the bag's folder with its metadata"):
+        open_sequence(place)
+
+
+@pytest.mark.parametrize(("profile", "says"), [("", "of other programs"), ("px4", "of px4")])
+def test_an_mcap_of_other_messages_is_not_called_broken(profile, says, tmp_path):
+    mcap_writer = pytest.importorskip("mcap.writer")
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = mcap_writer.Writer(file)
+        writer.start(profile, "test")
+        schema = writer.register_schema("thing", "jsonschema", b"{}")
+        channel = writer.register_channel("/thing", "json", schema)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(InputError, match=f"is a whole MCAP file with messages {says}") as error:
+        open_sequence(tmp_path / "a.mcap")
+    assert "mended" not in str(error.value)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])

@@ -10,46 +10,24 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
+from densify.bench.truth import TruthMap, Without, exact_truth, scanner_truth
 from densify.config import Config
 from densify.config.errors import InputError
-from densify.depth.exposure import Exposure, Shot, key_shots
-from densify.geometry import poses
-from densify.geometry.cameras import converted, depth_along, rays
-from densify.geometry.types import Bool, Camera, Float32, LidarSequence, Progress, Result, Sweep
+from densify.depth.exposure import key_shots
+from densify.geometry.types import Camera, Float32, LidarSequence, Progress, Result
 from densify.pipeline import run as pipeline
 from densify.pipeline.costs import Watch
 from densify.pipeline.key_result import METHODS, looks_around
 from densify.pipeline.recording import Recording
 from densify.readers.timeline import choose_cameras
-from densify.scores.depth_metrics import image_density, is_outlier_depth
+from densify.scores.depth_metrics import image_density
 
 PRODUCTS = ("measured", "filled")
 _PARTS = ("all", "moving")
-_REACH_M = 80.0
-_TOP_QUANTILE = 0.999
-_HIDING_PX = 11  # a return of the other scanner behind a nearer return may be occluded
-_HIDING_FRACTION, _HIDING_M = 0.03, 0.2
-_WRONG_M, _WRONG_FRACTION = 0.3, 0.05
-
-
-class TruthMap(NamedTuple):
-    """True depth of an image.
-
-    Attributes:
-        depth_m: (H,W) true depth in metres, 0 for no depth.
-        moving: (H,W) bool, True at pixels of moving objects.
-        by_disparity: True to count outliers by KITTI's rule (error above 3 px of disparity and 5
-            %). False to count errors above 0.3 m and 5 %.
-    """
-
-    depth_m: Float32
-    moving: Bool
-    by_disparity: bool
 
 
 def bench_depth(
@@ -85,100 +63,25 @@ def bench_depth(
         raise InputError(f"--method {method}: expected one of {', '.join(METHODS)}")
     if scanner is not None and not np.any(sequence[keys[0]].lidar == scanner):
         raise InputError(f"--scanner {scanner}: no returns of it in sweep {keys[0]}")
-    used = sequence if scanner is None else _Without(sequence, scanner)
+    used = sequence if scanner is None else Without(sequence, scanner)
     sums = {name: _Sums() for name in variants}
     for number, key in enumerate(keys):
         for name, config in variants.items():
             shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
             truths = {}
             if scanner is not None:
-                truths["scanner"] = _returns_of(scanner, sequence, key, window, shots, config)
+                truths["scanner"] = scanner_truth(scanner, sequence, key, window, shots, config)
             watch = Watch()
             looks = looks_around([method])
             recording = Recording(used, config.scored(), window, [key], None, None, watch, looks)
             made = pipeline.densify(recording, key, [method], cameras, watch)[method]
             key_sweep = recording.window(key)[key].sweep
-            truths["truth"] = _exact_truth(used, key_sweep, shots, config)
+            truths["truth"] = exact_truth(used, key_sweep, shots, config)
             sums[name].add(made, truths, used.cameras)
         if progress is not None:
             progress("bench", number + 1, len(keys))
     found = {name: variant.numbers(len(keys)) for name, variant in sums.items()}
     return {"data": sequence.name, "keys": list(keys), "scanner": scanner, "variants": found}
-
-
-class _Without:
-    """A recording without the returns of one scanner."""
-
-    def __init__(self, sequence: LidarSequence, scanner: int) -> None:
-        self._sequence, self._scanner = sequence, scanner
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._sequence, name)
-
-    def __getitem__(self, frame: int) -> Sweep:
-        sweep = self._sequence[frame]
-        return sweep.select(sweep.lidar != self._scanner)
-
-
-def _returns_of(
-    scanner: int,
-    sequence: LidarSequence,
-    key: int,
-    window: int,
-    shots: Mapping[str, Shot],
-    config: Config,
-) -> dict[str, TruthMap]:
-    """Return the depth measured by one scanner in the key sweep, by name of the map."""
-    recording = Recording(sequence, config, window, [key], looks_around=True)
-    cloud = recording.moment(key, all_sweeps=True, engine="").cloud
-    cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
-    stretch = recording.window(key)
-    maps = {}
-    for name, shot in shots.items():
-        view = Exposure.of(sequence, stretch, key, shot, config).sees(cloud)
-        depth_m = view.exposure.depth_m(view.points_cam)
-        farthest_first = np.argsort(-depth_m, kind="stable")
-        column, row = np.rint(view.uv[farthest_first]).astype(np.int64).T
-        shape = (shot.camera.height_px, shot.camera.width_px)
-        nearest_m, moving = np.zeros(shape, np.float32), np.zeros(shape, bool)
-        nearest_m[row, column] = depth_m[farthest_first]
-        moving[row, column] = cloud.moving[view.rows[farthest_first]]
-        before_m = ndimage.minimum_filter(
-            np.where(nearest_m > 0, nearest_m, np.float32(np.inf)), _HIDING_PX
-        )
-        nearest_m[nearest_m > (1 + _HIDING_FRACTION) * before_m + _HIDING_M] = 0
-        maps[name] = TruthMap(nearest_m, moving, by_disparity=False)
-    return maps
-
-
-def _exact_truth(
-    sequence: LidarSequence, key_sweep: Sweep, shots: Mapping[str, Shot], config: Config
-) -> dict[str, TruthMap]:
-    """Return the exact depth within range and view of the scanner, {} for a real recording."""
-    maps: dict[str, TruthMap] = {}
-    if sequence.truth is None:
-        return maps
-    away = key_sweep.points
-    if key_sweep.scanner_origins is not None:
-        away = away - key_sweep.scanner_origins[key_sweep.lidar]
-    top = np.quantile(away[:, 2] / np.linalg.norm(away[:, :2], axis=1), _TOP_QUANTILE)
-    for name, shot in shots.items():
-        if shot.number is None:
-            continue
-        camera, number = shot.camera, shot.number
-        depth_m = sequence.truth.depth_m(camera.name, number)
-        v, u = np.nonzero((depth_m > 0) & (depth_m <= _REACH_M))
-        ray = rays(camera, np.stack([u, v], 1).astype(np.float64))
-        scale = depth_m[v, u] / depth_along(ray, camera.measure)
-        lidar = poses.transform(poses.inverse(camera.T_cam_lidar), ray * scale[:, None])
-        below = lidar[:, 2] <= top * np.linalg.norm(lidar[:, :2], axis=1)
-        known_m = np.zeros_like(depth_m)
-        known_m[v[below], u[below]] = depth_m[v[below], u[below]]
-        moving = sequence.truth.moving_mask(camera.name, number)
-        measure = config.project.depth if config.project.depth != "auto" else camera.measure
-        known_m = converted(camera, known_m, camera.measure, measure)
-        maps[name] = TruthMap(known_m, moving, by_disparity=True)
-    return maps
 
 
 class _Sums:
@@ -236,9 +139,5 @@ def _counted(
     for part in _PARTS:
         known = (truth.depth_m > 0) & (truth.moving if part == "moving" else True)
         both = known & (depth_m > 0)
-        z, t = depth_m[both].astype(np.float64), truth.depth_m[both].astype(np.float64)
-        if truth.by_disparity:
-            wrong = is_outlier_depth(z, t, focal_px)
-        else:
-            wrong = (np.abs(z - t) > _WRONG_M) & (np.abs(z - t) > _WRONG_FRACTION * t)
+        wrong = truth.outliers(depth_m, both, focal_px)
         yield part, (int(known.sum()), int(both.sum()), int(wrong.sum()))

@@ -24,6 +24,8 @@ from densify.scores.depth_metrics import (
 SCHEMA_VERSION = 1
 """Version of `evaluate`'s dictionary. It grows when an entry changes its meaning or is removed."""
 
+_ALIKE = 0.05
+"""A map and its truth agree this well in most pixels."""
 KITTI_FOCAL_PX = 721.5377
 """Focal length of KITTI's rectified cameras on 2011_09_26. On other days it is 707 to 719 px."""
 
@@ -52,13 +54,15 @@ def evaluate(
         progress: Function called with (stage, done, total).
 
     Raises:
-        InputError: A file is no depth map or mask, or the sizes of a pair differ.
+        InputError: A file is no depth map or mask, the sizes of a pair differ, or one side stores
+            1000 x metres.
     """
     stereo = {"focal_px": focal_px, "baseline_m": baseline_m}
     by_part: dict[str, list[DepthErrors]] = defaultdict(list)
     images: list[dict[str, Any]] = []
     for number, pair in enumerate(pairs.pairs):
         predicted_m, truth_m, moving = _read(pair)
+        _check_unit(pair, predicted_m, truth_m)
         parts = errors_by_part(predicted_m, truth_m, moving, **stereo)
         for name, errors in parts.items():
             by_part[name].append(errors)
@@ -84,6 +88,21 @@ def evaluate(
         "images": images,
         **{f"without_{side}": [*map(str, getattr(pairs, f"without_{side}"))] for side in lonely},
     }
+
+
+def _check_unit(pair: DepthPair, predicted_m: Float32, truth_m: Float32) -> None:
+    """Raise InputError if one of two maps stores 1000 x metres instead of 256 x metres."""
+    both = (predicted_m > 0) & (truth_m > 0)
+    ratio = predicted_m[both] / truth_m[both]
+    factor = 1000 / 256
+    for path, too_large in ((pair.predicted, ratio), (pair.truth, 1 / ratio)):
+        middle = np.percentile(too_large, [25, 50, 75]) / factor if len(ratio) else np.zeros(3)
+        if np.abs(middle - 1).max() < _ALIKE:
+            raise InputError(
+                f"{path}: holds depths {factor * middle[1]:.2f} times those of the other map, as "
+                f"if it stored 1000 x metres (millimetres); expected 256 x metres: multiply its "
+                f"values by 0.256"
+            )
 
 
 def _read(pair: DepthPair) -> tuple[Float32, Float32, Bool | None]:

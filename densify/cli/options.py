@@ -34,12 +34,7 @@ def add_verb(
 ) -> argparse.ArgumentParser:
     """Add a verb to the command line and return its parser.
 
-    Args:
-        commands: Subparsers of argparse.
-        name: Name of the verb.
-        verb: Function called with the options; None for a verb that has verbs of its own.
-        about: One-line description.
-        epilog: Further help.
+    ``verb`` is called with the options; it is None for a verb that has verbs of its own.
     """
     description = f"{about[0].upper()}{about[1:]}."
     parser: argparse.ArgumentParser = commands.add_parser(
@@ -52,12 +47,7 @@ def add_verb(
 
 
 def option(parser: argparse.ArgumentParser, usage: str, about: str, **more: Any) -> None:
-    """Add an option.
-
-    Args:
-        usage: ``--name METAVAR``, or ``--name`` for a flag without a value.
-        about: Help text.
-    """
+    """Add an option by its usage, ``--name METAVAR``, or ``--name`` for a flag without a value."""
     name, _, metavar = usage.partition(" ")
     kind: dict[str, Any] = {"metavar": metavar} if metavar else {"action": "store_true"}
     parser.add_argument(name, help=about, **kind, **more)
@@ -78,10 +68,7 @@ def add_recording(parser: argparse.ArgumentParser, several: bool = False) -> Non
 
 
 def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add some of the options that several verbs share.
-
-    The names are window, method, camera, config (with ``--set``) and overwrite.
-    """
+    """Add some of the options window, method, camera, config (with ``--set``) and overwrite."""
     if "window" in names:
         about = (
             "number of sweeps on each side of the key (default: 5). More sweeps are denser and "
@@ -107,10 +94,7 @@ def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
 
 
 def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
-    """Return the specs of the recordings that a command names.
-
-    If it names none, log that the simulator is used, and return ``default``.
-    """
+    """Return the specs of the recordings that a command names, else log and return ``default``."""
     given = options.recording or []
     specs = [*([given] if isinstance(given, str) else given), *options.data]
     if not specs:
@@ -154,11 +138,7 @@ def check_new_file(path: Path, overwrite: bool, suffix: str = "") -> None:
 
 
 def sliced(sequence: LidarSequence, keys: range | None) -> list[int]:
-    """Return the frame numbers selected by ``--keys``; all frames for None.
-
-    Raises:
-        InputError: No frame is selected.
-    """
+    """Return the frame numbers selected by ``--keys``; all frames for None."""
     from densify.readers.timeline import format_frames
 
     there = [frame for frame in sequence.frames if keys is None or frame in keys]
@@ -194,11 +174,7 @@ def words(text: str) -> list[str]:
 
 
 def key_range(text: str, other: str = "") -> range:
-    """Parse ``A:B[:S]`` as a range.
-
-    Args:
-        other: Description of other accepted text, for the message.
-    """
+    """Parse ``A:B[:S]`` as a range; ``other`` says what else is accepted, for the message."""
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
         first, end, step = (*map(int, numbers), 1)[:3]

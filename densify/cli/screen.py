@@ -25,18 +25,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer of a verb.
+    """The answer of a verb."""
 
-    Attributes:
-        text: Text for people.
-        facts: Values for programs (``--json``). Lists of several answers are concatenated.
-        files: Written files.
-        first: File that the user may open first -> its content.
-    """
-
-    text: str = ""
+    text: str = ""  # text for people
+    # Values for programs (``--json``). Lists of several answers are concatenated.
     facts: Mapping[str, Any] = field(default_factory=dict)
-    files: Sequence[Path] = ()
+    files: Sequence[Path] = ()  # written files
+    # File that the user may open first -> its content
     first: Mapping[Path, str] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
@@ -52,8 +47,7 @@ class Answer:
 def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> dict[Path, str]:
     """Return the files to open first -> their content, at most one file of each kind.
 
-    Args:
-        kinds: Pattern of the end of a path -> content, most important first.
+    ``kinds`` has patterns of the end of a path -> content, most important first.
     """
     first: dict[Path, str] = {}
     for pattern, what in kinds.items():
@@ -95,11 +89,7 @@ def aligned(rows: Sequence[Sequence[str]], side: str = ">") -> str:
 
 
 def written(value: float | None, form: str) -> str:
-    """Return a number as text, "-" for None.
-
-    Args:
-        form: Format specification, optionally followed by a blank and a unit.
-    """
+    """Return a number as text, "-" for None; ``form`` is its format, with a blank and a unit."""
     if value is None:
         return "-"
     number, _, unit = form.partition(" ")
@@ -226,11 +216,7 @@ def _above_bars() -> AbstractContextManager[None]:
 
 
 def tell_doubts(doubts: Iterable[tuple[str, str, int]], most: int = 20) -> None:
-    """Log each distinct warning once with its keys, the most frequent first.
-
-    Args:
-        doubts: Tuples of warning, recording (or ""), and key.
-    """
+    """Log each distinct warning once with its keys; ``doubts`` are (warning, recording, key)."""
     from densify.readers.timeline import format_frames
 
     log = logging.getLogger("densify")

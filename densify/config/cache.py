@@ -7,6 +7,7 @@ entry is computed again. Only the user can write to the folder.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import logging
@@ -14,11 +15,12 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import platformdirs
@@ -28,9 +30,16 @@ from densify.config.errors import InputError
 
 T = TypeVar("T")
 _log = logging.getLogger("densify")
-# Raise a step's number when its result for the same inputs changes. Steps build on each other,
-# and an entry depends on all of them.
-_STEP_VERSIONS = "digests 1, registration 2, motion 13, far 4"
+_STEP_ROOMS = (
+    "readers/**/*.py",
+    "registration/*.py",
+    "free_space/*.py",
+    "flow/**/*.py",
+    "flow/**/*.json",
+    "geometry/**/*.py",
+    "pipeline/*.py",
+    "depth/far.py",
+)
 _MOST_ENTRIES = 10_000
 
 
@@ -38,15 +47,7 @@ class Cache:
     """A folder of cached results."""
 
     def __init__(self, limit_bytes: int = 10 * 1024**3, folder: Path | None = None) -> None:
-        """Open a cache.
-
-        Args:
-            limit_bytes: Greatest total size, enforced by `trim`.
-            folder: Folder of the entries; None for the user's cache directory.
-
-        Raises:
-            InputError: Other users can write to the folder.
-        """
+        """Open the folder of entries, by default the user's; `trim` keeps ``limit_bytes`` of it."""
         self._folder, self._limit_bytes = folder or own_folder("steps"), limit_bytes
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -54,40 +55,75 @@ class Cache:
             _log.warning("%s: %s; nothing is kept for later", self._folder, error.strerror or error)
 
     def get(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
-        """Return the cached result for these inputs, or else compute and cache it.
-
-        Args:
-            step: Name of the pipeline step.
-            inputs: Everything the result depends on, as `digest` accepts.
-            make: Computes the result.
-        """
-        path = self._folder / f"{step}-{digest((__version__, _STEP_VERSIONS, inputs))}.npz"
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                value: T = _unpacked(json.loads(arrays["json"].tobytes()), arrays)
-            os.utime(path)  # the entry was used
+        """Return a step's cached result for these inputs (as `digest` accepts), else make it."""
+        path = self._folder / f"{step}-{digest((__version__, inputs))}.npz"
+        if (entry := _read(path)) is not None:
+            return cast(T, entry[0])
+        with _only_maker(path):
+            if (entry := _read(path)) is not None:  # another thread or process made it
+                return cast(T, entry[0])
+            value = make()
+            try:
+                text, arrays = _packed(value)
+                save_arrays(path, {"json": np.frombuffer(text, np.uint8), **arrays})
+            except (OSError, TypeError) as error:
+                _log.debug("%s: not kept: %s", path, error)
             return value
-        except FileNotFoundError:
-            pass
-        except Exception as error:  # a damaged file raises anything
-            _log.debug("%s: made again: %s", path, error)
-        value = make()
-        try:
-            text, arrays = _packed(value)
-            save_arrays(path, {"json": np.frombuffer(text, np.uint8), **arrays})
-        except (OSError, TypeError) as error:
-            _log.debug("%s: not kept: %s", path, error)
-        return value
 
     def trim(self) -> None:
         """Delete the least recently used entries until the size is within the limit."""
-        with suppress(OSError):  # another process deletes too
-            entries = [(e.stat().st_mtime_ns, e, e.stat().st_size) for e in self._folder.iterdir()]
-            left = sum(num_bytes for *_, num_bytes in entries)
-            for number, (_, entry, num_bytes) in enumerate(sorted(entries)):
-                if left > self._limit_bytes or len(entries) - number > _MOST_ENTRIES:
-                    entry.unlink()
-                    left -= num_bytes
+        entries: list[tuple[int, Path, int]] = []
+        for path in self._folder.iterdir() if self._folder.is_dir() else ():
+            with suppress(OSError):  # another process deletes too
+                found = path.stat()
+                entries.append((found.st_mtime_ns, path, found.st_size))
+        left = sum(num_bytes for *_, num_bytes in entries)
+        for number, (_, path, num_bytes) in enumerate(sorted(entries)):
+            if left > self._limit_bytes or len(entries) - number > _MOST_ENTRIES:
+                with suppress(OSError):
+                    path.unlink()
+                left -= num_bytes
+
+
+def _read(path: Path) -> tuple[Any] | None:
+    """Return the value of an entry, None if the file is missing or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            value = _unpacked(json.loads(arrays["json"].tobytes()), arrays)
+        os.utime(path)  # the entry was used
+        return (value,)
+    except FileNotFoundError:
+        return None
+    except Exception as error:  # a damaged file raises anything
+        _log.debug("%s: made again: %s", path, error)
+        return None
+
+
+@contextmanager
+def _only_maker(path: Path) -> Iterator[None]:
+    """Hold a lock file, so that one thread or process at a time makes the entry."""
+    lock, number = path.with_suffix(".lock"), None
+    with suppress(OSError):  # where nothing can be written or locked, each makes its own
+        number = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
+        fcntl.flock(number, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        if number is not None:
+            with suppress(OSError):
+                lock.unlink()
+            with suppress(OSError):  # a forked process has the file open, too
+                fcntl.flock(number, fcntl.LOCK_UN)
+            os.close(number)
+
+
+@lru_cache(maxsize=1)
+def code_digest() -> str:
+    """Return a hash of the code that makes the pipeline's cached results."""
+    state, package = hashlib.blake2b(digest_size=20), Path(__file__).parents[1]
+    for path in sorted(path for room in _STEP_ROOMS for path in package.glob(room)):
+        state.update(path.read_bytes())
+    return state.hexdigest()
 
 
 def kept(cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:
@@ -118,10 +154,7 @@ def digest(value: Any) -> str:
 
 
 def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
-    """Return the value as JSON, and its arrays by the names used there.
-
-    Types that JSON lacks are written as ``{KIND: content}``. Raises TypeError for other types.
-    """
+    """Return the value as JSON, types it lacks as ``{KIND: content}``, and its arrays by name."""
     arrays: dict[str, np.ndarray] = {}
 
     def tree(value: Any) -> Any:
@@ -143,11 +176,7 @@ def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
 
 
 def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the value that `_packed` converted.
-
-    Only dataclasses and named tuples of already imported modules are built, without calling their
-    code.
-    """
+    """Return the value that `_packed` converted, with classes of imported modules alone."""
     if isinstance(tree, list):
         return [_unpacked(part, arrays) for part in tree]
     if not isinstance(tree, dict):
@@ -168,14 +197,7 @@ def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 
 def own_folder(name: str) -> Path:
-    """Return the folder of this name in the user's cache directory.
-
-    The environment variable DENSIFY_CACHE_DIR replaces that directory. The folder is created with
-    mode 0700 if possible.
-
-    Raises:
-        InputError: Other users can write to the folder.
-    """
+    """Return the folder of this name in DENSIFY_CACHE_DIR, else in the user's cache directory."""
     named = os.environ.get("DENSIFY_CACHE_DIR")
     root = Path(named or platformdirs.user_cache_dir("densify"))
     for folder in (root, root / name):

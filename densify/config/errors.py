@@ -27,10 +27,7 @@ def _cut(text: str, num_characters: int) -> str:
 
 
 def how_to_install(extra: str) -> str:
-    """Return the commands that install an optional extra.
-
-    ``densify`` on the package index is another project.
-    """
+    """Return the commands that install an extra; ``densify`` on the index is another project."""
     return f"pip install 'densify-lidar[{extra}]', or in a checkout pip install '.[{extra}]'"
 
 

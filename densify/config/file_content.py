@@ -6,6 +6,9 @@ Every error of malformed content becomes one InputError.
 
 from __future__ import annotations
 
+import codecs
+import gzip
+import io
 import json
 import os
 import stat
@@ -27,12 +30,7 @@ _MALFORMED = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a file for reading; the caller closes it.
-
-    Raises:
-        InputError: The file is missing or unreadable, is a folder, pipe or device, or is a pointer
-            to a file that Git LFS has not fetched.
-    """
+    """Open a regular file, no Git LFS pointer, for reading; the caller closes it."""
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
@@ -48,11 +46,7 @@ def open_file(path: Path) -> BinaryIO:
 
 
 def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return the content of a file.
-
-    Raises:
-        InputError: The file is unreadable or larger than ``most_bytes``.
-    """
+    """Return the content of a file."""
     with open_file(path) as file:
         check_size(os.fstat(file.fileno()).st_size, path, most_bytes)
         try:
@@ -62,23 +56,15 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return decompressed gzip data.
-
-    Args:
-        where: File, for the message.
-        most_bytes: Greatest size after decompression.
-
-    Raises:
-        InputError: The data is damaged or too large.
-    """
-    unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    """Return decompressed gzip data, ``most_bytes`` at most; errors begin with ``where``."""
     try:
-        content = unpack.decompress(data, most_bytes + 1)
-    except zlib.error as error:
+        with gzip.open(io.BytesIO(data)) as file:
+            content = file.read(most_bytes + 1)
+        if not data:
+            raise EOFError("it is empty")
+    except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{where}: not a whole gzip file: {error}; fetch it again") from error
     check_size(len(content), where, most_bytes)
-    if not unpack.eof:
-        raise InputError(f"{where}: not a whole gzip file: it is cut off; fetch it again")
     return content
 
 
@@ -97,23 +83,23 @@ def reason(error: BaseException) -> str:
 
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
-    """Return the text of a UTF-8 file.
+    """Return the text of a UTF-8 file, without a byte order mark."""
+    return decode_text(read_bytes(path, most_bytes), path)
 
-    Raises:
-        InputError: The file is unreadable, too large or not UTF-8.
-    """
+
+def decode_text(data: bytes, where: Path | str) -> str:
+    """Return UTF-8 text without a byte order mark; errors begin with ``where``."""
+    # Every second byte of plain words in UTF-16 is zero.
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or data[:2].count(0) == 1:
+        raise InputError(f"{where}: is text in UTF-16, expected UTF-8; save it as UTF-8")
     try:
-        return read_bytes(path, most_bytes).decode("utf-8")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: cannot be read: not a text file") from error
+        raise InputError(f"{where}: cannot be read: not a text file") from error
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        InputError: The file is unreadable or not valid JSON.
-    """
+    """Return the content of a JSON file."""
     return parse_json(read_bytes(path), path)
 
 
@@ -133,15 +119,9 @@ def read_yaml(path: Path) -> tuple[Any, dict[str, int]]:
 
 
 def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
-    """Return the content of YAML text and its line numbers.
+    """Return the content of YAML text, None if empty, and dotted key (``a.b``) -> its line.
 
-    Returns:
-        content: Parsed content, None if empty.
-        lines: Dotted key, such as ``a.b`` -> line of that key.
-
-    Raises:
-        InputError: The YAML is invalid, has custom tags, duplicate keys or more than 30 aliases.
-            The message begins with ``where``.
+    Custom tags, duplicate keys and more than 30 aliases are refused.
     """
     import yaml
 
@@ -173,16 +153,7 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
 
 
 def needed(module: str, extra: str, what: str) -> Any:
-    """Import and return an optional module.
-
-    Args:
-        module: Import path.
-        extra: Extra of densify that installs the module.
-        what: Features that need the module, such as "Argoverse 2 recordings", for the message.
-
-    Raises:
-        InputError: The module is not installed. The message has the command that installs it.
-    """
+    """Import and return an optional module; the error says that ``what`` needs the ``extra``."""
     package = module.partition(".")[0]
     try:
         return import_module(module)
@@ -199,12 +170,7 @@ def needed(module: str, extra: str, what: str) -> Any:
 
 @contextmanager
 def described_in(where: Path | str, expected: str) -> Iterator[None]:
-    """Turn a missing key or a malformed value within the ``with`` block into an InputError.
-
-    Args:
-        where: File or option; begins the message.
-        expected: Correct content, for the message.
-    """
+    """Turn a missing key or malformed value in the block into an InputError, with ``expected``."""
     try:
         yield
     except InputError:

@@ -63,19 +63,12 @@ class Plugin:
 
 @dataclass(frozen=True)
 class Table:
-    """The plug-ins of one kind.
+    """The plug-ins of one kind."""
 
-    Attributes:
-        kind: Name of the kind, for messages.
-        group: Entry-point group through which packages add plug-ins.
-        members: Names of functions that a plug-in's module must have.
-        built_in: Plug-ins of densify.
-    """
-
-    kind: str
-    group: str
-    members: tuple[str, ...]
-    built_in: tuple[Plugin, ...]
+    kind: str  # name of the kind, for messages
+    group: str  # entry-point group through which packages add plug-ins
+    members: tuple[str, ...]  # names of functions that a plug-in's module must have
+    built_in: tuple[Plugin, ...]  # plug-ins of densify
 
     def names(self) -> list[str]:
         """Return the built-in names, then the names from other packages."""
@@ -91,11 +84,7 @@ class Table:
             )
 
     def row(self, name: str, where: str) -> Plugin:
-        """Return the plug-in of this name; the module of another package is imported.
-
-        Raises:
-            InputError: No plug-in has the name, or its package is broken.
-        """
+        """Return the plug-in of this name; the module of another package is imported."""
         self.require(name, where)
         rows = {row.name: row for row in self.built_in}
         return rows[name] if name in rows else self._load(self._added()[name])
@@ -153,11 +142,7 @@ ENGINES = Table(
 
 
 def check_engine_spec(spec: str) -> tuple[str, str]:
-    """Return name and argument of an engine's ``NAME[:ARGUMENT]``, without importing it.
-
-    Raises:
-        InputError: The engine does not exist, lacks its argument, or takes no argument.
-    """
+    """Return name and argument of an engine's ``NAME[:ARGUMENT]``, without importing it."""
     name, _, argument = spec.partition(":")
     ENGINES.require(name, "flow.engine")
     for row in ENGINES.built_in:
@@ -167,11 +152,7 @@ def check_engine_spec(spec: str) -> tuple[str, str]:
 
 
 def engine(spec: str) -> tuple[Plugin, str]:
-    """Return the plug-in and the argument of an engine's ``NAME[:ARGUMENT]``.
-
-    Raises:
-        InputError: As in `check_engine_spec`.
-    """
+    """Return the plug-in and the argument of an engine's ``NAME[:ARGUMENT]``."""
     name, argument = check_engine_spec(spec)
     return ENGINES.row(name, "flow.engine"), argument
 
@@ -184,7 +165,7 @@ def _any(*patterns: str) -> Callable[[Path], bool]:
 def _suffix(*suffixes: str) -> Callable[[Path], bool]:
     """Return a function that recognises a file with the suffix, or a folder with such files."""
     inside = _any(*(f"*{suffix}" for suffix in suffixes))
-    return lambda path: path.suffix in suffixes if path.is_file() else inside(path)
+    return lambda path: path.name.endswith(suffixes) if path.is_file() else inside(path)
 
 
 def _capture(with_metadata: bool) -> Callable[[Path], bool]:
@@ -203,10 +184,7 @@ _BESIDE = re.compile(r"\..*|(timestamps?|times|stamps|poses?|trajectory)\.\w+", 
 
 
 def _holds_sweeps(path: Path) -> bool:
-    """Return True if a folder has sweep files, at most two folders deep.
-
-    Tables of numbers count as sweeps only if the folder has no other files.
-    """
+    """Return True for sweep files at most two folders deep, or for tables of numbers alone."""
     near = (found for pattern in ("*", "*/*", "*/*/*") for found in path.glob(pattern))
     if (path / "densify.yaml").is_file() or any(_SWEEP.fullmatch(found.name) for found in near):
         return True
@@ -243,7 +221,8 @@ READERS = Table(
         Plugin("kitti-odometry", "densify.readers.kitti.odometry", _is_odometry,
                "KITTI odometry or SemanticKITTI (sequences/, or a folder in it with velodyne/)",
                scenes=True),
-        Plugin("ros", "densify.readers.ros", _suffix(".bag", ".db3", ".mcap"),
+        Plugin("ros", "densify.readers.ros",
+               _suffix(".bag", ".db3", ".mcap", ".db3.zstd", ".mcap.zstd"),
                "a ROS bag (.bag, .db3, .mcap, or a folder of them)", scenes=True),
         Plugin("dgp", "densify.readers.dgp", _any(_DGP, f"*/{_DGP}"),
                "a DGP scene such as DDAD's (with scene_<hash>.json)", scenes=True),
@@ -259,17 +238,11 @@ READERS = Table(
 
 
 class Form(NamedTuple):
-    """An export format.
+    """An export format."""
 
-    Attributes:
-        module: Module of `densify.outputs.export` with the function ``write_NAME``.
-        owned: Files and folders that the format writes.
-        of_drive: True if an export can cover several keys of a drive.
-    """
-
-    module: str
-    owned: tuple[str, ...]
-    of_drive: bool = False
+    module: str  # module of `densify.outputs.export` with the function ``write_NAME``
+    owned: tuple[str, ...]  # files and folders that the format writes
+    of_drive: bool = False  # True if an export can cover several keys of a drive
 
 
 EXPORTS = {

@@ -60,16 +60,12 @@ def presets() -> dict[str, Path]:
 
 
 def parse_override(override: str) -> dict[str, dict[str, Any]]:
-    """Return ``{section: {key: value}}`` from the text ``section.key=value``.
-
-    Raises:
-        InputError: The text has another form.
-    """
+    """Return ``{section: {key: value}}`` from the text ``section.key=value``."""
     name, equals, text = override.partition("=")
     section, dot, key = name.strip().partition(".")
     if not (equals and dot and section and key):
         raise InputError(
-            f"--set {override}: expected section.key=value, for example project.support=6"
+            f"--set {override}: expected section.key=value, for example project.fill_reach=1"
         )
     value, _ = parse_yaml(text, f"--set {override}")
     return {section: {key: value if text.strip() else ""}}
@@ -89,15 +85,9 @@ def apply_changes(
     where: str,
     sections: Mapping[str, type[Section]] = _SECTIONS,
 ) -> None:
-    """Overwrite settings in place with checked changes.
+    """Overwrite settings ``{section: {key: value}}`` in place with checked changes of that form.
 
-    Args:
-        values: ``{section: {key: value}}`` with every setting; changed in place.
-        changes: ``{section: {key: value}}`` with some settings.
-        where: File or option that gave the changes; begins error messages.
-
-    Raises:
-        InputError: As in `resolve`.
+    ``where``, the file or option that gave the changes, begins error messages.
     """
     for name, keys in _mapping(changes, where, "sections"):
         if name not in values:
@@ -116,7 +106,7 @@ def _mapping(value: Any, where: str, content: str) -> Iterable[tuple[Any, Any]]:
     if not isinstance(value, Mapping):
         raise InputError(
             f"{where}: got {value!r}, expected a mapping of {content}, for example "
-            f"project: {{support: 6}}"
+            f"project: {{fill_reach: 1}}"
         )
     return value.items()
 

@@ -39,17 +39,7 @@ class Section:
 
 
 def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
-    """Return a value converted to the type of its setting.
-
-    Args:
-        section: Section of the setting.
-        key: Name of the setting.
-        value: Value as given by the user.
-        where: File or option that gave the value; begins the message.
-
-    Raises:
-        InputError: The value has another type or is out of range.
-    """
+    """Return a user's value converted to the type of its setting; errors begin with ``where``."""
     knob = section.__dataclass_fields__[key]
     kind, _, optional = str(knob.type).partition(" | ")
     if optional and value is None:
@@ -105,14 +95,10 @@ class FlowSettings(Section):
         check_engine_spec(self.engine)
 
     def around(self, points_per_s: float) -> tuple[float, float]:
-        """Return how far around the window motion is searched, and at which spacing of sweeps.
+        """Return how far around the window motion is searched, and the spacing of those sweeps, s.
 
-        Sparse sweeps show little of a moving object, so every sweep is searched, farther around.
-
-        points_per_s: point rate of the scanner.
-
-        Returns seconds on each side of the window (``look_around_s`` unless null), and seconds
-        between the searched sweeps, 0 for every sweep.
+        Sparse sweeps (``points_per_s``) show little of a moving object: every one is searched
+        (spacing 0), farther around.
         """
         few = points_per_s < _FEW_POINTS_PER_S
         needed_s, step_s = (_AROUND_FEW_S, 0.0) if few else (_AROUND_S, _AROUND_S)
@@ -145,10 +131,8 @@ class ProjectSettings(Section):
     per: str = one_of("sweep", "image")
     depth: str = one_of("auto", "z", "range")
     visibility: bool = True
-    support: int = within(4, 1, 20)
     rims: str = one_of("image", "strict", "keep")
     fill_reach: float = within(1.5, 0.1, 5)
-    glass: str = one_of("plane", "keep")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -61,10 +61,6 @@ def call_all(
         num_workers: Number of processes. 1 uses this process.
         log: File to which worker processes append their log.
         scheduler: Address of a Dask scheduler whose workers replace local processes.
-
-    Raises:
-        ComputationError: The workers cannot begin, or the scheduler is lost.
-        InputError: The scheduler cannot be reached.
     """
     if num_workers == 1 and scheduler is None:
         for group in groups:
@@ -90,15 +86,7 @@ def call_all(
 
 @contextmanager
 def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
-    """Append log messages of ``densify`` in this process to a file within the block.
-
-    Args:
-        path: The log file.
-        thread: Identifier of the only thread to log, None for all threads.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Append log messages of ``densify`` to a file in the block: of all threads or of one."""
     try:
         handler = logging.FileHandler(path, encoding="utf-8")
     except OSError as error:
@@ -134,11 +122,8 @@ def _call_logged(call: Callable[[Item], Any], log: Path | None, item: Item) -> A
 def _until_a_death(
     call: Callable[[Item], Any], waiting: deque[Item], workers: _Workers
 ) -> Iterator[tuple[Item, Any]]:
-    """Yield (item, outcome) until all waiting items are done or a process dies.
-
-    Started items are removed from ``waiting`` in place. A death stops all running calls, whose
-    outcome is then a BrokenExecutor.
-    """
+    """Yield (item, outcome), and drop from ``waiting`` what starts, until a process dies."""
+    # A death stops all running calls, whose outcome is then a BrokenExecutor.
     running: dict[Future[Any], Item] = {}
     with workers as (executor, num_at_once):
         is_broken = False

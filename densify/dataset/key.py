@@ -32,29 +32,20 @@ _log = logging.getLogger("densify")
 
 @dataclass(frozen=True)
 class Job:
-    """A recording of a training set, as every process opens it.
+    """A recording of a training set, as every process opens it."""
 
-    Attributes:
-        drive: Name of the recording's folder.
-        data: Text of ``--data``, with an absolute path.
-        folder: Folder of the recording's files, relative to ``out``.
-        keys: Key frame numbers of the training set, by which the recording is cut into blocks.
-        cameras: Names of the wanted cameras.
-        out: Folder of the training set.
-        run: Unique text of the command's run, because long-lived workers must reopen the recording
-            in each run.
-        version: Version of densify that made the job.
-    """
-
-    drive: str
-    data: str
-    folder: str
+    drive: str  # name of the recording's folder
+    data: str  # text of ``--data``, with an absolute path
+    folder: str  # folder of the recording's files, relative to ``out``
+    # Key frame numbers of the training set, by which the recording is cut into blocks
     keys: tuple[int, ...]
-    cameras: tuple[str, ...]
+    cameras: tuple[str, ...]  # names of the wanted cameras
     recipe: Recipe
-    out: Path
+    out: Path  # folder of the training set
+    # Unique text of the command's run, because long-lived workers must reopen the recording in each
+    # run
     run: str
-    version: str = __version__
+    version: str = __version__  # version of densify that made the job
 
 
 def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
@@ -107,11 +98,7 @@ def _made(job: Job, key: int) -> KeyRecord:
 
 
 def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scores for a manifest line from the metrics of a result.
-
-    The scores are ``num_points``, ``num_moving`` and ``ghost``. By camera there are ``density``,
-    ``density_filled``, and ``outliers`` and ``mae_m`` against the held-out key sweep.
-    """
+    """Return the scores for a manifest line from the metrics of a result."""
     held_out = metrics["held_out"] or {}
     errors = {name: scores["measured"]["all"] for name, scores in held_out.items()}
     return {

@@ -99,11 +99,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
         return len(self._samples)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """Return a sample, a dict as described in the class.
-
-        Raises:
-            InputError: A file is missing or damaged, or the crop is larger than the image.
-        """
+        """Return a sample, a dict as described in the class."""
         name, camera_name, frame = self._samples[index]
         drive = self._drives[name]
         camera, K = drive.cameras[camera_name], drive.cameras[camera_name].K.copy()

@@ -50,19 +50,13 @@ Block = tuple[Drive, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class Summary:
-    """The progress of a training set, or of one shard.
+    """The progress of a training set, or of one shard."""
 
-    Attributes:
-        records: Records of the key sweeps tried so far, by drive and frame number.
-        num_keys: Number of wanted key sweeps.
-        num_made: Number of key sweeps made in this run.
-        seconds: Duration of this run.
-    """
-
+    # Records of the key sweeps tried so far, by drive and frame number
     records: Mapping[Key, KeyRecord]
-    num_keys: int
-    num_made: int = 0
-    seconds: float = 0.0
+    num_keys: int  # number of wanted key sweeps
+    num_made: int = 0  # number of key sweeps made in this run
+    seconds: float = 0.0  # duration of this run
 
     def count(self, status: str) -> int:
         """Return the number of key sweeps with this status: done, aside or failed."""
@@ -102,7 +96,8 @@ def make_dataset(
     Args:
         data: Recordings, as `densify.open_sequence` takes them.
         out: Folder of the training set.
-        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``, None for all.
+        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``, None for all. A
+            slice without start or stop begins at the first frame or ends at the last one.
         recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
         num_workers: Number of processes, as many as possible if None. More than one needs ``if
             __name__ == "__main__"`` in a script.
@@ -146,11 +141,7 @@ def make_dataset(
 
 
 def status(out: Path) -> Summary:
-    """Return the progress of a training set from its files.
-
-    Raises:
-        InputError: The folder holds no training set.
-    """
+    """Return the progress of a training set from its files."""
     table = read_plan(out)
     if table is None:
         raise InputError(f"--status {out}: no dataset.json in it; expected a set's folder")
@@ -208,10 +199,8 @@ def _finished(blocks: Sequence[Block], out: Path, verify: bool) -> dict[Key, Key
 def _jobs(
     blocks: Sequence[Block], done: Collection[Key], recipe: Recipe, out: Path, num_workers: int
 ) -> list[list[tuple[Job, int]]]:
-    """Return the key sweeps to make, in a group for each block.
-
-    The first key sweep of a group computes the results that the group shares.
-    """
+    """Return the key sweeps to make, in a group for each block."""
+    # The first key sweep of a group computes the results that the group shares.
     run, groups = uuid4().hex, []
     for drive, keys in blocks:
         cameras, place = tuple(drive.cameras), out.absolute()
@@ -230,12 +219,7 @@ def _record(
     num_keys: int,
     report: Callable[[Summary], None] | None,
 ) -> Summary:
-    """Record and report every key sweep, and return the final progress.
-
-    ``made`` has the items and outcomes of `call_all`. New records are added to ``records`` in
-    place. On an error the number of finished key sweeps is logged. A full disk is a
-    ComputationError.
-    """
+    """Record and report the outcomes of `call_all` as they come; return the final progress."""
     start_s = time.monotonic()
     summary = Summary(records, num_keys)
     try:

@@ -95,9 +95,6 @@ def read_manifests(root: Path) -> dict[Key, KeyRecord]:
     If a file has several lines for a key sweep, the last line counts. If several shards have a
     record, "done" counts before "aside" and "failed". Damaged lines before the last line give a
     warning.
-
-    Raises:
-        InputError: A manifest cannot be read.
     """
     rank = _STATUSES.index
     records: dict[Key, KeyRecord] = {}
@@ -109,11 +106,7 @@ def read_manifests(root: Path) -> dict[Key, KeyRecord]:
 
 
 def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> list[str]:
-    """Return the missing or changed files of a record, as paths relative to ``root``.
-
-    Args:
-        by_content: Compare sizes and hashes instead of sizes alone.
-    """
+    """Return the missing or changed files of a record, relative to ``root``, by size and hash."""
     damaged = []
     for name, file in record.files.items():
         try:
@@ -128,12 +121,9 @@ def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> lis
 
 
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
-    """Return (drive, frame number) of the key sweeps that need no further work.
+    """Return the key sweeps that need no further work: done or aside, and all files exist.
 
-    Their status is done or aside, and all their files exist.
-
-    Args:
-        verify: Compare sizes and hashes of the files instead of sizes alone.
+    With ``verify``, hashes of the files are compared too.
     """
     return {
         r.name
@@ -151,16 +141,7 @@ class Manifest:
     """
 
     def __init__(self, root: Path, shard: tuple[int, int] | None = None) -> None:
-        """Open a manifest, with the folder made if needed.
-
-        Args:
-            root: Folder of the training set.
-            shard: (k, n) for the k-th of n shards, from 1. None for a run without shards.
-
-        Raises:
-            InputError: Another process has the manifest open, or it cannot be read.
-            OutputError: The file cannot be written.
-        """
+        """Open the manifest of a training set, or of shard (k, n); its folder is made if needed."""
         stem = "manifest" if shard is None else f"manifest-{shard[0]}of{shard[1]}"
         self.path = root / f"{stem}.jsonl"
         try:
@@ -184,11 +165,7 @@ class Manifest:
         os.close(self._lock)
 
     def append(self, record: KeyRecord) -> None:
-        """Add or replace the record of a key sweep. The record is on the disk at return.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
+        """Add or replace the record of a key sweep. The record is on the disk at return."""
         try:
             with self.path.open("ab") as file:
                 file.write(record.to_line())

@@ -29,6 +29,7 @@ from densify.config.sections import Section, one_of, within
 from densify.geometry.types import Camera, LidarSequence
 from densify.outputs.atomic import plain, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of
+from densify.outputs.recording_folder import is_same
 from densify.pipeline.sweeps import Cut
 from densify.readers import Spec, open_sequence
 from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, runs
@@ -120,20 +121,13 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Drive:
-    """A recording of a training set.
+    """A recording of a training set."""
 
-    Attributes:
-        name: Name of the recording's folder.
-        data: Text of ``--data``, with an absolute path.
-        folder: Folder of the recording's files, relative to the training set.
-        cameras: The wanted cameras, by name.
-        blocks: Key frame numbers, ascending. The key sweeps of a block share pipeline stages.
-    """
-
-    name: str
-    data: str
-    folder: str
-    cameras: Mapping[str, Camera]
+    name: str  # name of the recording's folder
+    data: str  # text of ``--data``, with an absolute path
+    folder: str  # folder of the recording's files, relative to the training set
+    cameras: Mapping[str, Camera]  # the wanted cameras, by name
+    # Key frame numbers, ascending. The key sweeps of a block share pipeline stages.
     blocks: tuple[tuple[int, ...], ...]
 
     @property
@@ -143,18 +137,7 @@ class Drive:
 
 
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]:
-    """Open every recording and choose its key sweeps.
-
-    Args:
-        data: Recordings, as ``--data`` takes them.
-        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step`` in every recording,
-            None for all.
-        recipe: Settings of the training set.
-
-    Raises:
-        InputError: A recording cannot be opened, two have equal names, or a camera or frame is
-            unknown.
-    """
+    """Open every recording and choose its key sweeps; arguments as in `make_dataset`."""
     drives: dict[str, Drive] = {}
     for spec in data:
         sequence = open_sequence(spec)
@@ -181,11 +164,16 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]
 def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, ...]:
     if keys is None:
         return tuple(sequence.frames)
-    wanted = range(keys.start, keys.stop, keys.step or 1)
     first, last = min(sequence.frames), max(sequence.frames)
+    start = first if keys.start is None else keys.start
+    stop = last + 1 if keys.stop is None else keys.stop
+    step = 1 if keys.step is None else keys.step
+    if not all(isinstance(number, int) for number in (start, stop, step)) or step < 1:
+        raise InputError(f"keys: got {keys}, expected whole numbers and a step of 1 or more")
+    wanted = range(start, stop, step)
     chosen = tuple(f for f in sequence.frames if f in wanted)
-    if not chosen or (keys.start < first or wanted[-1] > last):
-        text = f"{keys.start}:{keys.stop}" + ("" if keys.step in (None, 1) else f":{keys.step}")
+    if not chosen or (start < first or wanted[-1] > last):
+        text = f"{start}:{stop}" + ("" if step == 1 else f":{step}")
         raise InputError(
             f"--keys {text}: {sequence.name} ({spec}) has {format_frames(sequence.frames)}; "
             f"expected A:B within {first}:{last + 1}, or all"
@@ -202,12 +190,7 @@ def check_place(out: Path) -> None:
 
 
 def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
-    """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe.
-
-    Raises:
-        InputError: The folder holds a different training set.
-        OutputError: The file cannot be written.
-    """
+    """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe."""
     table = _table(recipe, drives)
     before = read_plan(out)
     if before is not None:
@@ -219,11 +202,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
-    """Return the content of dataset.json, None if the file does not exist.
-
-    Raises:
-        InputError: The file is damaged or of another version.
-    """
+    """Return the content of dataset.json, None if the file does not exist."""
     path = out / _FILE
     if not path.is_file():
         return None
@@ -303,6 +282,11 @@ def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str,
     united = dict(before)
     for name, drive in now.items():
         old = before.get(name, drive)
+        if not is_same(name, drive["data"], name, old["data"]):
+            raise InputError(
+                f"--out {out}: {name} in the set is another recording, {old['data']}; got "
+                f"{drive['data']}; choose another --out"
+            )
         for part in ("folder", "cameras"):
             if old[part] != drive[part]:
                 raise InputError(

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import html
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from densify.config.errors import InputError
-from densify.dataset.manifest import KeyRecord, read_manifests
+from densify.dataset.manifest import Key, KeyRecord, read_manifests
+from densify.dataset.neighbours import worse_than_neighbours
 from densify.dataset.plan import planned_keys, read_plan
 from densify.outputs.atomic import write_file
 from densify.outputs.report.key_page import KeyFiles, key_page
@@ -47,15 +48,7 @@ def write_report(place: Path, overwrite: bool = False) -> list[Path]:
     """Write the HTML pages of a folder and return their paths.
 
     The page is ``report.html`` for a run or a training set, and ``compare.html`` for a comparison.
-
-    Args:
-        place: Folder of a key sweep, its parent folder if it holds no other, or a training set.
-        overwrite: Replace existing pages.
-
-    Raises:
-        InputError: The folder has no run, comparison or training set, its main files are damaged,
-            or a page exists.
-        OutputError: A page cannot be written.
+    ``place`` may also be the parent folder of a single key sweep.
     """
     pages = _pages(place)
     for path in pages:
@@ -87,20 +80,18 @@ def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
         return _pages(inside[0])
     found = f"{len(inside)} keys; name one of them" if inside else "none of these"
     raise InputError(
-        f"{place}: holds {found}; expected the folder of a key, such as densify-out/000120, or a "
-        f"training set"
+        f"{place}: holds {found}; expected the folder of a key, such as "
+        f"densify-out/street/000120, or a training set"
     )
 
 
 def _set_page(root: Path) -> bytes:
-    """Return the bytes of a training set's page.
-
-    The table starts with the failed key sweeps, then has the highest ghost rates first.
-    """
+    """Return the bytes of a training set's page: failed keys first, then the most ghosts."""
     table, records = read_plan(root) or {}, read_manifests(root)
     counts = Counter[str](record.status for record in records.values())
     counts["to make"] = len(planned_keys(table) - records.keys())
-    keys = [_row(record) for record in sorted(records.values(), key=_badness)]
+    worse = worse_than_neighbours(records)
+    keys = [_row(record, worse) for record in sorted(records.values(), key=_badness)]
     heads = dict.fromkeys(head for row in keys for head in row)
     page = _PAGE.format(
         title=html.escape(f"{root.resolve().name}: {len(records):,} keys"),
@@ -119,13 +110,14 @@ def _badness(record: KeyRecord) -> tuple[Any, ...]:
     return _STATUSES.index(record.status), -share, record.name
 
 
-def _row(record: KeyRecord) -> dict[str, Any]:
+def _row(record: KeyRecord, worse: Mapping[Key, str]) -> dict[str, Any]:
     """Return column title -> cell for the row of a key sweep."""
+    doubts = (worse.get(record.name), *record.warnings)
     row = {
         "recording": record.drive,
         "key": record.key,
         "status": record.status,
-        "reason or warnings": record.reason or "; ".join(record.warnings),
+        "reason or warnings": record.reason or "; ".join(filter(None, doubts)),
         "sweeps": len(record.frames),
         "seconds": record.seconds,
     }

@@ -12,10 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 from densify.geometry import poses
-from densify.geometry.types import Cloud, Float, FlowField, ObjectTrack, Stretch
+from densify.geometry.types import (
+    Cloud,
+    Float,
+    Float32,
+    FlowField,
+    Int,
+    ObjectTrack,
+    Stretch,
+)
 
-_CONFIDENCE_PER_S = 0.7
-_CONFIDENCE_MOVED = 0.8
 _LEAST_SEEN = 3  # points of an object in one sweep; fewer do not determine its rotation
 _BEYOND_PERCENT = 1.0  # percent of the points outside the object's box, on each side
 
@@ -24,8 +30,7 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
     """Return the points of all sweeps as one cloud in the lidar frame of the key sweep.
 
     Moving points are displaced by their scene flow. Static points keep their rigid positions, bit
-    for bit. The confidence is a relative score. It falls with the time between a sweep and the key
-    sweep, and is lower for displaced points.
+    for bit.
 
     Args:
         stretch: Registered sweeps of the window.
@@ -43,9 +48,8 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
         cloud.rigid_points[part] = poses.transform(T_key_lidar, sweep.points).take(rows, axis=0)
         cloud.points[part] = cloud.rigid_points[part]
         since_key_ns = sweep.stamp_ns - stretch[key].sweep.stamp_ns
-        own = max(0.1, 1 - _CONFIDENCE_PER_S * abs(since_key_ns) * 1e-9)
         cloud.frame[part], cloud.since_key_ns[part] = registered.frame, since_key_ns
-        cloud.confidence[part], cloud.intensity[part] = own, sweep.intensity[rows]
+        cloud.intensity[part] = sweep.intensity[rows]
         cloud.row[part], cloud.lidar[part] = sweep.row[rows], sweep.lidar[rows]
         cloud.moving[part], cloud.instance[part] = flow.moving[rows], flow.instance[rows]
 
@@ -54,9 +58,16 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
         cloud.points[place] += poses.rotate(T_key_lidar, flow.total[rows])
         if flow.velocity_m_s is not None:
             cloud.velocity_m_s[place] = poses.rotate(T_key_lidar, flow.velocity_m_s[rows])
-        if registered.frame != key:
-            cloud.confidence[place] = own * _CONFIDENCE_MOVED
+    cloud.confidence[:] = confidence_of(cloud.since_key_ns)
     return cloud
+
+
+def confidence_of(since_key_ns: Int) -> Float32:
+    """Return 1 / (1 + t), t seconds between a sweep and the key sweep: a relative score of 0 to 1.
+
+    since_key_ns: (M,) times of the sweeps in ns.
+    """
+    return (1 / (1 + np.abs(since_key_ns) * 1e-9)).astype(np.float32)
 
 
 def _empty_cloud(num: int) -> Cloud:

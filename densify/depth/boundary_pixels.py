@@ -25,8 +25,6 @@ from densify.geometry.compiled import Kernel, inlined
 
 MOST_CONFIDENCE = 0.2
 """Greatest confidence of a boundary pixel, least confidence of any other measured pixel."""
-_NUM_ROUNDS = 2
-_RIM_WEIGHT = 0.5  # greatest weight of the vote of a boundary pixel
 _LEAST_SHARE = 0.97  # share of the votes for a pixel that is kept
 _FEW = 100  # number of boundary pixels below which the image is not aligned
 _SUREST = 2.5  # greatest -log10 of the share of the votes against
@@ -36,9 +34,9 @@ _DECAY = 1.2  # distance at which a vote counts half, in spacings of neighbourin
 _SAME_M, _SAME_FRACTION = 0.2, 0.05  # tolerance within which a surface agrees with a depth
 _COLOURS = 6.0  # standard deviation of the colours of a surface, in L*a*b*
 _THROUGH = 0.001  # weight of a vote across an edge of the image
+_STRIDE = 3.0  # number of compared colours per spacing of rays, on the path to a voter
 _DOUBT = 0.04  # weight of a constant vote, half of it for the depth and half against
 _ASIDE = 0.6  # tested shift of the image, in spacings of neighbouring rays
-_STRIDE = 3.0  # number of compared colours per spacing of rays, on the path to a voter
 _ROUNDED = 1 - 1e-6  # tolerance for rounding of a share
 _MISFIT = (
     "image edges do not lie where depth has edges (calibration, clock, blur?): pixels at depth "
@@ -53,16 +51,14 @@ _MOVED = (
 def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
     """Return the layers with the boundary pixels (``rim_m``) accepted that the image confirms.
 
-    A pixel is accepted if 97 % of the votes are for its depth. Boundary pixels vote too, with half
-    the weight, and in a second round by their own share of votes. Their ``confidence`` becomes 0 to
-    0.2 by this share. An image that is offset by up to one spacing of rays is shifted, with a
+    A pixel is accepted if 97 % of the votes are for its depth. Its ``confidence`` becomes 0 to 0.2
+    by this share. An image that is offset by up to one spacing of rays is shifted, with a
     warning. An image that is blurred or does not fit is ignored, with a warning. The returned
     ``lab`` is None if the image was not used.
 
     Args:
         layers: Map with measured pixels (``depth_m``) and boundary pixels (``rim_m``).
-        rims: ``image`` accepts pixels that the image confirms, ``keep`` also all others that no
-            nearer patch covers, ``strict`` none.
+        rims: ``image`` accepts pixels that the image confirms, ``keep`` all, ``strict`` none.
     """
     pixel = np.flatnonzero(layers.rim_m)
     share, lab, warnings = np.full(len(pixel), np.float32(0.5)), None, layers.warnings
@@ -72,14 +68,20 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
             warnings = (*warnings, _MISFIT)
         else:
             lab = aligned.lab
-            share = shares(replace(layers, lab=lab), pixel)
+            share = vote(
+                replace(layers, lab=lab),
+                voters(layers.depth_m, layers.tilt),
+                pixel,
+                layers.rim_m.flat[pixel],
+                surely=True,
+            )
             if aligned.right_px or aligned.down_px:
                 warnings = (*warnings, _MOVED.format(place=aligned))
     believed = share >= _LEAST_SHARE
     if rims == "strict":
         believed[:] = False
     elif rims == "keep":
-        believed |= ~layers.behind_patch.flat[pixel]
+        believed[:] = True
     kept = pixel[believed]
     depth_m = layers.depth_m.copy()
     depth_m.flat[kept] = layers.rim_m.flat[kept]
@@ -94,21 +96,6 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
         lab=lab,
         warnings=warnings,
     )
-
-
-def shares(layers: Layers, pixel: Int) -> Float32:
-    """Return the (R,) cautious share of the votes, 0 to 1, that confirm each boundary pixel.
-
-    Args:
-        layers: Map with the boundary pixels (``rim_m``) and an aligned image.
-        pixel: (R,) flat indices of the boundary pixels in the image.
-    """
-    voters = _voters(layers, np.maximum(layers.depth_m, layers.rim_m))
-    share, weight = np.ones(len(pixel), np.float32), np.ones_like(layers.depth_m)
-    for _ in range(_NUM_ROUNDS):
-        weight.flat[pixel] = _RIM_WEIGHT * share**2
-        share = vote(layers, voters, pixel, layers.rim_m.flat[pixel], weight, surely=True)
-    return share
 
 
 def voted_for(
@@ -130,13 +117,13 @@ def voted_for(
         least_share: Least share of the votes, 0 to 1, that must be for the depth.
         surely: True for the cautious share of `vote`.
     """
-    confirmed, weight = np.ones(len(pixel), bool), np.ones_like(layers.depth_m)
+    confirmed = np.ones(len(pixel), bool)
     steps = None
     for map_m in known_m:
-        voters = _voters(layers, map_m)
-        other_voters = True if steps is None else (voters.steps != steps).any(axis=0).flat[pixel]
-        rows, steps = np.flatnonzero(confirmed & other_voters), voters.steps
-        share = vote(layers, voters, pixel[rows], depth_m[rows], weight, surely)
+        known = voters(map_m, layers.tilt)
+        other_voters = True if steps is None else (known.steps != steps).any(axis=0).flat[pixel]
+        rows, steps = np.flatnonzero(confirmed & other_voters), known.steps
+        share = vote(layers, known, pixel[rows], depth_m[rows], surely)
         confirmed[rows] = share >= _ROUNDED * least_share
     return confirmed
 
@@ -156,15 +143,13 @@ class Voters(NamedTuple):
     tilt: Float32
 
 
-def _voters(layers: Layers, known_m: Float32) -> Voters:
+def voters(known_m: Float32, tilt: Float32) -> Voters:
     """Return the pixels with a depth ``known_m`` (H,W) above 0, in metres, as voters."""
     inverse = np.divide(1, known_m, out=np.zeros_like(known_m), where=known_m > 0)
-    return Voters(first_known(known_m > 0), inverse, layers.tilt)
+    return Voters(first_known(known_m > 0), inverse, np.ascontiguousarray(tilt))
 
 
-def vote(
-    layers: Layers, voters: Voters, pixel: Int, depth_m: Float32, weight: Float32, surely: bool
-) -> Float32:
+def vote(layers: Layers, voters: Voters, pixel: Int, depth_m: Float32, surely: bool) -> Float32:
     """Return the (P,) weighted share of the votes, 0 to 1, that confirm the depth of each pixel.
 
     The first known pixel in each of 16 directions votes for the depth if its own surface, extended
@@ -175,7 +160,6 @@ def vote(
         voters: Known pixels with their surfaces.
         pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
         depth_m: (P,) depths to confirm, in metres.
-        weight: (H,W) weight of each voting pixel.
         surely: True takes the least share of five positions of the image (unshifted, and shifted by
             0.6 ray spacings to each side), with a small constant vote. False takes the unshifted
             image; the share is 0 without voters.
@@ -185,10 +169,7 @@ def vote(
     lab = (
         np.zeros((0, 0, 3), np.float32) if layers.lab is None else np.ascontiguousarray(layers.lab)
     )
-    voters = voters._replace(tilt=np.ascontiguousarray(voters.tilt))
-    _vote.over_rows(
-        len(pixel), pixel, 1 / depth_m, voters, weight, lab, layers.gap_px, surely, share
-    )
+    _vote.over_rows(len(pixel), pixel, 1 / depth_m, voters, lab, layers.gap_px, surely, share)
     return share
 
 
@@ -239,8 +220,6 @@ def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
     """
     if lab.size == 0:
         return 1 + _THROUGH
-    narrow = -0.5 / (_COLOURS * _COLOURS)
-    most = np.float32(np.log(0.01 * _THROUGH) / narrow)  # more makes no difference
     stride = max(np.int64(gap / _STRIDE), 1)
     height, width = lab.shape[:2]
     row, column = min(max(v, 0), height - 1), min(max(u, 0), width - 1)
@@ -252,13 +231,11 @@ def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
         off_light, off_a = lab[row, column, 0] - light, lab[row, column, 1] - a
         off_b = lab[row, column, 2] - b
         change = max(change, off_light * off_light + off_a * off_a + off_b * off_b)
-        if change > most:
-            break
-    return np.exp(narrow * change) + _THROUGH
+    return np.exp(-0.5 / (_COLOURS * _COLOURS) * change) + _THROUGH
 
 
 @Kernel
-def _vote(first, last, pixel, inverse, voters, weight, lab, gap_px, surely, share):  # type: ignore[no-untyped-def]
+def _vote(first, last, pixel, inverse, voters, lab, gap_px, surely, share):  # type: ignore[no-untyped-def]
     """Fill ``share`` (P,) float32, the result of `vote`.
 
     inverse: (P,) inverse of the depth to confirm, 1/m. lab: (H,W,3) image, empty without an image.
@@ -284,9 +261,7 @@ def _vote(first, last, pixel, inverse, voters, weight, lab, gap_px, surely, shar
                 k = steps[d]
                 if k == 0:
                     continue
-                du, dv = offset(d, k)
-                one = weight[v + dv, u + du] / (1 + k / (_DECAY * gap))
-                one *= _alike(lab, v + down, u + right, d, k, gap)
+                one = _alike(lab, v + down, u + right, d, k, gap) / (1 + k / (_DECAY * gap))
                 votes += one
                 votes_for += one * agrees[d]
             least = min(least, votes_for / votes)

@@ -5,9 +5,8 @@ The stages of a map rank its pixels. The rank rises with the number of sweeps an
 the distance to a depth discontinuity and the votes of the image. It falls with roughness and with
 the distance over which a pixel is filled.
 
-The probability of an outlier is a sum of two terms: a share for the rank, and a share times the
-contradiction by measured pixels around. Both fall with the rank. Both were measured against exact
-ground truth for each group of pixels, by the origin of the depth and the roughness around.
+The share of outliers of a rank falls with the rank. It was measured against exact ground truth for
+each group of pixels, by the origin of the depth and the roughness around.
 ``examples/fit_confidence.py`` writes these tables to ``confidence.json`` beside this file.
 
 Within the measured and within the filled pixels of a map, confidence keeps the order of the ranks.
@@ -23,14 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import isotonic_regression
 
 from densify.config.file_content import read_json
 from densify.depth.layers import Layers
-from densify.depth.neighbours import extended
-from densify.geometry.compiled import Kernel
 from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32, Ranked
 from densify.scores.depth_metrics import (
     KITTI_BASELINE_M,
@@ -48,8 +44,6 @@ GROUPS = tuple(
     for ragged in (0, *_RAGGED)
 )
 """Origin of a pixel's depth, and share of boundary pixels among the measured pixels around."""
-CAUSES = ("anyway", "contradicted")
-"""Terms of the share of outliers: without contradiction, and per unit of contradiction."""
 NUM_RANKS = 200
 NUM_MEASURED = sum(not group.startswith("filled") for group in GROUPS)
 """Number of groups of measured pixels; the other groups are of filled pixels."""
@@ -58,100 +52,39 @@ _FILE = Path(__file__).with_name("confidence.json")
 _AROUND = 4.0  # half size of the surroundings, in spacings of neighbouring rays
 _TILT = 0.01  # decades from rank 0 to 1, so that different ranks have different confidences
 _NUM_STEPS = 20
-_GIVEN = 2.0  # number of agreeing pixels around that is assumed, as a prior
 
 
-def contradicted(layers: Layers, focal_px: float) -> Float32:
-    """Return the (H,W) share of the measured pixels around that contradict a pixel's depth.
+def rank_pixels(layers: Layers, far: Bool) -> Ranked:
+    """Return the rank and the group of each pixel of a map.
 
-    A measured pixel contradicts if its surface, extended to the pixel, would make the pixel an
-    outlier by KITTI's rule. Measured pixels within one spacing of rays count, boundary pixels too.
-    The share is 0 in closed car windows, because the background may be measured through them.
+    Roughness is a mean within four spacings of rays to all sides.
+
+    far: (H,W) True at pixels measured by sweeps beyond the window.
     """
-    measured_m = np.maximum(layers.depth_m, layers.rim_m)
-    inverse, known = (
-        np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
-        for depth_m in (layers.filled_m, measured_m)
-    )
-    pixel = np.flatnonzero(layers.filled_m)
-    share = np.zeros_like(layers.filled_m)
-    half_px = max(2, round(float(np.median(layers.gap_px))))
-    apart = OUTLIER_PX / (focal_px * KITTI_BASELINE_M)
-    _contradicted.over_rows(len(pixel), pixel, inverse, known, layers.tilt, half_px, apart, share)
-    if layers.solid is not None:
-        share[layers.solid] = 0
-    return share
-
-
-@Kernel
-def _contradicted(first, last, pixel, inverse, known, tilt, half_px, apart, share):  # type: ignore[no-untyped-def]
-    """Fill ``share`` (H,W) float32 at each flat index in ``pixel`` (P,).
-
-    inverse and known: (H,W) inverse depth of the filled and of the measured map, 1/m, 0 none.
-    half_px: half size of the surroundings; up to 11 by 11 pixels are compared. apart: inverse depth
-    that is 3 px of disparity, 1/m.
-    """
-    height, width = known.shape
-    step = max(1, -(-half_px // 5))
-    half_px = half_px // step * step
-    for i in range(first, last):
-        v, u = pixel[i] // width, pixel[i] % width
-        here = inverse[v, u]
-        least = max(apart, OUTLIER_FRACTION * here)
-        num = against = 0
-        for dv in range(-half_px, half_px + 1, step):
-            row = v + dv
-            if row < 0 or row >= height:
-                continue
-            for du in range(-half_px, half_px + 1, step):
-                column = u + du
-                if column < 0 or column >= width or (du == 0 and dv == 0):
-                    continue
-                if known[row, column] > 0:
-                    num += 1
-                    against += abs(extended(known, tilt, row, column, du, dv) - here) > least
-        share[v, u] = against / (num + _GIVEN)
-
-
-def rank_pixels(layers: Layers, far: Bool, contradicted: Float32) -> Ranked:
-    """Return the rank, the group and the contradiction of each pixel of a map.
-
-    Contradiction and roughness are means within four spacings of rays to all sides.
-
-    Args:
-        far: (H,W) True at pixels measured by sweeps beyond the window.
-        contradicted: (H,W) share of contradicting pixels, see `contradicted`.
-    """
-    rim, measured = layers.rim_m > 0, (layers.depth_m > 0) | (layers.rim_m > 0)
-    shown = layers.filled_m > 0
+    rim, shown = layers.rim_m > 0, layers.filled_m > 0
     size = 2 * max(2, round(_AROUND * float(np.median(layers.gap_px)))) + 1
-
-    def mean(values: Float32 | Bool, of: Bool) -> Float32:
-        """Return the (H,W) mean of the values over the surrounding pixels where ``of`` is True."""
-        sums, num = (
-            ndimage.uniform_filter(part.astype(np.float32), size, mode="constant")
-            for part in (np.where(of, values, 0), of)
-        )
-        return np.clip(sums / np.maximum(num, np.float32(1 / size**2)), 0, 1)
-
+    num_rim, num = (
+        ndimage.uniform_filter(part.astype(np.float32), size, mode="constant")
+        for part in (rim, rim | (layers.depth_m > 0))
+    )
+    ragged = np.searchsorted(_RAGGED, num_rim / np.maximum(num, 1 / size**2), side="right")
     how = np.where(layers.depth_m > 0, far.astype(np.uint8), np.uint8(2))
-    ragged = np.searchsorted(_RAGGED, mean(rim, measured), side="right")
     group = np.where(shown, how * (len(_RAGGED) + 1) + ragged, 0).astype(np.uint8)
     rank = np.where(shown, np.clip(layers.confidence, 0, 1), np.float32(0))
-    return Ranked(rank, group, np.where(shown, mean(contradicted, shown), np.float32(0)))
+    return Ranked(rank, group)
 
 
 def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float32:
     """Return the (H,W) confidence ``-log10(P) / 5`` with the probability P of an outlier.
 
     Args:
-        found: Rank, group and contradiction of each pixel, from `rank_pixels`.
+        found: Rank and group of each pixel, from `rank_pixels`.
         shown: (H,W) True at pixels with a depth; the confidence is 0 elsewhere.
-        tables: (G,2,R) share of outliers by group (`GROUPS`), term (`CAUSES`) and step of the rank;
-            None for the package's own.
+        tables: (G,R) share of outliers by group (`GROUPS`) and step of the rank; None for the
+            package's own.
     """
     rank, group = found.rank[shown], found.group[shown]
-    log_wrong = curves(amounts(found, shown), _own_tables() if tables is None else tables)
+    log_wrong = curves(num_pixels(found, shown), _own_tables() if tables is None else tables)
     place = rank.astype(np.float64) * NUM_RANKS - 0.5
     steps = np.arange(NUM_RANKS)
     measured, filled = (np.interp(place, steps, curve) for curve in log_wrong)
@@ -161,39 +94,28 @@ def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float
     return confidence
 
 
-def steps_of(rank: Float32) -> NDArray[np.int64]:
-    """Return the index of the step of each rank (0 to 1), among R = `NUM_RANKS` equal steps."""
-    return np.minimum((rank * NUM_RANKS).astype(np.int64), NUM_RANKS - 1)
+def num_pixels(found: Ranked, of: Bool) -> Float:
+    """Return the (G,R) number of pixels by group and step of the rank, of R = `NUM_RANKS`.
 
-
-def amounts(found: Ranked, of: Bool) -> Float:
-    """Return (G,2,R) by group and step of the rank: the number of pixels, and their contradiction.
-
-    The product with a table of `calibrated` is the expected number of outliers.
-
-    Args:
-        found: Rank, group and contradiction of each pixel.
-        of: (H,W) True at pixels that count.
+    of: (H,W) True at pixels that count.
     """
-    place = found.group[of].astype(np.int64) * NUM_RANKS + steps_of(found.rank[of])
-    size = len(GROUPS) * NUM_RANKS
-    sums = [np.bincount(place, weights, size) for weights in (None, found.contradicted[of])]
-    return np.stack([s.reshape(len(GROUPS), NUM_RANKS) for s in sums], axis=1).astype(np.float64)
+    step = np.minimum((found.rank[of] * NUM_RANKS).astype(np.int64), NUM_RANKS - 1)
+    place = found.group[of].astype(np.int64) * NUM_RANKS + step
+    num = np.bincount(place, minlength=len(GROUPS) * NUM_RANKS)
+    return num.reshape(len(GROUPS), NUM_RANKS).astype(np.float64)
 
 
-def curves(pixels: Float, tables: Float) -> Float:
+def curves(num: Float, tables: Float) -> Float:
     """Return (2,R) log10 of the probability of an outlier by step of the rank.
 
     The rows are for measured and for filled pixels.
 
     Args:
-        pixels: (G,2,R) sums of `amounts`.
-        tables: (G,2,R) shares of outliers.
+        num: (G,R) numbers of `num_pixels`.
+        tables: (G,R) shares of outliers.
     """
-    num = pixels[:, 0]
-    wrong_num = np.minimum((pixels * tables).sum(axis=1), num)
     shares = [
-        falling(num[part].sum(axis=0), wrong_num[part].sum(axis=0))
+        falling(num[part].sum(axis=0), (num * tables)[part].sum(axis=0))
         for part in (slice(NUM_MEASURED), slice(NUM_MEASURED, None))
     ]
     return np.log10(np.clip(shares, 10.0 ** (_TILT - DECADES), 1))
@@ -224,10 +146,9 @@ def own_file() -> dict[str, Any]:
 
 
 def tables_of(written: dict[str, Any]) -> Float:
-    """Return the (G,2,R) share of outliers from the content of a file as `own_file` returns."""
+    """Return the (G,R) share of outliers from the content of a file as `own_file` returns."""
     middle = (np.arange(NUM_RANKS) + 0.5) / NUM_RANKS
-    knots = [[np.array(written["tables"][g][c]).T for c in CAUSES] for g in GROUPS]
-    return np.array([[np.interp(middle, *ends) for ends in row] for row in knots])
+    return np.array([np.interp(middle, *np.array(written["tables"][g]).T) for g in GROUPS])
 
 
 def wrong(confidence: Float | Float32) -> Float:

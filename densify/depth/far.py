@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from densify.depth.accumulate import confidence_of
 from densify.depth.exposure import AT_ONCE, Exposure
-from densify.depth.patches import FREE, tangents
+from densify.depth.patches import tangents
 from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
@@ -33,8 +34,7 @@ from densify.geometry.types import (
 
 _MOST_RANGE_M = 60.0
 _MOST_SPACING_M = 0.05  # enough, as many sweeps measure a surface; larger patches hide edges
-_GROUP_M = 2.5  # travel within which sweeps count as one observation, as they share errors
-_CONFIDENCE = 0.5
+_FREE = 0.3, 0.015  # least distance of a seen-through point in front: metres, share of the range
 _SLACK_M = 0.5
 _SAME_DEPTH = 0.05  # step of depth, as a share; a pixel needs one point in each
 _PRIME = 2_654_435_761  # its multiples visit any smaller number of points in mixed order
@@ -79,7 +79,7 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
         for number, witness in enumerate(witnesses):
             rows = np.flatnonzero(whose == number)
             there = poses.transform(T[number], points.take(rows, axis=0))
-            free[rows] = images[witness].sees_through(there, *FREE, _FEW_FILLED)
+            free[rows] = images[witness].sees_through(there, *_FREE, _FEW_FILLED)
         return free
 
     with ThreadPoolExecutor(num_threads()) as pool:
@@ -115,8 +115,9 @@ def standing(
     """
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     one = np.zeros(len(sweep), np.int32)
+    every = np.ones(len(one), bool)
     normal, spacing_m = tangents(
-        sweep.points, sweep.lidar, one, np.ones(len(one), bool), sensors, [sensors.origins_m]
+        sweep.points, sweep.lidar, one, every, sensors, [sensors.origins_m]
     )
     return StandingWorld(
         points=poses.transform(T_world_lidar, sweep.points).astype(np.float32),
@@ -201,31 +202,24 @@ def far_cloud(
     rows = np.flatnonzero(needed)
     points = poses.transform(T_key_found, found.points.take(rows, axis=0).astype(np.float64))
     found = found.select(rows)
-    num, source = len(found), found.source
+    num, since_key_ns = len(found), found.stamp_ns - stretch[key].sweep.stamp_ns
     cloud = Cloud(
         points=points,
         rigid_points=points,
-        frame=np.array(found.frames, np.int32)[source],
-        since_key_ns=(found.stamp_ns - stretch[key].sweep.stamp_ns)[source],
+        frame=np.array(found.frames, np.int32)[found.source],
+        since_key_ns=since_key_ns[found.source],
         row=found.row,
         lidar=found.lidar,
         moving=np.zeros(num, bool),
         instance=np.full(num, -1, np.int32),
         velocity_m_s=np.zeros((num, 3), np.float32),
-        confidence=np.full(num, _CONFIDENCE, np.float32),
+        confidence=confidence_of(since_key_ns)[found.source],
         intensity=found.intensity,
         rgb=np.zeros((num, 3), np.uint8),
         far=np.ones(num, bool),
     )
-    group = np.floor(found.travel_m / _GROUP_M).astype(np.int32)
-    surface = Patches(
-        normal=poses.rotate(T_key_found, found.normal.astype(np.float64)).astype(np.float32),
-        spacing_m=found.spacing_m,
-        free=np.zeros(num, bool),
-        sweep=source,
-        place=(group - group.min(initial=0))[source],
-    )
-    return cloud, surface
+    normal = poses.rotate(T_key_found, found.normal.astype(np.float64)).astype(np.float32)
+    return cloud, Patches(normal, found.spacing_m)
 
 
 def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) -> Int:

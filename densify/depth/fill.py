@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +24,6 @@ FILL_CONFIDENCE = 0.5
 _GROWTH = (1 / 3, 2 / 3, 1.0)  # half sizes of the windows, in spacings of rays
 _EDGE_M, _EDGE_FRACTION = 0.2, 0.05  # greatest deviation from a plane; the larger one counts
 _LEAST_SHARE, _LEAST_STAR_SHARE = 0.9, 0.8  # share of the votes
-_AROUND, _LEAST_KNOWN = 0.35, 0.3  # spacings of rays to all sides; share of known pixels there
 _RIDGE_PX2 = 1e-7
 _MIN_PLANE_PX = 6  # fewer do not distinguish a plane from a step
 _MOST_PX = 120  # greatest half size of a window
@@ -33,8 +31,6 @@ _ROWS = 8  # rows that are skipped together if they hold no measured pixel
 _STAR_REACH = 1.0  # greatest distance of a known pixel, in spacings of rays
 _STAR_MET, _STAR_GAP = 8, 7  # directions with a known pixel; neighbouring directions without
 _STAR_SPREAD = 0.1  # greatest difference between the predictions, as a share of inverse depth
-_STRIP_PX = 6  # height of an empty strip along the image's lower border
-_ABOVE = 12  # index of the direction upwards
 
 
 def fill(layers: Layers, reach: float) -> Layers:
@@ -58,32 +54,15 @@ def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     """Drop pixels filled since the map ``before_m`` (H,W) that too few votes confirm (`voted_for`).
 
     Only measured pixels vote, because filled pixels would confirm themselves. Boundary pixels that
-    were not accepted may only vote against, unless they are occluded. This protects the pillar of a
-    car, which has few measured pixels. least_share: share of the votes, 0 to 1, that is enough.
+    were not accepted may only vote against. This protects the pillar of a car, which has few
+    measured pixels. least_share: share of the votes, 0 to 1, that is enough.
     """
     filled = (layers.filled_m > 0) & (before_m == 0)
     pixel = np.flatnonzero(filled)
-    accepted_m = layers.depth_m
-    with_rims_m = np.where(layers.behind_patch, accepted_m, np.maximum(accepted_m, layers.rim_m))
-    maps_m, depth_m = (with_rims_m, accepted_m), layers.filled_m.flat[pixel]
+    maps_m = np.maximum(layers.depth_m, layers.rim_m), layers.depth_m
+    depth_m = layers.filled_m.flat[pixel]
     filled.flat[pixel] = ~voted_for(layers, maps_m, pixel, depth_m, least_share)
     return layers.without(filled)
-
-
-def without_isolated(layers: Layers) -> Layers:
-    """Drop filled pixels if fewer than three tenths of the surrounding pixels have a depth."""
-    known = layers.filled_m > 0
-    row, column = np.nonzero(known & (layers.depth_m == 0))
-    gap_px = layers.spacing_px[row, column].max(axis=1)
-    half_px = np.maximum(np.rint(_AROUND * gap_px).astype(np.int64), 1)
-    height, width = known.shape
-    top, left = np.maximum(row - half_px, 0), np.maximum(column - half_px, 0)
-    low, right = np.minimum(row + half_px + 1, height), np.minimum(column + half_px + 1, width)
-    num = cv2.integral(known.astype(np.uint8))
-    num_known = num[low, right] - num[top, right] - num[low, left] + num[top, left]
-    dropped = np.zeros_like(known)
-    dropped[row, column] = num_known < _LEAST_KNOWN * (low - top) * (right - left)
-    return layers.without(dropped)
 
 
 class _Known(NamedTuple):
@@ -119,13 +98,13 @@ def fill_between(
     """Interpolate empty pixels that have measured pixels on both sides.
 
     The window around an empty pixel must hold measured pixels to its left, to its right, above and
-    below. No depth discontinuity may run through them. There is a discontinuity if deviations from
-    a plane differ by more than 0.2 m and 5 % of the nearest depth. With fewer than six pixels the
-    depths themselves are compared.
+    below: nothing is extrapolated. No depth discontinuity may run through them. There is a
+    discontinuity if deviations from a plane differ by more than 0.2 m and 5 % of the nearest depth.
+    With fewer than six pixels the depths themselves are compared.
 
-    The pixel gets the depth of the plane, limited to the range of depths in the window: nothing is
-    extrapolated. Weights fall to zero just outside the window. The window grows in thirds of the
-    ray spacing, then to ``reach`` spacings. The smallest sufficient window is taken.
+    The pixel gets the depth of the plane. Weights fall to zero just outside the window. The window
+    grows in thirds of the ray spacing, then to ``reach`` spacings. The smallest sufficient window
+    is taken.
 
     Args:
         depth_m: (H,W) measured depth in metres, 0 none.
@@ -264,7 +243,7 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, s
             if num >= _MIN_PLANE_PX and spread / (centre * centre) > allowed:
                 continue
             if centre > 0:
-                filled_m[row, column] = 1 / min(max(centre, far), near)
+                filled_m[row, column] = 1 / centre
                 least = np.float32(np.inf)
                 for i in range(num):
                     least = min(least, inside.confidence[i])
@@ -280,9 +259,8 @@ def fill_stars(layers: Layers) -> Layers:
     A hole is filled if at least eight directions have a known pixel within a spacing of rays, and
     at most seven neighbouring directions have none. The surface of each known pixel is extended to
     the hole. These predictions must agree to 10 % of inverse depth. Their mean, weighted by the
-    reciprocal of the steps, needs eight tenths of the votes. In an empty strip of up to six rows
-    along the image's lower border two directions fewer are enough. The confidence is half the least
-    of the known pixels.
+    reciprocal of the steps, needs eight tenths of the votes. The confidence is half the least of
+    the known pixels.
     """
     known = layers.filled_m > 0
     inverse = np.divide(1, layers.filled_m, out=np.zeros_like(layers.filled_m), where=known)
@@ -314,9 +292,9 @@ def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  
 
     pixel: (P,) flat indices of the empty pixels, ascending. steps: (16,H,W) of `first_known`.
     inverse: (H,W) inverse depth, 1/m. known: (H,W) confidence. found: (2,P) float32 output, depth
-    in m and least confidence, 0 where the predictions differ.
+    in m and least confidence, 0 where known pixels do not surround the hole or differ.
     """
-    height, width = inverse.shape
+    width = inverse.shape[1]
     met = np.empty(len(DIRECTIONS), np.bool_)
     for p in range(first, last):
         row, column = pixel[p] // width, pixel[p] % width
@@ -330,14 +308,12 @@ def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  
             met[d] = k != NONE and du * du + dv * dv <= reach_px * reach_px
             if met[d]:
                 w = extended(inverse, tilt, row + dv, column + du, du, dv)
+                near, far = max(near, w), min(far, w)
                 sum_w += w / k
                 weight += 1 / k
-                near, far = max(near, w), min(far, w)
                 least = min(least, known[row + dv, column + du])
                 num += 1
-        strip_px = height - 1 - row + np.int64(steps[_ABOVE, row, column])
-        along = 2 if strip_px <= _STRIP_PX else 0
-        if num < _STAR_MET - along or _widest_gap(met) > _STAR_GAP + along:
+        if num < _STAR_MET or _widest_gap(met) > _STAR_GAP:
             continue
         w = sum_w / weight
         if near - far <= _STAR_SPREAD * w:

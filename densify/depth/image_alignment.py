@@ -123,11 +123,10 @@ def _edge_sums(lab: Float32, layers: Layers, step_px: int) -> Float:
     """
     known_m = np.maximum(layers.depth_m, layers.rim_m)
     strict_m = np.where(layers.rim_m == 0, layers.depth_m, np.float32(0))
-    clear_m = np.where(layers.behind_patch, np.float32(0), known_m)
-    row, column = (_some(f) // step_px for f in np.nonzero((clear_m > 0) & (layers.rim_m > 0)))
+    row, column = (_some(f) // step_px for f in np.nonzero((known_m > 0) & (layers.rim_m > 0)))
     changes = _changes(_reduced(lab, step_px))
     changes = np.pad(changes, ((0, 0), (_REACH, _REACH), (_REACH, _REACH)), "edge")
-    sums = _sums(changes, row, column, *_across(clear_m, step_px)[:, row, column])
+    sums = _sums(changes, row, column, *_across(known_m, step_px)[:, row, column])
     total = sums / max(float(sums.mean()), 1e-12)
     for depth_m, gap in ((known_m, _GAP), (strict_m, _STRICT_GAP)):
         row, column = _jumps(depth_m, gap, step_px)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from densify.depth.exposure import Exposure, InView
 from densify.geometry.cameras import pixels_per_metre
@@ -17,12 +16,10 @@ from densify.geometry.types import Bool, Camera, Cloud, Float, Float32, Int, Pat
 
 HIDDEN_M, HIDDEN_FRACTION = 0.2, 0.06
 """Least distance of an occluded point behind the nearest surface: metres plus share of depth."""
-_FOOTPRINT = 0.4  # half size of a patch, in spacings of rays
+FOOTPRINT = 0.35
+"""Half size of a patch, and of the spot of a laser, in spacings of neighbouring rays."""
 _SLACK_M = 0.05  # added to the footprint, for errors of registration and flow
-_MAX_HALF_PX = 24.0  # a point close to the lens must not occlude the whole image
-_MAX_TILT = 0.25  # of the inverse depth per pixel; a plane edge-on has no slope
 _SAME_AGE_NS = 10_000_000
-_MOST_SWEEPS = np.iinfo(np.int64).bits - 1  # number of sweeps that are counted separately
 
 
 @dataclass(frozen=True)
@@ -38,7 +35,6 @@ class PointsInImage:
         spacing_px: (K,2) spacing of neighbouring rays, across and down.
         moving: (K,) True for moving points.
         frame: (K,) frame number of the source sweep.
-        sweep: (K,) number of the source, 0 to 62, see `_witness`.
         age_ns: (K,) time between the source sweep and the key sweep, see `_ages_ns`.
         far: (K,) True for points of sweeps beyond the window.
     """
@@ -51,7 +47,6 @@ class PointsInImage:
     spacing_px: Float
     moving: Bool
     frame: np.ndarray
-    sweep: np.ndarray
     age_ns: Int
     far: Bool
 
@@ -77,38 +72,29 @@ class PointsInImage:
         return 1 / self.depth.astype(np.float64)
 
 
-def points_in_image(cloud: Cloud, view: InView, patches: Patches, vetoed: bool) -> PointsInImage:
-    """Return the points of the cloud in the view, with the patches' size and slope in pixels.
-
-    Args:
-        vetoed: True leaves out points that the key sweep saw through.
-    """
-    row = np.rint(view.uv[:, 1]).astype(np.uint16)
-    kept = np.argsort(row, kind="stable")
-    if vetoed:
-        kept = kept[~patches.free[view.rows[kept]]]
-    exposure, index = view.exposure, view.rows[kept]
-    points_cam = view.points_cam.take(kept, axis=0)
+def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInImage:
+    """Return the points of the cloud in the view, with the patches' size and slope in pixels."""
+    by_row = np.argsort(np.rint(view.uv[:, 1]).astype(np.uint16), kind="stable")
+    exposure, index = view.exposure, view.rows[by_row]
+    points_cam = view.points_cam.take(by_row, axis=0)
     depth = exposure.depth_m(points_cam).astype(np.float32)
     normal = rotate(exposure.T_cam_key, patches.normal.take(index, axis=0).astype(np.float64))
     plain = exposure.camera.is_rectified and exposure.measure == "z"
     focal_px, slope, spacing_px = (_pinhole if plain else _any_lens)(
         exposure, points_cam, depth, normal, patches.spacing_m.take(index, axis=0)
     )
-    most, far = _MAX_TILT / depth[:, None], patches.place >= 0
-    slope = np.nan_to_num(slope, posinf=0.0, neginf=0.0)
+    frame, far = cloud.frame[index], cloud.far[index]
     return PointsInImage(
         index=index,
-        uv=view.uv.take(kept, axis=0),
+        uv=view.uv.take(by_row, axis=0),
         depth=depth,
         focal_px=focal_px,
-        slope=np.clip(slope, -most, most),
+        slope=np.nan_to_num(slope, posinf=0.0, neginf=0.0),
         spacing_px=spacing_px,
         moving=cloud.moving[index],
-        frame=cloud.frame[index],
-        sweep=_witness(patches, far)[index],
-        age_ns=_ages_ns(cloud.since_key_ns[index], patches.sweep[index], far[index]),
-        far=far[index],
+        frame=frame,
+        age_ns=_ages_ns(cloud.since_key_ns[index], frame, far),
+        far=far,
     )
 
 
@@ -157,31 +143,20 @@ def _any_lens(
     return focal_px, slope, spacing_px
 
 
-def _witness(patches: Patches, far: Bool) -> NDArray[np.int32]:
-    """Return the (M,) source number of each point, 0 to 62.
-
-    Each sweep of the window has its own number, and so has each part of the road beyond it. Distant
-    parts may share a number.
-    """
-    num_near = min(int(patches.sweep[~far].max(initial=-1)) + 1, _MOST_SWEEPS - 1)
-    shared = num_near + patches.place % (_MOST_SWEEPS - num_near)
-    return np.where(far, shared, np.minimum(patches.sweep, _MOST_SWEEPS - 1)).astype(np.int32)
-
-
-def _ages_ns(since_key_ns: Int, sweep: NDArray[np.int32], far: Bool) -> Int:
+def _ages_ns(since_key_ns: Int, frame: np.ndarray, far: Bool) -> Int:
     """Return the (K,) times between the points' sweeps and the key sweep.
 
     Sweeps of the window whose times differ by less than 10 ms count as equally old. Otherwise clock
     jitter would decide between the sweeps before and after the key sweep.
     """
-    near = ~far
-    of_sweep = np.zeros(int(sweep[near].max(initial=-1)) + 1, np.int64)
-    of_sweep[sweep[near]] = np.abs(since_key_ns[near])
+    ages_ns, near = np.abs(since_key_ns), np.flatnonzero(~far)
+    first = int(frame[near].min(initial=np.iinfo(np.int32).max))
+    of_sweep = np.zeros(max(0, int(frame[near].max(initial=-1)) + 1 - first), np.int64)
+    of_sweep[frame[near] - first] = ages_ns[near]
     for younger, older in pairwise(np.argsort(of_sweep, kind="stable")):
         if of_sweep[older] - of_sweep[younger] < _SAME_AGE_NS:
             of_sweep[older] = of_sweep[younger]
-    ages_ns = np.abs(since_key_ns)
-    ages_ns[near] = of_sweep[sweep[near]]
+    ages_ns[near] = of_sweep[frame[near] - first]
     return ages_ns
 
 
@@ -191,7 +166,7 @@ def distance_behind(points: PointsInImage, camera: Camera) -> Float:
     The distance is a share of the tolerance: above 1 the point is occluded.
     """
     slack_px = _SLACK_M * points.focal_px / points.depth[:, None]
-    half_px = np.clip(_FOOTPRINT * points.spacing_px + slack_px, 0.5, _MAX_HALF_PX)
+    half_px = np.maximum(FOOTPRINT * points.spacing_px + slack_px, 0.5)
     nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
     paint(points.uv, points.inverse, points.slope, half_px, nearest)
     column, row = np.rint(points.uv).astype(np.int64).T
@@ -233,14 +208,11 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
                 covered[k] = max(covered[k], np.float32(there))
 
 
-def sorted_by_pixel(
-    points: PointsInImage, rank: Int, confidence: Float32, camera: Camera
-) -> tuple[Int, Int]:
+def sorted_by_pixel(points: PointsInImage, rank: Int, camera: Camera) -> tuple[Int, Int]:
     """Sort the points by pixel, the best point of each pixel first.
 
     Args:
         rank: (K,) rank of each point. The lowest comes first, then the nearest.
-        confidence: (K,) confidence, which decides between points equal in all else.
 
     Returns:
         ``start`` (H·W+1,) and ``order`` (K,): the points of pixel p are ``order[start[p]:start[p +
@@ -250,12 +222,12 @@ def sorted_by_pixel(
     start = np.empty(camera.height_px * camera.width_px + 1, np.int64)
     order = np.empty(len(rank), np.int64)
     pixel = row * camera.width_px + column
-    _by_pixel(pixel, rank, points.depth, points.frame, points.uv, confidence, start, order)
+    _by_pixel(pixel, rank, points.depth, points.frame, points.uv, start, order)
     return start, order
 
 
 @inlined
-def _before(a, b, rank, depth, frame, uv, confidence):  # type: ignore[no-untyped-def]
+def _before(a, b, rank, depth, frame, uv):  # type: ignore[no-untyped-def]
     """Return True if point a wins a pixel over b. Equal points may come in any order."""
     if rank[a] != rank[b]:
         return rank[a] < rank[b]
@@ -265,13 +237,11 @@ def _before(a, b, rank, depth, frame, uv, confidence):  # type: ignore[no-untype
         return frame[a] < frame[b]
     if uv[a, 0] != uv[b, 0]:
         return uv[a, 0] < uv[b, 0]
-    if uv[a, 1] != uv[b, 1]:
-        return uv[a, 1] < uv[b, 1]
-    return confidence[a] > confidence[b]
+    return uv[a, 1] < uv[b, 1]
 
 
 @Kernel
-def _by_pixel(pixel, rank, depth, frame, uv, confidence, start, order):  # type: ignore[no-untyped-def]
+def _by_pixel(pixel, rank, depth, frame, uv, start, order):  # type: ignore[no-untyped-def]
     """Fill start (num_pixels + 1,) and order (K,) of `sorted_by_pixel`."""
     start[:] = 0
     for p in pixel:
@@ -283,7 +253,7 @@ def _by_pixel(pixel, rank, depth, frame, uv, confidence, start, order):  # type:
     for i in range(len(pixel)):
         p = pixel[i]
         at = start[p] + filled[p]
-        while at > start[p] and _before(i, order[at - 1], rank, depth, frame, uv, confidence):
+        while at > start[p] and _before(i, order[at - 1], rank, depth, frame, uv):
             order[at] = order[at - 1]
             at -= 1
         order[at] = i

@@ -20,7 +20,6 @@ class Layers:
         depth_m: Depth of pixels that are accepted as measured.
         rim_m: Depth of boundary pixels, measured so close to a depth discontinuity that they may
             show the background. Accepted boundary pixels stay in this layer too.
-        behind_patch: True if a boundary pixel is measured behind the patch of a nearer point.
         filled_m: Depth of accepted and of interpolated pixels.
         confidence: Confidence or rank of each pixel, 0 to 1.
         point: Index, in the cloud, of the point that measured the pixel; -1 none.
@@ -29,14 +28,11 @@ class Layers:
             pixels.
         lab: (H,W,3) camera image in L*a*b*, None if there is no image.
         warnings: Messages on parts of the request that could not be done.
-        solid: True in closed car windows and on bodies of moving objects (`MovingBody`).
-        glass: True where a measured pixel was removed from a car window.
-        key_only: True if only the key sweep has returns of the surface.
+        solid: True on bodies of moving objects (`MovingBody`).
     """
 
     depth_m: Float32
     rim_m: Float32
-    behind_patch: Bool
     filled_m: Float32
     confidence: Float32
     point: NDArray[np.int32]
@@ -45,8 +41,6 @@ class Layers:
     lab: Float32 | None = None
     warnings: tuple[str, ...] = ()
     solid: Bool | None = None
-    glass: Bool | None = None
-    key_only: Bool | None = None
 
     @property
     def gap_px(self) -> Float32:

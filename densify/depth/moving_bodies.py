@@ -26,21 +26,18 @@ from densify.depth.boundary_pixels import MOST_CONFIDENCE, VOTERS_REACH, voted_f
 from densify.depth.exposure import Exposure
 from densify.depth.fill import FILL_CONFIDENCE
 from densify.depth.hulls import crossing, half_spaces, passes_near
-from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
+from densify.depth.image_points import FOOTPRINT, HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
 from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
 from densify.depth.object_rays import ObjectRays, rays_toward
-from densify.depth.seen_through import RAY_BLUR, Rays
+from densify.depth.seen_through import Rays
 from densify.geometry import cameras
 from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.types import Cloud
 
 _AROUND_M, _LEAST_AROUND = 0.25, 6  # a point of the body has six other such points around
-_POSE_M = 0.03  # standard deviation of the pose of the body
-_LIMBS_S = 0.1  # time from the key within which limbs keep their positions
 _PRIOR = 0.05  # number of rays that end on the body, assumed everywhere
 _WHOLE = 0.8  # closed share of the front from which a body is closed as a whole, as a car is
-_MOST_OPEN = 0.15  # share of the front that rays pass through; more of a truck with its underside
 _LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # share of rays that end on the body; a third at glass
 _VOTES_OF_WHOLE, _VOTES_OF_OPEN = 0.75, 0.97  # share of the votes along the silhouette
 _DEEP_M = 0.6  # farther behind the front of the hull are seats, axles and the far side
@@ -57,8 +54,6 @@ class MovingBody(NamedTuple):
         velocity_m_s: (3,) velocity of the object without ego-motion, same frame.
         entries: (K,3) positions where the rays enter the hull, same frame and time.
         ends: (K,) True if the ray ends on the object, False if it passes through.
-        weight: (K,) weight of the ray, lower far from the key sweep in time and just below the
-            hull's surface; 0 if the ray ends far behind the front, as on wheels.
         frame: (K,) frame number of the ray's sweep.
     """
 
@@ -66,7 +61,6 @@ class MovingBody(NamedTuple):
     velocity_m_s: Float32
     entries: Float
     ends: Bool
-    weight: Float
     frame: NDArray[np.integer]
 
 
@@ -109,7 +103,7 @@ def without_sweep(
         corners = _corners(cloud.points[cloud.moving & (cloud.instance == k)])
         kept = body.frame != frame
         if len(corners):
-            rays = (column[kept] for column in (body.entries, body.ends, body.weight, body.frame))
+            rays = (column[kept] for column in (body.entries, body.ends, body.frame))
             told[k] = MovingBody(corners, body.velocity_m_s, *rays)
     return told
 
@@ -126,23 +120,17 @@ def _corners(points: Float) -> Float:
 
 def _met(
     cloud: Cloud, instance: int, corners: Float, rays: ObjectRays
-) -> tuple[Float, Bool, Float, NDArray[np.integer]]:
-    """Return entries, ends, weight and frame of the rays that meet a hull, as in `MovingBody`.
+) -> tuple[Float, Bool, NDArray[np.integer]]:
+    """Return entries, ends and frame of the rays that meet a hull, as in `MovingBody`.
 
     corners: (V,3) corners of the hull of object ``instance``. rays: rays of all sweeps toward it.
     """
     rays = rays.select(passes_near(corners, rays.start, rays.way))
-    spaces = half_spaces(corners)
-    enter, leave = crossing(spaces, rays.start, rays.way)
+    enter, leave = crossing(half_spaces(corners), rays.start, rays.way)
     meets = (enter > 0) & (enter < np.minimum(leave, 1))
     (rows, start, way), enter = rays.select(meets), enter[meets]
-    middle = start + (enter + np.minimum(leave[meets], 1))[:, None] / 2 * way
-    below_m = -(middle @ spaces[:, :3].T + spaces[:, 3]).max(axis=1, initial=-np.inf)
     ends = cloud.moving[rows] & (cloud.instance[rows] == instance)
-    weight = np.exp(-abs(cloud.since_key_ns[rows]) * 1e-9 / _LIMBS_S)
-    weight[~ends] *= 1 - np.exp(-0.5 * (np.maximum(below_m[~ends], 0) / _POSE_M) ** 2)
-    weight[ends & ((1 - enter) * np.linalg.norm(way, axis=1) > _DEEP_M)] = 0
-    return start + enter[:, None] * way, ends, weight, cloud.frame[rows]
+    return start + enter[:, None] * way, ends, cloud.frame[rows]
 
 
 def close_bodies(
@@ -236,13 +224,13 @@ class _Front(NamedTuple):
 
     def closed(self, body: MovingBody, exposure: Exposure, spacing_px: Float32) -> Float:
         """Return the (h,w) share, 0 to 1, of the rays entering at a pixel that end on the body."""
-        blur_px = np.maximum(RAY_BLUR * np.median(spacing_px, axis=(0, 1)), 1.0)
+        blur_px = np.maximum(FOOTPRINT * np.median(spacing_px, axis=(0, 1)), 1.0)
         at = self.pixels(exposure, body.entries, _each(body.velocity_m_s, body.entries))
         front_m = 1 / np.maximum(self.inverse[at.place], 1e-6)
         faces = at.depth_m < front_m + HIDDEN_M + HIDDEN_FRACTION * front_m
         counts = np.zeros((2, *self.inverse.shape))
         ends = body.ends[at.which].astype(np.int64)
-        np.add.at(counts, (ends, *at.place), np.where(faces, body.weight[at.which], 0))
+        np.add.at(counts, (ends, *at.place), faces)
         passed, ended = (cv2.GaussianBlur(n, (0, 0), blur_px[0], sigmaY=blur_px[1]) for n in counts)
         ended = ended + _PRIOR / (2 * np.pi * blur_px.prod())
         share: Float = np.where(self.inverse > 0, ended / (ended + passed), 0)
@@ -308,7 +296,6 @@ def _shown(
     """
     inside, now_m, surface_m = share > 0, layers.filled_m, (1 / surface).astype(np.float32)
     whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
-    whole &= (share[inside] < _LEAST_OF_WHOLE).mean() <= _MOST_OPEN
     before = (now_m > 0) & (now_m < surface_m - HIDDEN_M - HIDDEN_FRACTION * surface_m)
     closed = share >= (_LEAST_OF_WHOLE if whole else _LEAST_OF_OPEN)
     core = _well_inside(closed, float(np.median(layers.gap_px[inside]))) & ~before

@@ -14,7 +14,7 @@ from densify.geometry.compiled import Kernel, inlined
 
 NONE = int(np.iinfo(np.uint8).max)
 """Value of the number of steps if no known pixel is within 254 steps."""
-_LEAST, _MOST = 0.7, 1.4  # range of the extended inverse depth, relative to the start
+_LEAST, _MOST = 0.7, 1.4  # limits of the extended inverse depth, relative to the start
 
 
 def _directions() -> NDArray[np.int64]:
@@ -88,7 +88,12 @@ def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
         tilt: (H,W,2) slope of the inverse depth to the right and down, 1/m per px.
     """
     there = inverse[v, u]
-    here = there - tilt[v, u, 0] * du - tilt[v, u, 1] * dv
+    return limited(there - tilt[v, u, 0] * du - tilt[v, u, 1] * dv, there)
+
+
+@inlined
+def limited(here, there):  # type: ignore[no-untyped-def]
+    """Return inverse depth ``here``, extended from ``there``, within 0.7 to 1.4 times ``there``."""
     return min(max(here, _LEAST * there), _MOST * there)
 
 

@@ -14,14 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.depth.neighbours import slopes
-from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.types import Bool, Cloud, Float, Float32, Patches
+from densify.geometry.types import Bool, Cloud, Float, Patches
 
-FREE = 0.3, 0.015
-"""Least distance of a seen-through point in front of all returns around: the larger of a
-distance in metres and a share of the range."""
 _STEEP = 5.7  # greatest slope, 10 degrees of incidence; a steeper surface on one side is a step
 _BEND_M, _BEND = 0.10, 0.25  # greatest change of the slope, in metres and as a share
 _AROUND, _MOST_CELLS = 5.0, 20  # radius of neighbours of unordered rays: spacings, most cells
@@ -29,52 +25,25 @@ _RIDGE = 0.005  # share of the mean square distance of the neighbours
 
 
 def patches(
-    cloud: Cloud,
-    key: int,
-    sensors: Sensors,
-    origins: Mapping[int, Float],
-    key_image: RangeImage | None = None,
-    wanted: Bool | None = None,
+    cloud: Cloud, sensors: Sensors, origins: Mapping[int, Float], wanted: Bool | None = None
 ) -> Patches:
     """Return the surface patches of a cloud.
 
     A patch is tangent to the neighbouring returns of the same scanner and sweep. If the neighbours
-    are on no single surface, the patch faces the scanner. ``free`` marks points of other sweeps
-    that the key sweep saw through. Only the key sweep decides, because other sweeps rightly saw
-    through positions that a moving object reached later.
+    are on no single surface, the patch faces the scanner.
 
     Args:
         cloud: M accumulated points.
-        key: Frame number of the key sweep.
         sensors: Scanners, with the angles between their rays.
         origins: (S,3) origins of the scanners, key sweep's lidar frame, by frame number.
-        key_image: Range image of the key sweep; if None, no point is ``free``.
-        wanted: (M,) True for points in view of a camera, None for all. Other points get only their
-            sweep number.
+        wanted: (M,) True for points in view of a camera, None for all. Other points get zeros.
     """
     frames, inverse = np.unique(cloud.frame, return_inverse=True)
     sweep: NDArray[np.int32] = inverse.ravel().astype(np.int32)
     if wanted is None:
         wanted = np.ones(len(cloud), bool)
-    normal, spacing_m = tangents(
-        cloud.rigid_points, cloud.lidar, sweep, wanted, sensors, [origins[int(f)] for f in frames]
-    )
-    free = np.zeros(len(cloud), bool)
-    other = np.flatnonzero(wanted & (cloud.frame != key))
-    if key_image is not None and len(other):
-        points, velocity_m_s = cloud.points[other], cloud.velocity_m_s[other]
-        free[other] = seen_through_by_key(points, velocity_m_s, key_image)
-    return Patches(normal, spacing_m, free, sweep, np.full(len(cloud), -1, np.int32))
-
-
-def seen_through_by_key(points: Float, velocity_m_s: Float32, key_image: RangeImage) -> Bool:
-    """Return (N,) True for the points that the key sweep saw through.
-
-    Args:
-        points: (N,3) positions in metres, key sweep's lidar frame, at its reference time.
-        velocity_m_s: (N,3) velocities of the points in the same frame, without ego-motion.
-    """
-    return key_image.sees_through(points, *FREE, velocity_m_s=velocity_m_s)
+    origin = [origins[int(f)] for f in frames]
+    return tangents(cloud.rigid_points, cloud.lidar, sweep, wanted, sensors, origin)
 
 
 def tangents(
@@ -84,8 +53,8 @@ def tangents(
     wanted: Bool,
     sensors: Sensors,
     origins: Sequence[Float],
-) -> tuple[Float32, Float32]:
-    """Return normals (M,3) and ray spacings (M,2) of the points ``wanted`` (M,), 0 for others.
+) -> Patches:
+    """Return the patches of M points, with zeros for points that are not ``wanted`` (M,).
 
     A point p is on the tangent plane if normal · (p - origin) = 1. Spacings are metres between
     neighbouring rays, along the azimuth and along the elevation.
@@ -99,7 +68,7 @@ def tangents(
     normal = np.zeros((len(points), 3), np.float32)
     spacing_m = np.zeros((len(points), 2), np.float32)
     if not len(points):
-        return normal, spacing_m
+        return Patches(normal, spacing_m)
     num_scanners = len(origins[0])
     place = (sweep * num_scanners + lidar).astype(np.int32)
     seen = np.empty((3, len(points)), np.float32)
@@ -114,7 +83,7 @@ def tangents(
             _nearest_in_cells(seen, mine, grid, cells)
             mine = mine[wanted[mine]]
             find.over_rows(len(mine), mine, seen, model.table, grid, cells, normal, spacing_m)
-    return normal, spacing_m
+    return Patches(normal, spacing_m)
 
 
 @Kernel

@@ -7,7 +7,7 @@ depth is the range.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -16,21 +16,19 @@ from scipy import ndimage
 
 from densify.config import ProjectSettings
 from densify.depth.boundary_pixels import accept_boundary_pixels
-from densify.depth.car_windows import close_windows
-from densify.depth.confidence import calibrated, contradicted, rank_pixels
+from densify.depth.confidence import calibrated, rank_pixels
 from densify.depth.exposure import Exposure, InView
-from densify.depth.fill import fill, fill_stars, without_isolated
+from densify.depth.fill import fill, fill_stars
 from densify.depth.image_points import PointsInImage, points_in_image
 from densify.depth.layers import Layers
 from densify.depth.measured_pixels import MeasuredPixels, nearest_pixels, visible_pixels
 from densify.depth.moving_bodies import MovingBody, close_bodies
 from densify.depth.seen_through import Rays, without_seen_through
 from densify.depth.spots import measure_spots
-from densify.geometry.types import Camera, Cloud, DepthMap, Float, Float32, Patches, Ranked, Reason
+from densify.geometry.types import Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
 
 _BLOCK_PX = 16  # blocks within which the density of rays is about constant
 _JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
-_MOST_CONTRADICTED = 0.7  # share of the pixels around; of those above, at least half are outliers
 _LEAST_CONFIDENCE = np.float32(1) / np.iinfo(np.uint8).max  # stored as 1; 0 is no depth
 
 
@@ -42,7 +40,6 @@ def project(
     filled: bool = True,
     lab: Float32 | None = None,
     rays: Rays | None = None,
-    share_lost: Callable[[Float], Float] | None = None,
     bodies: Mapping[int, MovingBody] | None = None,
 ) -> DepthMap:
     """Return the depth map of a cloud in the view of a camera.
@@ -56,38 +53,29 @@ def project(
         filled: False leaves out the fill.
         lab: (H,W,3) image in L*a*b*. If None, no boundary pixel is accepted.
         rays: Rays of the window. If None, no pixel is rejected as seen through.
-        share_lost: Function of `densify.depth.car_windows.share_lost`. If None, car windows stay
-            open.
         bodies: Bodies of moving objects by instance number.
     """
     exposure, camera, visible = view.exposure, view.exposure.camera, settings.visibility
-    points = points_in_image(cloud, view, patches, vetoed=visible)
-    own = np.clip(cloud.confidence[points.index], _LEAST_CONFIDENCE, 1.0)
+    points = points_in_image(cloud, view, patches)
     reason = np.full(len(cloud), Reason.OUTSIDE, np.uint8)
     if visible:
-        reason[patches.free] = Reason.VETOED
-        pixels = visible_pixels(points, own, camera, settings.support, reason)
+        pixels = visible_pixels(points, camera, reason)
     else:
-        pixels = nearest_pixels(points, own, camera, reason)
+        pixels = nearest_pixels(points, cloud.confidence[points.index], camera, reason)
     layers = accept_boundary_pixels(_layers_of(pixels, points, camera, lab), settings.rims)
     if filled:
         layers = fill(layers, settings.fill_reach)
-        if visible and share_lost is not None and settings.glass == "plane":
-            layers = close_windows(layers, exposure, share_lost)
-        layers = without_isolated(fill_stars(layers))
+        layers = fill_stars(layers)
         if visible and bodies:
             layers = close_bodies(layers, cloud, exposure, bodies)
     rank = None
     if visible:
         if rays is not None:
             layers = without_seen_through(layers, cloud, view, rays, reason)
-        against = contradicted(layers, camera.focal_px)
-        if filled:
-            layers = layers.without(against > _MOST_CONTRADICTED)
         measured = layers.depth_m > 0
         far = np.zeros(measured.shape, bool)
         far[measured] = cloud.far[layers.point[measured]]
-        rank = rank_pixels(layers, far, against)
+        rank = rank_pixels(layers, far)
         layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
     _set_reasons(layers, reason)
     if visible and filled:
@@ -115,14 +103,12 @@ def _layers_of(
     return Layers(
         depth_m=depth_m,
         rim_m=np.where(inside, np.float32(0), pixels.depth_m).reshape(shape),
-        behind_patch=pixels.behind_patch.reshape(shape),
         filled_m=depth_m,
         confidence=np.maximum(pixels.confidence, least).reshape(shape),
         point=image(points.index.astype(np.int32), -1),
         tilt=image(points.slope.astype(np.float32)),
         spacing_px=_spacing_px(near, shape),
         lab=lab,
-        key_only=pixels.key_only.reshape(shape),
     )
 
 
@@ -153,10 +139,8 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
 
 def _set_reasons(layers: Layers, reason: NDArray[np.uint8]) -> None:
     """Set the ``reason`` (M,) in place for points in the map and points removed from it."""
-    reason[layers.point[(layers.rim_m > 0) & ~layers.behind_patch]] = Reason.EDGE
+    reason[layers.point[layers.rim_m > 0]] = Reason.EDGE
     reason[layers.point[layers.depth_m > 0]] = Reason.KEPT
-    if layers.glass is not None:
-        reason[layers.point[layers.glass]] = Reason.GLASS
 
 
 def _finished(

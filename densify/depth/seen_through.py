@@ -13,18 +13,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from densify.depth.exposure import Exposure, InView
-from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
+from densify.depth.image_points import FOOTPRINT, HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
 from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
 from densify.geometry import poses
 from densify.geometry.types import Bool, Cloud, Float, Float32, Reason, Stretch
 
 _SHARE = 0.25  # share of passing rays above which a pixel is rejected
-RAY_BLUR = 0.35
-"""Standard deviation of the position where a ray counts, in spacings of neighbouring rays."""
 _NUM_STEPS = 6
 
 
@@ -80,15 +77,14 @@ def without_seen_through(
     The ray of an occluded static point passed through where it crosses the surface of the map,
     clearly before its end. The ray of any other point ended in its pixel. Both are blurred by a
     third of the ray spacing. A pixel is rejected if more than a quarter of the rays passed through.
-    Closed car windows and moving bodies stay. Pixels within a ray spacing of surfaces that only the
-    key sweep measured stay too, because an undetected moving object was elsewhere at other times.
+    Moving bodies stay.
 
     Args:
         view: Points of the cloud in the image.
         reason: (M,) `Reason` of each point of the cloud so far.
     """
     counts = np.isin(cloud.frame, rays.stretch.frames)
-    counts &= (reason != Reason.OUTSIDE) & (reason != Reason.VETOED)
+    counts &= reason != Reason.OUTSIDE
     stopped = counts & (reason != Reason.HIDDEN)
     passed = counts & ~stopped & ~cloud.moving
     gap_px, shape = float(np.median(layers.gap_px)), layers.filled_m.shape
@@ -101,12 +97,10 @@ def without_seen_through(
         return crossings(layers.filled_m, rays.starts(ends), ends.points, view.exposure)
 
     num, num_stopped = (
-        _counts(uv, shape, RAY_BLUR * gap_px)
+        _counts(uv, shape, FOOTPRINT * gap_px)
         for uv in (through(passed), view.uv[stopped[view.rows]])
     )
     dropped = num > _SHARE * (num + num_stopped)
-    if layers.key_only is not None:
-        dropped &= ~ndimage.maximum_filter(layers.key_only, 2 * round(gap_px) + 1)
     if layers.solid is not None:
         dropped &= ~layers.solid
     return layers.without(dropped)

@@ -11,13 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.depth.image_points import PointsInImage
+from densify.depth.image_points import FOOTPRINT, PointsInImage
 from densify.depth.layers import Layers
 from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M
 from densify.geometry.compiled import Kernel
 
-_SPOT = 0.35  # half width, in spacings of rays along the azimuth
-_MOST_PX = 4  # greatest half width
+_MOST_PX = 4  # greatest half width of a spot
 
 
 def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
@@ -31,7 +30,7 @@ def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
     if not len(measured):
         return layers
     point = points.at(layers.point.flat[measured])
-    radius_px = np.minimum(_SPOT * points.spacing_px[point, 0], _MOST_PX)
+    radius_px = np.minimum(FOOTPRINT * points.spacing_px[point, 0], _MOST_PX)
     filled_m = np.where(layers.depth_m == 0, layers.filled_m, np.float32(0))
     found = np.full(shape, -1)
     nearest, uv = np.full(shape, np.inf), points.uv[point]

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import Config, ProjectSettings
-from densify.depth.car_windows import share_lost
 from densify.depth.confidence import reliability
 from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.far import far_cloud
@@ -25,10 +24,9 @@ from densify.depth.moving_bodies import (
     outlines,
     without_sweep,
 )
-from densify.depth.patches import patches, seen_through_by_key
+from densify.depth.patches import patches
 from densify.depth.project import project
 from densify.depth.seen_through import Rays
-from densify.free_space.range_image import RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.cameras import converted
@@ -77,14 +75,12 @@ class Views:
 
     Attributes:
         key: Frame number of the key sweep.
-        key_image: Range image of the key sweep.
         origins: (S,3) of the scanners, key sweep's lidar frame, by frame number of the sweep.
         rays: Rays of the window's sweeps.
         lab: (H,W,3) L*a*b* images of the maps that show an image.
     """
 
     key: int
-    key_image: RangeImage | None
     exposures: Mapping[str, Exposure]
     sensors: Sensors
     origins: Mapping[int, Float]
@@ -97,7 +93,6 @@ class Views:
         sequence: LidarSequence,
         stretch: Stretch,
         key: int,
-        key_image: RangeImage,
         shots: Mapping[str, Shot],
         images: Mapping[str, NDArray[np.uint8]],
         settings: Config,
@@ -106,7 +101,6 @@ class Views:
         sensors = Sensors.of(stretch.sweeps)
         return Views(
             key=key,
-            key_image=key_image,
             exposures={
                 name: Exposure.of(sequence, stretch, key, shot, settings)
                 for name, shot in shots.items()
@@ -121,14 +115,12 @@ class Views:
             lab={name: lab(image) for name, image in images.items()},
         )
 
-    def see(self, cloud: Cloud, visible: bool = True) -> SeenCloud:
-        """Return a cloud and its patches; ``visible`` marks those the key sweep saw through."""
-        key_image, in_view = self.key_image if visible else None, self.in_view(cloud)
-        wanted = np.zeros(len(cloud), bool)
+    def see(self, cloud: Cloud) -> SeenCloud:
+        """Return a cloud with its patches, as the cameras see it."""
+        in_view, wanted = self.in_view(cloud), np.zeros(len(cloud), bool)
         for view in in_view.values():
             wanted[view.rows] = True
-        surface = patches(cloud, self.key, self.sensors, self.origins, key_image, wanted)
-        return SeenCloud(cloud, surface, in_view)
+        return SeenCloud(cloud, patches(cloud, self.sensors, self.origins, wanted), in_view)
 
     def in_view(self, cloud: Cloud) -> dict[str, InView]:
         """Return the points of a cloud in each image, by name of the map."""
@@ -138,20 +130,14 @@ class Views:
         """Return the bodies of moving objects by instance number, from all points of the window."""
         return moving_bodies(cloud, self.rays, self.exposures.values())
 
-    def far(
-        self, found: StandingWorld, T_key_found: Float, stretch: Stretch, standing_only: bool
-    ) -> SeenCloud:
+    def far(self, found: StandingWorld, T_key_found: Float, stretch: Stretch) -> SeenCloud:
         """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`.
 
         Args:
             found: Static points along the road.
             T_key_found: (4,4) from the world of ``found`` to the key sweep's lidar frame.
-            standing_only: True leaves out points that the key sweep saw through.
         """
         cloud, surface = far_cloud(found, T_key_found, stretch, self.key, self.exposures)
-        if self.key_image is not None and standing_only:
-            free = seen_through_by_key(cloud.points, cloud.velocity_m_s, self.key_image)
-            surface = replace(surface, free=free)
         return SeenCloud(cloud, surface, self.in_view(cloud))
 
     def depth(
@@ -160,16 +146,23 @@ class Views:
         """Return the depth map of each view by name.
 
         Args:
-            visible: True leaves out occluded, seen-through and unsupported points.
+            visible: True leaves out occluded and unsupported points.
             filled: True interpolates between measured pixels.
         """
         settings = replace(self.settings, visibility=visible)
-        lost = None if self.key_image is None else share_lost(self.key_image)
-        maps = {}
-        for name, view in seen.in_view.items():
-            shown = self.lab.get(name), self.rays, lost, seen.bodies
-            maps[name] = project(seen.cloud, view, settings, seen.patches, filled, *shown)
-        return maps
+        return {
+            name: project(
+                seen.cloud,
+                view,
+                settings,
+                seen.patches,
+                filled,
+                self.lab.get(name),
+                self.rays,
+                seen.bodies,
+            )
+            for name, view in seen.in_view.items()
+        }
 
     def coloured(
         self,
@@ -252,7 +245,7 @@ class Views:
         """Return every moving object alone by instance number, points without an object as -1."""
         movers = {}
         for instance in np.unique(cloud.instance[cloud.moving]).tolist():
-            part = self.see(cloud.select(cloud.moving & (cloud.instance == instance)), visible)
+            part = self.see(cloud.select(cloud.moving & (cloud.instance == instance)))
             part = part._replace(bodies={k: b for k, b in bodies.items() if k == instance})
             depth = self.depth(part, visible)
             movers[instance] = Mover(self.coloured(part, depth, images), depth)
@@ -330,7 +323,6 @@ class HeldOut:
         Args:
             cloud: Cloud with the key sweep's moving points and their velocities.
         """
-        views = replace(views, key_image=None)  # the held-out sweep must not help
         settings = replace(views.settings, rims="strict", visibility=True)
         own = cloud.select(cloud.frame == views.key)
 
@@ -352,39 +344,45 @@ class HeldOut:
         return HeldOut(views, key_alone, moving, float(np.median(known)) if len(known) else 0.0)
 
     def without_key(self, seen: SeenCloud) -> SeenCloud:
-        """Return the cloud without the key sweep and its evidence on free space and bodies."""
+        """Return the cloud without the key sweep and its evidence on bodies."""
         others = seen.cloud.frame != self.views.key
-        surface = seen.patches.select(others)
-        surface = replace(surface, free=np.zeros(len(surface.free), bool))
-        cloud = seen.cloud.select(others)
+        surface, cloud = seen.patches.select(others), seen.cloud.select(others)
         bodies = without_sweep(seen.bodies, cloud, self.views.key)
         return SeenCloud(cloud, surface, self.views.in_view(cloud), bodies)
+
+    def maps(self, seen: SeenCloud, visible: bool) -> dict[str, tuple[DepthMap, Float32, Bool]]:
+        """Return each map made without the key sweep, its (H,W) truth, and (H,W) moving pixels.
+
+        Returns from far inside a moving body are no ground truth: they passed its windows, but the
+        map shows the glass. The result is empty if no points remain.
+        """
+        others = self.without_key(seen)
+        if not len(others.cloud):
+            return {}
+        made = {}
+        for name, depth in self.views.depth(others, visible).items():
+            moving, truth_m = self.moving[name], self.key_alone[name].depth_m
+            inside = moving & far_inside(seen.bodies.values(), self.views.exposures[name], truth_m)
+            made[name] = depth, np.where(inside, np.float32(0), truth_m), moving & ~inside
+        return made
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Return the scores of each map made without the key sweep, None if no points remain.
 
         Besides `depth_metrics.depth_scores` each has the ``curve`` of precision over density,
         ``reliability``, and the share ``unjudged`` of filled pixels without a return of the key
-        sweep within a ray spacing. Returns from far inside a moving body are no ground truth: they
-        passed its windows, but the map shows the glass.
+        sweep within a ray spacing.
         """
-        others = self.without_key(seen)
-        if not len(others.cloud):
-            return None
-        made = self.views.depth(others, visible)
         scores: dict[str, Any] = {}
-        for name, maps in made.items():
-            exposure, moving = self.views.exposures[name], self.moving[name]
-            camera, truth_m = exposure.camera, self.key_alone[name].depth_m
-            inside = moving & far_inside(seen.bodies.values(), exposure, truth_m)
-            truth_m = np.where(inside, np.float32(0), truth_m)
+        for name, (depth, truth_m, moving) in self.maps(seen, visible).items():
+            camera = self.views.exposures[name].camera
             scores[name] = {
-                **depth_metrics.depth_scores(maps, truth_m, moving & ~inside, camera),
-                "curve": depth_metrics.precision_density(maps, truth_m, camera),
-                "reliability": reliability(maps, truth_m, camera),
-                "unjudged": self._unjudged(name, maps, seen.bodies),
+                **depth_metrics.depth_scores(depth, truth_m, moving, camera),
+                "curve": depth_metrics.precision_density(depth, truth_m, camera),
+                "reliability": reliability(depth, truth_m, camera),
+                "unjudged": self._unjudged(name, depth, seen.bodies),
             }
-        return scores
+        return scores or None
 
     def _unjudged(
         self, name: str, maps: DepthMap, bodies: Mapping[int, MovingBody]

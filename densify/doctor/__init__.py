@@ -85,15 +85,10 @@ CHECKS: tuple[Callable[[Sample], list[Finding]], ...] = (
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The findings about a recording.
+    """The findings about a recording."""
 
-    Attributes:
-        sample: Sweeps that were examined.
-        findings: Findings in the order of `CHECKS`.
-    """
-
-    sample: Sample
-    findings: tuple[Finding, ...]
+    sample: Sample  # sweeps that were examined
+    findings: tuple[Finding, ...]  # findings in the order of `CHECKS`
 
     @property
     def worst(self) -> Verdict:
@@ -105,9 +100,6 @@ def examine(sequence: LidarSequence, config: Config) -> Diagnosis:
     """Run all checks on a recording.
 
     At most 15 sweeps and about 40 images are read, whatever the length of the recording.
-
-    Raises:
-        InputError: No sweep of the sample can be read.
     """
     sample = Sample.of(sequence, config.register)
     return Diagnosis(sample, tuple(found for check in CHECKS for found in check(sample)))

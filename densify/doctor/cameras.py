@@ -47,8 +47,10 @@ def check_cameras(sample: Sample) -> list[Finding]:
         if broken:
             remedy = "fetch the image again, or give size and calibration of images like it"
             findings.append(finding(f"{camera.name}: images", WRONG, broken, remedy))
-        if views:
-            findings += check_calibration(camera, views)
+        findings += check_calibration(camera, views)
+        if findings[-1].check != f"{camera.name}: clock":
+            text = "not compared, because the calibration is not known to be right"
+            findings.append(finding(f"{camera.name}: clock", UNKNOWN, text))
     return findings
 
 
@@ -78,11 +80,8 @@ def camera_views(
 ) -> tuple[list[View], str]:
     """Return views (a sweep and its nearest image) from all registered spots of the sample.
 
-    Args:
-        silhouettes: Frame number -> depth discontinuities of that sweep; missing ones are added.
-
-    Returns:
-        The views, and the error message if an image cannot be read, else "".
+    ``silhouettes`` has depth discontinuities by frame number; missing ones are added. The second
+    value is the error message if an image cannot be read, else "".
     """
     exposed_ns = sample.sequence.image_stamps_ns(camera.name)
     numbers, stamps_ns = list(exposed_ns), np.array([*exposed_ns.values()], np.int64)

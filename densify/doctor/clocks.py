@@ -87,8 +87,10 @@ def check_point_times(sample: Sample) -> list[Finding]:
     """Check that the firing times within a sweep span about one period."""
     findings, sweeps = [], [spot.sweeps[spot.middle] for spot in sample.spots]
     period_s = sample.timeline.period_ns * 1e-9
-    if len(sample.timeline.frames) < 2 or any(s.offset_ns is None for s in sweeps):
-        return []
+    if any(s.offset_ns is None for s in sweeps):
+        return [finding("point times", UNKNOWN, "the points have no times")]
+    if len(sample.timeline.frames) < 2:
+        return [finding("point times", UNKNOWN, "one sweep tells no period to compare with")]
     for lidar in sample.lidars:
         offsets_s = [
             s.offset_ns[s.lidar == lidar] * 1e-9 for s in sweeps if s.offset_ns is not None
@@ -113,8 +115,10 @@ def check_point_times(sample: Sample) -> list[Finding]:
 def check_deskewing(sample: Sample) -> list[Finding]:
     """Compare how well sweeps align with the point times as given, reversed, and left out."""
     spot = sample.fastest
-    if spot is None or spot.sweeps[0].offset_ns is None:
-        return []
+    if spot is None:
+        return [finding("deskewing", UNKNOWN, "no sweeps could be registered")]
+    if spot.sweeps[0].offset_ns is None:
+        return [finding("deskewing", UNKNOWN, "the points have no times")]
     if spot.speed_m_s < _LEAST_SPEED_M_S:
         return [finding("deskewing", UNKNOWN, spot.too_slow(_LEAST_SPEED_M_S))]
 
@@ -142,10 +146,7 @@ def check_deskewing(sample: Sample) -> list[Finding]:
 
 
 def _apart_m(spot: Spot) -> float:
-    """Return the median distance (m) between the first and the last registered sweep of a spot.
-
-    Only near points above the ground count. It is 1 m if the sweeps cannot be registered.
-    """
+    """Return the median distance (m) of near points above ground between a spot's end sweeps."""
     if spot.trajectory is None:
         return _CLOSE_M
     ends = spot.stretch.sweeps[0], spot.stretch.sweeps[-1]

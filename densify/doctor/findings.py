@@ -29,21 +29,14 @@ Value = float | int | str | list[float]
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check.
+    """The result of one check."""
 
-    Attributes:
-        check: Name of the checked property, such as "stamps".
-        verdict: Severity.
-        evidence: Sentence with the number on which the verdict is based.
-        remedy: Option or line that corrects the error; empty if the verdict is FINE or UNKNOWN.
-        values: Name (with unit) -> measured number.
-    """
-
-    check: str
-    verdict: Verdict
-    evidence: str
+    check: str  # name of the checked property, such as "stamps"
+    verdict: Verdict  # severity
+    evidence: str  # sentence with the number on which the verdict is based
+    # Option or line that corrects the error; empty if the verdict is FINE or UNKNOWN
     remedy: str = ""
-    values: Mapping[str, Value] = field(default_factory=dict)
+    values: Mapping[str, Value] = field(default_factory=dict)  # name (with unit) -> measured number
 
 
 def finding(

@@ -41,10 +41,7 @@ def changed(
 
 
 def _rolled(by: int) -> Callable[[Float], Float]:
-    """Return a function that corrects a rotation (3,3) whose quaternion was read in wrong order.
-
-    The function shifts the elements x y z w cyclically by ``by`` places, as `numpy.roll`.
-    """
+    """Return a function that rolls a rotation's quaternion x y z w, as `numpy.roll`."""
     return lambda R: Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), by)).as_matrix()
 
 
@@ -96,12 +93,7 @@ def check_poses(sample: Sample) -> list[Finding]:
 
 
 def _described(given: list[Float], found: list[Float], spots: list[Spot]) -> tuple[str, str]:
-    """Return the main error of the poses, scale or drift, as text, and its correction as text.
-
-    Args:
-        given: Recorded pose (4,4) of the last sweep relative to the first, for each spot.
-        found: The same pose by odometry.
-    """
+    """Return the main error of the poses, scale or drift, and its correction, as texts."""
     given_m, found_m = (np.array([T[:3, 3] for T in steps]) for steps in (given, found))
     off_m, way_m = (given_m - found_m).mean(axis=0), found_m.mean(axis=0)
     if np.linalg.norm(off_m) < 0.5 * np.linalg.norm(given_m - found_m, axis=1).mean():
@@ -118,12 +110,8 @@ def _described(given: list[Float], found: list[Float], spots: list[Spot]) -> tup
 
 
 def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
-    """Measure the time shift between the poses and the sweeps.
-
-    It is the shift at which the poses agree best with odometry. It is observable only where the
-    vehicle turns or changes its speed. ``found`` has, for each registered spot (some sweeps),
-    the pose (4,4) of the last sweep relative to the first by odometry.
-    """
+    """Measure at which time shift the poses agree best with odometry (4,4) of each spot."""
+    # It is observable only where the vehicle turns or changes its speed.
     late_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
     cost, num_used = np.zeros(len(late_s)), 0
     for spot, step in zip(sample.registered, found, strict=True):
@@ -137,7 +125,8 @@ def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
             off = poses.log(poses.inverse(_between([track.at(ns) for ns in ends_ns])) @ step)
             cost[row] += np.sum((off[3:] / _NOISE_M) ** 2) + np.sum((off[:3] / _NOISE_RAD) ** 2)
     if not num_used:
-        return []
+        text = "the recording has too few poses before and after the sweeps looked at"
+        return [finding("clock of poses", UNKNOWN, text)]
     good = late_s[cost < cost.min() + _EVEN_COST]
     low_s, high_s, best_s = float(good.min()), float(good.max()), float(late_s[np.argmin(cost)])
     text = (
@@ -177,19 +166,12 @@ def _between(pair: list[Float]) -> Float:
 
 
 class _Off(NamedTuple):
-    """Errors of the given relative poses against odometry.
+    """Errors of the given relative poses against odometry."""
 
-    Attributes:
-        m: Median translation error over the spots.
-        deg: Median rotation error over the spots.
-        cost: The larger error, as a multiple of its tolerance.
-        way_m: Longest distance driven within a spot.
-    """
-
-    m: float
-    deg: float
-    cost: float
-    way_m: float
+    m: float  # median translation error over the spots
+    deg: float  # median rotation error over the spots
+    cost: float  # the larger error, as a multiple of its tolerance
+    way_m: float  # longest distance driven within a spot
 
     @staticmethod
     def of(given: list[Float], found: list[Float]) -> _Off:

@@ -86,11 +86,9 @@ def check_axes(sample: Sample) -> list[Finding]:
 
 
 def _ground_share(sample: Sample, up: Float) -> float:
-    """Return the share of near returns in the fullest layer (slab across ``up``) with few below it.
-
-    ``up`` is a unit vector (3,). The layer must not be above the origin. The share counts in excess
-    of an even spread over all heights. The result is the median over the spots.
-    """
+    """Return the share of near returns in the fullest layer across ``up`` (3,) with few below."""
+    # The layer must not be above the origin. The share counts in excess of an even spread over all
+    # heights. The result is the median over the spots.
     shares = []
     for spot in sample.spots:
         points = spot.sweeps[spot.middle].points
@@ -134,10 +132,8 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
 
 
 def _own_returns(spots: list[Spot]) -> tuple[float, int]:
-    """Return the range (m) of the farthest own-vehicle returns, and their number of 0.1 m cells.
-
-    The lowest layer is excluded, because ground is at the same position in all sweeps too.
-    """
+    """Return the range (m) of the farthest own-vehicle returns, and their number of 0.1 m cells."""
+    # The lowest layer is excluded, because ground is at the same position in all sweeps too.
     cells = []
     for sweep in [s for spot in spots for s in (spot.sweeps[0], spot.sweeps[-1])]:
         range_m = np.linalg.norm(sweep.points, axis=1)
@@ -172,7 +168,7 @@ def check_sensors(sample: Sample) -> list[Finding]:
     """Describe each scanner as the pipeline models it: rings, field of view, number of returns."""
     spot = sample.fastest
     if spot is None:
-        return []
+        return [finding("scanners", UNKNOWN, "no sweeps could be registered")]
     findings = []
     used = [replace(s, sweep=in_range(s.sweep, sample.settings)) for s in spot.stretch.sweeps]
     for number, model in Sensors.of(used).models.items():

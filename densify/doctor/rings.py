@@ -42,6 +42,8 @@ def check_rings(sample: Sample) -> list[Finding]:
         given_m = R @ sample.spots[0].sweeps[0].origin_m(lidar)
         points = _still_points(sample, lidar) @ R.T
         if len(points) < _LEAST_POINTS:
+            text = f"{len(points)} near points, {_LEAST_POINTS} are needed to tell"
+            findings.append(finding(_place_of(lidar), UNKNOWN, text))
             continue
         found_m = found_origin(points, given_m)
         findings.append(_check_origin(lidar, points, R, given_m, found_m))
@@ -52,11 +54,7 @@ def check_rings(sample: Sample) -> list[Finding]:
 def _check_compensation(
     sample: Sample, lidar: int, R: Float, origins_m: tuple[Float, Float]
 ) -> Finding:
-    """Check that the motion within a sweep is not compensated already.
-
-    ``R`` (3,3) turns lidar to scanner axes. ``origins_m`` are two possible positions (3,) of the
-    scanner, in scanner axes.
-    """
+    """Check that the motion within a sweep is not compensated already."""
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     spot = sample.fastest
     if spot is None:
@@ -112,15 +110,8 @@ def _still_points(sample: Sample, lidar: int) -> Float:
 
 
 def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: Float) -> Finding:
-    """Compare the given with the found position of a scanner.
-
-    Args:
-        points: (N,3) returns, in the scanner's axes.
-        R: (3,3) rotation from lidar to scanner axes.
-        given_m: (3,) position as configured, in the scanner's axes.
-        found_m: (3,) position at which the rings are sharpest, in the scanner's axes.
-    """
-    name = "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
+    """Compare a scanner's given position (3,) with that of the sharpest rings, scanner axes."""
+    name = _place_of(lidar)
     given, found = sharpness(points, given_m), sharpness(points, found_m)
     off_m = float(np.linalg.norm(found_m - given_m))
     given_m, found_m = given_m @ R, found_m @ R
@@ -137,6 +128,10 @@ def _check_origin(lidar: int, points: Float, R: Float, given_m: Float, found_m: 
     elif off_m > _OFF_M and found > CLEARLY * given:
         verdict = WRONG
     return finding(name, verdict, text, remedy, **values)
+
+
+def _place_of(lidar: int) -> str:
+    return "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
 
 
 def _text(place_m: Float) -> str:

@@ -22,17 +22,11 @@ _STEP_S = 0.1
 
 @dataclass(frozen=True)
 class Spot:
-    """A spot: a few consecutive sweeps at one position in the recording.
+    """A spot: a few consecutive sweeps at one position in the recording."""
 
-    Attributes:
-        sweeps: Raw sweeps, own vehicle included.
-        trajectory: Poses by odometry; None if registration failed.
-        failure: Reason of the failure.
-    """
-
-    sweeps: tuple[Sweep, ...]
-    trajectory: Trajectory | None
-    failure: str = ""
+    sweeps: tuple[Sweep, ...]  # raw sweeps, own vehicle included
+    trajectory: Trajectory | None  # poses by odometry; None if registration failed
+    failure: str = ""  # reason of the failure
 
     @cached_property
     def stretch(self) -> Stretch:
@@ -67,21 +61,13 @@ class Spot:
 
 @dataclass(frozen=True)
 class Sample:
-    """The examined sweeps.
+    """The examined sweeps."""
 
-    Attributes:
-        sequence: The recording.
-        timeline: Reference times of all its sweeps.
-        spots: Groups of consecutive sweeps, ascending in time.
-        unreadable: Frame number -> reason why a chosen sweep could not be read.
-        settings: Settings of registration.
-    """
-
-    sequence: LidarSequence
-    timeline: Timeline
-    spots: tuple[Spot, ...]
-    unreadable: dict[int, str]
-    settings: RegisterSettings = field(default_factory=RegisterSettings)
+    sequence: LidarSequence  # the recording
+    timeline: Timeline  # reference times of all its sweeps
+    spots: tuple[Spot, ...]  # groups of consecutive sweeps, ascending in time
+    unreadable: dict[int, str]  # frame number -> reason why a chosen sweep could not be read
+    settings: RegisterSettings = field(default_factory=RegisterSettings)  # settings of registration
 
     @staticmethod
     def of(sequence: LidarSequence, settings: RegisterSettings) -> Sample:

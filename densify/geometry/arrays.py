@@ -16,11 +16,7 @@ Bool = NDArray[np.bool_]
 
 
 def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return an (M,) structured array whose fields are the given columns.
-
-    Args:
-        columns: Field name -> its (M,) values. The fields are packed without padding.
-    """
+    """Return an (M,) structured array of (M,) columns, by field name, without padding."""
     rows = np.empty(
         len(next(iter(columns.values()))), [(name, c.dtype) for name, c in columns.items()]
     )

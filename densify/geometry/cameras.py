@@ -52,9 +52,6 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
             too near or outside the view of the lens.
         visible: (N,) bool, True for a point in the view of the lens that falls on a pixel after
             ``rint`` and is farther than 0.1 m: in z for a pinhole, in range for other lenses.
-
-    Raises:
-        InputError: The camera model is unknown, or its number of coefficients is invalid.
     """
     lens = _lens(camera)
     uv, seen = np.full((len(points_cam), 2), np.nan), np.zeros(len(points_cam), bool)
@@ -90,13 +87,10 @@ def rays(camera: Camera, uv: Float) -> Float:
 
 
 def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
-    """Return the (N,2,3) Jacobian of the projection, in pixels per metre.
+    """Return the (N,2,3) Jacobian of the projection of visible points (N,3), camera frame.
 
-    Element [n, i, j] is the change of u (i = 0) or v (i = 1) of point n, per metre of motion
-    along axis j of the camera frame.
-
-    Args:
-        points_cam: (N,3) metres, camera frame; visible points only.
+    Element [n, i, j] is the change of u (i = 0) or v (i = 1) of point n in pixels, per metre of
+    motion along axis j of the camera frame.
     """
     lens = _lens(camera)
     range_m = np.linalg.norm(points_cam, axis=1, keepdims=True)
@@ -111,24 +105,15 @@ def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
 
 
 def depth_along(points_cam: Float, measure: str) -> Float:
-    """Return the (N,) depth in metres of points in the camera frame.
-
-    Args:
-        points_cam: (N,3) metres, camera frame.
-        measure: ``z`` for depth along the optical axis, ``range`` for distance from the lens.
-    """
+    """Return (N,) depths (m) of points (N,3), camera frame: ``z`` along the axis or ``range``."""
     return points_cam[:, 2] if measure == "z" else np.linalg.norm(points_cam, axis=1)
 
 
 def converted(camera: Camera, depth_m: Float32, given: str, wanted: str) -> Float32:
-    """Convert an (H,W) depth map between depth along the optical axis and range.
+    """Convert an (H,W) depth map (metres, 0 none) of a camera from one measure to another.
 
-    Args:
-        camera: The camera of the map.
-        depth_m: (H,W) metres, 0 for pixels without depth.
-        given: Measure of ``depth_m``, ``z`` or ``range``.
-        wanted: Measure of the result. Pixels whose ray has z <= 0 become 0, unless the measures
-            are the same and the map is returned unchanged.
+    Measures are ``z``, along the optical axis, and ``range``. Pixels whose ray has z <= 0 become 0,
+    unless the measures are the same and the map is returned unchanged.
     """
     if given == wanted:
         return depth_m
@@ -140,21 +125,13 @@ def converted(camera: Camera, depth_m: Float32, given: str, wanted: str) -> Floa
 
 
 class _Lens(NamedTuple):
-    """The distortion of a lens, which moves points of the plane in the module's docstring.
+    """The distortion of a lens, which moves points of the plane in the module's docstring."""
 
-    Attributes:
-        numerator: Polynomial in the squared radius; divided by ``denominator``, the radial factor.
-        denominator: Polynomial in the squared radius.
-        p1: First tangential coefficient of OpenCV.
-        p2: Second tangential coefficient of OpenCV.
-        limit: Squared radius up to which the distorted radius grows.
-    """
-
-    numerator: Polynomial
+    numerator: Polynomial  # over the denominator, of the squared radius: the radial factor
     denominator: Polynomial
-    p1: float
+    p1: float  # tangential coefficients of OpenCV
     p2: float
-    limit: float
+    limit: float  # squared radius up to which the distorted radius grows
 
 
 def _lens(camera: Camera) -> _Lens:
@@ -197,12 +174,10 @@ def _lens_of(model: str, given: tuple[float, ...]) -> _Lens:
 
 
 def _stops_growing(n: Polynomial, d: Polynomial) -> float:
-    """Return the squared radius up to which the distorted radius grows.
-
-    The radial factor of radius r is n(s)/d(s) with s = r², and n', d' are derivatives by s. The
-    distorted radius r n/d stops growing at the first positive root of n d + 2 s (n' d - n d').
-    Beyond the first root of d it has no meaning.
-    """
+    """Return the squared radius up to which the distorted radius grows."""
+    # The radial factor of radius r is n(s)/d(s) with s = r², and n', d' are derivatives by s. The
+    # distorted radius r n/d stops growing at the first positive root of n d + 2 s (n' d - n d').
+    # Beyond the first root of d it has no meaning.
     growth = n * d + Polynomial([0.0, 2.0]) * (n.deriv() * d - n * d.deriv())
     roots = np.concatenate([growth.trim(1e-15).roots(), d.trim(1e-15).roots()])
     stops = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
@@ -275,10 +250,7 @@ def _pixels(camera: Camera, lens: _Lens, points_cam: Float) -> Float:
 
 
 def _unbent(lens: _Lens, wanted: Float) -> Float:
-    """Return the (N,2) inverse of `_bent`, NaN where the inverse does not exist.
-
-    A table gives the radial part. Newton's method then refines the result.
-    """
+    """Return the (N,2) inverse of `_bent`, NaN where the inverse does not exist."""
     # Evenly in angle, because the plane of a lens with a half-space view is infinite.
     radius = np.tan(np.linspace(0, np.arctan(np.sqrt(lens.limit)), _NUM_ANGLES))
     radius = radius[radius < 1e3]
@@ -299,12 +271,7 @@ def _unbent(lens: _Lens, wanted: Float) -> Float:
 
 
 def _slopes(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float, Float]:
-    """Return three (N,) partial derivatives of the distortion on the plane.
-
-    Returns:
-        Derivative of the distorted x by x, of the distorted x by y (equal to the derivative of
-        the distorted y by x), and of the distorted y by y.
-    """
+    """Return (N,) slopes of the distortion: x by x, x by y (equal to y by x), and y by y."""
     s, n, d = x**2 + y**2, lens.numerator, lens.denominator
     factor = n(s) / d(s)
     growth = 2 * (n.deriv()(s) - factor * d.deriv()(s)) / d(s)

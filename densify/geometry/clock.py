@@ -69,10 +69,7 @@ class Clock:
     def around(self, i: int, reach_s: float, most: int) -> list[int]:
         """Return the sweeps within ``reach_s`` plus half a period of sweep i, without i, ascending.
 
-        Args:
-            i: Index of a sweep.
-            reach_s: Greatest time before and after sweep i.
-            most: Greatest number of sweeps on each side. A larger number is thinned out evenly.
+        More than ``most`` sweeps on a side are thinned out evenly.
         """
         within_ns = self._slack_ns(reach_s)
         first = int(np.searchsorted(self.time_ns, self.time_ns[i] - within_ns))
@@ -81,27 +78,16 @@ class Clock:
         return sorted(_thinned(before, most) + _thinned(after, most))
 
     def at(self, i: int, later_s: float) -> int | None:
-        """Return the sweep whose time is nearest to ``later_s`` after sweep i.
+        """Return the sweep nearest to ``later_s`` after sweep i, None if no sweep is on that side.
 
-        Args:
-            i: Index of a sweep.
-            later_s: Time in seconds. If positive, only sweeps after i are candidates, else only
-                sweeps before i.
-
-        Returns:
-            The index, or None if no sweep is on that side.
+        A negative ``later_s`` searches the sweeps before i.
         """
         side = range(i + 1, len(self.time_ns)) if later_s > 0 else range(i - 1, -1, -1)
         wanted_ns = self.time_ns[i] + later_s * 1e9
         return min(side, key=lambda j: abs(self.time_ns[j] - wanted_ns), default=None)
 
     def nearest(self, j: int, among: Iterable[int]) -> int:
-        """Return the candidate nearest in time to sweep j, the earlier candidate of two.
-
-        Args:
-            j: Index of a sweep.
-            among: Indices of the candidate sweeps.
-        """
+        """Return the candidate nearest in time to sweep j, the earlier candidate of two."""
         return min(among, key=lambda k: (abs(self.time_ns[k] - self.time_ns[j]), k))
 
     def from_end_s(self, i: int) -> float:

@@ -26,6 +26,7 @@ from typing import Any, TypeVar
 
 import numba
 from numba.core import event
+from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 
 from densify.config.cache import others_can_write
@@ -68,10 +69,8 @@ def inlined(function: _Function) -> _Function:
 
 
 def _imported_code(function: Callable[..., Any]) -> str:
-    """Return a digest of the source files of the inlined functions, "" if all are in the same file.
-
-    Numba's cache detects changes of the function's own file only.
-    """
+    """Return a digest of the source files of inlined functions, "" if all are in the same file."""
+    # Numba's cache detects changes of the function's own file only.
     files = {
         f.__code__.co_filename for f in function.__globals__.values() if isinstance(f, Dispatcher)
     }
@@ -93,6 +92,25 @@ def _is_open(folder: Path) -> bool:
     return found is not None
 
 
+class _Kept(FunctionCache):
+    """Numba's cache of one function on disk. If it fails, the function is compiled in every run."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the compiled function for these types, None if none can be loaded."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # a damaged file: unpickling can raise anything
+            _log.debug("%s: compiled code cannot be loaded: %s", self.cache_path, error)
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep the compiled function for these types, if possible."""
+        try:
+            super().save_overload(sig, data)
+        except Exception as error:  # a full disk, a damaged index
+            _log.debug("%s: compiled code cannot be kept: %s", self.cache_path, error)
+
+
 class Kernel:
     """A function compiled by numba at the first call with new types, and cached for later runs.
 
@@ -107,7 +125,8 @@ class Kernel:
         function.__qualname__ += _imported_code(function)  # part of the name of the cache file
         self._function = function
         try:
-            self._compiled = numba.njit(function, cache=True, **_OPTIONS)
+            self._compiled = numba.njit(function, **_OPTIONS)
+            self._compiled._cache = _Kept(function)  # type: ignore[attr-defined]
         except RuntimeError as error:  # no place for a cache
             self._do_without_cache(error)
             return
@@ -117,20 +136,10 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the compiled function."""
-        try:
-            return self._compiled(*arguments)
-        except Exception as error:  # a full disk, a damaged file: unpickling can raise anything
-            self._do_without_cache(error)
-            return self._compiled(*arguments)
+        return self._compiled(*arguments)
 
     def over_rows(self, num_rows: int, *arguments: Any) -> None:
-        """Call the kernel as ``kernel(begin, end, *arguments)`` for row ranges, on all cores.
-
-        Args:
-            num_rows: Number of rows; the ranges cover 0 to ``num_rows``.
-            arguments: Arrays that the kernel reads and writes. Its result for a row must depend on
-                that row alone.
-        """
+        """Call ``kernel(begin, end, *arguments)`` for row ranges, on all cores, as `over_rows`."""
         over_rows(self, num_rows, *arguments)
 
     def _do_without_cache(self, error: Exception | str) -> None:
@@ -147,11 +156,8 @@ def num_threads() -> int:
 def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> None:
     """Call ``function(begin, end, *arguments)`` on all cores, for ranges that cover all rows.
 
-    Args:
-        function: Writes its result into the argument arrays. Its result for a row must depend on
-            that row alone. It must not call `over_rows`.
-        num_rows: Number of rows; the ranges cover 0 to ``num_rows``.
-        arguments: Passed on to each call.
+    The function writes its result into the arguments and must not call `over_rows`. Its result for
+    a row must depend on that row alone.
     """
     num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
     if num_parts <= 1:

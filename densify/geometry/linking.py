@@ -14,17 +14,12 @@ from densify.geometry.types import Bool, Float, Int
 def link(points: Float, distance_m: float) -> tuple[int, Int]:
     """Return groups of points by single linkage: points closer than ``distance_m`` share a group.
 
-    The points are sorted into a grid whose cell diagonal equals the distance, hence all points of a
-    cell are linked. Only neighbouring cells are compared, and the cost does not grow with the
-    square of the point density.
+    The points (N,3) are sorted into a grid whose cell diagonal equals the distance, hence all
+    points of a cell are linked. Only neighbouring cells are compared, and the cost does not grow
+    with the square of the point density.
 
-    Args:
-        points: (N,3) metres.
-        distance_m: Greatest distance of linked points.
-
-    Returns:
-        The number of groups G, and (N,) int64 group labels 0 to G - 1, numbered by the first point
-        of each group.
+    Returns the number of groups G, and (N,) int64 group labels 0 to G - 1, numbered by the first
+    point of each group.
     """
     if not len(points):
         return 0, np.zeros(0, np.int64)
@@ -47,15 +42,10 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
 
 
 def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
-    """Return (N,) True for the points closer than ``within_m`` to a dense seed.
+    """Return (N,) True for the points (N,3) closer than ``within_m`` to a dense seed.
 
-    A seed is dense if at least ``least_share`` of the points within ``within_m`` of it are seeds.
-
-    Args:
-        points: (N,3) metres.
-        seed: (N,) bool, True for the seeds among the points.
-        within_m: Distance in metres, for both tests.
-        least_share: Share of 0 to 1.
+    ``seed`` is an (N,) mask. A seed is dense if at least ``least_share`` of the points within
+    ``within_m`` of it are seeds.
     """
     close, seeds = np.zeros(len(points), bool), points[seed]
     if not len(seeds):
@@ -73,15 +63,8 @@ def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: floa
 
 @Kernel
 def _join(points: Float, start: Int, pairs: Int, squared: float, parent: Int) -> None:
-    """Link cells that have two points closer than the distance, by union-find in place.
-
-    Args:
-        points: (N,3) metres, sorted by cell.
-        start: (C+1,) cell c owns the points ``start[c]`` to ``start[c + 1] - 1``.
-        pairs: (P,2) cells that may be linked.
-        squared: Square of the distance in m².
-        parent: (C,) starts as 0 to C - 1; changed to the root cell of each cell.
-    """
+    """Link the cells of ``pairs`` that have two points closer than the distance, by union-find."""
+    # Cell c owns the points start[c] to start[c + 1] - 1, and parent[c] becomes its root.
     for k in range(len(pairs)):
         a, b = _root(parent, pairs[k, 0]), _root(parent, pairs[k, 1])
         if a != b and _touch(points, start, pairs[k, 0], pairs[k, 1], squared):

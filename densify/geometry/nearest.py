@@ -15,15 +15,9 @@ def tree_of(points: Float) -> cKDTree:
 
 
 def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Float, Int]:
-    """Return the distance to the nearest point of the tree, and the row of that point.
+    """Return (N,) distances to the nearest points of the tree, and (N,) int64 rows of these points.
 
-    Args:
-        queries: (N,d) positions.
-        within_m: Greatest distance.
-
-    Returns:
-        (N,) distances and (N,) int64 rows of the tree's points; inf and -1 for a query without a
-        point closer than ``within_m``.
+    They are inf and -1 for a query (N,d) without a point closer than ``within_m``.
     """
     distance_m, found = tree.query(queries, distance_upper_bound=within_m)
     row = np.asarray(found, np.int64)
@@ -32,14 +26,9 @@ def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Fl
 
 
 def nearest_k(tree: cKDTree, queries: Float, k: int) -> tuple[Float, Int]:
-    """Return the distances to the k nearest points of the tree, and the rows of these points.
+    """Return (N,k) ascending distances to the k nearest points, and (N,k) int64 rows in the tree.
 
-    Args:
-        queries: (N,d) positions.
-        k: Number of neighbours, reduced to M if larger.
-
-    Returns:
-        (N,k) distances, ascending, and (N,k) int64 rows of the tree's points.
+    ``k`` is reduced to the number of points if larger.
     """
     distance_m, row = tree.query(queries, np.arange(1, min(k, tree.n) + 1))
     return np.asarray(distance_m), np.asarray(row, np.int64)

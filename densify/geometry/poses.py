@@ -58,37 +58,18 @@ def exp(twist: Float) -> Float:
 
 
 def twist_between(T_world_a: Float, T_world_b: Float, seconds: float) -> Float:
-    """Return the (6,) velocity (rad/s, m/s) of the motion from pose a to pose b, in frame a.
-
-    Args:
-        T_world_a: (4,4) first pose.
-        T_world_b: (4,4) second pose.
-        seconds: Time from a to b.
-    """
+    """Return the (6,) velocity (rad/s, m/s) of the motion from pose a to pose b, in frame a."""
     return log(inverse(T_world_a) @ T_world_b) / seconds
 
 
 def twist_to(T_world_lidar: Float, stamp_ns: Int, i: int) -> Float:
-    """Return the (6,) velocity (rad/s, m/s) from pose i - 1 to pose i, in the frame of pose i - 1.
-
-    Args:
-        T_world_lidar: (n,4,4) poses.
-        stamp_ns: (n,) times of the poses.
-        i: Index of 1 to n - 1.
-    """
+    """Return the (6,) velocity (rad/s, m/s) from pose i - 1 to i, in the frame of pose i - 1."""
     seconds = (stamp_ns[i] - stamp_ns[i - 1]) * 1e-9
     return twist_between(T_world_lidar[i - 1], T_world_lidar[i], seconds)
 
 
 def carried(T_a_b: Float, twist_b: Float) -> Float:
-    """Return twists (...,6) of frame b expressed in frame a, by the adjoint of ``T_a_b``.
-
-    Frames a and b are fixed to the same rigid body.
-
-    Args:
-        T_a_b: (...,4,4) poses of b in a.
-        twist_b: (...,6) twists in frame b; rotation first.
-    """
+    """Return twists (...,6) of frame b in frame a of the same rigid body, by the adjoint."""
     R_a_b = T_a_b[..., :3, :3]
     turn = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., :3])
     along = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., 3:])
@@ -96,12 +77,7 @@ def carried(T_a_b: Float, twist_b: Float) -> Float:
 
 
 def transform_each(twist: Float, points: Float) -> Float:
-    """Return the (N,3) points after moving each point by ``exp`` of its own twist.
-
-    Args:
-        twist: (N,6) rotation vector (rad) and translation (m) of each point.
-        points: (N,3) metres.
-    """
+    """Return the (N,3) points after moving each point by ``exp`` of its own twist (N,6)."""
     moved: Float = Rotation.from_rotvec(twist[:, :3]).apply(points)
     moved += twist[:, 3:]
     return moved
@@ -113,13 +89,9 @@ def interpolate(T_world_a: Float, T_world_b: Float, fraction: float) -> Float:
 
 
 def fit_rigid(source: Float, target: Float) -> Float:
-    """Return the (4,4) rigid motion that maps source points to target points in least squares.
+    """Return the (4,4) rigid motion that maps source (N,3) to target points in least squares.
 
     A rotation that the points do not determine, as about a line of points, is zero (Kabsch 1976).
-
-    Args:
-        source: (N,3) metres.
-        target: (N,3) metres, the corresponding points row by row.
     """
     from_m, to_m = source.mean(axis=0), target.mean(axis=0)
     # einsum and not BLAS: its sums do not depend on the number of threads.

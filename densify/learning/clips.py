@@ -32,24 +32,17 @@ _POSES_GIVEN = {"register": {"source": "dataset"}}
 
 @dataclass(frozen=True)
 class ClipSweep:
-    """The n points of a sweep above the ground.
+    """The n points of a sweep above the ground."""
 
-    Attributes:
-        points: (n,3) metres, world axes, origin at the scanner's position in the clip's key frame.
-        height_m: (n,) height above the ground.
-        origin_m: (3,) position of the scanner, in the coordinates of ``points``.
-        time_s: Time since the clip's first sweep.
-        flow: (2,n,3) metres, world axes, ego-motion removed: flow to the previous sweep and to the
-            next sweep, 0 where that sweep is missing. None without labels.
-        moving: (n,) bool, None without labels.
-    """
-
+    # (n,3) metres, world axes, origin at the scanner's position in the clip's key frame
     points: Float32
-    height_m: Float32
-    origin_m: Float32
-    time_s: float
+    height_m: Float32  # (n,) height above the ground
+    origin_m: Float32  # (3,) position of the scanner, in the coordinates of ``points``
+    time_s: float  # time since the clip's first sweep
+    # (2,n,3) metres, world axes, ego-motion removed: flow to the previous sweep and to the next
+    # sweep, 0 where that sweep is missing. None without labels.
     flow: Float32 | None = None
-    moving: Bool | None = None
+    moving: Bool | None = None  # (n,) bool, None without labels
 
 
 Clip = tuple[ClipSweep, ...]
@@ -58,24 +51,14 @@ Clip = tuple[ClipSweep, ...]
 
 @dataclass(frozen=True)
 class ClipMaker:
-    """Make clips by number: the same number gives the same clip, in any process.
+    """Make clips by number: the same number gives the same clip, in any process."""
 
-    Attributes:
-        data: Specifications of recordings, or `STREETS`.
-        teacher: Source of the labels, as in `make_clip`.
-    """
-
-    data: tuple[str, ...]
+    data: tuple[str, ...]  # specifications of recordings, or `STREETS`
     seed: int
-    teacher: str = "objective"
+    teacher: str = "objective"  # source of the labels, as in `make_clip`
 
     def __call__(self, number: int) -> Clip:
-        """Make the clip of a number.
-
-        Raises:
-            InputError: A recording cannot be read or lacks the required ground truth.
-            ComputationError: No neighbouring sweeps could be registered at 8 random places.
-        """
+        """Make the clip of a number."""
         rng = np.random.default_rng([self.seed, number])
         spec = self.data[int(rng.integers(len(self.data)))]
         sequence: LidarSequence = (
@@ -115,10 +98,8 @@ def _new_street(spec: str, rng: np.random.Generator) -> Street:
 def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
     """Return the clip of up to 7 sweeps around a key frame.
 
-    Args:
-        key: Frame number of the middle sweep.
-        teacher: Source of the labels: "truth" for the recording's ground truth, "engine" for the
-            scene flow of the engine ``groups``. Other words give no labels.
+    The ``teacher`` gives the labels: "truth" the recording's ground truth, "engine" the scene flow
+    of the engine ``groups``. Other words give no labels.
     """
     stretch = Recording(sequence, settings, NUM_SWEEPS // 2, [key]).window(key)
     heights, frames = ground(stretch), stretch.frames

@@ -28,11 +28,7 @@ def check_argument(argument: str) -> None:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """Return the motion of the scene, as `densify.flow.engines.EngineModule`.
-
-    Args:
-        argument: Path of the model file.
-    """
+    """Return the motion of a scene by a model file (`densify.flow.engines.EngineModule`)."""
     model, sweeps = read_model(Path(argument)), scene.stretch.sweeps
     rows = zip(sweeps, scene.candidates, strict=True)
     standing = [AboveGround.of(sweep, scene.ground, found.row) for sweep, found in rows]
@@ -52,10 +48,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
 def flows_of(model: Model, standing: list[AboveGround], origins: list[Float]) -> list[Float]:
     """Return for each sweep the flow (n,3) to the next sweep, metres, world, ego-motion removed.
 
-    The last sweep has its flow to the previous sweep.
-
-    Args:
-        origins: Position (3,) of the scanner at each sweep, world.
+    The last sweep has its flow to the previous sweep. ``origins`` are (3,) scanner positions.
     """
     flows = []
     for i, own in enumerate(standing):
@@ -76,15 +69,9 @@ def _neighbor(i: int, count: int) -> int:
 def _grouped(
     scene: Scene, i: int, candidates: Candidates, standing: AboveGround, velocity_m_s: Float
 ) -> tuple[Candidates, Float]:
-    """Return the candidates of sweep i for tracking, and their (n,3) velocities, m/s, world.
-
-    Clusters that move according to the network may start a track, at their median velocity.
-    Clusters from free-space violations alone may only join a track that was started elsewhere.
-
-    Args:
-        standing: The n points above the ground.
-        velocity_m_s: (n,3) velocities by the network, world.
-    """
+    """Return the candidates of sweep i for tracking, and their (n,3) velocities, m/s, world."""
+    # Clusters that move according to the network may start a track, at their median velocity.
+    # Clusters from free-space violations alone may only join a track that was started elsewhere.
     moves = np.linalg.norm(velocity_m_s, axis=1) >= MOVES_M_S
     registered = scene.stretch.sweeps[i]
     row = candidates.row

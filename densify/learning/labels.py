@@ -22,19 +22,13 @@ from densify.pipeline.recording import Recording
 
 @dataclass(frozen=True)
 class Label:
-    """The scene flow label of one sweep with N points.
-
-    Attributes:
-        after: The next sweep.
-        field: Flow to the next sweep, in the sweep's lidar frame, ego-motion removed.
-        sure: (N,) True for points whose flow is certain.
-        T_next_here: (4,4) from the lidar frame of the sweep to the lidar frame of the next sweep.
-    """
+    """The scene flow label of one sweep with N points."""
 
     registered: RegisteredSweep
-    after: RegisteredSweep
-    field: FlowField
-    sure: Bool
+    after: RegisteredSweep  # the next sweep
+    field: FlowField  # flow to the next sweep, in the sweep's lidar frame, ego-motion removed
+    sure: Bool  # (N,) True for points whose flow is certain
+    # (4,4) from the lidar frame of the sweep to the lidar frame of the next sweep
     T_next_here: np.ndarray
 
 
@@ -43,14 +37,8 @@ def label_sweeps(
 ) -> Iterator[tuple[int, Label | ComputationError | InputError]]:
     """Yield (frame number, label) of each sweep, or (frame number, error) if labelling fails.
 
-    Sweeps without a next sweep or without boxes are left out.
-
-    Args:
-        frames: Frame numbers to label.
-        config: Settings, which say where the poses come from.
-
-    Raises:
-        InputError: The recording has no boxes.
+    Sweeps without a next sweep or without boxes are left out. ``config`` says where the poses come
+    from.
     """
     boxes = getattr(sequence, "boxes", None)
     if boxes is None or all(boxes(frame) is None for frame in sequence.frames):
@@ -87,11 +75,6 @@ def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
     """Write the label's flow file ``FRAME_NEXT.npz`` into a folder and return its path.
 
     It holds the flow without and with (``total_flow``) ego-motion, and ``valid`` for certain flow.
-    The file appears only when it is complete.
-
-    Raises:
-        InputError: The file exists and ``overwrite`` is False.
-        OutputError: The file cannot be written.
     """
     sweep, field = label.registered.sweep, label.field
     path = folder / f"{sweep.frame:06d}_{label.after.frame:06d}.npz"

@@ -51,29 +51,19 @@ _LARGEST_HEIGHT_M = 4.0
 
 
 class NetworkCloud(NamedTuple):
-    """One sweep of n points as input of the network.
+    """One sweep of n points as input of the network."""
 
-    Attributes:
-        points: (n,3) float32 metres, world axes (z up), origin at the *source* sweep's scanner.
-        height_m: (n,) float32 height above the ground.
-    """
-
+    # (n,3) float32 metres, world axes (z up), origin at the *source* sweep's scanner
     points: Tensor
-    height_m: Tensor
+    height_m: Tensor  # (n,) float32 height above the ground
 
 
 class AboveGround(NamedTuple):
-    """The n points of a sweep above the ground.
+    """The n points of a sweep above the ground."""
 
-    Attributes:
-        row: (n,) index into the sweep's points.
-        points: (n,3) metres, world.
-        height_m: (n,) height above the ground.
-    """
-
-    row: Int
-    points: Float
-    height_m: Float32
+    row: Int  # (n,) index into the sweep's points
+    points: Float  # (n,3) metres, world
+    height_m: Float32  # (n,) height above the ground
 
     @staticmethod
     def of(registered: RegisteredSweep, ground: HeightMap, row: Int | None = None) -> AboveGround:
@@ -94,9 +84,6 @@ def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> lis
 
     Source and target come first, then the sweeps before the source (after it if the target is
     earlier). An index beyond the first or last sweep becomes None.
-
-    Args:
-        num_wanted: Number of sweeps that the network takes.
     """
     step = source - target
     wanted = [source, target, *(source + step * n for n in range(1, num_wanted - 1))]
@@ -196,13 +183,12 @@ class _Block(nn.Module):
 
 
 class _Pillars:
-    """The m points of one sweep within the grid, sorted by cell.
+    """The m points of one sweep within the grid, sorted by cell."""
 
-    row: (m,) index into the sweep's points. cell: (m,) number of the cell. features: (m,6) offset
-    from the cell's centre in cells, scaled height, and offset from the scanner in hundreds of
-    metres. filled, size: (f,) number and point count of each cell with points. of_point: (m,) row
-    in filled.
-    """
+    # row: (m,) index into the sweep's points. cell: (m,) number of the cell. features: (m,6) offset
+    # from the cell's centre in cells, scaled height, and offset from the scanner in hundreds of
+    # metres. filled, size: (f,) number and point count of each cell with points. of_point: (m,) row
+    # in filled.
 
     def __init__(self, row: Tensor, cell: Tensor, features: Tensor) -> None:
         self.row, self.cell, self.features = row, cell, features
@@ -250,13 +236,10 @@ _HEADER, _WEIGHTS = "header", "weights/"
 
 @dataclass(frozen=True)
 class Model:
-    """A network with its weights.
-
-    Attributes:
-        made: How the network was trained, plain values for JSON.
-    """
+    """A network with its weights."""
 
     network: Voxels
+    # How the network was trained, plain values for JSON
     made: Mapping[str, Any] = field(default_factory=dict)
 
     def flow(self, sweeps: Sweeps) -> Float:
@@ -270,13 +253,7 @@ class Model:
 
 
 def write_model(path: Path, model: Model) -> None:
-    """Write a model file. The same model gives the same bytes.
-
-    The file appears only when it is complete.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write a model file. The same model gives the same bytes."""
     header = {"format": FORMAT, "version": VERSION, "network": NETWORK, "made": model.made}
     text = json.dumps(header, sort_keys=True).encode()
     arrays: dict[str, NDArray[Any]] = {_HEADER: np.frombuffer(text, np.uint8)}
@@ -288,11 +265,7 @@ def write_model(path: Path, model: Model) -> None:
 
 
 def read_model(path: Path) -> Model:
-    """Return the model of a file.
-
-    Raises:
-        InputError: The file is missing, damaged, of another version, or not a model.
-    """
+    """Return the model of a file."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a model that densify train flow wrote")
     arrays = read_arrays(path)

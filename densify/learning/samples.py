@@ -36,24 +36,16 @@ _SCALES = (0.95, 1.05)
 
 
 class Sample(NamedTuple):
-    """One pair of sweeps to train on; the source has n points.
+    """One pair of sweeps to train on; the source has n points."""
 
-    Attributes:
-        sweeps: Source, target, and sweeps before the source; augmented coordinates.
-        drawn: (d,) rows of the source points that the objective uses.
-        drawn_target: (e,3) target points that the objective uses.
-        in_reach: (n,) mask of the source points within the network's grid, which count in the loss.
-        flow: (n,3) known flow to the target, m, without ego-motion; None without labels.
-        moving: (n,) bool tensor, None without labels.
-    """
-
-    sweeps: Sweeps
-    drawn: Tensor
-    drawn_target: Tensor
+    sweeps: Sweeps  # source, target, and sweeps before the source; augmented coordinates
+    drawn: Tensor  # (d,) rows of the source points that the objective uses
+    drawn_target: Tensor  # (e,3) target points that the objective uses
+    # (n,) mask of the source points within the network's grid, which count in the loss
     in_reach: Tensor
     duration_s: float
-    flow: Any = None
-    moving: Any = None
+    flow: Any = None  # (n,3) known flow to the target, m, without ego-motion; None without labels
+    moving: Any = None  # (n,) bool tensor, None without labels
 
 
 def on_device(value: Any, device: torch.device) -> Any:
@@ -67,12 +59,7 @@ def on_device(value: Any, device: torch.device) -> Any:
 
 
 def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
-    """Yield samples without end.
-
-    Args:
-        make: Maker of clips (short series of sweeps), called with 0, 1, 2 and so on.
-        num_wanted: Number of sweeps that the network takes.
-    """
+    """Yield samples without end, of clips from ``make``, for a network of ``num_wanted`` sweeps."""
     for group in count():
         mixed = [make(group * _NUM_MIXED + n) for n in range(_NUM_MIXED)]
         rng = np.random.default_rng([make.seed, group, 1])
@@ -101,9 +88,7 @@ def sample_of(
 ) -> Sample:
     """Return the sample of two neighbouring sweeps of a clip, given by their indices.
 
-    Args:
-        rng: Generator that turns, mirrors, scales and draws at random. None changes nothing and
-            draws evenly.
+    ``rng`` turns, mirrors, scales and draws at random. None changes nothing and draws evenly.
     """
     here, there = clip[source], clip[target]
     change = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)

@@ -29,29 +29,17 @@ _NUM_AVERAGED = 50  # number of losses
 
 @dataclass(frozen=True)
 class Training:
-    """The settings of a training.
+    """The settings of a training."""
 
-    Attributes:
-        data: Specifications of recordings.
-        steps: Number of training steps, each with one pair of sweeps.
-        teacher: Source of supervision: "objective", "engine" or "truth".
-        device: Device to train on, "auto", "cpu" or "cuda".
-    """
-
-    data: tuple[str, ...]
-    steps: int
-    teacher: str = "objective"
+    data: tuple[str, ...]  # specifications of recordings
+    steps: int  # number of training steps, each with one pair of sweeps
+    teacher: str = "objective"  # source of supervision: "objective", "engine" or "truth"
     seed: int = 0
-    device: str = "auto"
+    device: str = "auto"  # device to train on, "auto", "cpu" or "cuda"
 
 
 def train(training: Training, out: Path, progress: Progress | None = None) -> float:
-    """Train a network, write the model to ``out``, and return the mean loss of the last 50 steps.
-
-    Raises:
-        InputError: A setting or a recording cannot be used.
-        ComputationError: The loss is not a number.
-    """
+    """Train a network, write the model to ``out``, and return the mean of its last 50 losses."""
     loss_of, device = TEACHERS[training.teacher], chosen_device(training.device)
     if training.steps < 1:
         raise InputError(f"--steps {training.steps}: expected 1 or more")
@@ -85,11 +73,7 @@ def train(training: Training, out: Path, progress: Progress | None = None) -> fl
 
 
 def chosen_device(name: str) -> torch.device:
-    """Return the torch device for "cpu", "cuda", or "auto" (CUDA if available).
-
-    Raises:
-        InputError: CUDA is requested, but torch finds no CUDA device.
-    """
+    """Return the torch device for "cpu", "cuda", or "auto" (CUDA if available)."""
     has_cuda = torch.cuda.is_available()
     if name == "cuda" and not has_cuda:
         raise InputError("--device cuda: torch finds no CUDA device here; use --device cpu")

@@ -46,11 +46,8 @@ def file_aside(path: Path) -> Iterator[Path]:
 def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
     """Yield a folder to write into, which becomes ``folder`` if the block ends without an error.
 
-    On any exception ``folder`` and its parent folders are as they were before.
-
-    Args:
-        owned: Names of the entries that the block writes. Existing entries of these names are
-            replaced or removed. All other entries of ``folder`` are kept.
+    On any exception ``folder`` and its parent folders are as they were before. Existing entries
+    with names in ``owned`` are replaced or removed. All other entries of ``folder`` are kept.
     """
     folder = Path(os.path.realpath(folder))
     missing = [place for place in folder.parents if not place.exists()]

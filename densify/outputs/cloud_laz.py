@@ -109,16 +109,8 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
 
     ``gps_time`` is the reference time of the source sweep as LAS 1.4 defines it: seconds since
     1980-01-06 minus 10^9, without leap seconds. Coordinates are rounded to 1 mm. Intensity and
-    colour are scaled to 16 bits. Equal clouds give equal bytes.
-
-    Args:
-        path: The file to write.
-        cloud: The accumulated cloud.
-        stamp_ns: Reference time of the key sweep in ns since 1970. Its day is the date in the
-            header.
-
-    Raises:
-        ValueError: A coordinate is not finite or beyond 2,147 km.
+    colour are scaled to 16 bits. Equal clouds give equal bytes. The day of ``stamp_ns``, the key
+    sweep's reference time since 1970, is the date in the header.
     """
     import laspy
 
@@ -152,11 +144,7 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
 
 
 def read_cloud(path: Path) -> StoredCloud:
-    """Return the cloud in a file that `write_cloud` wrote.
-
-    Raises:
-        InputError: The file cannot be read, or lacks a dimension.
-    """
+    """Return the cloud in a file that `write_cloud` wrote."""
     las = read_las(path)
     known = {*_STANDARD_DIMENSIONS, *(name for name, _, _ in _EXTRA_DIMENSIONS)}
     if missing := known - set(las.point_format.dimension_names):

@@ -35,46 +35,29 @@ def encode_png(image: NDArray[np.uint16] | NDArray[np.uint8]) -> bytes:
 
 
 def encode_jpeg(picture: Picture, quality: int = 92) -> bytes:
-    """Return the bytes of a JPEG file of an (H,W,3) RGB picture.
-
-    Args:
-        quality: 0 to 100. Lower values give smaller files with visible blocks.
-    """
+    """Return the bytes of a JPEG file of an (H,W,3) RGB picture; ``quality`` is 0 to 100."""
     bgr = np.ascontiguousarray(picture[:, :, ::-1])
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def map_path(folder: Path, kind: str, name: str, suffix: str = ".png") -> Path:
-    """Return the path ``folder/kind/name.png`` of a map.
-
-    The name is CAMERA, or CAMERA/NUMBER with ``project.per=image``.
-    """
+    """Return the path ``folder/kind/name.png`` of a map; the name is CAMERA or CAMERA/NUMBER."""
     return folder / kind / f"{name}{suffix}"
 
 
 def write_depth_png(path: Path, depth_m: Float32) -> None:
-    """Write a depth map. A pixel stores ``rint(256 * depth_m)``.
+    """Write an (H,W) depth map in metres, 0 none. A pixel stores ``rint(256 * depth_m)``.
 
     Depths beyond 65535/256 = 256 m or below 2 mm (half a step) are stored as 0, no depth.
-
-    Args:
-        depth_m: (H,W) depth in metres, 0 for no depth.
-
-    Raises:
-        ValueError: A depth is negative or not finite.
     """
     write_file(path, encode_png(_quantised(depth_m)))
 
 
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
-    """Write a confidence map as PNG of 8 bits.
+    """Write an (H,W) confidence map as PNG of 8 bits.
 
     A pixel stores ``1 + rint(254 * confidence)``: 1 to 255 for confidence 0 to 1. It stores 0 where
     `write_depth_png` stores no depth.
-
-    Args:
-        confidence: (H,W) confidence from 0 to 1.
-        depth_m: (H,W) depth in metres that the confidence describes.
     """
     levels = np.zeros(depth_m.shape, np.uint8)
     has_depth = _quantised(depth_m) > 0
@@ -83,15 +66,10 @@ def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> N
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
-    """Write an age map as PNG of 16 bits.
+    """Write an (H,W) age map as PNG of 16 bits.
 
     A pixel stores ``1 + rint(1000 * age_s)``, age in steps of 1 ms, and 65535 for 65.5 s or more.
     It stores 0 where `write_depth_png` stores no depth.
-
-    Args:
-        age_s: (H,W) seconds between the image's exposure and the sweep that measured the pixel, 0
-            or more at every pixel with a depth.
-        depth_m: (H,W) depth in metres, 0 for no depth.
     """
     steps = np.zeros(depth_m.shape, np.uint16)
     has_depth = _quantised(depth_m) > 0
@@ -116,10 +94,7 @@ def write_flow_png(path: Path, flow_px: Float32) -> None:
 
     The PNG has 16 bits. Red stores ``rint(64 * u) + 2^15`` for the flow u to the right in pixels,
     green the same for the flow down. Blue is 1 where the flow is known; elsewhere all are 0.
-
-    Args:
-        flow_px: (H,W,2) flow in pixels, to the right and down, NaN where unknown. Flow beyond 512
-            px is written as unknown.
+    ``flow_px`` is (H,W,2), NaN where unknown. Flow beyond 512 px is written as unknown.
     """
     levels = np.rint(_STEPS_PER_PX * flow_px.astype(np.float64)) + 2**15
     known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)
@@ -134,24 +109,12 @@ def metres(stored: NDArray[np.uint16]) -> Float32:
 
 
 def read_depth_png(path: Path) -> Float32:
-    """Return the (H,W) depth in metres of a PNG, 0 for no depth.
-
-    Raises:
-        InputError: The file is no PNG of 16 bits and one channel.
-    """
+    """Return the (H,W) depth in metres of a PNG, 0 for no depth."""
     return metres(read_stored(path, np.uint16, "a depth map"))
 
 
 def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -> NDArray[Any]:
-    """Return the (H,W) pixel values of a map without conversion to metres.
-
-    Args:
-        kind: Expected type of the pixels.
-        what: Name of the map, for the error message.
-
-    Raises:
-        InputError: The file is damaged, or has other bits or channels than expected.
-    """
+    """Return the (H,W) pixel values as stored; ``kind`` is their type, ``what`` names the map."""
     image = read_image(path, as_stored=True)
     if image.dtype != kind or image.ndim != 2:
         got = f"{image.dtype} of shape {image.shape}"
@@ -161,11 +124,7 @@ def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -
 
 
 def read_mask_png(path: Path) -> Bool:
-    """Return an (H,W) mask, True where any colour channel is above 0. Transparency is ignored.
-
-    Raises:
-        InputError: The file is no image.
-    """
+    """Return an (H,W) mask, True where any colour channel is above 0. Transparency is ignored."""
     image = read_image(path, as_stored=True)
     colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
     mask: Bool = colours > 0

@@ -64,30 +64,34 @@ flow to the previous sweep instead."""
 def write_flow(result: Result, context: Context, folder: Path) -> None:
     """Write the flow files ``flow/*.npz`` if ``output.flow`` asks for flow."""
     if result.flow is not None:
-        write_flow_npz(folder / "flow", result.flow)
+        write_flow_npz(folder / "flow", result.flow, result.recording)
 
 
-def write_flow_npz(folder: Path, flow: StretchFlow) -> list[Path]:
+def write_flow_npz(folder: Path, flow: StretchFlow, recording: str) -> list[Path]:
     """Write ``folder/000119_000120.npz`` for the flow from sweep 119 to 120, and all other steps.
 
-    Return the paths of the files.
+    The array ``recording`` in each file is the name of the recording. Return the paths of the
+    files.
     """
     paths = []
     for (frame, target), field in flow.steps.items():
         sweep = flow.stretch[frame].sweep
         total_flow = _total_flow(flow, frame, target)
-        data = flow_npz(field, row=sweep.row, total_flow=total_flow, object=field.instance)
+        data = flow_npz(
+            field,
+            row=sweep.row,
+            total_flow=total_flow,
+            object=field.instance,
+            recording=np.array(recording),
+        )
         paths.append(folder / f"{frame:06d}_{target:06d}.npz")
         write_file(paths[-1], data)
     return paths
 
 
 def _total_flow(flow: StretchFlow, frame: int, target: int) -> np.ndarray:
-    """Return the (N,3) flow in metres from sweep ``frame`` to sweep ``target``, with ego-motion.
-
-    The flow is the point's position in the lidar frame of ``target`` at its reference time, minus
-    the measured position in the lidar frame of ``frame``.
-    """
+    """Return the (N,3) flow in metres from sweep ``frame`` to sweep ``target``, with ego-motion."""
+    # Position in the lidar frame of target at its reference time, minus position as measured.
     points, field = flow.stretch[frame].sweep.points, flow.steps[frame, target]
     T = flow.stretch.T_target_source(target, frame)
     return poses.transform(T, points + field.total) - points
@@ -97,11 +101,7 @@ def flow_npz(field: FlowField, **beside: Any) -> bytes:
     """Return the bytes of a .npz file with a flow field of N points.
 
     The arrays are ``residual_flow`` (N,3) float32 in metres without ego-motion, ``moving``,
-    ``instance`` (-1 none), ``lost``, and ``to_reference`` float32 if known.
-
-    Args:
-        field: The flow field, in the lidar frame of its sweep.
-        beside: Further arrays by name. Float64 arrays are stored as float32.
+    ``instance`` (-1 none), ``lost``, ``to_reference`` float32 if known, and those of ``beside``.
     """
     arrays: dict[str, Any] = {"residual_flow": field.displacement}
     arrays |= {name: getattr(field, name) for name in ("moving", "instance", "lost")} | beside
@@ -115,10 +115,7 @@ def flow_npz(field: FlowField, **beside: Any) -> bytes:
 
 
 def _followed(known: dict[int, Float], frame: int, stretch: Stretch) -> Float:
-    """Return the (4,4) pose of a sweep, chained to the last earlier pose in ``known``.
-
-    ``known`` is frame number -> (4,4) pose in the world of the whole recording.
-    """
+    """Return the (4,4) world pose of a sweep, chained to the last earlier one in ``known``."""
     before = next((f for f in reversed(known) if f in stretch.frames), None)
     if before is None:
         return stretch[frame].T_world_lidar
@@ -155,14 +152,8 @@ def flow_writer(
 ) -> Iterator[FlowWriter]:
     """Yield a function that writes the flow of one sweep. Each file appears when it is complete.
 
-    Args:
-        form: Name of a format in the module's docstring.
-        out: Folder of ``--out``.
-        frames: Frame numbers of the sweeps to write. The file of opensceneflow holds all of them.
-
-    Raises:
-        InputError: A package is missing, or a file exists and must not be overwritten.
-        OutputError: A file cannot be written.
+    ``form`` is a format of the module's docstring, ``frames`` are the sweeps to write. The file of
+    opensceneflow holds all of them.
     """
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)
     following = dict(zip(sequence.frames[:-1], sequence.frames[1:], strict=True))
@@ -203,7 +194,7 @@ def flow_writer(
             elif form == "doc-depth":
                 _write_classes(paths[frame], frame, flow)
             else:
-                write_flow_npz(out, ahead)
+                write_flow_npz(out, ahead, sequence.name)
             return paths[frame].parent if form == "semantickitti" else _place(form, out, name)
 
         yield write
@@ -243,12 +234,8 @@ def _write_classes(path: Path, frame: int, flow: StretchFlow) -> None:
 
 
 def _write_paths(folder: Path, sequence: LidarSequence, T_world_lidar: dict[int, Float]) -> None:
-    """Write the lidar poses, and calibration and poses of the first camera, for DOC-Depth.
-
-    traj_camera.ply has the lidar pose at the exposure of each image, and the index of the image in
-    the recording. DOC-Depth's document names the quaternion qx qy qz qw, its reader q_x q_y q_z
-    q_w. The file has both.
-    """
+    """Write the lidar poses, and calibration and poses of the first camera, for DOC-Depth."""
+    # traj_camera.ply has the lidar pose at the exposure of each image, and the image's index.
     stamp_ns = np.array([sequence.stamp_ns(f) for f in T_world_lidar], np.int64)
     track = PoseTrack(sequence.name, stamp_ns, np.stack([*T_world_lidar.values()]))
     _save_path(folder / "traj_odometry.ply", track, stamp_ns, list(T_world_lidar))

@@ -73,15 +73,10 @@ _PACKAGES = (
 
 @dataclass(frozen=True)
 class Context:
-    """Describe how a result was asked for. Each output function gets it beside the result.
+    """Describe how a result was asked for. Each output function gets it beside the result."""
 
-    Attributes:
-        config: The merged configuration as plain mappings, by section.
-        data: Specification of the recording, as the user gave it.
-    """
-
-    config: Mapping[str, Any]
-    data: str
+    config: Mapping[str, Any]  # the merged configuration as plain mappings, by section
+    data: str  # specification of the recording, as the user gave it
 
 
 def write_depth(result: Result, context: Context, folder: Path) -> None:
@@ -89,9 +84,6 @@ def write_depth(result: Result, context: Context, folder: Path) -> None:
 
     Age is the time between the image's exposure and the sweep that measured the pixel. A filled
     pixel has the age of the nearest measured pixel.
-
-    Raises:
-        ValueError: The maps have no ages.
     """
     for camera, depth in result.depth.items():
         if depth.age_s is None:
@@ -177,8 +169,8 @@ def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
 def record(result: Result, context: Context) -> dict[str, Any]:
     """Return a mapping that says how a result was made.
 
-    The mapping has data, key, frames, cameras, warnings, configuration, cost of each stage, and
-    versions. A package of unknown version, as in system builds, has None.
+    The mapping has recording (its name), data, key, frames, cameras, warnings, configuration, cost
+    of each stage, and versions. A package of unknown version, as in system builds, has None.
     """
     versions: dict[str, str | None] = {"densify": __version__, "python": platform.python_version()}
     versions["platform"] = platform.platform()
@@ -187,6 +179,7 @@ def record(result: Result, context: Context) -> dict[str, Any]:
         with suppress(PackageNotFoundError):
             versions[package] = version(package)
     return {
+        "recording": result.recording,
         "data": context.data,
         "key": result.key,
         "stamp_ns": result.stamp_ns,

@@ -50,6 +50,7 @@ _VALIDATION = {
 }
 _KITTI_DRIVE = re.compile(r"(\d{4}_\d\d_\d\d_drive_\d{4})(?:_sync|_extract)?", re.ASCII)
 _PUNCTUATION = str.maketrans({":": "-", "?": "_", "=": "-", "&": "_"})
+_DEFAULT_STREET = "street:street?seed=0&sensor=hdl64"
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 
 
@@ -66,10 +67,13 @@ def split_of(drive: str) -> Split:
 def drive_folder(name: str) -> str:
     """Return a valid, unique folder name for a recording.
 
-    A valid name, such as KITTI's names, is kept. ``street:street?seed=0&sensor=hdl64`` becomes
-    ``street-street_seed-0_sensor-hdl64``. Any other name is reduced to ASCII letters and digits. A
+    A valid name, such as KITTI's names, is kept. The simulated street with default options is
+    ``street``; ``street:highway?seed=0&sensor=hdl64`` becomes
+    ``street-highway_seed-0_sensor-hdl64``. Any other name is reduced to ASCII letters and digits. A
     hash at its end keeps the name unique.
     """
+    if name == _DEFAULT_STREET:
+        return "street"
     folder = name.translate(_PUNCTUATION)
     if _FOLDER_NAME.fullmatch(folder):
         return folder
@@ -84,20 +88,10 @@ def write_key(
     sparse: Mapping[str, DepthMap],
     dense: Mapping[str, DepthMap],
 ) -> dict[str, FileRecord]:
-    """Write the depth maps of one key sweep. Equal maps give equal bytes.
+    """Write the depth maps of one key sweep, and return path in the tree -> size and hash.
 
-    Args:
-        root: Root folder of the tree.
-        folder: Folder of the drive, relative to the root: ``val/2011_09_26_drive_0013_sync``.
-        frame: Frame number of the key sweep.
-        sparse: Camera -> map of the key sweep alone.
-        dense: Camera -> map of all sweeps.
-
-    Returns:
-        Path relative to the root -> size and hash of the file.
-
-    Raises:
-        OutputError: A file cannot be written.
+    ``folder`` is the drive's, ``val/2011_09_26_drive_0013_sync``. ``sparse`` has the maps of the
+    key sweep alone, ``dense`` those of all sweeps, by camera. Equal maps give equal bytes.
     """
     paths = []
     for camera, maps in dense.items():
@@ -114,18 +108,7 @@ def write_key(
 
 
 def write_readme(root: Path, method: str, window: int, settings: Mapping[str, Any]) -> None:
-    """Write ``README.txt``, which describes the files beside it and how they were made.
-
-    The text depends only on the arguments and the version of densify.
-
-    Args:
-        method: Method that made the dense maps, such as ``flow``.
-        window: Number of sweeps before and after the key sweep.
-        settings: All other settings, as plain mappings.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write ``README.txt``, which describes the files beside it and how they were made."""
     text = _README.format(
         version=__version__,
         method=method,

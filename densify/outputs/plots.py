@@ -18,6 +18,7 @@ import numpy as np
 from densify.geometry.types import METHOD_NAMES, Float32, Result
 from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import Picture, encode_png
+from densify.outputs.front_view import front_first
 from densify.outputs.key_outputs import Context
 
 if TYPE_CHECKING:
@@ -45,25 +46,23 @@ def write_key_figure(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_figure(path: Path, results: Mapping[str, Result]) -> None:
-    """Write a figure with the measured depth of each method in the first camera.
+    """Write a figure with the measured depth of each method in the camera that looks ahead.
 
     With a prior, the figure also shows the completed depth of the last method. Without a camera no
     file is written.
-
-    Args:
-        results: Method -> result for the same key sweep.
     """
     method, last = list(results.items())[-1]
     if not last.depth:
         return
-    camera = next(iter(last.depth))
+    camera = front_first([*last.depth], last.views, last.T_key_lidar)[0]
     panels = [(METHOD_NAMES.get(m, m), r, "measured") for m, r in results.items()]
     if camera in last.full:
         panels.append((f"{METHOD_NAMES.get(method, method)} and prior", last, "full"))
     drawn = {}
     for title, result, product in panels:
         depth_m = (result.full if product == "full" else result.depth)[camera].depth_m
-        text = f"{title}: {np.count_nonzero(depth_m) / depth_m.size:.1%} of pixels"
+        named = f", {camera}" * (len(last.depth) > 1)
+        text = f"{title}{named}: {np.count_nonzero(depth_m) / depth_m.size:.1%} of pixels"
         drawn[text + _error(result, camera, product)] = depth_m
     write_file(path, encode_png(draw_figure(_image(last, camera), drawn)))
 
@@ -87,11 +86,8 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
     """Return a picture (h,w,3), as blue, green, red, of panels with depth over a camera's image.
 
     Each depth covers 3 x 3 pixels. Where they overlap, the nearest depth is drawn. Colours run from
-    red at 3 m to blue at 80 m on a logarithmic scale.
-
-    Args:
-        image: (H,W,3) uint8 RGB image, drawn in gray.
-        panels: Title -> (H,W) depth in metres, 0 for no depth.
+    red at 3 m to blue at 80 m on a logarithmic scale. ``image`` is (H,W,3) RGB, drawn in gray.
+    ``panels`` has title -> (H,W) depth in metres, 0 for no depth.
     """
     kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
     gray = (_BRIGHTNESS * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8)
@@ -160,10 +156,7 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
     """Draw the share of outliers over the density, one point for each confidence threshold.
 
     Each camera has its own axes, two in a row. Thin lines show measured pixels, thick lines the
-    filled map.
-
-    Args:
-        curves: Camera -> method -> points of `densify.scores.depth_metrics.precision_density`.
+    filled map. ``curves`` has camera -> method -> `precision_density`.
     """
     from matplotlib.figure import Figure
 

@@ -19,26 +19,16 @@ from densify.readers import checks
 
 @dataclass(frozen=True)
 class SceneFile:
-    """The content of scene.json.
+    """The content of scene.json."""
 
-    Attributes:
-        table: The parsed JSON of the whole file.
-        views: Name of the depth map -> its camera and pose.
-        T_key_lidar: Frame number of a sweep of the window -> (4,4) pose in the key sweep's lidar
-            frame.
-    """
-
-    table: Mapping[str, Any]
-    views: Mapping[str, CameraView]
+    table: Mapping[str, Any]  # the parsed JSON of the whole file
+    views: Mapping[str, CameraView]  # name of the depth map -> its camera and pose
+    # Frame number of a sweep of the window -> (4,4) pose in the key sweep's lidar frame
     T_key_lidar: Mapping[int, Float]
 
 
 def read_scene(path: Path) -> SceneFile:
-    """Read scene.json.
-
-    Raises:
-        InputError: The file is missing or damaged.
-    """
+    """Read scene.json."""
     with damage_named(path):
         table = read_json(path)
         poses = {sweep["frame"]: sweep["T_key_lidar"] for sweep in table["sweeps"]}
@@ -50,11 +40,7 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def read_tracks(path: Path) -> list[ObjectTrack]:
-    """Return the tracks of moving objects in movers.json.
-
-    Raises:
-        InputError: The file is missing or damaged, or an object has no pose at the key sweep.
-    """
+    """Return the tracks of moving objects in movers.json."""
     with damage_named(path):
         table = read_json(path)
         tracks = [_track(entry) for entry in table["objects"]]

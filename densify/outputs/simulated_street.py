@@ -67,16 +67,7 @@ def write_street(
 ) -> Path:
     """Write frames of a simulated street and return the path to give to ``--data``.
 
-    On an error no file of the recording is left.
-
-    Args:
-        format: Name of a format in `FORMATS`.
-        frames: Frame numbers to write.
-        cameras: Names of the cameras to write, None for all.
-        overwrite: Replace an existing recording.
-
-    Raises:
-        InputError: The format, a frame or a camera is unknown or unfit, or the recording exists.
+    ``format`` is one of `FORMATS`. On an error no file of the recording is left.
     """
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
@@ -101,29 +92,17 @@ def write_street(
 
 @dataclass(frozen=True)
 class Excerpt:
-    """Chosen frames and cameras of a simulated street.
-
-    Attributes:
-        frames: Frame numbers, ascending.
-        cameras: Names of the cameras.
-    """
+    """Chosen frames and cameras of a simulated street."""
 
     street: Street
-    frames: tuple[int, ...]
-    cameras: tuple[str, ...]
+    frames: tuple[int, ...]  # frame numbers, ascending
+    cameras: tuple[str, ...]  # names of the cameras
 
     @classmethod
     def of(
         cls, street: Street, frames: Sequence[int], cameras: Sequence[str] | None = None
     ) -> Excerpt:
-        """Return an excerpt with checked frames and cameras.
-
-        Args:
-            cameras: Names of the cameras, None for all of the street.
-
-        Raises:
-            InputError: A frame or a camera does not exist.
-        """
+        """Return an excerpt with checked frames and cameras, None for all cameras of the street."""
         names = tuple(street.cameras if cameras is None else cameras)
         for name in names:
             checks.camera_named(street.cameras, name, Path(street.name))
@@ -136,11 +115,7 @@ class Excerpt:
         return cls(street, tuple(sorted(frames)), names)
 
     def image_numbers(self, camera: str) -> list[int]:
-        """Return the numbers of the images exposed during the excerpt.
-
-        The excerpt lasts from half a sweep period before the first stamp to half a sweep period
-        after the last stamp.
-        """
+        """Return the numbers of the images exposed up to half a sweep period around the excerpt."""
         half_ns = self.street.simulator.period_ns // 2
         begin_ns = self.street.stamp_ns(self.frames[0]) - half_ns
         end_ns = self.street.stamp_ns(self.frames[-1]) + half_ns
@@ -152,12 +127,7 @@ class Excerpt:
         return encode_png(self.street.image(camera, number)[:, :, ::-1])
 
     def T_world_ego(self, stamp_ns: Int, T_lidar_ego: Float | None = None) -> Float:
-        """Return the (n,4,4) true poses of an ego frame at (n,) times in ns since 1970.
-
-        Args:
-            T_lidar_ego: (4,4) pose of the ego frame in the lidar frame, None for the lidar frame
-                itself.
-        """
+        """Return (n,4,4) true poses of an ego frame, None the lidar's, at (n,) times (ns)."""
         T_world_lidar = [self.street.simulator.T_world_lidar_at(int(t)) for t in stamp_ns]
         return np.stack(T_world_lidar) @ (np.eye(4) if T_lidar_ego is None else T_lidar_ego)
 
@@ -182,10 +152,7 @@ def _numbered(frames: Sequence[int], progress: Progress) -> Iterator[tuple[int, 
 
 
 def _write_truth(folder: Path, excerpt: Excerpt, bodies: Bodies, renumbered: bool) -> None:
-    """Write the ground truth folder, numbered from 0 if ``renumbered``, else by frame number.
-
-    ``bodies`` has the poses of all rigid bodies at the stamp of each sweep.
-    """
+    """Write the ground truth folder, numbered from 0 if ``renumbered``, else by frame number."""
     street = excerpt.street
     write_bodies(folder, bodies)
     for number, frame in enumerate(excerpt.frames):
@@ -321,8 +288,7 @@ def stamp_lines(stamps_ns: Int) -> str:
 def sweep_data(street: Street, frame: int, points: Float | Float32 | None = None) -> bytes:
     """Return the bytes of a KITTI sweep file: float32 x y z intensity for each return.
 
-    Args:
-        points: (N,3) positions in metres, None for each point at its own firing time.
+    ``points`` (N,3) replace the positions as fired.
     """
     returns = street.returns(frame)
     columns = [returns.points if points is None else points, returns.intensity]
@@ -337,10 +303,8 @@ def T_lidar_imu(tilt_deg: float) -> Float:
 def oxts_line(street: Street, frame: int, first: int) -> str:
     """Return an oxts record of the true pose. Velocities, accelerations and turn rates are 0.
 
-    Args:
-        frame: Frame number of the record.
-        first: First frame number written, which lies at the fixed latitude. Readers take the scale
-            of the Mercator projection from the first record.
+    The frame ``first``, the first one written, lies at the fixed latitude: readers take the scale
+    of the Mercator projection from it.
     """
     T_lidar = T_lidar_imu(street.simulator.tilt_deg)
     here, start = (

@@ -17,6 +17,7 @@ from densify.geometry.types import Result
 from densify.outputs import flow_writers, key_outputs, plots
 from densify.outputs.atomic import staged_folder, write_json
 from densify.outputs.key_outputs import Context
+from densify.outputs.recording_folder import check_recording
 from densify.outputs.report.key_page import write_report
 
 _OUTPUTS: Mapping[tuple[str, ...], Callable[[Result, Context, Path], None]] = {
@@ -48,29 +49,14 @@ def check_writable(
     overwrite: bool = False,
     verb: Literal["run", "compare"] = "run",
 ) -> None:
-    """Raise InputError if a result cannot be written. No file is changed.
-
-    Reasons are missing permissions, and existing files of ``verb`` that must not be overwritten.
-
-    Args:
-        out: Folder of ``--out``, which need not exist.
-        key: Frame number of the key sweep.
-    """
+    """Raise InputError if a result of ``verb`` cannot be written. No file is changed."""
     owned = _RUN if verb == "run" else _COMPARISON
     _check_place(_key_folder(out, key), owned, out, overwrite)
 
 
 @contextmanager
 def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
-    """Yield a folder to write into, which becomes ``folder`` if the block ends without an error.
-
-    Args:
-        owned: Names of the entries that the block writes, see `staged_folder`.
-        out: Folder of ``--out``, for error messages.
-
-    Raises:
-        InputError: As in `check_writable`.
-    """
+    """Yield a folder for the entries ``owned`` (as `staged_folder`), after `check_writable`."""
     _check_place(folder, owned, out, overwrite)
     with staged_folder(folder, owned) as staging:
         yield staging
@@ -107,19 +93,11 @@ def write_result(
 ) -> list[Path]:
     """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
 
-    Other files in the folder are kept.
-
-    Args:
-        result: Result for one key sweep.
-        out: Parent folder.
-        config: The merged configuration, as plain mappings.
-        data: Specification of the recording, as the user gave it.
-        overwrite: Replace an earlier result.
-
-    Raises:
-        InputError: The folder cannot be written to, or holds a result.
+    Other files in the folder are kept. ``config`` is the merged configuration as plain mappings,
+    ``data`` the recording as the user named it.
     """
     context = Context(config, data)
+    check_recording(out, result.recording, data, [result.key])
     with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:
         for write in _OUTPUTS.values():
             write(result, context, folder)
@@ -134,13 +112,10 @@ def write_comparison(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write the results of several methods and return the paths of the files.
+    """Write the results of several methods, by method, and return the paths of the files.
 
     The files are ``out/KEY/compare.json`` and ``compare.png``. The folder ``compare/`` has the
-    maps, cloud and scene of the last method.
-
-    Args:
-        results: Method -> result for the same key sweep. Other arguments as in `write_result`.
+    maps, cloud and scene of the last method. Other arguments as in `write_result`.
     """
     last = list(results.values())[-1]
     key, context = last.key, Context(config, data)
@@ -150,6 +125,7 @@ def write_comparison(
         "methods": {m: {"frames": r.frames, **r.metrics} for m, r in results.items()},
         "warnings": list(dict.fromkeys(w for r in results.values() for w in r.warnings)),
     }
+    check_recording(out, last.recording, data, [key])
     with writing(_key_folder(out, key), _COMPARISON, out, overwrite) as folder:
         write_json(folder / "compare.json", table)
         plots.write_figure(folder / "compare.png", results)

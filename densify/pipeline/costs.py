@@ -51,6 +51,12 @@ class Watch:
             self._thread.inner_s = inner_s + total_s
         self._report(name, 1)
 
+    def restart(self) -> None:
+        """Forget the costs measured until now, before the next key."""
+        with self._lock:
+            self._seconds.clear()
+            self._peak_mb.clear()
+
     def costs(self) -> tuple[StageCost, ...]:
         """Return the cost of each stage measured until now, repeated runs of a stage added up."""
         return tuple(StageCost(n, self._seconds[n], peak) for n, peak in self._peak_mb.items())

@@ -129,7 +129,7 @@ def result_of_method(
             movers = views.movers(cloud, visible, seen.bodies, scene.images)
         if output.movers != "keep":
             static = cloud.select(~cloud.moving & ~cloud.far)
-            seen = views.see(static, visible).joined(far)
+            seen = views.see(static).joined(far)
         depth = _add_ages(scene, method, views.depth(seen, visible, filled))
         if visible:
             depth = _without_times(scene, depth)
@@ -161,10 +161,19 @@ def result_of_method(
     )
 
 
+def see(scene: KeyScene, name: str, cloud: Cloud) -> SeenCloud:
+    """Return the points of the method ``name`` as the cameras see them.
+
+    cloud: Points at the key's time, as the method accumulates them.
+    """
+    visible = METHODS[name].visible and scene.settings.project.visibility
+    return _see_window(scene, cloud, visible).joined(_see_far(scene, METHODS[name]))
+
+
 def _see_window(scene: KeyScene, cloud: Cloud, visible: bool) -> SeenCloud:
     """Return the accumulated points as the cameras see them, with the bodies of moving objects."""
     with scene.watch.stage("project"):
-        seen = scene.views.see(cloud, visible)
+        seen = scene.views.see(cloud)
         return seen._replace(bodies=scene.views.bodies(cloud)) if visible else seen
 
 
@@ -173,7 +182,7 @@ def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
     if not method.far or scene.beyond is None:
         return None
     with scene.watch.stage("far"):
-        return scene.views.far(*scene.beyond, scene.stretch, standing_only=method.visible)
+        return scene.views.far(*scene.beyond, scene.stretch)
 
 
 def _add_ages(

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from densify.config import Config
-from densify.config.cache import Cache, kept
+from densify.config.cache import Cache, code_digest, kept
 from densify.config.errors import InputError, SweepError, UnfitSweepError
 from densify.config.plugins import engine as engine_row
 from densify.depth.accumulate import accumulate, object_tracks
@@ -374,7 +374,7 @@ class Recording:
 
         # Processes of one run share the result. A digest would read every sweep of the road.
         shared = self._cache if self._run is not None else None
-        inputs = [self._run, self.sequence.name, number, row]
+        inputs = [code_digest(), self._run, self.sequence.name, number, row]
         return kept(shared, "far", lambda: inputs, make)
 
     def _in_windows(self, number: int) -> frozenset[int]:
@@ -394,6 +394,7 @@ class Recording:
 
         def inputs() -> Any:
             content = [(f, self._sweeps.content(f)) for f in frames]
-            return [self.settings.register, self.timeline.period_ns, content, list(settings)]
+            code, period_ns = code_digest(), self.timeline.period_ns
+            return [code, self.settings.register, period_ns, content, list(settings)]
 
         return kept(self._cache, step, inputs, make)

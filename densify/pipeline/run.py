@@ -214,7 +214,8 @@ def densify(
         key: Frame number of the key sweep.
         methods: Names of `METHODS`.
         cameras: Names of cameras; None for all.
-        watch: Measures the cost of each stage.
+        watch: Measures the cost of each stage, from zero. A stage shared by several keys counts for
+            the first of them.
         with_images: Colour the cloud, and score depth if there is ground truth. The maps are the
             same either way.
         priors: Depth images that complete the maps of the last method.
@@ -225,6 +226,7 @@ def densify(
     """
     methods = tuple(dict.fromkeys(methods))
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
+    watch.restart()
     recording.window(key)  # raises its errors before an image is read
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
     with watch.stage("images"):
@@ -237,7 +239,7 @@ def densify(
         beyond = far.result() if far is not None else None
         if key == max(recording.cut.number_of):  # no later key needs them
             recording.forget_raw()
-        scene = _scene_of(
+        scene = scene_of(
             recording, key, shots, images, beyond, moments[methods[-1]].cloud, with_images, watch
         )
         filled = [settings.is_scored or name == methods[-1] for name in methods]
@@ -251,8 +253,14 @@ def densify(
             kind = settings.prior.kind
             made[-1] = complete_with_prior(made[-1], priors, shots, scene.truth, kind)
     results: dict[str, Result] = {}
+    costs = watch.costs()
     for result in made:
-        results[result.method] = replace(result, costs=watch.costs(), baselines=dict(results))
+        results[result.method] = replace(
+            result,
+            costs=costs,
+            baselines=dict(results),
+            recording=sequence.name,
+        )
     return add_warnings(results, recording, key, shots)
 
 
@@ -265,7 +273,7 @@ def _moments(recording: Recording, key: int, methods: Sequence[str]) -> dict[str
     return moments
 
 
-def _scene_of(
+def scene_of(
     recording: Recording,
     key: int,
     shots: Mapping[str, Shot],
@@ -278,7 +286,7 @@ def _scene_of(
     """Return the shared inputs of a key's methods; ``cloud`` says which points of it move."""
     sequence, settings, stretch = recording.sequence, recording.settings, recording.window(key)
     key_image = RangeImage.of(stretch[key])
-    views = Views.of(sequence, stretch, key, key_image, shots, images, settings)
+    views = Views.of(sequence, stretch, key, shots, images, settings)
     truth = views.truth(sequence.truth) if with_images and sequence.truth else {}
     held_out = None
     if settings.is_scored:
@@ -324,6 +332,8 @@ def _open(
         )
     if isinstance(methods, str):
         raise InputError(f"methods: got {methods!r}, expected a list of names, such as ['flow']")
+    if not methods:
+        raise InputError(f"--methods: got no name, expected some of {', '.join(METHODS)}")
     for name in methods:
         if name not in METHODS:
             raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")

@@ -27,9 +27,6 @@ class ReaderModule(Protocol):
         Args:
             path: File or folder of the recording.
             scene: Scene name or reader's option after ``#`` in ``--data``; None without ``#``.
-
-        Raises:
-            InputError: The path or scene holds no recording. The message names the path.
         """
         ...
 
@@ -113,10 +110,7 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
 
 
 def _reader_of(parsed: Spec, where: str) -> Plugin:
-    """Return the named reader, or the first reader that recognises the path.
-
-    Error messages begin with ``where``.
-    """
+    """Return the named reader, or the first reader that recognises the path."""
     if parsed.reader is not None:
         return READERS.row(parsed.reader, where)
     if not parsed.path.exists():
@@ -153,10 +147,7 @@ def _what_is_there(path: Path) -> str:
 
 
 def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:
-    """Return the path of the first recording in a folder, at most two levels down; else None.
-
-    Readers are tried in the given order, each on all paths.
-    """
+    """Return the first recording in a folder, at most two levels down; None without one."""
     places = [*path.glob("*"), *path.glob("*/*")][:_MOST_PLACES] if path.is_dir() else []
     places = [place for place in sorted(places) if place.exists()]  # links may lead nowhere
     found = (place for reader in readers for place in places if reader.recognises(place))

@@ -43,23 +43,14 @@ _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 
 def open_recording(path: Path, scene: str | None) -> Argoverse2:
-    """Open an Argoverse 2 log; sweeps and images are read later, on request.
-
-    Args:
-        path: Folder of a log, of a split, or of the whole data set.
-        scene: Name of the log; None if ``path`` is a log or holds a single log.
-    """
+    """Open a log: its folder, or that of its split or the data set with its name as ``scene``."""
     if scene is None and (path / _POSES).is_file():
         return Argoverse2(path)
     places = (path, path / "train", path / "val", path / "test")
     found = [file.parent for place in places for file in place.glob(f"*/{_POSES}")]
     logs = {log.name: log for log in found}
-    if not logs:
-        raise InputError(
-            f"{path}: no Argoverse 2 log; expected {_POSES} and sensors/lidar in it, or in folders "
-            f"within it"
-        )
-    return Argoverse2(logs[checks.chosen_scene("argoverse2", path, scene, sorted(logs))])
+    none = f"no Argoverse 2 log; expected {_POSES} and sensors/lidar in it, or in folders within it"
+    return Argoverse2(logs[checks.chosen_scene("argoverse2", path, scene, sorted(logs), none)])
 
 
 class Argoverse2(FileSequence):
@@ -69,11 +60,7 @@ class Argoverse2(FileSequence):
     """
 
     def __init__(self, log: Path) -> None:
-        """Read the poses and the calibration in the folder of a log.
-
-        Raises:
-            InputError: The log has no sweeps, or a table is missing or malformed.
-        """
+        """Read the poses and the calibration in the folder of a log."""
         sweeps = checks.numbered_files(log / "sensors" / "lidar", ".feather")
         if not sweeps:
             raise InputError(
@@ -126,13 +113,7 @@ class Argoverse2(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return the annotated boxes of a sweep in the lidar frame, None if it has no boxes.
-
-        The test split has no boxes.
-
-        Raises:
-            InputError: The table is malformed.
-        """
+        """Return a sweep's annotated boxes in the lidar frame; None in the test split."""
         if self._annotations is None:
             return None
         path, columns = self.where / "annotations.feather", self._annotations

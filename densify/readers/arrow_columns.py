@@ -30,15 +30,10 @@ def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str,
     """Return columns of a feather file by name, (N,) for a table of N rows.
 
     Args:
-        path: Path of the feather file.
         columns: Kind of values expected, by column name: "n" finite numbers, "m" numbers that may
             be NaN, "i" integers, "s" strings, "b" bytes, "t" booleans, "l" lists of numbers. A
             column "l" is returned as an object array of arrays or None.
         what: Kind of recording, such as "Argoverse 2 recordings", for the error message.
-
-    Raises:
-        InputError: The file is missing or damaged, or a column is missing, has null values or
-            has another kind of values.
     """
     needed("pyarrow", "argoverse", what)
     feather = needed("pyarrow.feather", "argoverse", what)
@@ -48,14 +43,7 @@ def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str,
 def read_parquet(
     path: Path, columns: Mapping[str, str], what: str, where: Mapping[str, int] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Return columns of a parquet file by name, (N,) for N selected rows, as `read_feather` does.
-
-    Args:
-        path: Path of the parquet file.
-        columns: Kind of values expected, by column name, as in `read_feather`.
-        what: Kind of recording, for the error message.
-        where: Required value by column name; only rows with these values are read.
-    """
+    """Return columns of a parquet file as `read_feather`, of the rows with the values ``where``."""
     parquet = needed("pyarrow.parquet", "waymo", what)
     filters = [(name, "=", value) for name, value in (where or {}).items()]
 

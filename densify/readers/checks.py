@@ -6,6 +6,7 @@ Each check raises InputError with a message that begins with the file or folder.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,20 +25,36 @@ _ORTHONORMAL_TOLERANCE = 1e-3  # far above the rounding of text and float32 file
 
 
 def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
-    """Return the files named by a number, such as ``0000000120.bin``, by ascending number.
+    """Return the files of a folder named by a number, such as ``0000000120.bin``, ascending.
 
-    Args:
-        folder: Folder of the files; if it does not exist, the result is empty.
-        suffixes: Accepted suffixes in lower case, with the dot.
+    Of files whose names differ in the suffix alone, the one with the first of ``suffixes`` is
+    taken.
     """
     if not folder.is_dir():
         return {}
-    found = {
-        int(path.stem): path
-        for path in folder.iterdir()
-        if path.stem.isdecimal() and path.suffix.lower() in suffixes
-    }
+    files = [p for p in folder.iterdir() if p.stem.isdecimal() and p.suffix.lower() in suffixes]
+    found: dict[int, Path] = {}
+    for path in sorted(files, key=lambda p: (suffixes.index(p.suffix.lower()), p.name)):
+        before = found.setdefault(int(path.stem), path)
+        if before.stem != path.stem:
+            raise InputError(
+                f"{path}: has the number {int(path.stem)}, as {before.name} has; expected one file "
+                f"of each number; move one of them away"
+            )
     return dict(sorted(found.items()))
+
+
+def file_within(root: Path, name: str, where: Path | str) -> Path:
+    """Return the path of a file that a table names relative to a data set's folder.
+
+    Raise InputError, starting with ``where``, if the name leads out of the folder.
+    """
+    path = root / name
+    if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)):
+        raise InputError(
+            f"{where}: names the file {name!r}, outside of {root}; expected a path within it"
+        )
+    return path
 
 
 def drive_around(path: Path) -> Path | None:
@@ -46,17 +63,7 @@ def drive_around(path: Path) -> Path | None:
 
 
 def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
-    """Return the entry of a frame, such as a file or a stamp.
-
-    Args:
-        entries: Entries by frame number.
-        frame: Number of the requested frame.
-        what: Kind of entry, such as ``"sweep"``, for the error message.
-        where: Folder or file of the entries, for the error message.
-
-    Raises:
-        InputError: The frame has no entry. The message names the existing frames.
-    """
+    """Return the entry of a frame, such as a file or stamp; errors name ``what`` and ``where``."""
     if frame not in entries:
         raise InputError(
             f"{where}: no {what} of frame {frame}; frames that exist: {format_frames(entries)}"
@@ -74,11 +81,7 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
 
 
 def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
-    """Decode an image file's bytes to (H,W,3) uint8 RGB; a gray image has three equal channels.
-
-    Raises:
-        InputError: The image is damaged, or its size differs from the camera's.
-    """
+    """Decode an image file's bytes to (H,W,3) uint8 RGB; a gray image has three equal channels."""
     bgr = decode_image(data, where)
     image_size(bgr.shape, camera, where)
     return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
@@ -104,16 +107,8 @@ def pinhole(
 ) -> Camera:
     """Return a camera with zero skew.
 
-    Args:
-        name: Name of the camera.
-        size_px: Width and height of the images.
-        fx_fy_cx_cy: Focal lengths and principal point (px).
-        T_cam_lidar: (4,4) transform from the lidar frame to the camera frame.
-        where: Name of the calibration file, with which error messages begin.
-        lens: Further arguments of `Camera`, such as ``distortion``.
-
-    Raises:
-        InputError: A number is not finite, or a focal length or the size is not positive.
+    ``size_px`` is (width, height), ``fx_fy_cx_cy`` in pixels, ``T_cam_lidar`` (4,4). ``lens`` has
+    further arguments of `Camera`, such as ``distortion``. Errors begin with ``where``.
     """
     fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
@@ -125,18 +120,12 @@ def pinhole(
     return Camera(name, *size_px, K, T_cam_lidar, **lens)
 
 
-def chosen_scene(reader: str, path: Path, scene: str | None, names: Sequence[str]) -> str:
-    """Return the name of the requested scene, or of the only scene of a data set.
-
-    Args:
-        reader: Name of the reader, for the error message.
-        path: Path of the data set, for the error message.
-        scene: Name of the requested scene, None if the user named no scene.
-        names: Names of all scenes in the data set.
-
-    Raises:
-        InputError: The scene does not exist, or none is requested and there are several.
-    """
+def chosen_scene(
+    reader: str, path: Path, scene: str | None, names: Sequence[str], none: str
+) -> str:
+    """Return the requested scene, for None the only one; ``none`` is the error without any."""
+    if not names:
+        raise InputError(f"{path}: {none}")
     if scene in names or (scene is None and len(names) == 1):
         return scene or names[0]
     shown = ", ".join(names[:4]) + f", ... {names[-1]} ({len(names)} in all)" * (len(names) > 4)
@@ -154,11 +143,7 @@ def truth_beside(recording: Path) -> Truth | None:
 
 
 def parse_numbers(text: str, where: str, count: int) -> Float:
-    """Parse the (count,) finite numbers, separated by white space, of a line or file.
-
-    Raises:
-        InputError: The count or a value is wrong. The message begins with ``where``.
-    """
+    """Parse the (count,) finite numbers, separated by white space, of a line or file."""
     try:
         values = np.array(text.split(), np.float64)
     except ValueError as error:
@@ -171,15 +156,7 @@ def parse_numbers(text: str, where: str, count: int) -> Float:
 
 
 def rigid(T: Any, where: str) -> Float:
-    """Return a rigid transform as a checked (4,4) float64 matrix.
-
-    Args:
-        T: Matrix (4,4) or (3,4), or its 16 or 12 numbers row by row.
-        where: Name of the file or line, with which error messages begin.
-
-    Raises:
-        InputError: A number is not finite, or the upper left (3,3) part is not a rotation.
-    """
+    """Return a checked (4,4) rigid transform, given as (4,4), (3,4), or 16 or 12 numbers."""
     T = np.asarray(T, np.float64)
     T = T.reshape(-1, 4) if T.size in (12, 16) else T
     if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
@@ -201,11 +178,9 @@ def rotation(R: Float, where: str) -> Float:
 
 
 def scanner_axes(T_lidar_scanner: Float) -> Float:
-    """Return the (S,3,3) rotations from the lidar frame to the axes of each of S scanners.
+    """Return the (S,3,3) rotations from the lidar frame to scanner axes, of (S,4,4) mounting poses.
 
-    Args:
-        T_lidar_scanner: (S,4,4) mounting poses. The axes of an upside-down scanner are turned by
-            180 degrees about its x axis, until z points up.
+    The axes of an upside-down scanner are turned by 180 degrees about x, until z points up.
     """
     R = T_lidar_scanner[:, :3, :3]
     upright = np.where(R[:, 2:, 2:] < 0, R * [1.0, -1.0, -1.0], R)
@@ -215,17 +190,7 @@ def scanner_axes(T_lidar_scanner: Float) -> Float:
 def quaternion_pose(
     w_x_y_z: Sequence[float] | Float, translation_m: Sequence[float] | Float, where: str
 ) -> Float:
-    """Return the (4,4) pose of a quaternion, which is normalised, and a translation.
-
-    Args:
-        w_x_y_z: (4,) quaternion, scalar part first.
-        translation_m: (3,) translation.
-        where: Name of the file or row, with which error messages begin.
-
-    Raises:
-        InputError: A number is missing or not finite, or the quaternion's length is not within
-            0.01 of 1.
-    """
+    """Return the (4,4) pose of a unit quaternion, scalar first, and a translation in metres."""
     from scipy.spatial.transform import Rotation
 
     try:
@@ -247,12 +212,7 @@ def quaternion_pose(
 
 
 def upright_poses(centre_m: Float, heading_rad: Float) -> Float:
-    """Return the (K,4,4) poses of K boxes that are rotated only about the z axis of the frame.
-
-    Args:
-        centre_m: (K,3) centres of the boxes.
-        heading_rad: (K,) directions of the boxes' fronts, from x towards y.
-    """
+    """Return (K,4,4) poses at centres (K,3), turned about z by (K,) headings from x towards y."""
     T = np.tile(np.eye(4), (len(centre_m), 1, 1))
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c
@@ -267,17 +227,13 @@ def boxes(
     where: str,
     lidar: Int | None = None,
 ) -> Boxes:
-    """Check and return the K boxes of a sweep.
+    """Check and return the K boxes of a sweep; errors begin with ``where``.
 
     Args:
         track: (K,) name of each box's object, the same in all sweeps; "" if it is not tracked.
         T_lidar_box: (K,4,4) poses of the boxes' centres in the lidar frame, x to the front.
         size_m: (K,3) length, width and height.
-        where: Name of the file or sweep, with which error messages begin.
         lidar: (K,) index of the scanner whose points a box encloses, -1 for all; None for all.
-
-    Raises:
-        InputError: A size is not positive, a pose is not finite, or an object has two boxes.
     """
     bad = np.flatnonzero(~((size_m > 0) & (size_m < np.inf)).all(axis=1))
     if len(bad):

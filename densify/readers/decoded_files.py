@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Decode arrays, images and LAS files safely with NumPy, OpenCV, simplejpeg and laspy.
+"""Decode arrays, images and LAS files safely with NumPy, OpenCV and laspy.
 
 Each function checks the sizes stated in a file's header before it allocates memory. Every error of
 a library is raised as InputError.
@@ -8,6 +8,7 @@ a library is raised as InputError.
 from __future__ import annotations
 
 import io
+import logging
 import math
 import struct
 import zipfile
@@ -20,10 +21,13 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.config.file_content import MOST_BYTES, check_size, open_file, read_bytes, reason
+from densify.readers.stray_bytes import decode_strictly
 
 Arrays = dict[str, NDArray[Any]]
 
 MOST_PIXELS = 1 << 27
+_log = logging.getLogger("densify")
+_folders_told: set[Path] = set()
 # Offset of the points, number of records, bytes per point, number of points.
 _LAS_HEADER = struct.Struct("<96xIIxHI")
 # LAS 1.4 only: offset and number of extended records, number of points.
@@ -32,11 +36,7 @@ _RECORD_BYTES = 54  # smallest size of a variable length record
 
 
 def read_array(path: Path) -> NDArray[Any]:
-    """Return the array of a .npy file.
-
-    Raises:
-        InputError: The file is missing, too large, damaged, or holds Python objects.
-    """
+    """Return the array of a .npy file."""
     data = read_bytes(path)
     try:
         return _array(data)
@@ -47,16 +47,7 @@ def read_array(path: Path) -> NDArray[Any]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
 ) -> Arrays:
-    """Return the arrays of a .npz file by name.
-
-    Args:
-        path: Path of the .npz file.
-        names: Names of the arrays to read, if the file has them; None reads all.
-        most_bytes: Largest total size of the uncompressed arrays.
-
-    Raises:
-        InputError: The file is missing or damaged, contains Python objects, or is too large.
-    """
+    """Return the arrays of a .npz file by name: those in ``names``, None for all."""
     data = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -92,22 +83,16 @@ def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
 def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDArray[Any]:
     """Decode the bytes of a PNG or JPEG file to (H,W,3) uint8 pixels in blue, green, red.
 
-    Args:
-        data: Content of the image file.
-        where: Name of the file, with which error messages begin.
-        as_stored: True keeps the file's data type and channels, such as (H,W) uint16.
-
-    Raises:
-        InputError: The data are no complete PNG or JPEG file, or exceed `MOST_PIXELS`.
+    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16.
     """
     import cv2
 
     try:
         if _checked_format(data, where) == "JPEG" and not as_stored:
-            import simplejpeg
-
-            # OpenCV and Pillow decode damaged JPEG data to wrong colours.
-            return simplejpeg.decode_jpeg(data, "BGR", strict=True)
+            pixels, mended = decode_strictly(data)
+            if mended:
+                _tell_mended(where, mended)
+            return pixels
         flags = cv2.IMREAD_UNCHANGED if as_stored else cv2.IMREAD_COLOR
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         if image is None:
@@ -122,6 +107,18 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
         ) from error
 
 
+def _tell_mended(where: Path | str, mended: str) -> None:
+    """Warn of an image that breaks the rules of its format; once for a folder or topic."""
+    if (folder := Path(where).parent) not in _folders_told:
+        _folders_told.add(folder)
+        _log.warning(
+            "%s: %s; all of its pixels are there and are read. Others like it in %s are not named",
+            where,
+            mended,
+            folder,
+        )
+
+
 def _checked_format(data: bytes, where: Path | str) -> str:
     """Return "PNG" or "JPEG", the format of an image file; raise an exception if damaged."""
     from PIL import Image
@@ -133,20 +130,13 @@ def _checked_format(data: bytes, where: Path | str) -> str:
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
-    """Return the width and height (px) of an image file after decoding all pixels.
-
-    Raises:
-        InputError: The file is not a complete PNG or JPEG image.
-    """
+    """Return the width and height (px) of an image file after decoding all pixels."""
     height, width = read_image(path).shape[:2]
     return width, height
 
 
 def stated_size_px(path: Path) -> tuple[int, int] | None:
-    """Return the width and height (px) stated in an image file's header, None without a header.
-
-    Damage in the rest of the file is not detected.
-    """
+    """Return the width and height (px) that an image's header states, None without a header."""
     from PIL import Image
 
     try:
@@ -167,11 +157,7 @@ def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
 
 
 def read_las(path: Path) -> Any:
-    """Return a `laspy.LasData` with all points of a LAS or LAZ file.
-
-    Raises:
-        InputError: The file is missing, too large or damaged.
-    """
+    """Return a `laspy.LasData` with all points of a LAS or LAZ file."""
     import laspy
 
     data = read_bytes(path)

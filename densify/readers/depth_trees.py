@@ -9,6 +9,7 @@ The folder of estimated maps and the folder of true maps each have one of these 
     000005/depth/image_02/000007.png                        its maps of single images, by number
     [image_02/]0000000005.png, scene_a.png                  plain folders; the name is the frame
 
+Folders that `densify export` wrote into PREDICTED are left out, because they hold copies.
 The sets of `densify dataset` have the first or the third layout. A drive is KITTI's dated name
 anywhere in a path, or the folder that holds proj_depth.
 """
@@ -47,18 +48,12 @@ class DepthPair:
 
 @dataclass(frozen=True)
 class DepthPairs:
-    """Pairs of estimated and true depth maps, and the files that could not be paired.
+    """Pairs of estimated and true depth maps, and the files that could not be paired."""
 
-    Attributes:
-        pairs: One or more pairs, ordered by the path of the true map.
-        without_truth: Paths of estimated maps without a true map.
-        without_prediction: Paths of true maps without an estimated map.
-        without_mask: Paths of paired true maps without a mask; empty if no masks are given.
-    """
-
-    pairs: tuple[DepthPair, ...]
-    without_truth: tuple[Path, ...] = ()
-    without_prediction: tuple[Path, ...] = ()
+    pairs: tuple[DepthPair, ...]  # one or more pairs, ordered by the path of the true map
+    without_truth: tuple[Path, ...] = ()  # paths of estimated maps without a true map
+    without_prediction: tuple[Path, ...] = ()  # paths of true maps without an estimated map
+    # Paths of paired true maps without a mask; empty if no masks are given
     without_mask: tuple[Path, ...] = ()
 
 
@@ -85,9 +80,6 @@ def pair_depth_files(
         truth: Path of a true map, or of a folder. Two files are paired whatever their names.
         mask: Folder of masks of moving objects, or one file beside two files; None for no masks.
         filled: True pairs densify's filled maps, False its maps of measured pixels.
-
-    Raises:
-        InputError: A path does not exist, the names are ambiguous, or no files can be paired.
     """
     found = _product(_found(predicted, "PREDICTED"), predicted, filled)
     true = _found(truth, "TRUTH")
@@ -124,6 +116,9 @@ def _found(place: Path, what: str) -> list[_File]:
     paths = sorted(place.rglob("*.png"))
     # Hidden files are unfinished results.
     paths = [p for p in paths if "/." not in f"/{p.relative_to(place).as_posix()}"]
+    # Exported maps are copies of the maps beside them.
+    exported = {p.parent for p in place.rglob("export.yaml")} - {place}
+    paths = [p for p in paths if not exported.intersection(p.parents)]
     if not paths:
         raise InputError(
             f"{what} {place}: no such file or folder with PNG files, expected depth maps"
@@ -164,10 +159,7 @@ def _product(files: Sequence[_File], place: Path, filled: bool) -> list[_File]:
 def _match(
     left: Sequence[_File], right: Sequence[_File], left_place: Path, right_place: Path
 ) -> dict[Path, Path]:
-    """Return the left path by right path of each pair with equal frame.
-
-    Drive and camera must be equal too if all paths name them.
-    """
+    """Return right -> left path where frames agree, and drive and camera too if all name them."""
     everything = (*left, *right)
     told = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in everything)]
     here = _keyed(left, ["frame", *told], left_place)

@@ -28,11 +28,7 @@ def in_lines(lines: Sequence[tuple[str, str]]) -> str:
 def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
     """Summarise a recording as (name, text) pairs, among them frames, rate, cameras and poses.
 
-    The first and the last readable sweep are loaded, and no image. Rates are computed from the
-    median time between two sweeps or images.
-
-    Raises:
-        InputError: No sweep can be read.
+    The first and the last readable sweep are loaded, and no image. Rates are of median times.
     """
     timeline = Timeline.of(sequence)
     unreadable = dict(timeline.unknown)

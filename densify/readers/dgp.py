@@ -41,18 +41,12 @@ _BOGUS_YEAR = 2200
 
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
-    """Open a DGP scene; sweeps and images are read later, on request.
-
-    Args:
-        path: Folder of a scene, or a folder of scenes.
-        scene: Name of the scene's folder; None if ``path`` is a scene or holds a single scene.
-    """
+    """Open a scene by its folder, or by a folder of scenes with the scene's name."""
     if scene is None and find_scene(path):
         return Dgp(path)
     names = sorted(folder.name for folder in path.glob("*/") if find_scene(folder))
-    if not names:
-        raise InputError(f"{path}: no DGP scene; expected a folder with scene_<hash>.json")
-    return Dgp(path / checks.chosen_scene("dgp", path, scene, names))
+    none = "no DGP scene; expected a folder with scene_<hash>.json"
+    return Dgp(path / checks.chosen_scene("dgp", path, scene, names, none))
 
 
 def find_scene(folder: Path) -> Path | None:
@@ -62,27 +56,20 @@ def find_scene(folder: Path) -> Path | None:
 
 
 class _Datum(NamedTuple):
-    """One sweep or image, its time, and the (4,4) pose of its sensor at that time.
-
-    ``columns`` are the names of a sweep's columns. ``size_px`` is the (width, height) of an image.
-    """
+    """A sweep or image, its time, and the (4,4) pose of its sensor at that time."""
 
     path: Path
     stamp_ns: int
     T_world_sensor: Float
-    columns: tuple[str, ...]
-    size_px: tuple[int, int]
+    columns: tuple[str, ...]  # of a sweep
+    size_px: tuple[int, int]  # width and height of an image
 
 
 class Dgp(FileSequence):
     """A DGP scene as a `LidarSequence`, with poses of its images."""
 
     def __init__(self, path: Path) -> None:
-        """Read the description and the calibration in the folder of a scene.
-
-        Raises:
-            InputError: A file is missing or malformed, or the scene has no sweeps.
-        """
+        """Read the description and the calibration in the folder of a scene."""
         file = find_scene(path)
         if file is None:
             raise InputError(f"{path}: no DGP scene; expected scene_<hash>.json in it")
@@ -157,13 +144,14 @@ def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
     if not found["point_cloud"]:
         raise InputError(f"{file}: none of its sweeps is there; expected point_cloud/LIDAR/*.npz")
     images = dict(sorted(found["image"].items()))
-    return found["point_cloud"], images, file.parent / "calibration" / f"{key}.json"
+    calibration = checks.file_within(file.parent, f"calibration/{key}.json", file)
+    return found["point_cloud"], images, calibration
 
 
 def _datum(file: Path, kind: str, entry: Mapping[str, Any]) -> _Datum:
     datum, where = entry["datum"][kind], f"{file}: datum {entry['key']}"
     return _Datum(
-        file.parent / datum["filename"],
+        checks.file_within(file.parent, datum["filename"], where),
         _stamp_ns(entry["id"]["timestamp"]),
         _read_pose(datum["pose"], where),
         tuple(datum.get("point_format", ())),

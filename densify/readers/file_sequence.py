@@ -148,9 +148,6 @@ class FileSequence(ABC):
 
         Rows at 0 0 0, which many formats use as padding, and rows with a position that is not
         finite are dropped. Intensities that are not finite become 0.
-
-        Raises:
-            InputError: The sweep does not exist, its file is damaged, or no row is valid.
         """
         path, returns = self._checked_returns(frame)
         x, y, z = returns.points.T  # by columns: reductions over rows of three are far slower
@@ -199,11 +196,7 @@ class FileSequence(ABC):
         return self._image(calibrated, number)
 
     def T_world_lidar(self, frame: int) -> Float:
-        """Return the data set's (4,4) pose of the lidar in the world at a sweep's reference time.
-
-        Raises:
-            InputError: The sweep has no pose, or the pose is not a rigid transform.
-        """
+        """Return the recorded (4,4) pose of the lidar in the world at a sweep's reference time."""
         self.check_frame(frame)
         return checks.rigid(self._pose(frame), f"{self.where}: pose of frame {frame}")
 
@@ -213,11 +206,7 @@ class FileSequence(ABC):
             checks.of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
 
     def check_image(self, camera: str, number: int) -> Camera:
-        """Return the camera of an image.
-
-        Raises:
-            InputError: The camera or the image does not exist. The message lists the existing ones.
-        """
+        """Return the camera of an image."""
         calibrated = checks.camera_named(self.cameras, camera, self.where)
         checks.of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
         return calibrated

@@ -70,16 +70,8 @@ def check_argument(argument: str) -> None:
 def read_step(folder: Path, stretch: Stretch, here: int, there: int) -> FlowField:
     """Read the flow of a sweep's points to another sweep, ego-motion removed, in its lidar frame.
 
-    Points that are missing in the flow file are static.
-
-    Args:
-        folder: Folder of the flow files.
-        stretch: Registered sweeps.
-        here: Index in ``stretch.sweeps`` of the source sweep, whose points are returned.
-        there: Index in ``stretch.sweeps`` of the target sweep.
-
-    Raises:
-        InputError: The flow file is missing, damaged or malformed.
+    ``here`` (source) and ``there`` (target) are indices in ``stretch.sweeps``. Points that are
+    missing in the flow file are static.
     """
     frame, target = stretch.frames[here], stretch.frames[there]
     sweep, T_here_there = stretch.sweeps[here].sweep, stretch.T_target_source(frame, target)
@@ -100,7 +92,6 @@ def sweep_columns(
     point that is missing in the file has flow 0 and object -1, and is not valid.
 
     Args:
-        path: Path of the flow file.
         row: (N,) row index of each point in the sweep's file.
         points: (N,3) points in the source's lidar frame (m).
         T_here_there: (4,4) pose of the target's lidar frame in the source's lidar frame.
@@ -135,11 +126,7 @@ def sweep_columns(
 
 
 def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a flow file by name, as stored, after checking shapes and values.
-
-    Raises:
-        InputError: The file is missing, damaged or malformed.
-    """
+    """Return the arrays of a flow file by name, as stored, after checking shapes and values."""
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
     arrays = read_arrays(path, _KNOWN)
@@ -213,30 +200,18 @@ _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 @dataclass(frozen=True)
 class LabelledFlow:
-    """The ground-truth flow of the N points of a registered sweep.
+    """The ground-truth flow of the N points of a registered sweep."""
 
-    Attributes:
-        flow: (N,3) metres to the next sweep, ego-motion removed, in the sweep's lidar frame.
-        classes: (N,) uint8 index in `densify.scores.challenge.CLASSES`, or its ``IGNORED``.
-        valid: (N,) bool, the ground-truth flow of the point is known.
-    """
-
-    flow: Float
+    flow: Float  # (N,3) metres to the next sweep, ego-motion removed, in the sweep's lidar frame
+    # (N,) uint8 index in `densify.scores.challenge.CLASSES`, or its ``IGNORED``
     classes: NDArray[np.uint8]
-    valid: Bool
+    valid: Bool  # (N,) bool, the ground-truth flow of the point is known
 
 
 def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
-    """Read the ground-truth flow of a sweep to the next sweep.
+    """Read the ground-truth flow of a sweep (a frame number) to the next sweep of the stretch.
 
-    Args:
-        place: Folder of flow files ``FRAME_NEXT.npz`` or of Argoverse 2 labels.
-        name: Name of the recording, also of a subfolder that may hold its labels.
-        stretch: Registered sweeps, with the sweep and the next one.
-        frame: Frame number of the sweep.
-
-    Raises:
-        InputError: The sweep has no labels, or the labels are damaged or too few.
+    ``place`` holds ``FRAME_NEXT.npz`` or, itself or in its folder ``name``, Argoverse 2 labels.
     """
     if not place.is_dir():
         raise InputError(f"--truth {place}: no such folder; expected true flow in it")

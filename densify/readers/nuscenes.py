@@ -20,6 +20,7 @@ undone. Missing returns then lie at the origin and are left out.
 
 from __future__ import annotations
 
+import codecs
 import mmap
 import re
 from collections import defaultdict
@@ -67,21 +68,13 @@ def pose_of(record: Record, where: str) -> Float:
 
 
 def read_table(path: Path) -> dict[str, Record]:
-    """Return all records of a JSON table, by their tokens.
-
-    Raises:
-        InputError: The file is missing, or is no table of nuScenes.
-    """
+    """Return all records of a JSON table, by their tokens."""
     with described_in(path, _EXPECTED):
         return {str(record["token"]): record for record in read_json(_existing(path))}
 
 
 def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Record]:
-    """Return the records of a JSON table whose field ``key`` is in ``wanted``, by their tokens.
-
-    Raises:
-        InputError: The file is missing or cut off, or a wanted record is malformed.
-    """
+    """Return the records of a JSON table whose field ``key`` is in ``wanted``, by their tokens."""
     pattern = re.compile(rb'"%s"\s*:\s*"([^"]*)"' % key.encode())
     names = frozenset(name.encode() for name in wanted)
     found = []
@@ -90,7 +83,8 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
             open_file(_existing(path)) as file,
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
         ):
-            if data[:4096].lstrip()[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
+            begin = data[:4096].removeprefix(codecs.BOM_UTF8).lstrip()
+            if begin[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
                 raise ValueError("it does not begin with [ or end with ]")
             for match in _RECORD.finditer(data):
                 of = pattern.search(match[0])
@@ -111,15 +105,10 @@ def _existing(path: Path) -> Path:
 
 
 class KeyBox(NamedTuple):
-    """The annotated box of one object in one key frame.
+    """The annotated box of one object in one key frame."""
 
-    Attributes:
-        T_world_box: (4,4) pose of the box in the world: origin in its middle, x front, z up.
-        size_m: (3,) length, width, height.
-    """
-
-    T_world_box: Float
-    size_m: Float
+    T_world_box: Float  # (4,4) pose of the box in the world: origin in its middle, x front, z up
+    size_m: Float  # (3,) length, width, height
 
 
 @dataclass(frozen=True)
@@ -129,28 +118,15 @@ class Annotations:
     Between key frames, boxes are interpolated at constant velocity and turn rate, as in the devkit.
     An object in only one of two consecutive key frames is extrapolated from its nearest motion. Its
     box then has no track name, because the real position is unknown.
-
-    Attributes:
-        where: Path of the table, for messages.
-        key_ns: (n,) ascending times of the key frames.
-        boxes: Boxes of each key frame, by the token of the object.
     """
 
-    where: str
-    key_ns: Int
-    boxes: tuple[Mapping[str, KeyBox], ...]
+    where: str  # path of the table, for messages
+    key_ns: Int  # (n,) ascending times of the key frames
+    boxes: tuple[Mapping[str, KeyBox], ...]  # boxes of each key frame, by the token of the object
 
     @staticmethod
     def read(tables: Path, scene: str) -> Annotations | None:
-        """Return the boxes of a scene; None if the table is missing or has no box in the scene.
-
-        Args:
-            tables: Folder of the JSON tables.
-            scene: Token of the scene.
-
-        Raises:
-            InputError: A record is malformed, or an object has two boxes in a key frame.
-        """
+        """Return the boxes of a scene (a token); None if the table is missing or has none of it."""
         path = tables / "sample_annotation.json"
         if not path.is_file():
             return None
@@ -205,12 +181,7 @@ class Annotations:
 
 
 def open_recording(path: Path, scene: str | None) -> NuScenes:
-    """Open a scene of nuScenes, as `densify.readers.ReaderModule` specifies.
-
-    Args:
-        path: Folder of the JSON tables, or its parent with the tables of one or more versions.
-        scene: Name such as ``scene-0061``; None if there is only one scene.
-    """
+    """Open a scene, such as ``scene-0061``, by the folder of the JSON tables or by its parent."""
     folders = [path] if (path / "sample_data.json").is_file() else []
     folders = folders or sorted(found.parent for found in path.glob("v*/sample_data.json"))
     if not folders:
@@ -222,90 +193,49 @@ def open_recording(path: Path, scene: str | None) -> NuScenes:
     for folder in folders:
         for token, record in read_table(folder / "scene.json").items():
             scenes.setdefault(str(record.get("name")), (folder, token))
-    name = checks.chosen_scene("nuscenes", path, scene, list(scenes))
-    found = Scene.read(*scenes[name], name)
-    if len(found.lidars) > 1:
-        raise InputError(f"{path}: {name} has the lidars {', '.join(found.lidars)}, expected one")
-    return NuScenes(found)
+    name = checks.chosen_scene("nuscenes", path, scene, list(scenes), "no scene in scene.json")
+    return NuScenes(*scenes[name], name)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One sensor of a scene, with R records (sweeps or images).
+    """One sensor of a scene, with R records (sweeps or images)."""
 
-    Attributes:
-        stamps_ns: R times of the records, ascending.
-        files: R paths of the records' files; a file may be missing on the disk.
-        T_ego_sensor: R poses (4,4) of the sensor in the vehicle's frame.
-        size_px: Width and height of the images; zeros for a lidar.
-        intrinsics: Camera matrix (3 x 3) of the first record as parsed from JSON.
-    """
-
-    stamps_ns: Sequence[int]
-    files: Sequence[Path]
-    T_ego_sensor: Sequence[Float]
-    size_px: tuple[int, int]
-    intrinsics: Any
+    stamps_ns: Sequence[int]  # R times of the records, ascending
+    files: Sequence[Path]  # R paths of the records' files; a file may be missing on the disk
+    T_ego_sensor: Sequence[Float]  # R poses (4,4) of the sensor in the vehicle's frame
+    size_px: tuple[int, int]  # width and height of the images; zeros for a lidar
+    intrinsics: Any  # camera matrix (3 x 3) of the first record as parsed from JSON
 
     def on_disk(self) -> dict[int, Path]:
         """Return the existing files, by the index of their records."""
         return {i: file for i, file in enumerate(self.files) if isfile(file)}
 
 
-@dataclass(frozen=True)
-class Scene:
-    """A scene with its sensors.
-
-    Attributes:
-        tables: Folder of the JSON tables.
-        token: Token of the scene, its key in the tables.
-        lidars: Lidars by the name of their channel, sorted.
-        cameras: Cameras by the name of their channel, sorted.
-        track: Poses T_world_ego of the vehicle over time.
-    """
-
-    name: str
-    tables: Path
-    token: str
-    lidars: Mapping[str, Channel]
-    cameras: Mapping[str, Channel]
-    track: PoseTrack
-
-    @staticmethod
-    def read(tables: Path, token: str, name: str) -> Scene:
-        """Read the sensors and the vehicle's path of a scene, without sweeps and images.
-
-        Raises:
-            InputError: A table is missing or malformed, or the scene has no sweeps.
-        """
-        file, poses_file = tables / "sample_data.json", tables / "ego_pose.json"
-        with described_in(file, _EXPECTED):
-            samples = find_records(tables / "sample.json", "scene_token", {token})
-            data = find_records(file, "sample_token", set(samples))
-            records = sorted(data.values(), key=stamp_ns)
-            wanted = {record["ego_pose_token"] for record in records}
-            poses = find_records(poses_file, "token", wanted)
-            if not data or len(poses) < len(wanted):
-                raise InputError(
-                    f"{poses_file}: got {len(poses)} poses for {name}, expected the {len(wanted)} "
-                    f"of its {len(data)} records in sample_data.json"
-                )
-            lidars, cameras = (_channels(tables, records, kind) for kind in ("lidar", "camera"))
-            T_world_ego = {
-                stamp_ns(record): pose_of(record, f"{poses_file}: record {token}")
-                for token, record in poses.items()
-            }
-        if not lidars:
-            raise InputError(f"{file}: no lidar data of {name}")
-        stamps_ns = sorted(T_world_ego)
-        T = np.stack([T_world_ego[ns] for ns in stamps_ns])
-        track = PoseTrack(str(poses_file), np.array(stamps_ns, np.int64), T)
-        return Scene(name, tables, token, lidars, cameras, track)
+def _read_path(tables: Path, token: str, name: str) -> tuple[list[Record], PoseTrack]:
+    """Return a scene's sample data in the order of time, and the vehicle's path T_world_ego."""
+    file, poses_file = tables / "sample_data.json", tables / "ego_pose.json"
+    samples = find_records(tables / "sample.json", "scene_token", {token})
+    records = sorted(find_records(file, "sample_token", samples).values(), key=stamp_ns)
+    wanted = {record["ego_pose_token"] for record in records}
+    poses = find_records(poses_file, "token", wanted)
+    if not records or len(poses) < len(wanted):
+        raise InputError(
+            f"{poses_file}: got {len(poses)} poses for {name}, expected the {len(wanted)} of its "
+            f"{len(records)} records in sample_data.json"
+        )
+    T_world_ego = {
+        stamp_ns(record): pose_of(record, f"{poses_file}: record {token}")
+        for token, record in poses.items()
+    }
+    stamps_ns = sorted(T_world_ego)
+    T = np.stack([T_world_ego[ns] for ns in stamps_ns])
+    return records, PoseTrack(str(poses_file), np.array(stamps_ns, np.int64), T)
 
 
 def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[str, Channel]:
     """Return the sensors of a modality by channel, from sample data records in order of time."""
-    path = tables / "calibrated_sensor.json"
+    path, table = tables / "calibrated_sensor.json", tables / "sample_data.json"
     calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
     found: dict[str, list[Record]] = defaultdict(list)
     for record in records:
@@ -318,7 +248,7 @@ def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[st
         T = {t: pose_of(calibrated[t], f"{path}: record {t}") for t in dict.fromkeys(tokens)}
         channels[name] = Channel(
             [stamp_ns(record) for record in of],
-            [tables.parent / record["filename"] for record in of],
+            [checks.file_within(tables.parent, record["filename"], table) for record in of],
             [T[token] for token in tokens],
             (int(of[0].get("width") or 0), int(of[0].get("height") or 0)),
             calibrated[tokens[0]].get("camera_intrinsic"),
@@ -329,36 +259,39 @@ def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[st
 class NuScenes(FileSequence):
     """A nuScenes scene as a `LidarSequence`; the lidar frame is the scanner's own frame."""
 
-    def __init__(self, scene: Scene) -> None:
-        """Prepare a scene for reading its sweeps and images on demand.
-
-        Raises:
-            InputError: No sweep is on the disk, or a camera's calibration is malformed.
-        """
-        self._scene, self._lidar = scene, next(iter(scene.lidars.values()))
-        self._T_ego_lidar, track = self._lidar.T_ego_sensor[0], scene.track
-        self._stamps_ns = self._lidar.stamps_ns
-        self._track = PoseTrack(track.where, track.stamp_ns, track.T_world_ego @ self._T_ego_lidar)
-        root, there = scene.tables.parent, self._lidar.on_disk()
-        if not there:
+    def __init__(self, tables: Path, token: str, name: str) -> None:
+        """Read the sensors and the vehicle's path; sweeps and images are read on demand."""
+        self._tables, self._token, root = tables, token, tables.parent
+        with described_in(tables / "sample_data.json", _EXPECTED):
+            records, self._ego = _read_path(tables, token, name)
+            lidars, self._channels = (_channels(tables, records, k) for k in ("lidar", "camera"))
+        if len(lidars) != 1:
+            there = ", ".join(lidars) or "none"
+            raise InputError(f"{root}: got the lidars {there} of {name}, expected one")
+        (lidar,) = lidars.values()
+        self._T_ego_lidar, self._stamps_ns = lidar.T_ego_sensor[0], lidar.stamps_ns
+        T_world_lidar = self._ego.T_world_ego @ self._T_ego_lidar
+        self._track = PoseTrack(self._ego.where, self._ego.stamp_ns, T_world_lidar)
+        sweeps, channels = lidar.on_disk(), self._channels
+        if not sweeps:
             raise InputError(
-                f"{root}: none of the {len(self._lidar.files)} sweeps of {scene.name} are there; "
-                f"expected files such as {self._lidar.files[0]}"
+                f"{root}: none of the {len(lidar.files)} sweeps of {name} are there; expected "
+                f"files such as {lidar.files[0]}"
             )
-        images = {name: channel.on_disk() for name, channel in scene.cameras.items()}
+        images = {name: channel.on_disk() for name, channel in channels.items()}
         super().__init__(
-            scene.name,
+            name,
             root,
-            list(there),
-            {name: self._camera(name, channel) for name, channel in scene.cameras.items()},
-            {n: {i: scene.cameras[n].stamps_ns[i] for i in files} for n, files in images.items()},
+            list(sweeps),
+            {name: self._camera(name, channel) for name, channel in channels.items()},
+            {n: {i: channels[n].stamps_ns[i] for i in files} for n, files in images.items()},
             checks.truth_beside(root),
-            there,
+            sweeps,
             images,
         )
 
     def _camera(self, name: str, channel: Channel) -> Camera:
-        where = f"{self._scene.tables / 'calibrated_sensor.json'}: {name}"
+        where = f"{self._tables / 'calibrated_sensor.json'}: {name}"
         with described_in(where, "camera_intrinsic of 3 x 3 numbers"):
             K = np.array(channel.intrinsics, np.float64).reshape(3, 3)
         T_cam_lidar = inverse(channel.T_ego_sensor[0]) @ self._T_ego_lidar
@@ -369,11 +302,7 @@ class NuScenes(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the lidar frame; None if not annotated, as in the test split.
-
-        Raises:
-            InputError: The annotation table is malformed.
-        """
+        """Return a sweep's boxes in the lidar frame; None if not annotated (test split)."""
         self.check_frame(frame)
         if self._annotations is None:
             return None
@@ -381,12 +310,12 @@ class NuScenes(FileSequence):
 
     @cached_property
     def _annotations(self) -> Annotations | None:
-        return Annotations.read(self._scene.tables, self._scene.token)
+        return Annotations.read(self._tables, self._token)
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """Return the (4,4) pose T_world_cam at the exposure of image ``number`` of a camera."""
-        T_world_ego = self._scene.track.at(self.image_stamps_ns(camera)[number])
-        return T_world_ego @ self._scene.cameras[camera].T_ego_sensor[number]
+        T_world_ego = self._ego.at(self.image_stamps_ns(camera)[number])
+        return T_world_ego @ self._channels[camera].T_ego_sensor[number]
 
     def _returns(self, frame: int) -> Returns:
         data = read_bytes(self._files[frame])

@@ -25,12 +25,7 @@ from densify.readers.file_sequence import FileSequence, Returns
 
 
 def open_recording(path: Path, scene: str | None) -> Ouster:
-    """Open an Ouster capture, as `densify.readers.ReaderModule` specifies.
-
-    Args:
-        path: Capture, a ``.pcap`` file.
-        scene: Name of the metadata file in the folder of the capture; None to find the file.
-    """
+    """Open a ``.pcap`` capture; ``scene`` names the metadata beside it, None to find it."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an Ouster capture (.pcap)")
     metadata = find_metadata(path) if scene is None else path.with_name(scene)
@@ -60,12 +55,7 @@ class Ouster(FileSequence):
     """An Ouster capture as a `LidarSequence`, stamped at the first packet of each sweep."""
 
     def __init__(self, path: Path, metadata: Path) -> None:
-        """Open a capture with its metadata.
-
-        Raises:
-            InputError: The file is no capture, the metadata does not describe an Ouster, or the
-                capture is from another sensor than the metadata.
-        """
+        """Open a capture with its metadata."""
         core = needed("ouster.sdk.core", "ouster", "Ouster captures")
         pcap = needed("ouster.sdk.pcap", "ouster", "Ouster captures")
         read_json(metadata)

@@ -74,15 +74,7 @@ class PandaSet(FileSequence):
     """
 
     def __init__(self, path: Path) -> None:
-        """Read poses, stamps and intrinsics; sweeps and images are read on demand.
-
-        Args:
-            path: Folder of the sequence.
-
-        Raises:
-            InputError: The folder has no sweeps, or poses, stamps or intrinsics are missing or
-                malformed.
-        """
+        """Read poses, stamps and intrinsics of a sequence; sweeps and images are read on demand."""
         lidar = path / "lidar"
         found = {file.name.removesuffix(".pkl.gz"): file for file in sorted(lidar.glob("*.pkl.gz"))}
         sweeps = {int(name): file for name, file in found.items() if name.isdecimal()}
@@ -121,10 +113,8 @@ class PandaSet(FileSequence):
         return self._T_world_cam[camera][number]
 
     def _step_m(self, stamp_ns: int) -> float:
-        """Return the distance in metres between the recorded vehicle positions around a time.
-
-        A short distance means a small error of pose interpolation. Outside the path return inf.
-        """
+        """Return the distance (m) between the poses around a time, inf outside the path."""
+        # Where it is short, interpolation errs little.
         after = np.searchsorted(self._track.stamp_ns, stamp_ns)
         if not 0 < after < len(self._track.stamp_ns):
             return np.inf
@@ -158,11 +148,7 @@ class PandaSet(FileSequence):
         return self._track.at(self.stamp_ns(frame))
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return the boxes of a sweep in the lidar frame; None without a file of boxes.
-
-        Raises:
-            InputError: The file of boxes is malformed.
-        """
+        """Return the boxes of a sweep in the lidar frame; None without a file of boxes."""
         self.check_frame(frame)
         path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"
         if not path.is_file():
@@ -179,10 +165,7 @@ class PandaSet(FileSequence):
 
 
 def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
-    """Return (n,) stamps in ns and (n,4,4) world poses from a folder's JSON files.
-
-    Element i belongs to file number i. Raise InputError if ``last`` is not covered (n <= last).
-    """
+    """Return (n,) stamps in ns and (n,4,4) world poses by file number, up to ``last`` or more."""
     path = folder / "timestamps.json"
     with described_in(path, "a list of seconds"):
         stamps_s = np.array(read_json(path), np.float64).reshape(-1)

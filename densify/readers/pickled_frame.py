@@ -67,14 +67,9 @@ class _Unpickler(pickle._Unpickler):
 
 
 def read_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the columns of a gzipped, pickled data frame with N rows, by column name.
+    """Return the columns (N,) of a gzipped, pickled data frame, by name; no code in it is run.
 
-    Each column is an array (N,) of numbers, or of Python objects where the frame holds texts. The
-    caller must check the type of these objects. No code in the file is run.
-
-    Raises:
-        InputError: The file is missing, damaged, or no data frame of numbers and texts, or it
-            names a function that data frames do not need.
+    A column of texts holds Python objects, whose type the caller must check.
     """
     data = read_bytes(path)
     try:

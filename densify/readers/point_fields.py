@@ -33,11 +33,10 @@ _NAMES = {
     "x": "x",
     "y": "y",
     "z": "z",
-    "intensity": "intensity intensities reflectance reflectivity remission i signal "
-    "scalar_intensity amplitude",
+    "intensity": "intensity intensities reflectance reflectivity remission i signal amplitude",
     "time": "time t timestamp time_stamp offset_time time_offset timeoffset offset_ns offset_us "
-    "time_us time_ns stamp gps_time scalar_time",
-    "ring": "ring line channel laser_id laser_number laserid beam scalar_ring",
+    "time_us time_ns stamp gps_time gpstime",
+    "ring": "ring line channel laser_id laser_number laserid beam",
     "lidar": "lidar lidar_id scanner sensor_id scanner_channel",
 }
 _SHORTEST_SHARE, _LONGEST_SHARE = 0.08, 4.0  # accepted span of a sweep's times, in periods
@@ -61,8 +60,11 @@ class Fields:
 
 
 def find_fields(names: Collection[str]) -> Fields:
-    """Find the field of each quantity by name, in any case; the order of `_NAMES` decides."""
-    lower = {name.lower(): name for name in reversed(list(names))}
+    """Find the field of each quantity by name, in any case; the order of `_NAMES` decides.
+
+    CloudCompare puts ``scalar_`` before the names of fields.
+    """
+    lower = {name.lower().removeprefix("scalar_"): name for name in reversed(list(names))}
     found = {
         part: next((lower[name] for name in known.split() if name in lower), "")
         for part, known in _NAMES.items()
@@ -72,37 +74,23 @@ def find_fields(names: Collection[str]) -> Fields:
 
 @dataclass(frozen=True)
 class PointTimes:
-    """How to convert a field of point times to nanoseconds since the stamp of the sweep.
+    """How to convert a field of point times to nanoseconds since the stamp of the sweep."""
 
-    Attributes:
-        field: Name of the field.
-        unit: Unit of the times, one of `UNIT_NS`.
-        absolute: True if times count from an epoch, False if from the stamp of the sweep.
-        other_clock: True if the epoch of absolute times is not the epoch of the stamps.
-        middle_ns: Typical middle of a sweep's times, since its stamp. It is not used with
-            ``other_clock``, where the middle is computed for each sweep.
-        reach_ns: Largest accepted distance of a time from the middle of its sweep.
-        reference: Part of the sweep measured at its stamp, one of `REFERENCES`; "" to use the
-            times as they are.
-    """
-
-    field: str
-    unit: str
-    absolute: bool
-    other_clock: bool
+    field: str  # name of the field
+    unit: str  # unit of the times, one of `UNIT_NS`
+    absolute: bool  # True if times count from an epoch, False if from the stamp of the sweep
+    other_clock: bool  # True if the epoch of absolute times is not the epoch of the stamps
+    # Typical middle of a sweep's times, since its stamp. It is not used with ``other_clock``, where
+    # the middle is computed for each sweep.
     middle_ns: int
-    reach_ns: int
+    reach_ns: int  # largest accepted distance of a time from the middle of its sweep
+    # Part of the sweep measured at its stamp, one of `REFERENCES`; "" to use the times as they are
     reference: str
 
     def offset_ns(self, values: NDArray[Any], stamp_ns: int) -> tuple[Int, Bool]:
-        """Convert the times of a sweep's N points to nanoseconds since its stamp.
+        """Convert (N,) times of a sweep's points, in the field's unit, to ns since its stamp.
 
-        Args:
-            values: (N,) values of the field, in its own unit.
-            stamp_ns: Stamp of the sweep.
-
-        Returns:
-            The times (N,) int64 in ns, 0 where invalid, and a mask (N,) of the valid times.
+        Returns (N,) int64 times, 0 where invalid, and an (N,) mask of the valid times.
         """
         right = self._right(values, stamp_ns)
         offset_ns = np.zeros(len(values), np.int64)
@@ -126,12 +114,7 @@ class PointTimes:
         return self._zero(near)[1] if self.reference else self._in_ns(near.min())
 
     def _right(self, values: NDArray[Any], stamp_ns: int | None) -> Bool:
-        """Return a mask (N,) of the valid times, within `reach_ns` of the middle of the sweep.
-
-        Args:
-            values: (N,) values of the field, in its own unit.
-            stamp_ns: Stamp of the sweep, None if unknown.
-        """
+        """Return an (N,) mask of the valid times, within `reach_ns` of the middle of the sweep."""
         times_ns = values.astype(np.float64) * UNIT_NS[self.unit]
         middle_ns = self.middle_ns + ((stamp_ns or 0) if self.absolute else 0.0)
         if (self.other_clock or stamp_ns is None) and np.isfinite(times_ns).any():
@@ -140,10 +123,7 @@ class PointTimes:
         return right
 
     def _zero(self, near: NDArray[Any]) -> tuple[Any, int]:
-        """Return the time to subtract from a sweep's M valid times ``near`` (M,).
-
-        The first value is in the unit of the field, the second is the same time in nanoseconds.
-        """
+        """Return the time to subtract from valid times (M,), in the field's unit and in ns."""
         low, high = near.min(), near.max()
         if self.reference or self.other_clock:
             share = {"": 0, "start": 0, "middle": 0.5, "end": 1}[self.reference]
@@ -170,11 +150,9 @@ def widened(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _extent(times: NDArray[Any]) -> tuple[float, float]:
-    """Return the middle of a sweep's times (N,) and half their span, without outlying times.
-
-    Outlying times are farther from the middle of the shortest interval that contains half of the
-    times than twice the width of this interval.
-    """
+    """Return the middle of a sweep's times (N,) and half their span, without outlying times."""
+    # Outlying times are farther from the middle of the shortest interval that holds half of the
+    # times than twice the width of this interval.
     times = np.sort(times[np.isfinite(times)].astype(np.float64))
     half = len(times) // 2
     width = times[half:] - times[: len(times) - half]
@@ -185,17 +163,9 @@ def _extent(times: NDArray[Any]) -> tuple[float, float]:
 
 
 def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K, Columns]:
-    """Read the columns of up to 5 sweeps with points, spread over a recording.
+    """Read the columns of up to 5 sweeps with points, spread over a recording, by sweep.
 
-    Args:
-        sweeps: Frame numbers, files or messages, as ``read`` takes them.
-        read: Function that returns the columns of one sweep.
-
-    Returns:
-        The columns by element of ``sweeps``; empty if all sampled sweeps are without points.
-
-    Raises:
-        InputError: No sampled sweep has points, and at least one sweep is unreadable.
+    Unreadable sweeps are left out, unless no other has points. ``read`` returns a sweep's columns.
     """
     found, errors = dict[K, Columns](), list[InputError]()
     for sweep in sweeps[:: max(1, len(sweeps) // _NUM_SAMPLED)][:_NUM_SAMPLED]:
@@ -223,15 +193,12 @@ def find_times(
     """Find the unit, epoch, middle and span of point times from several sweeps of a recording.
 
     The unit is the most frequent unit. The middle and the span are medians over the sweeps.
+    Known values of ``unit``, ``absolute`` and ``reference`` are kept, "" or None is found.
 
     Args:
         sweeps: Values (N,) of the field for each sweep; N differs between sweeps.
-        field: Name of the field.
         period_ns: Time between consecutive sweeps.
         stamps_ns: Stamps of the given sweeps, None without stamps.
-        unit: Unit of the times, "" to find the unit.
-        absolute: As in `PointTimes`, None to find the value.
-        reference: As in `PointTimes`, "" if unknown.
 
     Returns:
         The meaning of the times and its description; or None and the reason of the failure.
@@ -267,11 +234,7 @@ def find_times(
 
 
 def _unit_of(values: NDArray[Any], field: str, period_ns: int, unit: str) -> tuple[str, str]:
-    """Return the unit of a sweep's times (N,) and "", or else "" and the reason of the failure.
-
-    Args:
-        unit: Known unit; "" to find the unit in which the times span about one period.
-    """
+    """Return the unit of a sweep's times (N,) and "", or else "" and the reason of the failure."""
     times = widened(values)
     times = times[np.isfinite(times)]
     middle, reach = _extent(times) if len(times) else (0.0, 0.0)
@@ -312,18 +275,12 @@ def scaled(intensity: NDArray[Any], scale: float) -> Float32:
 
 @dataclass(frozen=True)
 class PointLayout:
-    """The meaning of the fields in a sensor's sweeps.
-
-    Attributes:
-        times: Meaning of the point times, None without usable times.
-        time_words: Description of the times, or the reason why there are none.
-        intensity_scale: Divisor that scales intensities to 0 to 1.
-    """
+    """The meaning of the fields in a sensor's sweeps."""
 
     fields: Fields
-    times: PointTimes | None
-    time_words: str
-    intensity_scale: float
+    times: PointTimes | None  # meaning of the point times, None without usable times
+    time_words: str  # description of the times, or the reason why there are none
+    intensity_scale: float  # divisor that scales intensities to 0 to 1
 
     @staticmethod
     def find(
@@ -335,18 +292,12 @@ class PointLayout:
         intensity_scale: float = 0.0,
         **times: Any,
     ) -> PointLayout:
-        """Find the layout from the columns of several sweeps.
+        """Find the layout from the columns of several sweeps; ``where`` begins error messages.
 
         Args:
-            where: File or topic, which begins error messages.
-            period_ns: Time between consecutive sweeps.
-            stamps_ns: Stamps of the given sweeps, None without stamps.
             named: Names of fields that the user gave, by the attributes of `Fields`.
             intensity_scale: Known divisor of intensities, 0 to find the divisor.
             times: Known ``unit``, ``absolute`` or ``reference`` of `find_times`.
-
-        Raises:
-            InputError: No field holds x, y or z.
         """
         fields = Fields(**(vars(find_fields(sweeps[0])) | dict(named or {})))
         missing = [axis for axis in "xyz" if not getattr(fields, axis)]
@@ -370,9 +321,6 @@ class PointLayout:
 
         A valid row has a finite position other than 0 0 0 and a time inside the sweep. Invalid
         rows get the position 0 0 0.
-
-        Raises:
-            InputError: The sweep lacks a field of the layout.
         """
         missing = [name for name in vars(self.fields).values() if name and name not in columns]
         if missing:

@@ -6,6 +6,7 @@ No content of a file is run as code.
 
 from __future__ import annotations
 
+import codecs
 import io
 import re
 import warnings
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import check_size, needed, read_bytes, reason
+from densify.config.file_content import check_size, decode_text, needed, read_bytes, reason
 from densify.readers.decoded_files import read_array, read_arrays, read_las
 
 Columns = dict[str, NDArray[Any]]
@@ -26,21 +27,29 @@ Columns = dict[str, NDArray[Any]]
 _UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most data sets follow
 _ALIKE = 0.5  # largest median step between rows, as a share of the coordinates
 _FEWEST_ROWS = 20  # for this test
+_NAME_COLUMNS = (
+    "name all of them in densify.yaml beside the sweeps' folder, such as "
+    "sweeps: {columns: [x, y, z, intensity, time]}"
+)
 _MOST_COLUMNS = 100  # a wider array is probably transposed
+_MOST_ORGANISED = 16  # values of a point in an organised array; more may be its width
 _ROWS_LOOKED_AT = 4000
+_BIN_LAYOUTS = {
+    4: _UNNAMED,
+    5: (*_UNNAMED, "ring"),  # nuScenes
+    6: (*_UNNAMED, "elongation", "timestamp"),  # Waymo, as mmdetection3d writes it
+}
+_MOST_RINGS, _MOST_ELONGATION, _MOST_ASCENDING = 256, 2.0, 0.9
 
 
 @dataclass(frozen=True)
 class PointTable:
-    """The N points of a file.
+    """The N points of a file."""
 
-    Attributes:
-        columns: Values (N,) of each column as stored, by name. Columns that have no name in the
-            file get the names of `unnamed`.
-        beside: Further arrays of an .npz file, by name.
-    """
-
+    # Values (N,) of each column as stored, by name. Columns that have no name in the file get the
+    # names of `unnamed`.
     columns: Columns
+    # Further arrays of an .npz file, by name
     beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -51,8 +60,10 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     """Read the points of a file, all rows in file order.
 
     ========================= ==================================================================
-    .bin                      float32 columns
-    .npy, .npz                an (N,3 or more) array, in an .npz called ``points``; or structured;
+    .bin                      float32 columns; without names, those of KITTI, nuScenes or Waymo if
+                              size and values fit one of them
+    .npy, .npz                an (N,3 or more) array, in an .npz called ``points``; or organised,
+                              (H,W,3 or more); or structured;
                               or an .npz of x, y, z and others, (N,) each
     .csv, .txt                numbers, NaN where blank; a first line of words names the columns
     .pcd                      ascii, binary, binary_compressed
@@ -63,9 +74,6 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     Args:
         path: Point file.
         names: Names of the columns if the file has none. By default they are those of `unnamed`.
-
-    Raises:
-        InputError: The file is missing, damaged, of another format, or has no rows.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -91,10 +99,14 @@ def unnamed(num_columns: int) -> tuple[str, ...]:
 
 def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Columns:
     """Return the k columns of an (N,k) array, or the fields of a structured array, by name."""
-    if array.dtype.names and array.ndim == 1:
-        return {name: array[name] for name in array.dtype.names if array[name].ndim == 1}
+    fields = array.dtype.names
+    if fields and array.ndim in (1, 2):
+        array = array.ravel()
+        return {name: array[name] for name in fields if array[name].ndim == 1}
     if array.size == 0:
         return {}
+    if array.ndim == 3 and array.shape[2] <= _MOST_ORGANISED:  # (H,W,C): rings, columns, values
+        array = array.reshape(-1, array.shape[2])
     fits = array.ndim == 2 and 3 <= array.shape[1] <= _MOST_COLUMNS
     if not fits or array.dtype.kind not in "fiu":
         raise InputError(
@@ -110,27 +122,49 @@ def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Col
 
 
 def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
-    data, num_columns = read_bytes(path), len(_UNNAMED) if names is None else len(names)
+    data = read_bytes(path)
+    if names is None:
+        fitting = [known for num, known in _BIN_LAYOUTS.items() if _fits(data, num)]
+        if len(fitting) > 1:
+            counts = " and ".join(str(len(known)) for known in fitting)
+            raise ValueError(f"it fits {counts} float32 columns alike; {_NAME_COLUMNS}")
+        names = fitting[0] if fitting else None
+    num_columns = len(_UNNAMED) if names is None else len(names)
     if len(data) % (4 * num_columns):
         raise ValueError(
             f"got {len(data)} bytes, expected a multiple of {4 * num_columns} "
-            f"({num_columns} float32 columns); it is cut off, or has another number of columns"
+            f"({num_columns} float32 columns); it is cut off, or has other columns: {_NAME_COLUMNS}"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, num_columns)
     if names is None and not _are_scanned(rows[:_ROWS_LOOKED_AT, :3]):
         raise ValueError(
             "read as rows of 4 little-endian float32 columns, neighbouring points are not alike; "
-            "in a plain folder name the columns in densify.yaml: sweeps.columns"
+            f"if it has other columns, {_NAME_COLUMNS}"
         )
     return PointTable(_matrix(rows, names, path))
 
 
-def _are_scanned(points: NDArray[Any]) -> bool:
-    """Return True if consecutive (N,3) points are close to each other, as in a scan.
+def _fits(data: bytes, num_columns: int) -> bool:
+    """Return True if size and values are those of the layout with this number of columns."""
+    if len(data) % (4 * num_columns):
+        return False
+    rows = np.frombuffer(data, "<f4").reshape(-1, num_columns)[:_ROWS_LOOKED_AT]
+    if len(rows) < _FEWEST_ROWS or not _are_scanned(rows[:, :3]):
+        return False
+    with np.errstate(invalid="ignore"):
+        if num_columns > 4 and not (np.isfinite(rows[:, 3:]) & (rows[:, 3:] >= 0)).all():
+            return False
+        if num_columns == 5:
+            return bool(((rows[:, 4] % 1 == 0) & (rows[:, 4] < _MOST_RINGS)).all())
+        if num_columns == 6:  # a time, which ascends, is no elongation
+            ascending = np.mean(np.diff(rows[:, 4]) >= 0)
+            return bool(rows[:, 4].max() < _MOST_ELONGATION and ascending < _MOST_ASCENDING)
+    return True
 
-    Rows read with a wrong number of columns mix x with y, and consecutive points lie far apart. The
-    test compares the median step with the coordinates.
-    """
+
+def _are_scanned(points: NDArray[Any]) -> bool:
+    """Return True if consecutive (N,3) points are close to each other, as in a scan."""
+    # Rows read with a wrong number of columns mix x with y: then points lie far apart.
     with np.errstate(invalid="ignore"):  # wrongly read bytes may be signalling NaN
         near = np.nan_to_num(points.astype(np.float64), posinf=0, neginf=0)
     step, size = np.abs(np.diff(near, axis=0)).sum(axis=1), np.abs(near).sum(axis=1)
@@ -154,7 +188,7 @@ def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
-    lines = read_bytes(path).decode("utf-8-sig").splitlines()
+    lines = decode_text(read_bytes(path), path).splitlines()
     skip, words, delimiter = _header(lines)
     rows = lines[skip:]
     if delimiter:
@@ -175,10 +209,7 @@ def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[str], str | None]:
-    """Return the number of header lines, the column names and the delimiter (None: whitespace).
-
-    Comments before the names are skipped.
-    """
+    """Return the number of header lines, the column names and the delimiter (None: whitespace)."""
     for number, line in enumerate(lines, 1):
         text = line.strip().lstrip("#").strip()
         if not text:
@@ -204,11 +235,7 @@ def _are_numbers(words: Sequence[str]) -> bool:
 
 
 def _pcd_header(file: Any) -> list[str]:
-    """Read the header lines up to DATA, without comments; the file is left at the first point.
-
-    The header is normalised for the parser: padding fields with a COUNT of 0 are removed, and
-    missing COUNT, VERSION, HEIGHT and POINTS are added.
-    """
+    """Read the header up to DATA for the parser: no padding fields, nothing optional missing."""
     lines: list[str] = []
     while len(lines) < 20:
         raw = file.readline(65536)
@@ -244,7 +271,7 @@ def _pcd_header(file: Any) -> list[str]:
 def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
     from pypcd4 import PointCloud
 
-    file = io.BytesIO(read_bytes(path))
+    file = io.BytesIO(read_bytes(path).removeprefix(codecs.BOM_UTF8))
     header = _pcd_header(file)
     counts = next((line.split()[1:] for line in header if line.startswith("COUNT")), [])
     if not all(word.isascii() and word.isdigit() and len(word) < 5 for word in counts):
@@ -270,7 +297,8 @@ def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
 
 def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
     ply = needed("trimesh.exchange.ply", "ply", ".ply files")
-    vertex = ply.load_ply(io.BytesIO(read_bytes(path)))["metadata"]["_ply_raw"]["vertex"]
+    file = io.BytesIO(read_bytes(path).removeprefix(codecs.BOM_UTF8))
+    vertex = ply.load_ply(file)["metadata"]["_ply_raw"]["vertex"]
     names = [name for name, kind in vertex["properties"].items() if "LIST" not in kind]
     columns = {name: np.ravel(vertex["data"][name]) for name in names}
     if any(len(column) != vertex["length"] for column in columns.values()):

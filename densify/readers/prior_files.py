@@ -37,25 +37,15 @@ _SAME_ASPECT = 0.02
 
 @dataclass(frozen=True)
 class PriorFiles:
-    """The files of the user's depth priors.
+    """The files of the user's depth priors."""
 
-    Attributes:
-        place: Folder or file that the user named.
-        values: Depth files, by camera name and image number.
-        sky: Files of sky masks, by camera name and image number.
-    """
-
-    place: Path
-    values: Mapping[str, Mapping[int, Path]]
-    sky: Mapping[str, Mapping[int, Path]]
+    place: Path  # folder or file that the user named
+    values: Mapping[str, Mapping[int, Path]]  # depth files, by camera name and image number
+    sky: Mapping[str, Mapping[int, Path]]  # files of sky masks, by camera name and image number
 
     @staticmethod
     def open(place: Path, cameras: Sequence[str]) -> PriorFiles:
-        """Find the priors of the given cameras in a folder, or take a single file.
-
-        Raises:
-            InputError: No prior is found, or a file could belong to several cameras.
-        """
+        """Find the priors of the given cameras in a folder, or take a single file."""
         where, example = f"--prior {place}", "0000000120.npy, .exr or .png"
         if not place.exists():
             raise InputError(f"{where}: no such folder or file; expected DIR/CAMERA/{example}")
@@ -86,9 +76,6 @@ class PriorFiles:
         """Return the prior of an image at the camera's size (H,W); None if the image has no prior.
 
         A prior of another size is resized if its aspect ratio agrees to 2 %.
-
-        Raises:
-            InputError: A file is unreadable, has another aspect ratio, or holds no depth.
         """
         path = self.values[camera.name].get(number)
         if path is None:

@@ -21,7 +21,7 @@ from densify.config.file_content import read_text
 from densify.geometry import poses
 from densify.geometry.types import Float, Int
 from densify.readers import checks
-from densify.readers.stamp_files import TIME_COLUMNS, TextTable
+from densify.readers.stamp_files import TIME_COLUMNS, TextTable, check_digits
 
 _MAX_BEYOND_NS = 200_000_000  # longest extrapolation of a pose, at constant velocity
 
@@ -31,17 +31,11 @@ _TURNS = tuple((f"q{a}", f"q_{a}", f"rot_{a}", f"orientation_{a}") for a in "wxy
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """The path of a vehicle as n poses over time.
+    """The path of a vehicle as n poses over time."""
 
-    Attributes:
-        where: File of the poses, for messages.
-        stamp_ns: (n,) int64 times of the poses, ascending.
-        T_world_ego: (n,4,4) poses of the vehicle (in some readers of the lidar) in the world.
-    """
-
-    where: str
-    stamp_ns: Int
-    T_world_ego: Float
+    where: str  # file of the poses, for messages
+    stamp_ns: Int  # (n,) int64 times of the poses, ascending
+    T_world_ego: Float  # (n,4,4) poses of the vehicle (in some readers of the lidar) in the world
 
     def __post_init__(self) -> None:
         if len(self.stamp_ns) < 2 or np.any(np.diff(self.stamp_ns) <= 0):
@@ -51,11 +45,7 @@ class PoseTrack:
             )
 
     def at(self, time_ns: int) -> Float:
-        """Return the pose T_world_ego (4,4) at a time, inter- or extrapolated at constant velocity.
-
-        Raises:
-            InputError: The time is more than 0.2 s before the first pose or after the last.
-        """
+        """Return T_world_ego (4,4) at a time, up to 0.2 s beyond the ends of the path."""
         begin, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
         beyond_ns = max(begin - time_ns, time_ns - end)
         if beyond_ns > _MAX_BEYOND_NS:
@@ -69,16 +59,13 @@ class PoseTrack:
         return poses.interpolate(self.T_world_ego[i], self.T_world_ego[i + 1], fraction)
 
     def as_fired(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Undo ego-motion compensation: move points to the vehicle frame at their firing times.
+        """Undo ego-motion compensation: return points in the vehicle frame at their firing times.
 
         Args:
             points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``. Points at 0 0 0
                 (padding) stay unchanged.
             stamp_ns: Reference time of the sweep.
             offset_ns: (N,) firing times since ``stamp_ns``.
-
-        Returns:
-            (N,3) metres, each point in the vehicle frame at its own firing time.
         """
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
@@ -107,31 +94,16 @@ class PoseTrack:
 
 @dataclass(frozen=True)
 class PoseFile:
-    """The n poses of a text file, in the frames that the file uses (usually T_world_body).
+    """The n poses of a text file, in the frames that the file uses (usually T_world_body)."""
 
-    Attributes:
-        path: File of the poses; the first file if each sweep has its own.
-        form: Name of the file's format, for messages.
-        T: (n,4,4) poses in file order.
-        stamps_ns: n times of the poses, None for a file without times.
-    """
-
-    path: Path
-    form: str
-    T: Float
-    stamps_ns: tuple[int, ...] | None = None
+    path: Path  # file of the poses; the first file if each sweep has its own
+    form: str  # name of the file's format, for messages
+    T: Float  # (n,4,4) poses in file order
+    stamps_ns: tuple[int, ...] | None = None  # n times of the poses, None for a file without times
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
-        """Read a file with one pose on each line, in any of the supported formats.
-
-        Args:
-            path: Text file of KITTI, 4x4 or TUM lines, or a table with named columns.
-            unit: Unit of the times (s, ms, us or ns), "" to find the unit.
-
-        Raises:
-            InputError: The file is malformed. The message names file and line.
-        """
+        """Read a file with one pose on each line; ``unit`` of the times, "" to find it."""
         table = TextTable.read(path, [name for names in _TURNS for name in names])
         width, time = len(table.rows[0]), None
         columns = [i for names in (*_TURNS, *_PLACES) if (i := table.column(names)) is not None]
@@ -153,16 +125,15 @@ class PoseFile:
         values = _numbers(table, columns)
         lines = zip(values, table.lines, strict=True)
         T = np.stack([checks.quaternion_pose(v[:4], v[4:], f"{path}: line {n}") for v, n in lines])
-        stamps_ns = None if time is None else table.times_ns(time, unit)[0]
+        stamps_ns = None
+        if time is not None:
+            stamps_ns, _ = table.times_ns(time, unit)
+            check_digits(stamps_ns, table.rows[0][time], path)
         return PoseFile(path, form, T, stamps_ns)
 
     @staticmethod
     def read_each(paths: Sequence[Path]) -> PoseFile:
-        """Read files with one pose each: 3x4 or 4x4 matrices, or x y z qx qy qz qw.
-
-        Raises:
-            InputError: A file is malformed.
-        """
+        """Read files with one pose each: 3x4 or 4x4 matrices, or x y z qx qy qz qw."""
         T = []
         for path in paths:
             count = len(read_text(path).split())

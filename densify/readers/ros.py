@@ -39,6 +39,7 @@ from densify.readers.ros_bag import POSES, Bag, Entry, Topics, place_of
 from densify.readers.ros_messages import (
     Transforms,
     camera_of,
+    check_encoding,
     cloud_columns,
     image_rgb,
     plain,
@@ -49,30 +50,18 @@ _USUAL_PERIOD_NS = 100_000_000
 
 
 def open_recording(path: Path, scene: str | None) -> RosBag:
-    """Open a ROS bag, as `densify.readers.ReaderModule` specifies.
-
-    Args:
-        path: File or folder of the bag.
-        scene: Chosen topics, such as ``points=/lidar&images=none&poses=tf``; None to find them.
-    """
+    """Open a bag; ``scene`` has its topics, such as ``points=/lidar&images=none``, None to find."""
     return RosBag(path, scene)
 
 
 class Lidar(NamedTuple):
-    """A lidar of the bag.
-
-    Attributes:
-        frame: Frame in the header of the messages.
-        entries: Index of the messages, by ascending stamp.
-        T_first_lidar: (4,4) pose of this lidar in the frame of the first lidar.
-        period_ns: Median time between consecutive messages.
-    """
+    """A lidar of the bag."""
 
     topic: str
-    frame: str
-    entries: list[Entry]
-    T_first_lidar: Float
-    period_ns: int
+    frame: str  # frame in the header of the messages
+    entries: list[Entry]  # index of the messages, by ascending stamp
+    T_first_lidar: Float  # (4,4) pose of this lidar in the frame of the first lidar
+    period_ns: int  # median time between consecutive messages
     layout: PointLayout
 
 
@@ -80,15 +69,7 @@ class RosBag(FileSequence):
     """A ROS bag as a `LidarSequence`; the lidar frame is the frame of the first lidar."""
 
     def __init__(self, path: Path, options: str | None = None) -> None:
-        """Index the bag: read all stamps, transforms and calibrations, and sample sweeps.
-
-        Args:
-            options: Chosen topics as in `open_recording`; None to find the topics.
-
-        Raises:
-            InputError: The bag is damaged, the lidar topic is not clear, or a named topic lacks a
-                frame or calibration.
-        """
+        """Index the bag: read all stamps, transforms and calibrations, and sample sweeps."""
         self._bag = Bag(path)
         self._topics = topics = Topics.choose(self._bag, options)
         self._index = self._bag.index([*topics.points, *topics.images])
@@ -257,6 +238,7 @@ class RosBag(FileSequence):
         if not self._index[topic]:
             raise InputError(f"{where}: holds no images")
         image = self._bag.message(topic, self._index[topic][0])
+        check_encoding(image, where)
         frame, lidar = plain(image.header.frame_id), self._lidars[0].frame
         T = self._transforms.between(frame, lidar)
         if T is None:

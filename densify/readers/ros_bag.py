@@ -21,6 +21,7 @@ from urllib.parse import parse_qsl
 from densify.config.errors import InputError
 from densify.config.file_content import needed, open_file, reason
 
+_MCAP = b"\x89MCAP0\r\n"  # begins and ends a file
 _MEND = "a bag that was cut off can be mended: rosbag reindex, ros2 bag reindex, mcap recover"
 
 _DRIVERS = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
@@ -48,28 +49,18 @@ _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
 
 
 class Entry(NamedTuple):
-    """Index entry that finds one message of a topic.
+    """Index entry that finds one message of a topic."""
 
-    Attributes:
-        stamp_ns: Time in the header of the message; the time of recording if the header has 0.
-        log_ns: Time at which the message was recorded.
-        turn: Index of the message among the topic's messages with the same ``log_ns``.
-    """
-
-    stamp_ns: int
-    log_ns: int
-    turn: int
+    stamp_ns: int  # time in the header of the message; the time of recording if the header has 0
+    log_ns: int  # time at which the message was recorded
+    turn: int  # index of the message among the topic's messages with the same ``log_ns``
 
 
 class Topic(NamedTuple):
-    """A topic of a bag.
-
-    Attributes:
-        type: Message type in ROS 2 notation, such as sensor_msgs/msg/PointCloud2.
-    """
+    """A topic of a bag."""
 
     name: str
-    type: str
+    type: str  # message type in ROS 2 notation, such as sensor_msgs/msg/PointCloud2
     num_messages: int
 
 
@@ -108,10 +99,7 @@ class Bag:
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Index the messages of the topics: entries by topic, with ascending stamps.
-
-        The method also counts the messages without stamps in ``num_unstamped``.
-        """
+        """Index the messages of the topics by ascending stamp, and count those without a stamp."""
         found: dict[str, list[Entry]] = {topic: [] for topic in topics}
         for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
             before = found[topic][-1] if found[topic] else None
@@ -164,6 +152,14 @@ class Bag:
             ) from error
 
     def _unreadable(self, error: Exception) -> InputError:
+        for file in self._files:
+            profile = _mcap_profile(file)
+            if profile is not None and profile != "ros2":
+                written = f"messages of {profile}" if profile else "messages of other programs"
+                return InputError(
+                    f"{file}: is a whole MCAP file with {written}, as densify export writes it; "
+                    f"expected a bag that ROS 2 recorded (profile ros2)"
+                )
         return InputError(f"{self.path}: not a whole bag: {reason(error)}; {_MEND}")
 
 
@@ -181,6 +177,20 @@ def message_types(is_ros2: bool) -> Any:
     return types
 
 
+def _mcap_profile(file: Path) -> str | None:
+    """Return the profile that a whole MCAP file states, "" for none; None for other files."""
+    if not file.is_file():
+        return None
+    with open_file(file) as opened:
+        begin = opened.read(4096)
+        opened.seek(max(0, opened.seek(0, 2) - len(_MCAP)))
+        if not begin.startswith(_MCAP) or opened.read() != _MCAP or len(begin) < 21:
+            return None
+    # The header record follows: its kind (1 byte) and length (8), then length and text of a string.
+    (num_bytes,) = struct.unpack_from("<I", begin, 17)
+    return begin[21 : 21 + num_bytes].decode("utf-8", "replace")
+
+
 def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
     """Return the topics with messages over all files of the recording, by name."""
     found: dict[str, Topic] = {}
@@ -193,13 +203,16 @@ def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
 
 
 def _bag_files(path: Path) -> list[Path]:
-    """Return the paths to open: a file, a ROS 2 bag's folder, or all .bag files in a folder.
-
-    Raises InputError for a path without a bag.
-    """
+    """Return the paths to open: a file, a ROS 2 bag's folder, or all .bag files in a folder."""
     suffixes = (".bag", ".db3", ".mcap")
     if (path.is_file() and path.suffix in suffixes) or (path / "metadata.yaml").is_file():
         return [path]
+    packed = [path] if path.suffix == ".zstd" and path.is_file() else sorted(path.glob("*.zstd"))
+    if packed:
+        raise InputError(
+            f"{packed[0]}: is compressed as a whole; name the bag's folder with its metadata.yaml, "
+            f"or decompress it by zstd -d {packed[0].name} and name {packed[0].stem}"
+        )
     for suffix in suffixes:
         found = sorted(path.glob(f"*{suffix}")) if path.is_dir() else []
         if found and (suffix == ".bag" or len(found) == 1):
@@ -225,32 +238,18 @@ def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
 
 @dataclass(frozen=True)
 class Topics:
-    """The topics of a bag that are used.
+    """The topics of a bag that are used."""
 
-    Attributes:
-        points: Topics of the lidars. Each message of the first topic is a sweep.
-        images: Topics of the cameras' images.
-        poses: Topic of the poses, ``tf`` for /tf, or "" to read no poses.
-        named: Options that the user gave (points, images, poses). A problem with a named topic is
-            an error; other unusable topics are skipped.
-    """
-
-    points: tuple[str, ...]
-    images: tuple[str, ...]
-    poses: str
+    points: tuple[str, ...]  # topics of the lidars. Each message of the first topic is a sweep.
+    images: tuple[str, ...]  # topics of the cameras' images
+    poses: str  # topic of the poses, ``tf`` for /tf, or "" to read no poses
+    # Options that the user gave (points, images, poses). A problem with a named topic is an error;
+    # other unusable topics are skipped.
     named: Collection[str]
 
     @staticmethod
     def choose(bag: Bag, options: str | None) -> Topics:
-        """Choose the topics to read, by the user's options and the message types.
-
-        Args:
-            options: Text after ``#`` in ``--data``, such as ``points=/lidar&poses=tf``.
-
-        Raises:
-            InputError: A named topic does not exist or has another type, or not exactly one topic
-                of point clouds exists and the user named no topic.
-        """
+        """Choose the topics to read, by the user's options (after ``#``) and the message types."""
         given = dict(parse_qsl(options or "", keep_blank_values=True))
         wrong = [key for key in given if key not in ("points", "images", "poses")]
         if wrong or (options and not given):

@@ -47,6 +47,7 @@ _PACKED = {  # channels, and OpenCV's conversion to RGB
     "yuv422_yuy2": (2, "COLOR_YUV2RGB_YUYV"),
     "yuyv": (2, "COLOR_YUV2RGB_YUYV"),
 }
+_GRAY_16 = ("mono16", "16uc1")
 _FIXED_M = 1e-6  # frames that move less, in metres or radians, are fixed
 
 
@@ -54,9 +55,6 @@ def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
     """Return the fields of a PointCloud2 or Livox CustomMsg by name, an array (N,) each as stored.
 
     Fields with several numbers for a point are left out.
-
-    Raises:
-        InputError: A field lies outside the bytes of a point, or data is too short.
     """
     if not hasattr(message, "point_step"):
         rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
@@ -75,7 +73,9 @@ def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
         layout[entry.name] = (order + kind, entry.offset)
     formats, offsets = [kind for kind, _ in layout.values()], [at for _, at in layout.values()]
     spec: Any = {"names": [*layout], "formats": formats, "offsets": offsets}
-    points_of_rows = _rows(message, message.row_step, message.point_step, where)
+    # Some drivers leave the step of an only row at zero.
+    step = message.row_step or message.width * message.point_step * (message.height == 1)
+    points_of_rows = _rows(message, step, message.point_step, where)
     points = points_of_rows.reshape(-1).view(np.dtype(spec | {"itemsize": message.point_step}))
     return {name: points[name] for name in layout}
 
@@ -92,27 +92,35 @@ def _rows(message: Any, step: int, item_bytes: int, where: str) -> NDArray[np.ui
     return np.ascontiguousarray(rows[:, :used])
 
 
-def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
-    """Return an Image or CompressedImage message as (H,W,3) uint8 RGB.
-
-    Raises:
-        InputError: The encoding is not supported, or the data is damaged.
-    """
-    import cv2
-
+def check_encoding(message: Any, where: str) -> None:
+    """Raise InputError for an Image or CompressedImage message in an encoding that is not read."""
     if hasattr(message, "format"):
-        bgr = decode_image(np.ascontiguousarray(message.data, np.uint8).tobytes(), where)
-        return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
-    encoding, size = message.encoding.lower(), (message.height, message.width)
-    if encoding in ("mono16", "16uc1"):
-        order = ">u2" if message.is_bigendian else "<u2"
-        gray = _rows(message, message.step, 2, where).view(order).reshape(size) >> 8
-        return cv2.cvtColor(gray.astype(np.uint8), cv2.COLOR_GRAY2RGB).astype(np.uint8)
-    if encoding not in _PACKED:
+        begin = bytes(np.asarray(message.data[:8], np.uint8))
+        if not begin.startswith((b"\xff\xd8", b"\x89PNG")):
+            raise InputError(
+                f"{where}: got images of the format {message.format!r}, expected JPEG or PNG; "
+                f"leave the camera out: name others with #images="
+            )
+    elif message.encoding.lower() not in (*_PACKED, *_GRAY_16):
         raise InputError(
             f"{where}: got the encoding {message.encoding}, expected one of "
             f"{', '.join(_PACKED)}, mono16; leave the camera out: name others with #images="
         )
+
+
+def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
+    """Return an Image or CompressedImage message as (H,W,3) uint8 RGB."""
+    import cv2
+
+    check_encoding(message, where)
+    if hasattr(message, "format"):
+        bgr = decode_image(np.ascontiguousarray(message.data, np.uint8).tobytes(), where)
+        return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
+    encoding, size = message.encoding.lower(), (message.height, message.width)
+    if encoding in _GRAY_16:
+        order = ">u2" if message.is_bigendian else "<u2"
+        gray = _rows(message, message.step, 2, where).view(order).reshape(size) >> 8
+        return cv2.cvtColor(gray.astype(np.uint8), cv2.COLOR_GRAY2RGB).astype(np.uint8)
     channels, conversion = _PACKED[encoding]
     pixels = _rows(message, message.step, channels, where).reshape(*size, channels)
     if conversion is None:
@@ -123,13 +131,8 @@ def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
 def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, where: str) -> Camera:
     """Convert a CameraInfo message to a camera, adjusted for binning and region of interest.
 
-    Args:
-        T_optical_lidar: (4,4) pose of the lidar in the optical frame named by the message.
-        rectified: True for rectified images, which use P and the rotation R; False for raw images,
-            which use K and the distortion D.
-
-    Raises:
-        InputError: The distortion model is unknown, or the calibration is not valid.
+    ``T_optical_lidar`` is the (4,4) pose of the lidar in the message's optical frame. Rectified
+    images use P and the rotation R, raw images K and the distortion D.
     """
     matrix = {  # ROS 1 writes K, ROS 2 k
         key: np.asarray(getattr(info, key if hasattr(info, key) else key.upper()), np.float64)
@@ -168,10 +171,8 @@ def _lens(named: str, distortion: tuple[float, ...], where: str) -> tuple[str, t
 
 
 def _binned(camera: Camera, info: Any) -> Camera:
-    """Adjust a camera to the region of interest and the binning of a CameraInfo.
-
-    Binning averages several sensor pixels, which moves pixel centres relative to the corner.
-    """
+    """Adjust a camera to the region of interest and the binning of a CameraInfo."""
+    # Binning averages sensor pixels, which moves pixel centres relative to the corner.
     roi, by = info.roi, np.array([max(1, info.binning_x), max(1, info.binning_y)])
     size = [roi.width or camera.width_px, roi.height or camera.height_px]
     K = camera.K.copy()
@@ -186,25 +187,17 @@ def _binned(camera: Camera, info: Any) -> Camera:
 
 @dataclass(frozen=True)
 class Transforms:
-    """The tree of coordinate frames of a bag.
+    """The tree of coordinate frames of a bag."""
 
-    Attributes:
-        where: Path of the bag, for messages.
-        fixed: Name of the parent frame and the constant pose T_parent_child (4,4), by child frame.
-        moving: Name of the parent frame and the path T_parent_child over time, by child frame.
-    """
-
-    where: str
+    where: str  # path of the bag, for messages
+    # Name of the parent frame and the constant pose T_parent_child (4,4), by child frame
     fixed: dict[str, tuple[str, Float]] = field(default_factory=dict)
+    # Name of the parent frame and the path T_parent_child over time, by child frame
     moving: dict[str, tuple[str, PoseTrack]] = field(default_factory=dict)
 
     @staticmethod
     def read(bag: Bag) -> Transforms:
-        """Read all transforms of /tf_static and /tf. A frame that never moves in /tf is fixed.
-
-        Raises:
-            InputError: A transform is not a rigid motion.
-        """
+        """Read all transforms of /tf_static and /tf. A frame that never moves in /tf is fixed."""
         found = Transforms(str(bag.path))
         heard: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
         for topic in bag.of_type("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
@@ -242,13 +235,9 @@ class Transforms:
         return found.get(target)
 
     def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
-        """Return the path of a frame over time, from /tf; None if the frame never moves.
+        """Return a frame's moving parent and its path in it, T_parent_frame; None if it is fixed.
 
-        The path is relative to the nearest moving parent in the tree: usually ``odom``, not
-        ``map``, which jumps at loop closures.
-
-        Returns:
-            Name of this parent, and the poses T_parent_frame over time.
+        The nearest moving parent is usually ``odom``, not ``map``, which jumps at loop closures.
         """
         T_body_frame, body, passed = np.eye(4), frame, {frame}
         while body in self.fixed and body not in self.moving:
@@ -264,17 +253,10 @@ class Transforms:
 
 
 def recorded_track(bag: Bag, topic: str, transforms: Transforms, lidar: str) -> PoseTrack:
-    """Read the path T_world_lidar from a topic of odometry or poses.
+    """Read the path T_world_lidar from a topic of odometry or poses; ``lidar`` names the frame.
 
     Odometry gives the pose of its child frame, which fixed transforms join to the lidar. Poses
     without a child frame are assumed to be poses of the lidar itself.
-
-    Args:
-        lidar: Name of the lidar's frame.
-
-    Raises:
-        InputError: No fixed frames join the child frame to the lidar, or the topic has fewer than
-            two poses.
     """
     found, where = dict[int, Float](), f"{bag.path}: {topic}"
     for message in bag.messages(topic):

@@ -26,30 +26,22 @@ _FILE_COLUMNS = ("filename", "file", "name", "image", "sweep", "path")
 TIME_COLUMNS = ("timestamp", "time", "stamp", "t")
 _MAX_NUMBER_DIGITS = 18  # a longer number is no frame number
 _MOST_NS = 2**63
+_MOST_EQUAL = 1 / 3  # share of the steps
 
 
 class Named(NamedTuple):
-    """A file and the number or time in its name.
-
-    Attributes:
-        number: Number in the name; None for a name with a time or without digits.
-        stamp_ns: Time in the name in nanoseconds; None for a name without a time.
-    """
+    """A file and the number or time in its name."""
 
     path: Path
-    number: int | None
-    stamp_ns: int | None
+    number: int | None  # number in the name; None for a name with a time or without digits
+    stamp_ns: int | None  # time in the name in nanoseconds; None for a name without a time
 
 
 def named(path: Path, unit: str = "") -> Named:
     """Find the frame number or the time in the name of a file.
 
     ``0000000120`` and ``cloud_12`` are numbers. ``1317042651.468569638``, ``1317042651_468569638``
-    and ``1317042651468`` are times since 1970.
-
-    Args:
-        unit: Unit of the last number in the name (s, ms, us or ns), which is then a time; "" to
-            recognise times since 1970 only.
+    and ``1317042651468`` are times since 1970. With a ``unit`` the last number is a time.
     """
     words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
     if unit:
@@ -102,31 +94,33 @@ def _epoch_unit(text: str) -> str:
     return ""
 
 
-class TextTable(NamedTuple):
-    """Table of a text file, with columns separated by blanks, commas, semicolons or tabs.
+def check_digits(stamps_ns: Collection[int], text: str, where: Path) -> None:
+    """Raise InputError if times in file order are equal because they were rounded.
 
-    Attributes:
-        names: Names of the columns in lower case; empty without a line of names.
-        lines: Line number of each row in the file, from 1.
-        rows: Words of each row.
+    ``text`` is the first time as the file has it.
     """
+    steps_ns = np.diff(np.array([*stamps_ns], np.int64))
+    num_equal = int((steps_ns == 0).sum())
+    least = min(2, len(steps_ns))  # one of several may be a hiccup of the recorder
+    if num_equal >= max(least, 1) and num_equal > _MOST_EQUAL * len(steps_ns):
+        raise InputError(
+            f"{where}: {num_equal} of {len(steps_ns)} times are equal to the time before, such as "
+            f"{text}: they have lost digits; write them anew with all digits, in nanoseconds or "
+            f"with %.9f"
+        )
+
+
+class TextTable(NamedTuple):
+    """Table of a text file, with columns separated by blanks, commas, semicolons or tabs."""
 
     path: Path
-    names: list[str]
-    lines: list[int]
-    rows: list[list[str]]
+    names: list[str]  # names of the columns in lower case; empty without a line of names
+    lines: list[int]  # line number of each row in the file, from 1
+    rows: list[list[str]]  # words of each row
 
     @staticmethod
     def read(path: Path, known: Collection[str]) -> TextTable:
-        """Read the table of a file.
-
-        Args:
-            known: Possible names of columns. The first line names the columns if it contains one of
-                these names or starts with ``#``.
-
-        Raises:
-            InputError: The file has no rows, or a row has fewer words than the first row.
-        """
+        """Read a file; its first line names columns if it has a known name or begins with #."""
         names: list[str] = []
         lines: list[int] = []
         rows: list[list[str]] = []
@@ -157,12 +151,7 @@ class TextTable(NamedTuple):
     def times_ns(self, column: int, unit: str) -> tuple[tuple[int, ...], str]:
         """Return the times of a column in nanoseconds, and the unit in the file ("date" for dates).
 
-        Args:
-            column: Index of the column.
-            unit: Unit of the numbers; "" to find the unit of times since 1970, else use seconds.
-
-        Raises:
-            InputError: A word is no time, or the median step is too long for assumed seconds.
+        Without a ``unit`` ("") the unit of times since 1970 is found; else it is seconds.
         """
         times = [words[column] for words in self.rows]
         dates = "-" in times[0][1:] and ":" in times[0]
@@ -186,30 +175,20 @@ class TextTable(NamedTuple):
 
 
 class StampFile(NamedTuple):
-    """The times of a text file, line by line.
-
-    Attributes:
-        stamp_ns: Time of each line in nanoseconds.
-        unit: Unit of the times in the file: s, ms, us, ns or date.
-        names: Name of the sweep or image file of each line; None if lines have only times.
-    """
+    """The times of a text file, line by line."""
 
     path: Path
-    stamp_ns: tuple[int, ...]
-    unit: str
+    stamp_ns: tuple[int, ...]  # time of each line in nanoseconds
+    unit: str  # unit of the times in the file: s, ms, us, ns or date
+    # Name of the sweep or image file of each line; None if lines have only times
     names: tuple[str, ...] | None
 
     @staticmethod
     def read(path: Path, unit: str = "") -> StampFile:
         """Read the times of a file with a time on each line, among other columns or alone.
 
-        Times are numbers, or dates such as 2011-09-26 13:10:51.158069617.
-
-        Args:
-            unit: Unit of the numbers, "" to find the unit as in `TextTable.times_ns`.
-
-        Raises:
-            InputError: The file is malformed. The message names file and line.
+        Times are numbers of a ``unit`` (as in `TextTable.times_ns`), or dates such as 2011-09-26
+        13:10:51.158069617.
         """
         table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
         at_time, at_name = table.column(TIME_COLUMNS), table.column(_FILE_COLUMNS)
@@ -220,4 +199,6 @@ class StampFile(NamedTuple):
             at_time = next((i for i in range(len(words)) if i != at_name), 0)
         stamps_ns, unit = table.times_ns(at_time, unit)
         files = None if at_name is None else tuple(Path(row[at_name]).name for row in table.rows)
+        if files is None:  # files of several cameras may have one time
+            check_digits(stamps_ns, words[at_time], path)
         return StampFile(path, stamps_ns, unit, files)

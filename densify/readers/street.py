@@ -59,9 +59,6 @@ class Street:
             hz: Sweeps per second: 5, 10 or 20.
             tilt_deg: Pitch of the lidar's mount in degrees, nose down; cameras are not tilted.
             cameras: Names of cameras in `densify.street.cameras.CAMERAS`.
-
-        Raises:
-            InputError: A name is unknown, or a number is outside its range.
         """
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)
@@ -86,11 +83,7 @@ class Street:
 
     @staticmethod
     def from_spec(spec: str) -> Street:
-        """Create a street from a text such as ``street:crossing?seed=2&sensor=vlp16``.
-
-        Raises:
-            InputError: The text has another form, or an option or value is unknown.
-        """
+        """Create a street from a text such as ``street:crossing?seed=2&sensor=vlp16``."""
         head, _, query = spec.partition("?")
         reader, _, preset = head.partition(":")
         if reader != "street":
@@ -199,20 +192,13 @@ class StreetTruth:
     _street: Street
 
     def sweep(self, frame: int) -> SweepTruth:
-        """Return the ground truth of a sweep's N raw points, row by row.
-
-        Each point is moved from its firing time to the reference time with its body. Positions are
-        in the lidar frame at the reference time.
-        """
+        """Return the ground truth of a sweep's N raw points, row by row."""
         returns = self._street.returns(frame)
         points = self._street.simulator.in_bodies(frame, returns)
         return self._street.bodies.sweep(frame, returns.body, returns.instance, points)
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return the true scene flow (N,3) in metres of a sweep's points to the time of ``target``.
-
-        Flow excludes ego-motion and is in the lidar frame of ``frame``; it is 0 for static points.
-        """
+        """Return the (N,3) true scene flow (m) of a sweep's points to the time of ``target``."""
         self._street.check(target)
         returns = self._street.returns(frame)
         points = self._street.simulator.in_bodies(frame, returns)

@@ -25,14 +25,10 @@ _NOMINAL_PERIOD_NS = 100_000_000  # period of a recording with one sweep
 
 
 class WindowFrames(NamedTuple):
-    """The window of sweeps around a key frame.
+    """The window of sweeps around a key frame."""
 
-    Attributes:
-        frames: Frame numbers in the window, ascending, including the key frame.
-        cuts: Reasons why the window is smaller than requested, a clause for each cut side.
-    """
-
-    frames: tuple[int, ...]
+    frames: tuple[int, ...]  # frame numbers in the window, ascending, including the key frame
+    # Reasons why the window is smaller than requested, a clause for each cut side
     cuts: tuple[str, ...]
 
 
@@ -72,19 +68,12 @@ def check_key(key: int) -> None:
 
 @dataclass(frozen=True)
 class Timeline:
-    """The reference times of a recording.
+    """The reference times of a recording."""
 
-    Attributes:
-        name: Name of the recording.
-        frames: Numbers of all n sweeps, ascending.
-        stamp_ns: (n,) int64 reference times of the sweeps; interpolated for ``unknown`` sweeps.
-        unknown: Reason why a stamp is unknown or out of order, by frame number.
-    """
-
-    name: str
-    frames: tuple[int, ...]
-    stamp_ns: Int
-    unknown: Mapping[int, str]
+    name: str  # name of the recording
+    frames: tuple[int, ...]  # numbers of all n sweeps, ascending
+    stamp_ns: Int  # (n,) int64 reference times of the sweeps; interpolated for ``unknown`` sweeps
+    unknown: Mapping[int, str]  # reason why a stamp is unknown or out of order, by frame number
 
     @staticmethod
     def of(sequence: LidarSequence) -> Timeline:
@@ -169,14 +158,8 @@ class Timeline:
     ) -> WindowFrames:
         """Return the key frame and up to ``window`` sweeps before and after the key frame.
 
-        A side ends early at the end of the recording, a hole in time, or an unusable sweep.
-
-        Args:
-            window: Number of sweeps on each side.
-            left_out: Reason why a sweep cannot be used, by frame number.
-
-        Raises:
-            InputError: The key frame does not exist, or the window is not valid.
+        A side ends early at the end of the recording, a hole in time, or an unusable sweep, whose
+        reason is in ``left_out`` by frame number.
         """
         check_window(window)
         if key not in self.row:
@@ -191,10 +174,7 @@ class Timeline:
     def _side(
         self, key: int, step: int, window: int, left_out: Mapping[int, str]
     ) -> tuple[list[int], str]:
-        """Return the frames on one side of the key frame, nearest first.
-
-        The second value is the reason for fewer than ``window`` frames, "" for a full side.
-        """
+        """Return frames beside the key, nearest first, and why they are fewer than ``window``."""
         side = [self.frames[row] for row in self._next_to(key, step, window)]
         for n, frame in enumerate(side):
             if frame in left_out:
@@ -216,10 +196,7 @@ class Timeline:
 
 
 def _out_of_order(stamps_ns: Int) -> list[int]:
-    """Return the indices of stamps outside the longest ascending subsequence.
-
-    Return no indices if these stamps are half of all stamps or more.
-    """
+    """Return the stamps outside the longest ascending series, unless they are half of all."""
     if np.all(np.diff(stamps_ns) > 0):
         return []
     best: list[int] = []  # by length: index of the lowest stamp that ends such a series
@@ -241,9 +218,6 @@ def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) 
     """Read a sweep with only the returns kept by `in_range`.
 
     Without ``settings.deskew`` the sweep has no firing times (``offset_ns`` is None).
-
-    Raises:
-        InputError: The sweep cannot be read.
     """
     sweep = in_range(sequence[frame], settings)
     return sweep if settings.deskew else replace(sweep, offset_ns=None)
@@ -267,9 +241,6 @@ def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list
     """Return the cameras with the given names, in this order.
 
     If ``names`` is None, return all cameras with images, or all cameras if there are no images.
-
-    Raises:
-        InputError: A camera does not exist. The message names the existing cameras.
     """
     if isinstance(names, str) or not isinstance(names, Iterable | None):
         one = [*sequence.cameras][:1]

@@ -37,13 +37,7 @@ def write_bodies(folder: Path, bodies: Bodies) -> None:
 def write_points(
     folder: Path, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], point: Float
 ) -> None:
-    """Write the body, object and body-fixed position of each of a sweep's N raw points.
-
-    Args:
-        body: (N,) index of the body of each point.
-        instance: (N,) number of the object of each point, -1 for points of no object.
-        point: (N,3) metres, position in the frame of the point's body.
-    """
+    """Write body, object (-1 none) and body-fixed position (N,3) of a sweep's N raw points."""
     _save(_points_path(folder, frame), body=body, instance=instance, point=point)
 
 
@@ -79,10 +73,7 @@ class FileTruth:
         return self.bodies.sweep(frame, body, instance, point)
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return the true scene flow (N,3) in metres of a sweep's points to the time of ``target``.
-
-        Flow excludes ego-motion and is in the lidar frame of ``frame``.
-        """
+        """Return the (N,3) true scene flow (m) of a sweep's points to the time of ``target``."""
         body, _, point = self._points(frame)
         return self.bodies.displacement(frame, target, body, point)
 

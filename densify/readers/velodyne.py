@@ -50,12 +50,7 @@ _PCAP = {  # magic number -> byte order, nanoseconds per unit of the fraction
 
 
 def open_recording(path: Path, scene: str | None) -> Velodyne:
-    """Open a Velodyne capture, as `densify.readers.ReaderModule` specifies.
-
-    Args:
-        path: Capture, a ``.pcap`` file.
-        scene: Name of the scanner's model, one of `MODELS`.
-    """
+    """Open a ``.pcap`` capture; ``scene`` is the scanner's model, one of `MODELS`."""
     if scene not in MODELS:
         got = "no model" if scene is None else f"the model {scene}"
         raise InputError(
@@ -69,14 +64,7 @@ class Velodyne(FileSequence):
     """A Velodyne capture as a `LidarSequence`, stamped at the last packet of each sweep."""
 
     def __init__(self, path: Path, model: str) -> None:
-        """Find the packets and turns of a capture; sweeps are decoded on demand.
-
-        Args:
-            model: Name of the scanner's model, one of `MODELS`.
-
-        Raises:
-            InputError: The file is no capture, or holds less than one turn.
-        """
+        """Find the packets and turns of a capture; sweeps are decoded on demand."""
         self._library = needed("velodyne_decoder", "velodyne", "Velodyne captures")
         self._model = getattr(self._library.Model, MODELS[model])
         self._begin, self._captured_ns, azimuth = _find_packets(path)
@@ -112,12 +100,7 @@ class Velodyne(FileSequence):
 
 
 def _find_packets(path: Path) -> tuple[Int, Int, Int]:
-    """Find the P packets with returns in a capture.
-
-    Returns:
-        Three arrays (P,): byte offset of the packet's payload in the file, capture time (ns), and
-        azimuth of the packet's first firing (hundredths of a degree).
-    """
+    """Return (P,) file offsets, capture times (ns) and azimuths (0.01 deg) of the packets."""
     found = []
     with open_file(path) as file:
         magic = file.read(24)[:4]

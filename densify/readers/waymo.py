@@ -80,17 +80,13 @@ class Components:
 
 
 class Laser(NamedTuple):
-    """The calibration of a lidar.
+    """The calibration of a lidar."""
 
-    Attributes:
-        T_vehicle_laser: (4,4) pose of the lidar in the vehicle's frame.
-        inclinations_rad: (H,) inclinations of the beams, from the lowest beam up; None for beams
-            spread evenly between ``bounds_rad``.
-        bounds_rad: Inclinations of the lower and upper limit of the field of view.
-    """
-
-    T_vehicle_laser: Float
+    T_vehicle_laser: Float  # (4,4) pose of the lidar in the vehicle's frame
+    # (H,) inclinations of the beams, from the lowest beam up; None for beams spread evenly between
+    # ``bounds_rad``
     inclinations_rad: Float | None
+    # Inclinations of the lower and upper limit of the field of view
     bounds_rad: tuple[float, float]
 
     def directions(self, size: tuple[int, ...]) -> Float:
@@ -108,19 +104,12 @@ class Laser(NamedTuple):
 
 
 class Image(NamedTuple):
-    """The times and the pose of an image.
+    """The times and the pose of an image."""
 
-    Attributes:
-        pose_ns: Time of the pose ``T_world_vehicle``.
-        exposed_ns: Exposure time of the middle row or column.
-        readout_s: Time between the exposures of the first and the last row or column.
-        T_world_vehicle: (4,4) pose of the vehicle in the world.
-    """
-
-    pose_ns: int
-    exposed_ns: int
-    readout_s: float
-    T_world_vehicle: Float
+    pose_ns: int  # time of the pose ``T_world_vehicle``
+    exposed_ns: int  # exposure time of the middle row or column
+    readout_s: float  # time between the exposures of the first and the last row or column
+    T_world_vehicle: Float  # (4,4) pose of the vehicle in the world
 
 
 def read_lasers(parts: Components) -> dict[int, Laser]:
@@ -145,9 +134,6 @@ def read_boxes(parts: Components) -> dict[int, Boxes]:
     """Return the boxes of all annotated frames, by ``frame_timestamp_micros``.
 
     Boxes are in the vehicle's frame at the frame's ``vehicle_pose``.
-
-    Raises:
-        InputError: The component ``lidar_box`` is missing or malformed.
     """
     numbers = (*BOX_CENTRE, *BOX_SIZE, BOX_HEADING)
     rows = parts.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
@@ -165,11 +151,7 @@ def read_boxes(parts: Components) -> dict[int, Boxes]:
 
 
 def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]]:
-    """Return times and poses of the images, without pixels, by camera name and frame number.
-
-    Args:
-        starts_us: ``frame_timestamp_micros`` of the n frames, ascending.
-    """
+    """Return times and poses of images by camera name and frame number; ``starts_us`` is (n,)."""
     head = "[CameraImageComponent]"
     pose, shutter = f"{head}.pose.transform", f"{head}.rolling_shutter_params"
     times = [f"{shutter}.{name}" for name in ("camera_trigger_time", "camera_readout_done_time")]
@@ -225,19 +207,12 @@ def _whole_us(seconds: float) -> int:
 
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
-    """Open a segment of Waymo, as `densify.readers.ReaderModule` specifies.
-
-    Args:
-        path: Folder of a split, such as ``training``.
-        scene: Name of the segment (CONTEXT); None if there is only one segment.
-    """
-    files = sorted((path / "lidar").glob("*.parquet"))
-    if not files:
-        raise InputError(
-            f"{path / 'lidar'}: no segments; expected files such as "
-            f"10017090168044687777_6380_000_6400_000.parquet"
-        )
-    return Waymo(path, checks.chosen_scene("waymo", path, scene, [file.stem for file in files]))
+    """Open a segment (CONTEXT) of the folder of a split, such as ``training``."""
+    names = sorted(file.stem for file in (path / "lidar").glob("*.parquet"))
+    none = (
+        "no segments; expected files such as lidar/10017090168044687777_6380_000_6400_000.parquet"
+    )
+    return Waymo(path, checks.chosen_scene("waymo", path, scene, names, none))
 
 
 class Waymo(FileSequence):
@@ -247,11 +222,7 @@ class Waymo(FileSequence):
     """
 
     def __init__(self, root: Path, context: str) -> None:
-        """Read stamps and calibrations; sweeps, images and poses are read on demand.
-
-        Raises:
-            InputError: A component is missing or malformed.
-        """
+        """Read stamps and calibrations; sweeps, images and poses are read on demand."""
         parts = self._parts = Components(root, context)
         self._starts_us = np.unique(parts.read("lidar", {STAMP: "i"})[STAMP])
         if not len(self._starts_us):
@@ -282,11 +253,7 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the vehicle's frame; None if not annotated (test split).
-
-        Raises:
-            InputError: The boxes are malformed.
-        """
+        """Return a sweep's boxes in the vehicle's frame; None if not annotated (test split)."""
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))
 

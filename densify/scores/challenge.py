@@ -44,32 +44,21 @@ class ThreeWayError(NamedTuple):
 
 
 class BucketedError(NamedTuple):
-    """The bucket normalised error of a class, or its mean over classes.
+    """The bucket normalised error of a class, or its mean over classes."""
 
-    Attributes:
-        static_m: Mean error in the static bucket, metres.
-        dynamic: Mean error in the other buckets as a share of the true flow, 1 for an estimate of
-            zero.
-    """
-
-    static_m: float
+    static_m: float  # mean error in the static bucket, metres
+    # Mean error in the other buckets as a share of the true flow, 1 for an estimate of zero
     dynamic: float
 
 
 class ChallengeScores(NamedTuple):
-    """The scores over all pairs of sweeps.
+    """The scores over all pairs of sweeps."""
 
-    Attributes:
-        three_way: Three-way end-point error in metres.
-        by_class: Bucketed error of each class with points, by name of the class.
-        mean: Bucketed error averaged over these classes.
-        num_points: Number of scored points.
-    """
-
-    three_way: ThreeWayError
+    three_way: ThreeWayError  # three-way end-point error in metres
+    # Bucketed error of each class with points, by name of the class
     by_class: dict[str, BucketedError]
-    mean: BucketedError
-    num_points: int
+    mean: BucketedError  # bucketed error averaged over these classes
+    num_points: int  # number of scored points
 
 
 class ChallengeScorer:

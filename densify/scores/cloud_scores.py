@@ -24,10 +24,6 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
     All returns of the key sweep in its direction and the eight directions around are farther, by
     more than max(0.5 m, 2 % of its range). At least six of the nine directions must have a return.
     Dark paint and glass give no return and hide ghosts.
-
-    Args:
-        key_image: Range image of the key sweep.
-        key: Frame number of the key sweep.
     """
     ghost, unjudged = np.zeros((2, len(cloud)), bool)
     other = np.flatnonzero(_others(cloud, key))

@@ -113,11 +113,8 @@ def precision_density(
     """Return density and share of outliers for each least confidence 0, 0.05, … 0.95.
 
     The values are given for ``measured`` and ``filled`` depth. ``density_*`` is the share of all
-    pixels that keep a depth. ``outliers_*`` is the share of outliers among kept pixels with ground
-    truth.
-
-    Args:
-        truth_m: (H,W) true depth in metres, 0 none.
+    pixels that keep a depth. ``outliers_*`` is the share of outliers among kept pixels with true
+    depth (H,W), in metres, 0 none.
     """
     curve = []
     for least in _LEAST_CONFIDENCES:
@@ -140,18 +137,11 @@ def errors_by_part(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> dict[str, DepthErrors]:
-    """Return `depth_errors` of parts of the pixels, by name of the part.
+    """Return `depth_errors` of parts of the pixels (H,W), by name of the part.
 
     The parts are ``all`` pixels, ranges of true depth (``0-10 m`` … ``over 80 m``), `depth_edges`
-    (``edge``) and other pixels (``not edge``). With ``moving`` pixels given, there are also parts
-    ``moving`` and ``static``.
-
-    Args:
-        predicted_m: (H,W) depth z in metres, 0 none.
-        truth_m: (H,W) true depth z in metres, 0 none.
-        moving: (H,W) True at pixels of moving objects, None if unknown.
-        focal_px: Focal length fx of the camera.
-        baseline_m: Stereo baseline that turns depth into disparity.
+    (``edge``) and other pixels (``not edge``). With a mask of ``moving`` pixels given, there are
+    also parts ``moving`` and ``static``. Other arguments as in `depth_errors`.
     """
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]
@@ -170,13 +160,10 @@ def errors_by_part(
 
 
 def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_BASELINE_M) -> Bool:
-    """Return (H,W) True at pixels of the true depth close to a depth discontinuity.
+    """Return (H,W) True at pixels of the true depth (m, 0 none) close to a depth discontinuity.
 
     Within 3 px of such a pixel there is a true depth that would be an outlier here. Level ground is
     no discontinuity: for a camera 1.65 m above it, disparity grows by 0.54/1.65 px per row.
-
-    Args:
-        truth_m: (H,W) true depth in metres, 0 none.
     """
     known = truth_m > 0
     disparity_px = np.zeros(truth_m.shape)
@@ -192,10 +179,7 @@ def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_
 
 
 def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
-    """Return the mean of each error over images, without images where it is undefined.
-
-    Counts of pixels are added up.
-    """
+    """Return the mean of each error over images where it is defined, and the sum of the counts."""
     means: dict[str, Any] = {}
     for field in fields(DepthErrors):
         values = [value for image in images if (value := getattr(image, field.name)) is not None]
@@ -212,12 +196,7 @@ def image_density(depth_m: Float32) -> float:
 def depth_scores(
     depth: DepthMap, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return `depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``.
-
-    Args:
-        truth_depth_m: (H,W) true depth in metres, 0 none.
-        moving_mask: (H,W) True at pixels of moving objects.
-    """
+    """Return `depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``."""
     return {
         product: scores_by_motion(image, truth_depth_m, moving_mask, camera)
         for product, image in (("measured", depth.depth_m), ("filled", depth.filled_m))

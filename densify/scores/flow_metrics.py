@@ -32,10 +32,7 @@ def accuracy(estimated: Float, true: Float, limit: float) -> float:
     """Return the share (0 to 1) of the points with a small end-point error.
 
     The error is below ``limit`` metres *or* below ``limit`` times the length of the true flow.
-
-    Args:
-        limit: `STRICT` (0.05 m or 5 %) or `RELAXED` (0.1 m or 10 %), as in FlowNet3D (CVPR 2019)
-            and Pontes et al. (3DV 2020).
+    `STRICT` and `RELAXED` are the limits of FlowNet3D (CVPR 2019) and Pontes et al. (3DV 2020).
     """
     error_m = end_point_errors(estimated, true)
     return mean_of((error_m < limit) | (error_m < limit * np.linalg.norm(true, axis=1)))

@@ -34,14 +34,10 @@ _PAINTS: tuple[Tint, ...] = (
 
 @dataclass(frozen=True)
 class Actor:
-    """An object of the street, such as a car or a pedestrian.
+    """An object of the street, such as a car or a pedestrian."""
 
-    Attributes:
-        name: Kind of the object.
-        bodies: Rigid parts. Only the first `num_solid` parts are tested for collisions.
-    """
-
-    name: str
+    name: str  # kind of the object
+    # Rigid parts. Only the first `num_solid` parts are tested for collisions.
     bodies: tuple[Body, ...]
     num_solid: int = 1
 

@@ -39,15 +39,10 @@ T_FISHEYE_LIDAR = np.array(  # on the left of the roof, facing left
 
 
 class Shutter(NamedTuple):
-    """The exposure times of a camera.
+    """The exposure times of a camera."""
 
-    Attributes:
-        delay_ns: Exposure of the first image minus frame 0's reference time.
-        period_ns: Time between images; None for one image per sweep.
-    """
-
-    delay_ns: int
-    period_ns: int | None = None
+    delay_ns: int  # exposure of the first image minus frame 0's reference time
+    period_ns: int | None = None  # time between images; None for one image per sweep
 
 
 def _pinhole(name: str, right_m: float, share: float = 1.0, row_time_s: float = 0.0) -> Camera:
@@ -105,26 +100,20 @@ _SUN = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
 
 @dataclass(frozen=True)
 class Picture:
-    """One exposure of (H,W) pixels.
+    """One exposure of (H,W) pixels."""
 
-    Attributes:
-        image: (H,W,3) uint8 RGB.
-        depth_m: (H,W) float32 depth of the nearest surface, glass included, by the camera's
-            ``measure``. 0 for pixels without a surface within 120 m, or outside the lens's view.
-        body: (H,W) int32 index of the visible body, -1 for sky.
-    """
-
-    image: NDArray[np.uint8]
+    image: NDArray[np.uint8]  # (H,W,3) uint8 RGB
+    # (H,W) float32 depth of the nearest surface, glass included, by the camera's ``measure``. 0 for
+    # pixels without a surface within 120 m, or outside the lens's view.
     depth_m: Float32
-    body: NDArray[np.int32]
+    body: NDArray[np.int32]  # (H,W) int32 index of the visible body, -1 for sky
 
 
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
     """Render the picture of a camera, each row exposed at its own time.
 
-    Args:
-        camera: Camera with its pose relative to the lidar frame of a level mount.
-        time_s: Exposure of the middle row, in seconds since frame 0.
+    The camera's pose is relative to the lidar frame of a level mount. ``time_s`` is the exposure of
+    the middle row, in seconds since frame 0.
     """
     h, w = camera.height_px, camera.width_px
     v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)
@@ -151,12 +140,7 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
 
 
 def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Float) -> Rays:
-    """Return rays in the world frame, each at the exposure time of its image row.
-
-    Args:
-        ray: (N,3) directions in the camera frame.
-        row: (N,) rows below the middle row, ascending.
-    """
+    """Return rays in the world frame, each at the exposure time of its row below the middle."""
     time = time_s + row * camera.row_time_s
     poses, T_ego_cam = poses_at(ego, time), T_ego_lidar() @ inverse(camera.T_cam_lidar)
     origin = poses.apply(np.broadcast_to(T_ego_cam[:3, 3], ray.shape))
@@ -204,10 +188,7 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
 
 
 def _sky(direction: Float) -> Float:
-    """Return (N,3) linear RGB of the sky in (N,3) directions.
-
-    The sky is paler towards the horizon and has a few soft clouds.
-    """
+    """Return (N,3) linear RGB of the sky in (N,3) directions."""
     up = np.clip(direction[:, 2], 0.0, 1.0)[:, None]
     blue = np.array([0.72, 0.80, 0.88]) * (1 - up) ** 3 + np.array([0.20, 0.38, 0.72]) * (
         1 - (1 - up) ** 3

@@ -61,11 +61,7 @@ _GOLDEN = 0.6180339887498949
 
 
 def laser(world: World, luck: Float) -> Optics:
-    """Return the optics of lidar: each ray that meets a surface stops, passes or is absorbed.
-
-    Args:
-        luck: (N,) random number of each ray in [0, 1).
-    """
+    """Return the optics of lidar, by a random number of each ray in [0, 1)."""
     surfaces = world.triangles
 
     def optics(met: Meeting) -> Int:
@@ -94,13 +90,7 @@ def laser(world: World, luck: Float) -> Optics:
 
 
 def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
-    """Return the (N,) share of pulses without a return, besides pulses that vehicles absorb.
-
-    Args:
-        material: (N,) materials.
-        tint: (N,) mean factors on the colours of the materials.
-        range_m: (N,) distances in metres.
-    """
+    """Return the (N,) share of pulses without a return, besides pulses that vehicles absorb."""
     ground, dark, other = (
         np.interp(range_m, _RANGE_M, lost) for lost in (_GROUND_LOST, _DARK_LOST, _OTHER_LOST)
     )
@@ -115,9 +105,7 @@ def _of_vehicle(material: Int) -> Bool:
 def patches(place: Float, owner: Int) -> Float:
     """Return (N,) numbers, uniform in 0 to 1, that vary smoothly over a surface.
 
-    Args:
-        place: (N,3) positions in metres.
-        owner: (N,) object indices. Different objects have independent numbers.
+    Different owners (object indices) have independent numbers.
     """
     cell = np.floor(place / _PATCH_M)
     share = place / _PATCH_M - cell
@@ -176,11 +164,7 @@ class Returns:
 
 
 def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
-    """Return the (4,4) pose of the lidar frame on the vehicle.
-
-    Args:
-        tilt_deg: Pitch of the mount about the origin of the lidar frame, positive nose down.
-    """
+    """Return the (4,4) pose of the lidar frame on the vehicle, tilted nose down."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("y", tilt_deg, degrees=True).as_matrix()
     T[2, 3] = LIDAR_HEIGHT_M
@@ -191,12 +175,7 @@ def scan(
     world: World, ego: Driving, sensor: Sensor, time_s: float, rng: np.random.Generator,
     period_ns: int = 100_000_000, tilt_deg: float = 0.0,
 ) -> Returns:  # fmt: skip
-    """Simulate one sweep from a mount tilted as in `T_ego_lidar`.
-
-    Args:
-        time_s: Reference time of the sweep, in seconds since frame 0.
-        period_ns: Duration of a sweep.
-    """
+    """Simulate one sweep around ``time_s``, seconds since frame 0, as long as ``period_ns``."""
     T = T_ego_lidar(tilt_deg)
     fired = firings(sensor, time_s, period_ns)
     n = len(fired.offset_ns)
@@ -251,18 +230,9 @@ def _spot(direction: Float) -> Float:
 
 
 def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Int, Bool]:
-    """Return the echo of each laser spot.
-
-    On one plane the centre ray counts. At an edge each ray of the spot is equally likely to be the
-    strongest echo. Two echoes close together sometimes merge into one at a range in between.
-
-    Args:
-        echoes: Hits of the rays of all spots.
-        spot: (N,S,3) directions of the rays, the centre first.
-
-    Returns:
-        (N,) range in metres, (N,) index of the ray that counts, (N,) True for spots at an edge.
-    """
+    """Return (N,) ranges (m) of laser spots, rays that count, and True for spots at an edge."""
+    # On one plane the centre ray counts. At an edge each ray is equally likely to be the strongest
+    # echo. Two echoes close together sometimes merge into one at a range in between.
     n, num = spot.shape[:2]
     range_m = echoes.range_m.reshape(n, num)
     slant = np.einsum("ni,nsi->ns", echoes.normal[::num], spot)

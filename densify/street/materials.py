@@ -88,11 +88,7 @@ def _rough(fine_m: float, coarse_m: float, contrast: float) -> Callable[[Float],
 def _laid(
     length_m: float, height_m: float, joint_m: float, joint: float
 ) -> Callable[[Float], Float]:
-    """Return a texture of bricks laid in courses.
-
-    Args:
-        joint: Brightness between the bricks.
-    """
+    """Return a texture of bricks laid in courses, with joints of the brightness ``joint``."""
 
     def texture(at: Float) -> Float:
         row = np.floor(at[:, 1] / height_m)
@@ -121,14 +117,7 @@ _TEXTURES = {
 
 
 def shade_factor(material: Int, uv: Float) -> Float:
-    """Return the (N,) brightness of the texture, around 1.
-
-    Textures move with their body, because uv are coordinates on its surface.
-
-    Args:
-        material: (N,) materials.
-        uv: (N,2) metres on the surface.
-    """
+    """Return the (N,) brightness of the texture, around 1, at (N,2) metres on the surface."""
     factor = np.ones(len(material))
     for kind, texture in _TEXTURES.items():
         rows = np.flatnonzero(material == kind)

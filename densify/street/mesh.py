@@ -31,23 +31,14 @@ _HALVES = np.array([0, 1, 2, 0, 2, 3])  # the triangles of a quad
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh of V vertices and T triangles.
+    """A mesh of V vertices and T triangles."""
 
-    Attributes:
-        vertices: (V,3) metres.
-        triangles: (T,3) vertex indices.
-        uv: (V,2) texture coordinates, metres on the surface.
-        material: (T,) materials.
-        tint: (T,3) factors on the colour of the material.
-        instance: (T,) int32 object numbers, -1 for none.
-    """
-
-    vertices: Float
-    triangles: NDArray[np.int64]
-    uv: Float
-    material: NDArray[np.int16]
-    tint: Float
-    instance: NDArray[np.int32]
+    vertices: Float  # (V,3) metres
+    triangles: NDArray[np.int64]  # (T,3) vertex indices
+    uv: Float  # (V,2) texture coordinates, metres on the surface
+    material: NDArray[np.int16]  # (T,) materials
+    tint: Float  # (T,3) factors on the colour of the material
+    instance: NDArray[np.int32]  # (T,) int32 object numbers, -1 for none
 
     @staticmethod
     def join(meshes: Sequence[Mesh]) -> Mesh:
@@ -62,11 +53,9 @@ class Mesh:
 
     @staticmethod
     def quads(corners: Float, material: Material, tint: Tint | Float = WHITE) -> Mesh:
-        """Return a mesh of (K,4,3) quads.
+        """Return a mesh of (K,4,3) quads, with corners in order around each quad.
 
-        Args:
-            corners: (K,4,3) metres, in order around each quad. Texture coordinates run along the
-                first side and away from it.
+        Texture coordinates run along the first side and away from it.
         """
         k = len(corners)
         side, away = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]

@@ -17,15 +17,10 @@ from densify.street.terrain import Curve, Speed, Terrain, left_of
 
 
 class Poses(NamedTuple):
-    """N poses ``T_world_body``.
+    """N poses ``T_world_body``."""
 
-    Attributes:
-        rotation: (N,3,3) rotation matrices.
-        position: (N,3) metres.
-    """
-
-    rotation: Float
-    position: Float
+    rotation: Float  # (N,3,3) rotation matrices
+    position: Float  # (N,3) metres
 
     def apply(self, points: Float) -> Float:
         """Return (N,3) body-frame points in the world, row by row."""
@@ -93,25 +88,17 @@ class Driving:
     """The trajectory of a vehicle that follows a curve on the ground with both axles.
 
     The origin is midway between the axles, x forward, z up.
-
-    Attributes:
-        curve: Path of both axles.
-        speed: Speed along the path.
-        station_m: Arc length along the path at time ``at_s``.
-        at_s: Time of ``station_m``, seconds since frame 0.
-        wheelbase_m: Distance of the two axles.
-        lift_m: Function from (N,) arc lengths to (N,) heights above the ground.
-        upright: Stay vertical on slopes, as a pedestrian does.
     """
 
-    curve: Curve
-    speed: Speed
-    station_m: float
-    at_s: float
+    curve: Curve  # path of both axles
+    speed: Speed  # speed along the path
+    station_m: float  # arc length along the path at time ``at_s``
+    at_s: float  # time of ``station_m``, seconds since frame 0
     terrain: Terrain
-    wheelbase_m: float
+    wheelbase_m: float  # distance of the two axles
+    # Function from (N,) arc lengths to (N,) heights above the ground
     lift_m: Callable[[Float], Float] | None = None
-    upright: bool = False
+    upright: bool = False  # stay vertical on slopes, as a pedestrian does
 
     def station(self, times_s: Float) -> Float:
         """Return (N,) arc lengths along the curve at (N,) seconds."""
@@ -130,10 +117,7 @@ class Driving:
 def on_ground(
     terrain: Terrain, rear: Float, front: Float, lift_m: Float, upright: bool = False
 ) -> Poses:
-    """Return the N poses of bodies that touch the ground at a rear and a front point.
-
-    ``rear`` and ``front`` (N,2) are x, y in the world, ``lift_m`` (N,) heights above the ground.
-    """
+    """Return the N poses of bodies that touch the ground at (N,2) rear and front points."""
     a = np.column_stack([rear, terrain.height(rear) + lift_m])
     b = np.column_stack([front, terrain.height(front) + lift_m])
     middle = (a + b) / 2
@@ -151,12 +135,7 @@ class Towed:
     def __init__(
         self, tractor: Driving, kingpin_m: float, wheelbase_m: float, first_s: float, last_s: float
     ) -> None:
-        """Build the trailer.
-
-        Args:
-            kingpin_m: Position of the kingpin along the x axis of the tractor.
-            wheelbase_m: Distance from the kingpin back to the axle.
-        """
+        """Build the trailer; the kingpin is ``kingpin_m`` along the x axis of the tractor."""
         self._tractor, self._kingpin_m = tractor, kingpin_m
         times = np.arange(first_s, last_s, 0.01)
         pin = self._pin(times)
@@ -179,21 +158,14 @@ class Towed:
 
 @dataclass(frozen=True)
 class Limb:
-    """A limb that swings about a horizontal hinge of its parent, in step with the distance walked.
+    """A limb that swings about a horizontal hinge of its parent, in step with its walk."""
 
-    Attributes:
-        parent: Trajectory of the body that carries the limb.
-        hinge_m: (3,) position of the hinge in the parent's frame; origin of the limb.
-        swing: Amplitude in rad.
-        stride_m: Distance walked in one full swing.
-        phase: Phase of the swing in rad.
-    """
-
-    parent: Driving
+    parent: Driving  # trajectory of the body that carries the limb
+    # (3,) position of the hinge in the parent's frame; origin of the limb
     hinge_m: tuple[float, float, float]
-    swing: float
-    stride_m: float
-    phase: float
+    swing: float  # amplitude in rad
+    stride_m: float  # distance walked in one full swing
+    phase: float  # phase of the swing in rad
 
     def poses(self, times_s: Float) -> Poses:
         """Return N poses at (N,) seconds."""
@@ -209,23 +181,15 @@ class Rectangles(NamedTuple):
     """Footprints of bodies: rectangles in the horizontal x-y plane of the world.
 
     The arrays may have any leading shape, written "...".
-
-    Attributes:
-        centre: (...,2) x, y of the centre, metres, world.
-        forward: (...,2) unit vector along the length, world.
-        half_m: (...,2) half length and half width, metres.
     """
 
-    centre: Float
-    forward: Float
-    half_m: Float
+    centre: Float  # (...,2) x, y of the centre, metres, world
+    forward: Float  # (...,2) unit vector along the length, world
+    half_m: Float  # (...,2) half length and half width, metres
 
     @staticmethod
     def of(mesh: Mesh, poses: Poses, slack_m: float = 0.0) -> Rectangles:
-        """Return the N footprints of a mesh at N poses: its bounding box seen from above.
-
-        Each side is moved outwards by ``slack_m``.
-        """
+        """Return the N footprints of a mesh at N poses: its bounds from above, plus ``slack_m``."""
         low, high = mesh.bounds
         n = len(poses.position)
         middle = np.append((low + high)[:2] / 2, 0.0)
@@ -245,10 +209,8 @@ class Rectangles(NamedTuple):
 
 
 def overlap(a: Rectangles, b: Rectangles) -> Bool:
-    """Return (...) True for pairs of rectangles that touch; leading shapes are broadcast.
-
-    Two rectangles are apart if a side of either of them separates the two (separating axes).
-    """
+    """Return (...) True for pairs of rectangles that touch; leading shapes are broadcast."""
+    # Two rectangles are apart if a side of either of them separates the two (separating axes).
     away = b.centre - a.centre
     apart = np.zeros(away.shape[:-1], bool)
     for p, q in ((a, b), (b, a)):

@@ -35,11 +35,7 @@ class Scenery:
         self._num_parked = 0
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
-        """Place a mesh, whose origin is on the ground, at a position.
-
-        Args:
-            solid: Part of the mesh that is tested for collisions; None for the whole mesh.
-        """
+        """Place a mesh on the ground; ``solid`` or all of it is tested for collisions."""
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
         self._stand(mesh, upright((*xy, z), heading), solid or mesh)
 
@@ -309,11 +305,7 @@ def furnish(scenery: Scenery, side: Side, spacing_m: float, trees: bool) -> None
 
 
 def park_cars(scenery: Scenery, side: Side, share: float, keep_free: Spans) -> None:
-    """Park cars along the kerb.
-
-    Args:
-        share: Share of the parking spaces that are taken.
-    """
+    """Park cars along the kerb, in a share of the parking spaces."""
     rng = scenery.rng
     station = side.begin_m + 4.0
     while station < side.end_m - 4.0:

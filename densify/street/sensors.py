@@ -17,17 +17,11 @@ from densify.geometry.types import Float, Int
 
 
 class Slots(NamedTuple):
-    """The N pulses of a sweep in the order of time.
+    """The N pulses of a sweep in the order of time."""
 
-    Attributes:
-        number: (N,) int64 index of the pulse, from 0.
-        share: (N,) firing time minus the reference time, in periods, -0.5 to 0.5.
-        time_s: (N,) firing time in seconds since frame 0, for patterns that continue from sweep
-            to sweep.
-    """
-
-    number: Int
-    share: Float
+    number: Int  # (N,) int64 index of the pulse, from 0
+    share: Float  # (N,) firing time minus the reference time, in periods, -0.5 to 0.5
+    # (N,) firing time in seconds since frame 0, for patterns that continue from sweep to sweep
     time_s: Float
 
 
@@ -37,17 +31,13 @@ class Spinning:
 
     It faces forward at the reference time. Beams fire one after another, never two at once, so
     every pulse has an azimuth of its own.
-
-    Attributes:
-        elevation_deg: Elevations of the beams in firing order.
-        columns_per_s: Firings per second of each beam. A revolution at 20 Hz has half the columns
-            of a revolution at 10 Hz.
-        phase: Lead in turns over a scanner that faces forward at the reference time.
     """
 
-    elevation_deg: tuple[float, ...]
+    elevation_deg: tuple[float, ...]  # elevations of the beams in firing order
+    # Firings per second of each beam. A revolution at 20 Hz has half the columns of a revolution at
+    # 10 Hz.
     columns_per_s: int
-    phase: float = 0.0
+    phase: float = 0.0  # lead in turns over a scanner that faces forward at the reference time
 
     def num_pulses(self, period_s: float) -> int:
         """Return the number of pulses in a sweep."""
@@ -77,16 +67,11 @@ class Raster(_Steady):
 
     A fast mirror swings from side to side, a slow mirror goes from top to bottom. No two pulses of
     a sweep have the same elevation.
-
-    Attributes:
-        width_deg: Width of the field of view, with its centre straight ahead.
-        height_deg: Height of the field of view.
-        lines_per_s: Swings of the fast mirror per second, counting each direction.
     """
 
-    width_deg: float
-    height_deg: float
-    lines_per_s: int
+    width_deg: float  # width of the field of view, with its centre straight ahead
+    height_deg: float  # height of the field of view
+    lines_per_s: int  # swings of the fast mirror per second, counting each direction
 
     def directions(self, slots: Slots) -> Float:
         """Return (N,3) unit vectors in the axes of the scanner."""
@@ -102,14 +87,11 @@ class Rosette(_Steady):
 
     It draws a rose around the forward axis. The rose continues from sweep to sweep and does not
     repeat, as in Livox's scanners.
-
-    Attributes:
-        width_deg: Diameter of the round field of view.
-        turns_per_s: Rotation rates of the two prisms. Petals are drawn at the difference of the
-            rates and turn at their sum.
     """
 
-    width_deg: float
+    width_deg: float  # diameter of the round field of view
+    # Rotation rates of the two prisms. Petals are drawn at the difference of the rates and turn at
+    # their sum.
     turns_per_s: tuple[float, float]
 
     def directions(self, slots: Slots) -> Float:
@@ -128,17 +110,12 @@ def _pointing(azimuth: Float, elevation: Float) -> Float:
 
 @dataclass(frozen=True)
 class Scanner:
-    """One scanner of a sensor.
-
-    Attributes:
-        max_range_m: Greatest range.
-        range_sigma_m: Standard deviation of the range noise.
-        origin_m: (3,) position of the scanner, lidar frame.
-    """
+    """One scanner of a sensor."""
 
     pattern: Spinning | Raster | Rosette
-    max_range_m: float
-    range_sigma_m: float
+    max_range_m: float  # greatest range
+    range_sigma_m: float  # standard deviation of the range noise
+    # (3,) position of the scanner, lidar frame
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
@@ -236,27 +213,15 @@ SENSORS: dict[str, Sensor] = {
 
 @dataclass(frozen=True)
 class Firings:
-    """The N pulses of a sweep in the order of time.
+    """The N pulses of a sweep in the order of time."""
 
-    Attributes:
-        direction: (N,3) unit vectors, lidar axes.
-        offset_ns: (N,) int64 firing time minus the reference time.
-        lidar: (N,) uint8 index of the scanner.
-    """
-
-    direction: Float
-    offset_ns: Int
-    lidar: NDArray[np.uint8]
+    direction: Float  # (N,3) unit vectors, lidar axes
+    offset_ns: Int  # (N,) int64 firing time minus the reference time
+    lidar: NDArray[np.uint8]  # (N,) uint8 index of the scanner
 
 
 def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
-    """Return all pulses of the sweep that lasts ``period_ns`` around ``time_s``.
-
-    The pulses of each scanner are evenly spaced in time.
-
-    Args:
-        time_s: Reference time of the sweep, in seconds since frame 0.
-    """
+    """Return all pulses of the sweep that lasts ``period_ns`` around ``time_s``, evenly in time."""
     parts = []
     for index, scanner in enumerate(sensor.scanners):
         num = scanner.pattern.num_pulses(period_ns * 1e-9)

@@ -30,34 +30,20 @@ PRESETS = {"street": street, "static": static_street, "crossing": crossing, "hig
 
 @lru_cache(maxsize=2)
 def build_scene(preset: str, seed: int) -> Scene:
-    """Return the scene of a preset and seed, always the same one.
-
-    Building takes 1 to 2 s. The last two scenes are kept, for all sensors and sweep rates.
-    """
+    """Return the scene of a preset and seed, always the same one. Building takes 1 to 2 s."""
     return PRESETS[preset](np.random.default_rng([seed, 0]))
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """Poses of B bodies at the reference times of F frames.
+    """Poses of B bodies at the reference times of F frames."""
 
-    Attributes:
-        T_world_lidar: (F,4,4) poses of the lidar.
-        T_world_body: (F,B,4,4) poses of the bodies. Body 0 is the static world.
-        moving: (F,B) bool, True if the body's object moves around that time.
-    """
-
-    T_world_lidar: Float
-    T_world_body: Float
-    moving: Bool
+    T_world_lidar: Float  # (F,4,4) poses of the lidar
+    T_world_body: Float  # (F,B,4,4) poses of the bodies. Body 0 is the static world.
+    moving: Bool  # (F,B) bool, True if the body's object moves around that time
 
     def place(self, frame: int, body: NDArray[np.int32], points: Float) -> Float:
-        """Return the (N,3) world positions, at a frame's reference time, of points fixed to bodies.
-
-        Args:
-            body: (N,) index of the body of each point.
-            points: (N,3) metres, each in the frame of its body.
-        """
+        """Return (N,3) world positions, at a frame's stamp, of points in body frames."""
         T_world_body = self.T_world_body[frame][body]
         placed: Float = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points)
         return placed + T_world_body[:, :3, 3]
@@ -75,10 +61,7 @@ class Bodies:
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
     ) -> Float:
-        """Return (N,3) true scene flow, as in `densify.geometry.types.Truth.displacement`.
-
-        It is exactly 0 in the static world. Arguments are as in `place`.
-        """
+        """Return (N,3) true scene flow, as in `densify.geometry.types.Truth.displacement`."""
         self.check(target)
         there, here = (self.place(f, body, points) for f in (target, frame))
         return (there - here) @ self.T_world_lidar[frame][:3, :3]
@@ -99,19 +82,15 @@ _MOVING_M, _MOVING_S = 0.05, 0.5
 
 @dataclass(frozen=True)
 class Simulator:
-    """A scene with a sensor. Its fields and the frame number determine all random values.
-
-    Attributes:
-        hz: Sweeps per second, such as 5, 10 or 20. The period is a whole number of nanoseconds.
-            The scene at a given time does not depend on it.
-        tilt_deg: Pitch of the mount, as in `densify.street.lidar.T_ego_lidar`.
-    """
+    """A scene with a sensor. Its fields and the frame number determine all random values."""
 
     preset: str
     seed: int
     sensor: Sensor
+    # Sweeps per second, such as 5, 10 or 20. The period is a whole number of nanoseconds. The scene
+    # at a given time does not depend on it.
     hz: int = 10
-    tilt_deg: float = 0.0
+    tilt_deg: float = 0.0  # pitch of the mount, as in `densify.street.lidar.T_ego_lidar`
 
     @property
     def period_ns(self) -> int:
@@ -164,8 +143,7 @@ class Simulator:
     def bodies_at(self, stamps_ns: Sequence[int], which: Sequence[int] | None = None) -> Bodies:
         """Return the poses of bodies at these times.
 
-        Args:
-            which: Indices of bodies, all bodies of an object together; None for all bodies.
+        ``which`` has indices of bodies, all bodies of an object together; None for all bodies.
         """
         times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
@@ -183,11 +161,8 @@ class Simulator:
         )
 
     def in_bodies(self, frame: int, returns: Returns) -> Float:
-        """Return the (N,3) measured points, each in the frame of the body it was measured on.
-
-        A raw point is transformed to the world by the scanner's pose at its firing time, and from
-        there to its body by the body's pose at the same time.
-        """
+        """Return the (N,3) measured points, each in the frame of the body it was measured on."""
+        # To the world and from there to the body by the poses at the point's firing time.
         times = at_offsets(seconds(self.stamp_ns(frame)), returns.offset_ns)
         points = transform(T_ego_lidar(self.tilt_deg), returns.points.astype(np.float64))
         points = self.scene.ego.poses(times).apply(points)

@@ -31,11 +31,7 @@ class Curve:
     """
 
     def __init__(self, xy: Float) -> None:
-        """Build the curve.
-
-        Args:
-            xy: (N,2) metres, neighbours about half a metre apart.
-        """
+        """Build the curve through (N,2) points in metres, neighbours about half a metre apart."""
         chord_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
         self.length_m = float(chord_m[-1])
         self.knots_m: Float = chord_m
@@ -70,12 +66,9 @@ class Curve:
     def bending(
         length_m: float, curvature: Callable[[Float], Float], origin_m: float = 0.0
     ) -> Curve:
-        """Return a curve of this length with a given curvature.
+        """Return a curve of this length and curvature (1/m, positive to the left, by arc length).
 
         At arc length ``origin_m`` it passes the origin with heading +x.
-
-        Args:
-            curvature: Function from arc length to curvature in 1/m, positive to the left.
         """
         step = 0.05
         station = np.arange(0.0, length_m + step, step)
@@ -100,11 +93,7 @@ class Lane:
     def __init__(
         self, road: Curve, offset_m: float | Callable[[Float], Float], forward: bool = True
     ) -> None:
-        """Build the lane.
-
-        Args:
-            offset_m: Metres to the left of the road's direction, constant or a function of station.
-        """
+        """Build the lane, ``offset_m`` (a number, or a function of station) to the left."""
         stations = road.knots_m
         offset = offset_m(stations) if callable(offset_m) else np.full(len(stations), offset_m)
         xy = road(stations) + road.normal(stations) * offset[:, None]
@@ -162,17 +151,11 @@ _COARSE_M = 8.0  # cells of the ground far from roads
 
 @dataclass(frozen=True)
 class Terrain:
-    """Height of the bare ground as a sum of W waves, ``sum a sin(k·xy + phase)``.
+    """Height of the bare ground as a sum of W waves, ``sum a sin(k·xy + phase)``."""
 
-    Attributes:
-        wave: (W,2) wave vectors k in rad/m.
-        amplitude_m: (W,) amplitudes a.
-        phase: (W,) phases in rad.
-    """
-
-    wave: Float
-    amplitude_m: Float
-    phase: Float
+    wave: Float  # (W,2) wave vectors k in rad/m
+    amplitude_m: Float  # (W,) amplitudes a
+    phase: Float  # (W,) phases in rad
 
     @staticmethod
     def hilly(rng: np.random.Generator, max_slope: float, scale_m: float = 1.0) -> Terrain:
@@ -226,17 +209,12 @@ class Road:
 
 @dataclass(frozen=True)
 class Ground:
-    """Terrain with roads on it.
-
-    Attributes:
-        kerb_m: Height of the kerb, by which everything outside the roads is raised.
-        pavement_m: Width of the pavement beside the roads.
-    """
+    """Terrain with roads on it."""
 
     terrain: Terrain
     roads: tuple[Road, ...]
-    kerb_m: float
-    pavement_m: float
+    kerb_m: float  # height of the kerb, by which everything outside the roads is raised
+    pavement_m: float  # width of the pavement beside the roads
 
     def distance(self, xy: Float) -> Float:
         """Return (N,) signed metres to the kerb, negative on the carriageway."""
@@ -254,10 +232,9 @@ class Ground:
         return self.terrain.height(xy) + self.kerb_m * (self.distance(xy) > 0)
 
     def mesh(self, margin_m: float, cell_m: float, far_m: float = 200.0) -> Mesh:
-        """Return fine triangles near the roads and coarse ones beyond.
+        """Return fine triangles up to ``margin_m`` from the roads and coarse ones up to ``far_m``.
 
-        Fine triangles reach ``margin_m`` from the roads, coarse ones ``far_m``. Coarse triangles
-        are sunk where fine ones cover them.
+        Coarse triangles are sunk where fine ones cover them.
         """
         centre = np.concatenate([r.curve(r.curve.knots_m) for r in self.roads])
         low, high = centre.min(axis=0) - margin_m - 4, centre.max(axis=0) + margin_m + 4

@@ -32,17 +32,13 @@ Recipe = Callable[[np.random.Generator], Actor]
 
 @dataclass(frozen=True)
 class Scene:
-    """A world and its moving actors.
-
-    Attributes:
-        footprints: Rectangles of the static objects that traffic must not touch.
-    """
+    """A world and its moving actors."""
 
     world: World
     ground: Ground
     ego: Driving
     actors: tuple[Actor, ...]
-    footprints: Rectangles
+    footprints: Rectangles  # rectangles of the static objects that traffic must not touch
 
 
 def tracks(actor: Actor, times_s: Float) -> list[Rectangles]:
@@ -64,11 +60,7 @@ class Traffic:
         self._moving = _one(Rectangles.of(EGO_BOX, ego.poses(self._times), 0.2))
 
     def add(self, recipe: Recipe) -> None:
-        """Add an actor, or none if every random draw collides.
-
-        Args:
-            recipe: Draws an actor. It is called again until an actor fits.
-        """
+        """Add an actor, drawn again until it fits, or none if every random draw collides."""
         for _ in range(_TRIES):
             actor = recipe(self._rng)
             new = tracks(actor, self._times)
@@ -89,10 +81,7 @@ class Traffic:
     ) -> None:
         """Put a vehicle on a lane, beside a station (arc length) of the road at the meeting time.
 
-        Args:
-            make: Function that makes the vehicle from its trajectory.
-            speed: Speed profile, or a speed in m/s that is varied at random.
-            slack_m: Greatest random change of the station.
+        A speed in m/s is varied at random, and the station by up to ``slack_m``.
         """
 
         def recipe(rng: np.random.Generator) -> Actor:
@@ -110,10 +99,7 @@ class Traffic:
         self, road: Curve, offset_m: tuple[float, float], forward: bool, station_m: float,
         slack_m: float = 4.0,
     ) -> None:  # fmt: skip
-        """Put a pedestrian along a road or another line, between two offsets to its left.
-
-        The pedestrian steps on and off the kerb where the path crosses it.
-        """
+        """Put a pedestrian along a line, between two offsets to its left, on and off the kerb."""
         ground = self.ground
 
         def recipe(rng: np.random.Generator) -> Actor:

@@ -29,72 +29,43 @@ _TINY = 1e-9
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body.
+    """A rigid body."""
 
-    Attributes:
-        mesh: Mesh in the frame of the body.
-        trajectory: Pose of the body over time.
-        instance: Number of the object it is part of; -1 if its triangles have object numbers.
-    """
-
-    mesh: Mesh
-    trajectory: Trajectory
+    mesh: Mesh  # mesh in the frame of the body
+    trajectory: Trajectory  # pose of the body over time
+    # Number of the object it is part of; -1 if its triangles have object numbers
     instance: int = -1
 
 
 class Rays(NamedTuple):
-    """N rays.
+    """N rays."""
 
-    Attributes:
-        origin: (N,3) metres, world.
-        direction: (N,3) unit vectors, world.
-        time_s: (N,) seconds since frame 0.
-    """
-
-    origin: Float
-    direction: Float
-    time_s: Float
+    origin: Float  # (N,3) metres, world
+    direction: Float  # (N,3) unit vectors, world
+    time_s: Float  # (N,) seconds since frame 0
 
 
 class Hits(NamedTuple):
-    """The hits of N rays.
+    """The hits of N rays."""
 
-    Attributes:
-        range_m: (N,) distances, inf without a hit.
-        triangle: (N,) index over the triangles of all bodies, -1 without a hit.
-        barycentric: (N,2) u and v, as in ``(1-u-v) a + u b + v c``.
-        absorbed: (N,) True if the ray ends at a surface without a return. Its range is inf.
-        normal: (N,3) normal of the triangle, world axes, of either sign.
-    """
-
-    range_m: Float
-    triangle: Int
-    barycentric: Float32
-    absorbed: Bool
-    normal: Float
+    range_m: Float  # (N,) distances, inf without a hit
+    triangle: Int  # (N,) index over the triangles of all bodies, -1 without a hit
+    barycentric: Float32  # (N,2) u and v, as in ``(1-u-v) a + u b + v c``
+    absorbed: Bool  # (N,) True if the ray ends at a surface without a return. Its range is inf.
+    normal: Float  # (N,3) normal of the triangle, world axes, of either sign
 
 
 class Meeting(NamedTuple):
-    """K rays that meet a surface of a body, for which `Optics` decides whether they end there.
+    """K rays that meet a surface of a body, for which `Optics` decides whether they end there."""
 
-    Attributes:
-        ray: (K,) ray indices.
-        triangle: (K,) triangle indices.
-        layer: Number of surfaces that the rays have passed before.
-        origin: (K,3) origins of the rays in the frame of the body.
-        direction: (K,3) unit vectors in the frame of the body.
-        distance_m: (K,) distances from the origins.
-        facing: (K,) inner products of directions and normals.
-        passed: (K,) object number of the previous surface that the ray passed, -1 for none.
-    """
-
-    ray: Int
-    triangle: Int
-    layer: int
-    origin: Float
-    direction: Float
-    distance_m: Float
-    facing: Float
+    ray: Int  # (K,) ray indices
+    triangle: Int  # (K,) triangle indices
+    layer: int  # number of surfaces that the rays have passed before
+    origin: Float  # (K,3) origins of the rays in the frame of the body
+    direction: Float  # (K,3) unit vectors in the frame of the body
+    distance_m: Float  # (K,) distances from the origins
+    facing: Float  # (K,) inner products of directions and normals
+    # (K,) object number of the previous surface that the ray passed, -1 for none
     passed: NDArray[np.int32]
 
     def place(self, rows: Int) -> Float:
@@ -144,10 +115,8 @@ class Triangles:
     ) -> tuple[Int, Int, Float]:
         """Return the rays that hit their body, the first triangle that each hits, and u, v there.
 
-        Args:
-            parts: Index of a body and the end of its rays, by ascending ends.
-            origin: (N,3) in the frame of the ray's body.
-            direction: (N,3) in the frame of the ray's body.
+        ``parts`` has the index of a body and the end of its rays, by ascending ends. ``origin`` and
+        ``direction`` (N,3) are in the frame of the ray's body.
         """
         start, ray = origin.astype(np.float32), direction.astype(np.float32)
         met, triangle, barycentric, begin = [], [], [], 0
@@ -186,12 +155,10 @@ class World:
         return Triangles(self.bodies)
 
     def cast(self, rays: Rays, optics: Optics, num_together: int = 1, spread: float = 0.0) -> Hits:
-        """Return the first surface at which each ray ends.
+        """Return the first surface at which each ray ends, by the decisions of ``optics``.
 
-        Args:
-            optics: Decides for each surface that a ray meets.
-            num_together: Number of consecutive rays with the same origin and time, whose
-                directions are within ``spread`` rad of the first ray's.
+        ``num_together`` consecutive rays have the same origin and time, and directions within
+        ``spread`` rad of the first ray's.
         """
         every = np.arange(len(rays.time_s))
         best = self._cast_bodies([(0, len(every))], rays.origin, rays.direction, every, optics)
@@ -214,12 +181,8 @@ class World:
         optics: Optics,
         num: int,
     ) -> None:
-        """Enter the hits of moving bodies that are nearer than those in ``best``.
-
-        Args:
-            near: Index of each body, the groups of rays that may hit it, and its poses then.
-            num: Number of rays in a group.
-        """
+        """Enter the hits of moving bodies that are nearer than those in ``best``."""
+        # near: index of each body, the groups of num rays that may hit it, and its poses then.
         poses = [pose for _, _, pose in near]
         groups = np.concatenate([rows for _, rows, _ in near])
         ends = num * np.cumsum([len(rows) for _, rows, _ in near])
@@ -239,14 +202,9 @@ class World:
             begin = end
 
     def _near(self, rays: Rays, farthest_m: Float, spread: float) -> Iterator[tuple[int, Int]]:
-        """Yield the index of each body but the first, and the indices of the rays that may hit it.
-
-        These rays intersect a ball around the positions of the body at all of their times, before
-        their static surface. Blocks of consecutive rays are tested before each ray.
-
-        Args:
-            farthest_m: (N,) distances beyond which hits of a ray do not matter.
-        """
+        """Yield the index of each body but the first, and indices of rays that may hit it."""
+        # These rays intersect a ball around the positions of the body at all of their times, before
+        # their static surface. Blocks of consecutive rays are tested before each ray.
         if len(self.bodies) < 2 or not len(rays.time_s):
             return
         first = np.arange(0, len(rays.time_s), _BLOCK)
@@ -299,16 +257,8 @@ class World:
         number: Int,
         optics: Optics,
     ) -> Hits:
-        """Return the hits of rays, each with one body.
-
-        Distances are to the plane of the triangle, in double precision, also for absorbed rays.
-
-        Args:
-            parts: Index of a body and the end of its rays, by ascending ends.
-            origin: (N,3) in the frame of the ray's body.
-            direction: (N,3) in the frame of the ray's body.
-            number: (N,) indices of the rays.
-        """
+        """Return the hits of rays, each with one body and in the frame of that body."""
+        # Distances are to the plane of the triangle, in double precision, also for absorbed rays.
         surfaces, n = self.triangles, len(origin)
         hits = Hits(
             np.full(n, np.inf), np.full(n, -1), np.zeros((n, 2), np.float32), np.zeros(n, bool),
@@ -341,14 +291,8 @@ class World:
 def _meets_ball(
     rays: tuple[Float, Float, Float], centre: Float, radius_m: Float | float, spread: Float | float
 ) -> Bool:
-    """Return (N,) True for rays that meet a ball.
-
-    Args:
-        rays: (N,3) origins in metres, (N,3) unit vectors, and (N,) lengths in metres.
-        centre: (3,) centre of the ball.
-        radius_m: Radius of the ball, (N,) or one.
-        spread: Greatest difference of a ray's true direction from its unit vector, (N,) or one.
-    """
+    """Return (N,) True for rays (origins, unit vectors, lengths) that meet a ball."""
+    # spread is the greatest difference of a ray's true direction from its unit vector.
     origin, direction, farthest_m = rays
     away = centre - origin
     along = np.einsum("ni,ni->n", away, direction)
@@ -360,10 +304,7 @@ def _meets_ball(
 
 @cache
 def _device() -> Any:
-    """Return the one Embree device of all scenes.
-
-    With a device for each scene, Embree fails after a thousand.
-    """
+    """Return the one Embree device of all scenes: after a thousand devices Embree fails."""
     from embreex.rtcore import EmbreeDevice
 
     return EmbreeDevice()

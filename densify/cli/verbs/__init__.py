@@ -28,10 +28,7 @@ _MORE = (
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Return the options of one command; ``options.verb(options)`` runs it.
-
-    It exits with 2 on a bad argument.
-    """
+    """Return the options of one command, which ``options.verb(options)`` runs; or exit with 2."""
     parser = _command_line()
     given = list(sys.argv[1:] if arguments is None else arguments)
     if "" in given:  # an empty path would be the current folder

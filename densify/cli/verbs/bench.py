@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,7 @@ from densify.config.errors import InputError
 
 if TYPE_CHECKING:
     from densify.bench.paper import PaperPair
+    from densify.bench.verdicts import Verdict
 
 _UNSEEN = (
     "street?seed=41@70",
@@ -43,6 +45,7 @@ def add(commands: Any) -> None:
     _add_depth(benches)
     _add_paper(benches)
     _add_doctor(benches)
+    _add_gate(benches)
     about = "make the tables of docs/results.md again, as Markdown on stdout; all take an hour"
     parser = add_verb(benches, "readme", _answer_readme, about)
     names = "depth, flow, registration"
@@ -146,6 +149,28 @@ def _add_doctor(benches: Any) -> None:
     add_common(parser, "config")
 
 
+def _add_gate(benches: Any) -> None:
+    parser = add_verb(
+        benches,
+        "gate",
+        _answer_gate,
+        "judge a change: the figures of 16 keys and 3 pairs beside stored ones, with their luck",
+        "Depth maps are compared at equal coverage, key by key. A figure is better or worse if its "
+        "mean change exceeds two standard deviations of luck (poses moved by 2 mm and 0.01°) and "
+        "two standard errors between the keys. Registration and flow are kept between calls while "
+        "their code stays the same.",
+    )
+    about = "folder of the real recordings (default: $DENSIFY_TEST_DATA; without, streets alone)"
+    option(parser, "--data DIR", about, type=Path, default=os.environ.get("DENSIFY_TEST_DATA"))
+    option(parser, "--only KIND,…", "some of depth, flow, registration (default: all)", type=words)
+    option(parser, "--keys NAME,…", "some of the keys (default: all)", type=words)
+    about = "stored figures to compare with (default: tests/gate.json)"
+    option(parser, "--stored FILE", about, type=Path, default=Path("tests/gate.json"))
+    option(parser, "--write FILE", "store the figures as they are now", type=Path)
+    about = "times that poses are moved to measure luck anew (default: 0, keep the stored luck)"
+    option(parser, "--draws N", about, type=natural, default=0)
+
+
 def _add_common(parser: argparse.ArgumentParser) -> None:
     about = "key frame; may be given several times (default: 120)"
     option(parser, "--key K", about, type=natural, action="append", dest="keys")
@@ -169,6 +194,39 @@ def _answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
             text = f"{title}\n{numbers_table(measured['methods'])}\n"
             yield Answer(text, {"runs": [measured]})
     yield Answer(facts={"config": as_mapping(config)})
+
+
+def _answer_gate(options: argparse.Namespace) -> Iterator[Answer]:
+    from densify.bench import gate
+    from densify.bench.verdicts import verdicts
+    from densify.config.cache import Cache
+
+    kinds = gate.KINDS if options.only is None else options.only
+    for kind in kinds:
+        if kind not in gate.KINDS:
+            raise InputError(f"--only {kind}: expected some of {', '.join(gate.KINDS)}")
+    stored = gate.read(options.stored) if options.stored.exists() else gate.Stored({}, {})
+    with progress_on_stderr() as progress:
+        now = gate.measure(options.data, kinds, options.keys, options.draws, progress, Cache())
+    luck = now.luck if options.draws else stored.luck
+    for group, names in gate.GROUPS.items():
+        parts = ({k: f for k, f in x.items() if k in names} for x in (stored.figures, now.figures))
+        rows = list(verdicts(*parts, luck))
+        if rows:
+            titles = [group, "keys", "before", "now", "change", "error", "luck", "worst", ""]
+            yield Answer(aligned([titles, *map(_verdict_cells, rows)]) + "\n")
+    yield Answer(facts={"figures": now.figures, "luck": luck})
+    if options.write is not None:
+        merged = gate.Stored(stored.figures | now.figures, stored.luck | luck)
+        gate.write(options.write, merged)
+        yield Answer(files=[options.write])
+
+
+def _verdict_cells(v: Verdict) -> list[str]:
+    key, change = v.worst
+    values = (v.before, v.now, v.change, v.error, v.luck)
+    cells = [f"{value:.4g}" for value in values[:2]] + [f"{value:+.4f}" for value in values[2:]]
+    return [v.figure, str(len(v.keys)), *cells, f"{key} {change:+.4f}", v.word]
 
 
 def _answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:

@@ -58,10 +58,7 @@ def answer(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _describe(scores: Mapping[str, Any]) -> str:
-    """Return a column for each part of the pixels.
-
-    Files without a counterpart are counted, and the first ones are named.
-    """
+    """Return a column for each part of the pixels; files without a counterpart are counted."""
     num, density = scores["num_images"], scores["density"]
     lines = [
         f"{num:,} image{'s' if num != 1 else ''}: predicted {percent(density['predicted'])} of "

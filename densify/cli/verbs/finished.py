@@ -12,7 +12,7 @@ from densify.cli.options import add_common, add_verb, option
 from densify.cli.screen import Answer
 from densify.config.plugins import EXPORTS
 
-_ONE = "folder of a key, such as densify-out/000120"
+_ONE = "folder of a key, such as densify-out/street/000120"
 
 
 def add_export(commands: Any) -> None:

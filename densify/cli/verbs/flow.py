@@ -61,7 +61,7 @@ def add_flow(commands: Any) -> None:
     option(
         parser,
         "--out F.npz|DIR",
-        "file or folder (default: densify-out/flow.npz, densify-out)",
+        "file or folder (default: densify-out/flow.npz, densify-out/RECORDING)",
         type=Path,
     )
     add_common(parser, "config", "overwrite")
@@ -101,11 +101,7 @@ def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
 
 
 def read_points(path: Path) -> Float:
-    """Return the (N,3) float64 points of a file in metres, in the order of the file.
-
-    Raises:
-        InputError: The file has another form, no points, or points that are not finite.
-    """
+    """Return the (N,3) float64 points of a file in metres, in the order of the file."""
     import numpy as np
 
     from densify.readers.point_files import read_table
@@ -127,10 +123,13 @@ def read_points(path: Path) -> Float:
 
 def _of_recording(spec: str, options: argparse.Namespace, config: Config) -> Iterator[Answer]:
     from densify.outputs.flow_writers import flow_writer
+    from densify.outputs.recording_folder import check_recording, default_folder
     from densify.pipeline.run import flow_steps
     from densify.readers import open_sequence
 
-    sequence, out = open_sequence(spec), options.out or Path("densify-out")
+    sequence = open_sequence(spec)
+    out = options.out or default_folder(sequence.name)
+    check_recording(out, sequence.name, spec)
     frames = sliced(sequence, options.keys)
     folders: dict[Path, None] = {}
     failed: dict[int, Exception] = {}

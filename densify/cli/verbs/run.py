@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ from densify.config.errors import ComputationError, InputError
 from densify.config.plugins import ENGINES
 
 if TYPE_CHECKING:
-    from densify.geometry.types import LidarSequence
+    from densify.geometry.types import LidarSequence, Result
 
 
 def add_run(commands: Any) -> None:
@@ -79,14 +79,8 @@ def _add_key_options(parser: argparse.ArgumentParser) -> None:
     )
     option(parser, "--report", about)
     add_common(parser, "config")
-    out = "densify-out"
-    option(
-        parser,
-        "--out DIR",
-        f"folder of the results (default: ./{out})",
-        type=Path,
-        default=Path(out),
-    )
+    about = "folder of the results (default: ./densify-out/RECORDING, by the recording's name)"
+    option(parser, "--out DIR", about, type=Path)
     add_common(parser, "overwrite")
 
 
@@ -95,14 +89,17 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     config = config_of(options)
     from densify.cli.results import FIRST_OF_RUN, key_facts, summary
     from densify.outputs import check_writable, write_result
+    from densify.outputs.recording_folder import check_recording, default_folder
     from densify.pipeline import run as pipeline
-    from densify.readers import open_sequence
+    from densify.readers import Spec, open_sequence
 
-    spec = recording_of(options)
+    spec = Spec.parse(recording_of(options)).absolute()
     sequence = open_sequence(spec)
     keys = _keys_of(sequence, options)
+    out = options.out or default_folder(sequence.name)
+    check_recording(out, sequence.name, spec, keys)
     for key in keys:
-        check_writable(options.out, key, options.overwrite)
+        check_writable(out, key, options.overwrite)
     failed: dict[int, Exception] = {}
     doubts: list[tuple[str, str, int]] = []
     window, method, cameras = options.window, options.method, options.cameras
@@ -116,13 +113,9 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
                 yield Answer(facts={"keys": [{"key": key, "error": str(result)}]})
                 continue
             paths = write_result(
-                result,
-                options.out,
-                config=as_mapping(config),
-                data=spec,
-                overwrite=options.overwrite,
+                result, out, config=as_mapping(config), data=spec, overwrite=options.overwrite
             )
-            first = first_of(paths, FIRST_OF_RUN)
+            first = first_of(_front_first(paths, result), FIRST_OF_RUN)
             yield Answer(summary(result), {"keys": [key_facts(result)]}, paths, first)
             doubts += [(warning, "", key) for warning in result.warnings]
             if result.depth and not any(maps.filled_m.any() for maps in result.depth.values()):
@@ -136,6 +129,15 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     if failed:
         told = "; ".join(f"key {key}: {error}" for key, error in failed.items())
         raise ComputationError(f"{len(failed)} of {len(keys)} keys not made: {told}")
+
+
+def _front_first(paths: Sequence[Path], result: Result) -> list[Path]:
+    """Return the paths, those of the map that looks ahead first."""
+    from densify.outputs.front_view import front_first
+
+    names = front_first([*result.depth], result.views, result.T_key_lidar)
+    front = [p for p in paths if names and p.with_suffix("").as_posix().endswith(f"/{names[0]}")]
+    return [*front, *(path for path in paths if path not in front)]
 
 
 def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
@@ -162,23 +164,23 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.cli.results import FIRST_OF_COMPARISON, comparison, key_facts
     from densify.dataset.report import write_comparison_page
     from densify.outputs import check_writable, write_comparison
+    from densify.outputs.recording_folder import check_recording, default_folder
     from densify.pipeline import run as pipeline
     from densify.pipeline.key_result import COMPARED
-    from densify.readers import open_sequence
+    from densify.readers import Spec, open_sequence
 
-    check_writable(options.out, options.key, options.overwrite, "compare")
-    spec, methods = recording_of(options), options.methods or COMPARED
+    spec = Spec.parse(recording_of(options)).absolute()
+    methods = options.methods or COMPARED
     sequence = open_sequence(spec)
+    out = options.out or default_folder(sequence.name)
+    check_recording(out, sequence.name, spec, [options.key])
+    check_writable(out, options.key, options.overwrite, "compare")
     with progress_on_stderr() as progress:
         results = pipeline.compare(
             sequence, options.key, options.window, options.cameras, config, progress, methods
         )
     paths = write_comparison(
-        results,
-        options.out,
-        config=as_mapping(config),
-        data=spec,
-        overwrite=options.overwrite,
+        results, out, config=as_mapping(config), data=spec, overwrite=options.overwrite
     )
     if config.output.report:
         paths.append(write_comparison_page(paths[0].parent))

@@ -91,8 +91,7 @@ class Cloud:
         return len(self.points)
 
 
-@dataclass(frozen=True)
-class Patches:
+class Patches(NamedTuple):
     """The surface patches of the M points of a cloud, in the same order.
 
     A patch is the piece of surface around a point, as large as the spacing of the rays there. It
@@ -102,34 +101,18 @@ class Patches:
         normal: (M,3) float32 normal of the tangent plane, of any length, key frame.
         spacing_m: (M,2) float32 distance to the neighbouring rays of the same sweep: in azimuth,
             then in elevation.
-        free: (M,) bool, True if the key sweep saw through the point.
-        sweep: (M,) int32 index of the source sweep, ascending by frame; sweeps beyond the window
-            come last.
-        place: (M,) int32 index of the stretch of road from which a sweep beyond the window measured
-            the point; -1 for sweeps of the window.
     """
 
     normal: Float32
     spacing_m: Float32
-    free: Bool
-    sweep: NDArray[np.int32]
-    place: NDArray[np.int32]
 
     def joined(self, other: Patches) -> Patches:
-        """Return these patches, then the patches of another cloud, made from other sweeps."""
-        num_sweeps = np.int32(self.sweep.max(initial=-1) + 1)
-        behind = vars(other) | {"sweep": num_sweeps + other.sweep}
-        return Patches(**{n: np.concatenate([c, behind[n]]) for n, c in vars(self).items()})
+        """Return these patches, then the patches of another cloud."""
+        return Patches(*(np.concatenate(both) for both in zip(self, other, strict=True)))
 
     def select(self, keep: Bool) -> Patches:
-        """Return the patches of the points where the (M,) mask ``keep`` is True.
-
-        They belong to ``cloud.select(keep)``. The sweeps are renumbered from 0 without gaps.
-        """
-        rows = np.flatnonzero(keep)
-        kept = {name: column.take(rows, axis=0) for name, column in vars(self).items()}
-        number = np.cumsum(np.bincount(kept["sweep"]) > 0) - 1
-        return Patches(**kept | {"sweep": number[kept["sweep"]].astype(np.int32)})
+        """Return the patches of ``cloud.select(keep)``, for an (M,) mask ``keep``."""
+        return Patches(self.normal[keep], self.spacing_m[keep])
 
 
 @dataclass(frozen=True)
@@ -180,13 +163,11 @@ class Reason(IntEnum):
     """Reason why a point is missing from a depth map; the first reason that applies."""
 
     KEPT = 0  # not missing: the pixel has the depth of this point
-    VETOED = 1  # the key sweep saw through its position
     OUTSIDE = 2  # not in the image
     HIDDEN = 3  # occluded by the patch of another point
     NOT_CHOSEN = 4  # another point of the pixel is nearer, or nearer in time to the key
-    UNSUPPORTED = 5  # too few sweeps agree with it, or the sweep nearest to the key does not
+    UNSUPPORTED = 5  # the sweep nearest to the key does not agree with it
     EDGE = 6  # boundary pixel: the pixel may show the other side of a depth discontinuity
-    GLASS = 7  # inside a vehicle, measured through a car window
 
 
 @dataclass(frozen=True)
@@ -257,13 +238,10 @@ class Ranked(NamedTuple):
     Attributes:
         rank: (H,W) float32 of 0 to 1, larger is more certain; 0 where ``filled_m`` has no depth.
         group: (H,W) uint8 kind of the pixel, each kind with a calibration of its own.
-        contradicted: (H,W) float32, share (0 to 1) of the measurements near the pixel that
-            contradict each other.
     """
 
     rank: Float32
     group: NDArray[np.uint8]
-    contradicted: Float32
 
 
 @dataclass(frozen=True)

@@ -132,13 +132,9 @@ class Truth(Protocol):
         """Return the ground truth of a sweep."""
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return the (N,3) true scene flow in metres between two reference times.
+        """Return the (N,3) true scene flow (m) of a sweep's points to the time of sweep ``target``.
 
-        It is in the lidar frame of ``frame``, with ego-motion removed.
-
-        Args:
-            frame: Frame number of the sweep whose N points move.
-            target: Frame number of the sweep to whose reference time they move.
+        It is in the lidar frame of ``frame``, with ego-motion removed, and 0 for static points.
         """
         ...
 

@@ -150,6 +150,7 @@ class Result:
             truth.
         T_key_lidar: Frame number -> (4,4) lidar pose of that sweep of the window in the key frame.
         tracks: Poses of each moving object.
+        recording: Name of the recording.
     """
 
     method: str
@@ -174,3 +175,4 @@ class Result:
     truth_m: Mapping[str, Float32] = field(default_factory=dict)
     T_key_lidar: Mapping[int, Float] = field(default_factory=dict)
     tracks: tuple[ObjectTrack, ...] = ()
+    recording: str = ""

@@ -242,14 +242,9 @@ class StretchFlow:
 
     @staticmethod
     def towards(key: int, stretch: Stretch, motion: Motion) -> StretchFlow:
-        """Return the flow of each sweep to the next sweep towards the key.
+        """Return the flow of each sweep to the next sweep towards the key (a frame number).
 
         The key sweep itself has the flow to a neighbour.
-
-        Args:
-            key: Frame number of the key.
-            stretch: Sweeps, the key among them.
-            motion: Motion of the points.
         """
         before = [f for f in stretch.frames if f <= key]
         after = [f for f in reversed(stretch.frames) if f >= key]

@@ -29,18 +29,13 @@ _RECORD = "export.yaml"
 
 @dataclass(frozen=True)
 class Export:
-    """The written files, and the pixels and points within the thresholds.
+    """The written files, and the pixels and points within the thresholds."""
 
-    Attributes:
-        paths: Paths of the files.
-        density: Camera -> ``measured`` and ``filled`` -> share of the pixels with a depth, for
-            formats with maps.
-        num_points: Number of points, for formats with a cloud.
-    """
-
-    paths: list[Path]
+    paths: list[Path]  # paths of the files
+    # Camera -> ``measured`` and ``filled`` -> share of the pixels with a depth, for formats with
+    # maps
     density: Mapping[str, Mapping[str, Kept]]
-    num_points: Kept | None = None
+    num_points: Kept | None = None  # number of points, for formats with a cloud
 
 
 def export_run(
@@ -60,15 +55,11 @@ def export_run(
         to: Name of a format in `densify.config.plugins.EXPORTS`.
         out: Folder to write into, None for ``RUN/export/FORMAT``.
         min_confidence: Least confidence of an exported pixel or point, 0 to 1.
-        max_age_ms: Greatest age in ms of an exported pixel or point, None for any. Age is the time
-            from the image's exposure (pixels) or the key sweep (points) to the sweep that measured
-            it. A filled pixel has the age of the nearest measured pixel.
+        max_age_ms: Greatest time in ms from the image's exposure (pixels) or the key sweep (points)
+            to the sweep that measured it, None for any. A filled pixel has the age of the nearest
+            measured pixel.
         cameras: Names of the cameras, None for all.
         overwrite: Replace an earlier export.
-
-    Raises:
-        InputError: A threshold is out of range, a file is missing, damaged or inconsistent, the
-            format cannot hold the run, or ``out`` holds an export or a run.
     """
     if not 0 <= min_confidence <= 1:
         raise InputError(f"--min-confidence {min_confidence}: expected a number from 0 to 1")

@@ -39,32 +39,20 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class Picture(NamedTuple):
-    """An image of a finished run, with its camera and pose.
+    """An image of a finished run, with its camera and pose."""
 
-    Attributes:
-        name: Name of the image's files.
-        run: The finished run.
-        map: Name of the depth map in the run that shows this image.
-        camera: The camera.
-        T_cam_world: (4,4) pose from the world, the first key sweep's lidar frame.
-        jpeg: Bytes of the image file.
-    """
-
-    name: str
-    run: FinishedRun
-    map: str
-    camera: Camera
-    T_cam_world: Float
-    jpeg: bytes
+    name: str  # name of the image's files
+    run: FinishedRun  # the finished run
+    map: str  # name of the depth map in the run that shows this image
+    camera: Camera  # the camera
+    T_cam_world: Float  # (4,4) pose from the world, the first key sweep's lidar frame
+    jpeg: bytes  # bytes of the image file
 
 
 def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``images/`` and ``sparse/0/`` with cameras.txt, images.txt and points3D.txt.
 
     The model has the points that a camera observed.
-
-    Raises:
-        InputError: COLMAP has no model of the lens.
     """
     pictures = write_images(runs, folder)
     _write_model(pictures, _observed(_world_cloud(runs)), folder)
@@ -84,9 +72,6 @@ def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
     ``movers/0003.ply`` has all points of object 3. ``movers/others.ply`` has moving points without
     a track, in the key sweep's lidar frame. ``tracks.json`` is the movers.json of the run. With
     several runs, each has its folder ``movers/000120/`` with ``tracks.json``.
-
-    Raises:
-        InputError: The maps hold ranges, or COLMAP has no model of the lens.
     """
     pictures = pictures_of(runs, flat=True)
     static = _world_cloud(runs)
@@ -144,10 +129,6 @@ def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
 
     Depth is measured depth in float32 millimetres, 0 for no depth. The cloud has the points that a
     camera observed.
-
-    Raises:
-        InputError: The maps hold ranges, a lens needs more than OpenCV's k1 k2 k3 p1 p2, or
-            fisheyes are mixed with other cameras.
     """
     pictures = write_images(runs, folder)
     fisheyes = {picture.camera.model == "fisheye" for picture in pictures}
@@ -195,13 +176,7 @@ def _frame(picture: Picture) -> dict[str, Any]:
 def pictures_of(runs: Sequence[FinishedRun], flat: bool = False) -> list[Picture]:
     """Return the images of the runs with poses in one world, the first key sweep's lidar frame.
 
-    Args:
-        runs: Finished runs, ascending by frame number.
-        flat: Use file names without folders, because the reader of Gaussian splatting drops
-            folders.
-
-    Raises:
-        InputError: The runs have no image.
+    ``flat`` gives file names without folders, which the reader of Gaussian splatting drops.
     """
     pictures = []
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
@@ -246,9 +221,6 @@ def intrinsics(camera: Camera) -> dict[str, float]:
 
     A pinhole has k1 k2 p1 p2 and, if present, k3 k4 k5 k6. A fisheye has k1 to k4. A pinhole
     without distortion has no coefficients.
-
-    Raises:
-        InputError: OpenCV's eight coefficients cannot describe the lens.
     """
     names = _FISHEYE_LENS if camera.model == "fisheye" else _LENS
     lens, K = list(camera.distortion), camera.K

@@ -36,15 +36,10 @@ _UNOBSERVED = np.array([140, 140, 140], np.uint8)
 
 
 class Kept(NamedTuple):
-    """A share of pixels with a depth, or a number of points, and how much the thresholds keep.
+    """A share of pixels with a depth, or a number of points, and how much the thresholds keep."""
 
-    Attributes:
-        before: Value without thresholds on confidence and age.
-        after: Value within the thresholds.
-    """
-
-    before: float
-    after: float
+    before: float  # value without thresholds on confidence and age
+    after: float  # value within the thresholds
 
 
 class FinishedRun:
@@ -54,8 +49,8 @@ class FinishedRun:
         key: Frame number of the key sweep.
         stamp_ns: Reference time of the key sweep in ns since 1970.
         data: Specification of the recording.
+        recording: Name of the recording.
         density: Camera -> ``measured``, ``filled`` -> share of pixels, for the maps read so far.
-        num_points: Number of points in the clouds read so far, None before the first cloud.
     """
 
     def __init__(
@@ -65,26 +60,24 @@ class FinishedRun:
         max_age_ms: float | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
-        """Open a folder. Arguments as in `densify.outputs.export.export_run`.
-
-        Raises:
-            InputError: The folder holds no run.
-        """
+        """Open a folder. Arguments as in `densify.outputs.export.export_run`."""
         path = folder / "run.yaml"
         if not path.is_file():
             raise InputError(
-                f"{folder}: no run.yaml in it; expected the folder of a finished run and key, such "
-                f"as densify-out/000120"
+                f"{folder}: {_what_is_there(folder)}; expected the folder of a finished run and "
+                f"key, such as densify-out/street/000120"
             )
         with damage_named(path):
             record = read_yaml(path)[0]
             self.key, self.stamp_ns = int(record["key"]), int(record["stamp_ns"])
             self.data = str(record["data"])
+            last = self.data.rstrip("/").rpartition("/")[2]
+            self.recording = str(record.get("recording") or last)
         self.folder, self._chosen = folder, cameras
         self._min_confidence = stored_confidence(min_confidence)
         self._max_age = stored_age(np.inf if max_age_ms is None else max_age_ms / 1000)
         self.density: dict[str, dict[str, Kept]] = {}
-        self.num_points: Kept | None = None
+        self._num_points: dict[Path, Kept] = {}
 
     @cached_property
     def cameras(self) -> list[str]:
@@ -111,6 +104,12 @@ class FinishedRun:
     def tracks(self) -> list[ObjectTrack]:
         """The tracks of moving objects, each with a pose at the key sweep."""
         return read_tracks(self.folder / "movers.json")
+
+    @property
+    def num_points(self) -> Kept | None:
+        """The number of points in the clouds read so far, None before the first cloud."""
+        counts = self._num_points.values()
+        return Kept(sum(k.before for k in counts), sum(k.after for k in counts)) if counts else None
 
     def measure(self, camera: str) -> str:
         """Return ``z`` (depth along the camera's axis) or ``range`` (distance from the lens)."""
@@ -154,11 +153,7 @@ class FinishedRun:
         return {kind: stored * keep for kind, stored in maps.items()}
 
     def full_m(self, camera: str) -> Float32:
-        """Return (H,W) filled depth in metres, completed with a prior if given, 0 for no depth.
-
-        Raises:
-            InputError: The map holds ranges instead of camera z.
-        """
+        """Return (H,W) filled depth in metres, completed with a prior if given, 0 for no depth."""
         if self.measure(camera) != "z":
             raise InputError(
                 f"{camera}: its depth is the range from the lens, and the form takes camera z; "
@@ -176,20 +171,20 @@ class FinishedRun:
 
     def cloud(self) -> StoredCloud:
         """Return the accumulated points within the thresholds."""
-        return self._select(read_cloud(self.folder / "cloud.laz"))
+        return self._read(self.folder / "cloud.laz")
 
     def mover_clouds(self) -> list[StoredCloud]:
         """Return a cloud for each separated object (``movers=separate``), within the thresholds."""
         paths = sorted(self.folder.glob("movers/*/cloud.laz"))
-        return [self._select(read_cloud(path)) for path in paths]
+        return [self._read(path) for path in paths]
 
-    def _select(self, cloud: StoredCloud) -> StoredCloud:
+    def _read(self, path: Path) -> StoredCloud:
+        cloud = read_cloud(path)
         age = stored_age(1e-9 * np.abs(cloud.stamp_ns - self.stamp_ns))
         keep = (stored_confidence(cloud.confidence) >= self._min_confidence) & (
             age <= self._max_age
         )
-        before = self.num_points or Kept(0, 0)
-        self.num_points = Kept(before.before + len(keep), before.after + int(keep.sum()))
+        self._num_points[path] = Kept(len(keep), int(keep.sum()))
         return cloud.select(keep)
 
 
@@ -218,71 +213,51 @@ def finished_runs(
     return sorted(runs, key=lambda run: (run.folder.parent, run.key))
 
 
+def _what_is_there(folder: Path) -> str:
+    """Return what a folder without run.yaml is, as a clause for an error."""
+    if (folder / "dataset.json").is_file():
+        return (
+            "holds a training set of maps alone (--layout kitti-depth), and the other formats need "
+            "clouds, ages and images; make the set with --layout densify to export it"
+        )
+    return "no run.yaml in it"
+
+
 class ShownSweep(NamedTuple):
-    """A sweep as measured, for display, with its registered pose.
+    """A sweep as measured, for display, with its registered pose."""
 
-    Attributes:
-        frame: Frame number.
-        stamp_ns: Reference time in ns since 1970.
-        T_key_lidar: (4,4) pose in the key sweep's lidar frame.
-        points: Points of the sweep. ``points.rigid_points`` are the measured positions.
-    """
-
-    frame: int
-    stamp_ns: int
-    T_key_lidar: Float
-    points: StoredCloud
+    frame: int  # frame number
+    stamp_ns: int  # reference time in ns since 1970
+    T_key_lidar: Float  # (4,4) pose in the key sweep's lidar frame
+    points: StoredCloud  # points of the sweep. ``points.rigid_points`` are the measured positions.
 
 
 class Shot(NamedTuple):
-    """An image of a camera (name and exposure time), with its depth maps.
+    """An image of a camera (name and exposure time), with its depth maps."""
 
-    Attributes:
-        name: Name of the map.
-        view: Camera and pose.
-        stamp_ns: Time of the exposure in ns since 1970.
-        jpeg: Bytes of the image file, None without an image.
-        maps_m: "depth" and "depth_filled" -> (H,W) float32 metres, 0 for no depth.
-        is_pinhole: True if the camera has no distortion and depth is along its axis.
-    """
-
-    name: str
-    view: CameraView
-    stamp_ns: int
-    jpeg: bytes | None
-    maps_m: dict[str, Float32]
-    is_pinhole: bool
+    name: str  # name of the map
+    view: CameraView  # camera and pose
+    stamp_ns: int  # time of the exposure in ns since 1970
+    jpeg: bytes | None  # bytes of the image file, None without an image
+    maps_m: dict[str, Float32]  # "depth" and "depth_filled" -> (H,W) float32 metres, 0 for no depth
+    is_pinhole: bool  # True if the camera has no distortion and depth is along its axis
 
 
 class Timeline(NamedTuple):
-    """All that a viewer shows of one densified key sweep: cloud, sweeps and camera images.
+    """All that a viewer shows of one densified key sweep: cloud, sweeps and camera images."""
 
-    Attributes:
-        run: The finished run of this key sweep.
-        T_world_key: (4,4) pose of the key sweep. The world is the first key sweep's lidar frame.
-        cloud: Accumulated points at the key sweep's time, key sweep's lidar frame.
-        sweeps: Sweeps of the window as measured, ascending in time; the key sweep alone if the
-            viewer shows several runs.
-        shots: Camera images with their depth maps, one `Shot` for each chosen map.
-    """
-
-    run: FinishedRun
+    run: FinishedRun  # the finished run of this key sweep
+    # (4,4) pose of the key sweep. The world is the first key sweep's lidar frame.
     T_world_key: Float
-    cloud: StoredCloud
+    cloud: StoredCloud  # accumulated points at the key sweep's time, key sweep's lidar frame
+    # Sweeps of the window as measured, ascending in time; the key sweep alone if the viewer shows
+    # several runs
     sweeps: list[ShownSweep]
-    shots: list[Shot]
+    shots: list[Shot]  # camera images with their depth maps, one `Shot` for each chosen map
 
 
 def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
-    """Yield one run with all sweeps of its window, or several runs with their key sweeps.
-
-    Args:
-        runs: Finished runs, ascending by frame number.
-
-    Raises:
-        InputError: Neither of two consecutive key sweeps is in the window of the other, so their
-            relative pose is unknown.
-    """
+    """Yield one run with all sweeps of its window, or several runs with their key sweeps."""
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
         cloud, sweeps = run.cloud(), []
         for sweep in run.scene.table["sweeps"]:
@@ -298,8 +273,7 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
 def key_poses(runs: Sequence[FinishedRun]) -> Iterator[Float]:
     """Yield ``T_world_key`` (4,4) of each run. The world is the first key sweep's lidar frame.
 
-    Raises:
-        InputError: A relative pose is unknown as in `timelines`.
+    Of two consecutive key sweeps, one must be in the window of the other.
     """
     T_world_key = np.eye(4)
     for before, run in zip([None, *runs], runs, strict=False):

@@ -37,9 +37,6 @@ def write_exr(run: FinishedRun, folder: Path) -> None:
     """Write the maps of `write_npy` as OpenEXR files with one 32-bit channel, without loss.
 
     The channel is ``Z`` for depth and ``Y`` for confidence.
-
-    Raises:
-        InputError: OpenEXR is not installed.
     """
     library = needed("OpenEXR", "exr", "EXR files")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
@@ -77,10 +74,9 @@ def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
     """
     files: list[dict[str, Any]] = []
     for run in runs:
-        name = run.data.rstrip("/").rpartition("/")[2]
-        if not name:
-            raise InputError(f"{run.folder}/run.yaml: data: expected the recording's name")
-        drive = folder / split_of(name) / drive_folder(name)
+        if not run.recording:
+            raise InputError(f"{run.folder}/run.yaml: recording: expected the recording's name")
+        drive = folder / split_of(run.recording) / drive_folder(run.recording)
         for view in run.cameras:
             files += _write_view(run, view, drive, folder)
     lines = [f"{file['rgb']} {file['depth']} {file['depth_filled']}\n" for file in files]
@@ -119,11 +115,7 @@ def write_ply(run: FinishedRun, folder: Path) -> None:
 
 
 def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write vertices as PLY (Turk, 1994), binary, little-endian.
-
-    Args:
-        columns: Property name -> (N,) float32, float64, int32, uint8 or uint16 values.
-    """
+    """Write (N,) columns by name as vertices of PLY (Turk, 1994), binary, little-endian."""
     rows = table(columns)
     rows = rows.astype(rows.dtype.newbyteorder("<"), copy=False)
     kinds = {name: _PLY_TYPES[rows.dtype[name].str.lstrip("<|")] for name in columns}

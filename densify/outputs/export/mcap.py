@@ -31,11 +31,7 @@ _NS = 10**9
 
 
 def write_mcap(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``recording.mcap``. Equal runs give equal bytes.
-
-    Raises:
-        InputError: foxglove-sdk is not installed, or a relative pose is unknown as in `timelines`.
-    """
+    """Write ``recording.mcap``. Equal runs give equal bytes."""
     foxglove = needed("foxglove", "mcap", "MCAP files")
     context, channels = foxglove.Context(), {}
     options = foxglove.mcap.MCAPWriteOptions(compression_threads=0)

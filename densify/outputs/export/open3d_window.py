@@ -14,9 +14,6 @@ def show(runs: Sequence[FinishedRun]) -> None:
     """Show static and moving points and the boxes of objects, with a time line over several runs.
 
     The call returns when the user closes the window.
-
-    Raises:
-        InputError: open3d is not installed, or there is no screen.
     """
     o3d, shown = needed("open3d", "open3d", "Windows with the cloud"), []
     for at, line in enumerate(timelines(runs)):

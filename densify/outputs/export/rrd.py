@@ -29,11 +29,7 @@ _POINT, _SWEEP_POINT = -1.5, -2.5  # radii in points of the screen, as rerun wri
 
 
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``recording.rrd``. Bytes differ each time: rerun numbers its chunks by the clock.
-
-    Raises:
-        InputError: rerun is not installed, or a relative pose is unknown as in `timelines`.
-    """
+    """Write ``recording.rrd``. Bytes differ each time: rerun numbers its chunks by the clock."""
     with _stream(runs) as stream:
         stream.save(folder / "recording.rrd")
         _log(stream, runs)

@@ -27,9 +27,6 @@ def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
 
     scene_meta.json has camera-to-world poses with OpenCV's axes. Images are in ``images/``.
     Measured depth is in ``depth/NAME.exr`` in metres, 0 for no depth.
-
-    Raises:
-        InputError: The maps hold ranges, a lens has distortion, or OpenEXR is missing.
     """
     library = needed("OpenEXR", "exr", "EXR files")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
@@ -56,7 +53,7 @@ def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
         )
     modalities = {name: {"frame_key": name, "format": name} for name in ("image", "depth")}
     meta = {
-        "scene_name": drive_folder(f"{runs[0].data}-{runs[0].key:06d}".rpartition("/")[2]),
+        "scene_name": f"{drive_folder(runs[0].recording)}-{runs[0].key:06d}",
         "dataset_name": "densify",
         "version": "0.1",
         "shared_intrinsics": False,
@@ -75,13 +72,10 @@ def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
     .index.txt lists the folders of the images. A folder has image.jpg, depth.png and meta.json (K
     scaled to an image of width and height 1). depth.png has 16 bits: measured depth on a
     logarithmic scale from ``near`` to ``far``, 0 for no depth.
-
-    Raises:
-        InputError: The maps hold ranges, or a lens has distortion.
     """
     names = []
     for run in runs:
-        drive = drive_folder(run.data.rstrip("/").rpartition("/")[2])
+        drive = drive_folder(run.recording)
         for picture in pictures_of([run], flat=True):
             picture.run.full_m(picture.map)
             _require_pinhole(picture, "moge")

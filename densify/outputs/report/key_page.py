@@ -21,6 +21,7 @@ from densify.outputs.atomic import write_file
 from densify.outputs.cloud_laz import read_cloud
 from densify.outputs.depth_png import read_stored
 from densify.outputs.export.finished_run import map_names
+from densify.outputs.front_view import front_first
 from densify.outputs.key_outputs import Context
 from densify.outputs.report.page_file import Blobs, packed_camera, packed_cloud, page_file
 from densify.outputs.scene_file import read_scene, read_tracks
@@ -41,27 +42,16 @@ _MAPS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
 
 @dataclass
 class KeyFiles:
-    """The files of one key sweep.
+    """The files of one key sweep."""
 
-    Attributes:
-        maps: Folder of depth maps, cloud and scene.
-        about: Content of run.yaml, or the same fields of compare.json.
-        methods: Method -> its scores. The last method made the maps.
-        missing: A sentence for each file that cannot be read.
-    """
-
-    maps: Path
-    about: Mapping[str, Any]
-    methods: Mapping[str, Mapping[str, Any]]
-    missing: list[str] = field(default_factory=list)
+    maps: Path  # folder of depth maps, cloud and scene
+    about: Mapping[str, Any]  # content of run.yaml, or the same fields of compare.json
+    methods: Mapping[str, Mapping[str, Any]]  # method -> its scores. The last method made the maps.
+    missing: list[str] = field(default_factory=list)  # a sentence for each file that cannot be read
 
     @staticmethod
     def of_run(folder: Path) -> KeyFiles:
-        """Return the files of a run.
-
-        Raises:
-            InputError: The file run.yaml is missing or damaged.
-        """
+        """Return the files of a run."""
         files = KeyFiles(folder, _mapping(read_yaml(folder / "run.yaml")[0]), {})
         metrics = _mapping(files.read(read_json, "metrics.json"))
         method = str(files.about.get("method", "run"))
@@ -78,12 +68,9 @@ class KeyFiles:
         return KeyFiles(folder / "compare", about, methods)
 
     def read(self, read: Callable[[Path], T], name: str, optional: bool = False) -> T | None:
-        """Return the content of a file, None if the file is damaged or missing.
+        """Return a file's content by a function of its path; note it in ``missing`` if damaged.
 
-        Args:
-            read: Function that reads a path.
-            name: Path of the file relative to ``maps``.
-            optional: Add no sentence to ``missing`` if there is no such file.
+        An ``optional`` file that does not exist is not noted.
         """
         path = self.maps / name
         if optional and not path.is_file():
@@ -135,22 +122,16 @@ def write_report(result: Result, context: Context, folder: Path) -> None:
 
 
 def key_page(files: KeyFiles, folder: str) -> bytes:
-    """Return the bytes of the HTML page.
+    """Return the bytes of the HTML page; a cloud with too many points is thinned out.
 
-    A cloud with too many points is thinned out, and the page says so.
-
-    Args:
-        files: Files of the key sweep.
-        folder: Folder of the run, as the user names it. "" for a comparison.
-
-    Raises:
-        InputError: Neither a depth map nor a cloud can be read.
+    ``folder`` is the run's, as the user names it. It is "" for a comparison.
     """
     scene = files.read(read_scene, "scene/scene.json", optional=True)
     views, sweeps = (scene.table["views"], scene.table["sweeps"]) if scene else ({}, [])
     focal_px = {name: view.camera.focal_px for name, view in (scene.views if scene else {}).items()}
     blobs, cameras = Blobs(), {}
-    for name in map_names(files.maps / "depth", files.maps / "depth_filled"):
+    names = map_names(files.maps / "depth", files.maps / "depth_filled")
+    for name in front_first(names, scene.views, scene.T_key_lidar) if scene else names:
         if maps := files.camera(name):
             cameras[name] = packed_camera(blobs, maps, files.image(name), focal_px.get(name))
     stored = files.read(read_cloud, "cloud.laz")

@@ -59,13 +59,10 @@ class Blobs:
         self.texts: dict[str, str] = {}
 
     def add(self, array: NDArray[Any]) -> dict[str, Any]:
-        """Pack an array and return the description that the page needs to unpack it.
+        """Pack integers (N,) or (H,W), 0 to 2^32, and return how the page unpacks them.
 
         The values are packed in 8, 16 or 32 bits. They are stored directly or as differences along
         the last axis, whichever is smaller.
-
-        Args:
-            array: (N,) or (H,W) integers of 0 or more, below 2^32.
         """
         array = array.astype(np.min_scalar_type(int(array.max(initial=0))))
         steps = np.diff(array, axis=-1, prepend=array.dtype.type(0))
@@ -100,14 +97,10 @@ def packed_camera(
     jpeg: bytes | None,
     focal_px: float | None,
 ) -> dict[str, Any]:
-    """Pack the maps of a camera into ``blobs`` and return the camera's entry in the page.
+    """Pack the maps of `KeyFiles.camera` into ``blobs`` and return the camera's entry in the page.
 
     Source sweep, age and the flag "measured" share one map of indices into ``sources``. A row of
     ``sources`` is [index of the sweep + 1, age in ms + 1, measured 0 or 1], 0 where unknown.
-
-    Args:
-        maps: Kind -> (H,W) values, see `outputs.report.key_page.KeyFiles.camera`.
-        jpeg: Bytes of the image, None without an image.
     """
     nothing = np.zeros_like(next(iter(maps.values())), np.uint16)
     depth, filled, sweep, age = (
@@ -135,14 +128,10 @@ def packed_cloud(
 ) -> dict[str, Any]:
     """Pack a thinned cloud into ``blobs`` and return its entry in the page, moving points first.
 
-    Positions are 16-bit integers: ``low_m`` + ``step_m`` times the integer. ``mover`` is 0 for
-    static points, 1 for moving points without a track, 2 and up for tracked objects. ``displaced``
-    is 32768 plus the displacement beyond rigid alignment in steps of ``displaced_step_m``, for
-    moving points only.
-
-    Args:
-        frames: Frame numbers of the page's sweeps. ``sweep`` holds indices into this list.
-        instances: Instance numbers of the tracked objects, in the order of ``mover``.
+    Positions are 16-bit integers: ``low_m`` + ``step_m`` times the integer. ``sweep`` has indices
+    in ``frames``. ``mover`` is 0 for static points, 1 for moving points without a track, 2 and up
+    for tracked objects, by ``instances``. ``displaced`` is 32768 plus the displacement beyond rigid
+    alignment in steps of ``displaced_step_m``, for moving points only.
     """
     rows = thinned(cloud.points, cloud.moving, _MOST_POINTS)
     chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])
@@ -173,12 +162,8 @@ def packed_cloud(
 def thinned(points: Float, moving: Bool, most: int) -> Int:
     """Return (K,) ascending indices of at most ``most`` points, drawn with a fixed random seed.
 
-    The probability grows with squared distance, so the result is about equally dense in angle.
-    Moving points get a larger weight.
-
-    Args:
-        points: (N,3) positions in metres, key sweep's lidar frame.
-        moving: (N,) bool, True for moving points.
+    The probability grows with squared distance from the origin of ``points`` (N,3), so the result
+    is about equally dense in angle. Points of the mask ``moving`` get a larger weight.
     """
     if len(points) <= most:
         return np.arange(len(points))
@@ -203,13 +188,7 @@ def _numbers(values: NDArray[np.int32], known: Sequence[int]) -> Int:
 
 
 def page_file(title: str, data: Mapping[str, Any], blobs: Blobs) -> bytes:
-    """Return the bytes of a whole HTML page.
-
-    Args:
-        title: Title as plain text.
-        data: Numbers, texts, lists and mappings, which the script reads as ``page``.
-        blobs: The packed arrays.
-    """
+    """Return the bytes of a whole HTML page, whose script reads ``data`` as ``page``."""
     script, style = "\n".join(map(_source, _SCRIPTS)), _source("page.css")
     policy = (
         f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; "

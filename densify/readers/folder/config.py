@@ -62,10 +62,7 @@ def _names(value: Any) -> tuple[str, ...]:
 
 
 def _axes(value: Any) -> Float:
-    """Return the (3,3) rotation from stored to lidar axes, by three names such as [z, -x, -y].
-
-    The names are the stored axes along the lidar's x, y and z axis.
-    """
+    """Return the (3,3) rotation that puts three stored axes, as [z, -x, -y], along x, y and z."""
     R = np.array([_AXES[name] for name in _names(value)])
     if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3)):
         raise ValueError
@@ -130,61 +127,39 @@ _CHECKS: dict[str, Check] = {
 
 @dataclass(frozen=True)
 class SweepFiles:
-    """Section ``sweeps``. By default ("" or 0) the reader finds the value in the files.
+    """Section ``sweeps``. By default ("" or 0) the reader finds the value in the files."""
 
-    Attributes:
-        files: Path of the folder of the sweeps.
-        columns: Names of the columns, for files that do not name them.
-        scale_m: Length of one unit of the stored points, in metres.
-        axes: (3,3) matrix that turns (or mirrors) stored points into the lidar frame, x forward,
-            y left, z up; None for the identity.
-        intensity: Name of the column with intensities.
-        intensity_scale: Stored intensity that becomes 1.
-        time: Name of the column with the firing times of the points.
-        time_unit: Unit of the firing times, in `densify.readers.point_fields.UNIT_NS`.
-        time_is: "relative" for times since the stamp, "absolute" for times since an epoch.
-        reference: Moment of the sweep that its stamp marks: "start", "middle" or "end".
-        lidar: Name of the column with the index of the scanner.
-        stamps: ``names`` if file names are stamps, or the path of a file with a stamp per sweep.
-        stamps_unit: Unit of the stamps.
-        rate_hz: Rate of sweeps without stamps; 0 for 10 Hz.
-        compensated: True if the points are ego-motion compensated to the stamp.
-        scanner_origins: (S,3) metres, start of each scanner's rays; None for 0 0 0.
-    """
-
-    files: str = ""
-    columns: tuple[str, ...] | None = None
-    scale_m: float = 1.0
+    files: str = ""  # path of the folder of the sweeps
+    columns: tuple[str, ...] | None = None  # names of the columns, for files that do not name them
+    scale_m: float = 1.0  # length of one unit of the stored points, in metres
+    # (3,3) matrix that turns (or mirrors) stored points into the lidar frame, x forward, y left, z
+    # up; None for the identity
     axes: Float | None = None
-    intensity: str = ""
-    intensity_scale: float = 0.0
-    time: str = ""
-    time_unit: str = ""
-    time_is: str = ""
-    reference: str = ""
-    lidar: str = ""
+    intensity: str = ""  # name of the column with intensities
+    intensity_scale: float = 0.0  # stored intensity that becomes 1
+    time: str = ""  # name of the column with the firing times of the points
+    time_unit: str = ""  # unit of the firing times, in `densify.readers.point_fields.UNIT_NS`
+    time_is: str = ""  # "relative" for times since the stamp, "absolute" for times since an epoch
+    reference: str = ""  # moment of the sweep that its stamp marks: "start", "middle" or "end"
+    lidar: str = ""  # name of the column with the index of the scanner
+    # ``names`` if file names are stamps, or the path of a file with a stamp per sweep
     stamps: str = ""
-    stamps_unit: str = ""
-    rate_hz: float = 0.0
-    compensated: bool = False
+    stamps_unit: str = ""  # unit of the stamps
+    rate_hz: float = 0.0  # rate of sweeps without stamps; 0 for 10 Hz
+    compensated: bool = False  # True if the points are ego-motion compensated to the stamp
+    # (S,3) metres, start of each scanner's rays; None for 0 0 0
     scanner_origins: Float | None = None
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Section ``poses``.
+    """Section ``poses``."""
 
-    Attributes:
-        file: Path of the pose file, "" to search for it.
-        stamps_unit: Unit of the stamps of the poses, "" to detect it.
-        T_frame_lidar: (4,4) pose of the lidar in the frame of the poses; None for the identity.
-        inverse: True if the file stores T_lidar_world instead of T_world_lidar.
-    """
-
-    file: str = ""
-    stamps_unit: str = ""
+    file: str = ""  # path of the pose file, "" to search for it
+    stamps_unit: str = ""  # unit of the stamps of the poses, "" to detect it
+    # (4,4) pose of the lidar in the frame of the poses; None for the identity
     T_frame_lidar: Float | None = None
-    inverse: bool = False
+    inverse: bool = False  # True if the file stores T_lidar_world instead of T_world_lidar
 
 
 @dataclass(frozen=True)
@@ -192,28 +167,21 @@ class CameraFiles:
     """One camera of the section ``cameras``.
 
     `Camera` describes model, distortion, max_angle_deg and row_time_s.
-
-    Attributes:
-        size: Width and height of the images in pixels.
-        K: (3,3) intrinsics in pixels.
-        T_cam_lidar: (4,4) transform from the lidar frame to the camera frame.
-        files: Path of the folder of images.
-        stamps: ``names`` if file names are stamps; ``sweeps`` if an image has the stamp of the
-            sweep of the same number; or the path of a file; "" to search for a file.
-        stamps_unit: Unit of the stamps of the images, "" to detect it.
-        clock_offset_s: Seconds added to the images' stamps, to convert them to the sweeps' clock.
     """
 
-    size: tuple[int, int]
-    K: Float
-    T_cam_lidar: Float
-    files: str = ""
+    size: tuple[int, int]  # width and height of the images in pixels
+    K: Float  # (3,3) intrinsics in pixels
+    T_cam_lidar: Float  # (4,4) transform from the lidar frame to the camera frame
+    files: str = ""  # path of the folder of images
     model: str = "pinhole"
     distortion: tuple[float, ...] = ()
     max_angle_deg: float = 180.0
     row_time_s: float = 0.0
+    # ``names`` if file names are stamps; ``sweeps`` if an image has the stamp of the sweep of the
+    # same number; or the path of a file; "" to search for a file
     stamps: str = ""
-    stamps_unit: str = ""
+    stamps_unit: str = ""  # unit of the stamps of the images, "" to detect it
+    # Seconds added to the images' stamps, to convert them to the sweeps' clock
     clock_offset_s: float = 0.0
 
 
@@ -232,13 +200,7 @@ class _File(NamedTuple):
         return self.error(key, f"got {shown}, expected {expected}")
 
     def mapping(self, key: str, value: Any, known: Collection[str] | None) -> dict[str, Any]:
-        """Return the mapping that is the value of a YAML key, empty for None.
-
-        Args:
-            key: Dotted name of the YAML key.
-            value: Value of the YAML key.
-            known: Names allowed in the mapping, None for any name.
-        """
+        """Return a YAML key's mapping, {} for None, if all its names are among ``known``."""
         value = {} if value is None else value
         if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
             raise self.unfit(key, value, "a mapping of keys to values")
@@ -270,25 +232,17 @@ class _File(NamedTuple):
 
 @dataclass(frozen=True)
 class FolderConfig:
-    """The contents of densify.yaml.
+    """The contents of densify.yaml."""
 
-    Attributes:
-        path: Path of densify.yaml, None if the folder has no such file.
-        cameras: Calibration and file settings of each camera, by name.
-    """
-
-    path: Path | None = None
+    path: Path | None = None  # path of densify.yaml, None if the folder has no such file
     sweeps: SweepFiles = SweepFiles()
     poses: Poses = Poses()
+    # Calibration and file settings of each camera, by name
     cameras: Mapping[str, tuple[Camera, CameraFiles]] = field(default_factory=dict)
 
     @staticmethod
     def read(folder: Path) -> FolderConfig:
-        """Read the densify.yaml of a folder; return the defaults if the folder has none.
-
-        Raises:
-            InputError: A key or a value is wrong. The message names file, line and key.
-        """
+        """Read the densify.yaml of a folder; return the defaults if the folder has none."""
         path = folder / NAME
         if not path.is_file():
             return FolderConfig()

@@ -53,25 +53,15 @@ _UNTIMED = (
 
 @dataclass(frozen=True)
 class SweepColumns:
-    """The columns of the sweeps of a folder, and their meaning.
+    """The columns of the sweeps of a folder, and their meaning."""
 
-    Attributes:
-        series: Files and stamps of the sweeps.
-        settings: Section ``sweeps`` of densify.yaml.
-        config: Path of densify.yaml, None if the folder has none.
-    """
-
-    series: Series
-    settings: SweepFiles
-    config: Path | None
+    series: Series  # files and stamps of the sweeps
+    settings: SweepFiles  # section ``sweeps`` of densify.yaml
+    config: Path | None  # path of densify.yaml, None if the folder has none
     _own_stamps_ns: dict[int, int] = field(default_factory=dict)
 
     def returns(self, frame: int, stamp_ns: int) -> Returns:
-        """Read all rows of a sweep with reference time ``stamp_ns``, in the lidar frame.
-
-        Raises:
-            InputError: The file is damaged, or lacks a column that other sweeps have.
-        """
+        """Read all rows of a sweep with reference time ``stamp_ns``, in the lidar frame."""
         path = self.series.paths[frame]
         columns = self._columns(path)
         found, valid = self.layout.returns(columns, path, stamp_ns)
@@ -114,9 +104,6 @@ class SweepColumns:
 
         The time is the sweep's stamp. Without stamps it is computed from absolute times of the
         points, or else from the frame number and the rate.
-
-        Raises:
-            InputError: The times of the points are needed and cannot be read.
         """
         if self.series.stamps_ns is not None:
             return self.series.stamps_ns[frame]
@@ -207,12 +194,7 @@ class Folder(FileSequence):
     """A folder of sweeps as a `LidarSequence`; `findings` states what the reader detected."""
 
     def __init__(self, path: Path | str) -> None:
-        """Read file names, densify.yaml, stamps and poses. Sweeps and images are read on request.
-
-        Raises:
-            InputError: The folder has no sweeps, or its other files are malformed or contradict
-                each other.
-        """
+        """Read file names, densify.yaml, stamps and poses; the rest is read on request."""
         folder = Path(path)
         self._config = FolderConfig.read(folder)
         known, cameras = self._config.sweeps, self._config.cameras
@@ -327,10 +309,7 @@ class Folder(FileSequence):
 def _stamped_by_sweeps(
     name: str, images: Series, frames: Sequence[int], given: CameraFiles
 ) -> dict[str, str]:
-    """Return a note that images have the stamps of sweeps, by the camera's name.
-
-    The result is empty if densify.yaml requests these stamps.
-    """
+    """Return a note, by camera, that images have sweeps' stamps without a request for them."""
     if given.stamps == "sweeps":
         return {}
     text = (

@@ -27,28 +27,18 @@ _POSE_FILES = [
 
 @dataclass(frozen=True)
 class Series:
-    """Files of sweeps or images in the order of time.
+    """Files of sweeps or images in the order of time."""
 
-    Attributes:
-        paths: Path of each file, by its number.
-        stamps_ns: Stamp of each file, by its number; None if neither names nor a file state it.
-        told_by: Source of the stamps, for people; "" without stamps.
-    """
-
-    paths: Mapping[int, Path]
+    paths: Mapping[int, Path]  # path of each file, by its number
+    # Stamp of each file, by its number; None if neither names nor a file state it
     stamps_ns: Mapping[int, int] | None
-    told_by: str
+    told_by: str  # source of the stamps, for people; "" without stamps
 
 
 def find_sweeps(folder: Path, files: str) -> list[Path]:
     """Return the numbered point files of a folder, all of the preferred suffix.
 
-    Args:
-        folder: Folder of the recording.
-        files: Subfolder of the sweeps; "" to search the folder and two levels of subfolders.
-
-    Raises:
-        InputError: No sweeps are found, or several folders hold sweeps of that suffix.
+    ``files`` is the subfolder of the sweeps; "" searches the folder and two levels below it.
     """
     if files:
         existing(folder, files, "sweeps: {files: ...}", is_folder=True)
@@ -91,14 +81,7 @@ def find_pose_file(folder: Path, name: str) -> Path | None:
 
 
 def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path:
-    """Return the path that densify.yaml names; raise InputError if the path does not exist.
-
-    Args:
-        folder: Folder that contains the path.
-        name: Relative path in densify.yaml.
-        key: YAML key of the path, for the error message.
-        is_folder: True if the path must be a folder, False if it must be a file.
-    """
+    """Return the file or folder ``name`` that densify.yaml gives under ``key``, if it exists."""
     path = folder / name
     if not (path.is_dir() if is_folder else path.is_file()):
         what = "folder" if is_folder else "file"
@@ -115,14 +98,10 @@ def in_time(
 
     Args:
         root: Folder of the recording.
-        paths: Files of sweeps, or images of one camera.
         stamps: ``names`` if file names are stamps; ``sweeps`` for files without stamps; a stamp
             file below the root or beside the files; "" to search for a stamp file.
         unit: Unit of the stamps, "" to detect it.
         shared: True to search a stamp file in the root too.
-
-    Raises:
-        InputError: A file has no stamp, two files have one number, or stamps do not ascend.
     """
     by_names = stamps == "names"
     names = [named(path, unit if by_names else "") for path in paths]
@@ -169,10 +148,7 @@ def _numbered(names: Sequence[Named]) -> dict[int, Named]:
 
 
 def _matched(file: StampFile, paths: Mapping[int, Path]) -> dict[int, int]:
-    """Return the stamp of each file, by its number.
-
-    A line of the stamp file is assigned by file name, or by order, or by the file's number.
-    """
+    """Return the stamp of each file by number; a line fits by file name, order or number."""
     if file.names is not None:
         by_name = {Path(n).stem: ns for n, ns in zip(file.names, file.stamp_ns, strict=True)}
         missing = [path for path in paths.values() if path.stem not in by_name]

@@ -40,15 +40,7 @@ class Drive(FileSequence):
     def __init__(
         self, name: str, where: Path, sweeps: Path, truth: Path, images: Mapping[str, Path]
     ) -> None:
-        """Find the sweeps and images; raise InputError if there are no sweeps.
-
-        Args:
-            name: Name of the recording for people and outputs.
-            where: Path of the recording, for messages.
-            sweeps: Folder of the .bin files.
-            truth: Folder whose subfolder ``truth`` may hold ground truth of a simulation.
-            images: Folder of images by camera name.
-        """
+        """Find the .bin files in ``sweeps`` and the images; truth/ may be in ``truth``."""
         files = checks.numbered_files(sweeps, ".bin")
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
@@ -84,13 +76,9 @@ def read_points(path: Path) -> tuple[Float, np.ndarray]:
 
 
 def turned_ns(points: Float, revolution_ns: int) -> Int:
-    """Return the (N,) int64 firing times of points since the scanner faced forward.
+    """Return (N,) int64 firing times since the scanner faced forward, -azimuth / 2π revolutions.
 
-    They are ``-azimuth / 2π`` of a revolution, thus negative in its first half.
-
-    Args:
-        points: (N,3) points in the lidar frame, not deskewed.
-        revolution_ns: Duration of one revolution.
+    ``points`` (N,3) are in the lidar frame, not deskewed. In the first half times are negative.
     """
     revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     return np.rint(revolution * revolution_ns).astype(np.int64)
@@ -100,9 +88,6 @@ def read_stamps(path: Path) -> dict[int, int]:
     """Return the stamps (ns since 1970) of a timestamps file, by frame number.
 
     Line k, counted from 0, belongs to frame k. Lines that are no stamps are skipped.
-
-    Raises:
-        InputError: The file has lines, but no line is a stamp.
     """
     lines = [line.strip() for line in read_text(path).splitlines()]
     stamps_ns = {}
@@ -128,12 +113,9 @@ def usual_period_ns(stamps_ns: Iterable[int]) -> int:
 
 
 def parse_oxts(text: str, where: str) -> Float:
-    """Return the (30,) numbers of an oxts record, one measurement of the GPS/IMU unit.
+    """Return the (30,) numbers of a record of the GPS/IMU unit; errors begin with ``where``.
 
     The first six are latitude and longitude (deg), altitude (m), roll, pitch and yaw (rad).
-
-    Raises:
-        InputError: The record is malformed. The message begins with ``where``.
     """
     values = checks.parse_numbers(text, where, 30)
     if abs(values[0]) >= 90:
@@ -144,11 +126,8 @@ def parse_oxts(text: str, where: str) -> Float:
 def T_mercator_imu(oxts: Float, first: Float) -> Float:
     """Return the (4,4) pose of the GPS/IMU unit on the Mercator plane (x east, y north, z up).
 
-    The pose is the same as in KITTI's devkit (convertOxtsToPose).
-
-    Args:
-        oxts: (30,) record of the GPS/IMU unit.
-        first: (30,) first record of the drive, whose latitude determines the scale.
+    As convertOxtsToPose of KITTI's devkit. ``oxts`` and ``first``, the drive's first, are (30,)
+    records; the first one's latitude determines the scale.
     """
     lat_deg, lon_deg, alt_m, roll, pitch, yaw = oxts[:6]
     scale_m = _EARTH_RADIUS_M * np.cos(np.deg2rad(first[0]))
@@ -213,11 +192,7 @@ class Calibration:
     ) -> Camera:
         """Return the rectified camera of an entry with a projection matrix P = K [I | t].
 
-        Args:
-            key: Key of the entry with P.
-            name: Name of the camera.
-            size_px: Width and height of the images.
-            T_rect_lidar: (4,4) transform from the lidar frame to the frame of rectified camera 0.
+        ``T_rect_lidar`` (4,4) maps the lidar frame to the frame of rectified camera 0.
         """
         P = self.numbers(key, 3, 4)
         onto, T_cam_rect = P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), np.eye(4)

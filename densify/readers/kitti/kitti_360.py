@@ -25,7 +25,6 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.config.errors import InputError
 from densify.config.file_content import described_in, parse_yaml, read_text
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
@@ -43,34 +42,17 @@ _HALF_VIEW_DEG = 90.0
 
 
 def open_recording(path: Path, scene: str | None) -> Kitti360:
-    """Open a KITTI-360 drive; sweeps and images are read later, on request.
-
-    Args:
-        path: Folder that contains data_3d_raw/.
-        scene: Name of a drive, ``2013_05_28_drive_0000_sync``; None if there is a single drive.
-    """
+    """Open a drive, by its name, of the folder that contains data_3d_raw/."""
     names = sorted(p.parent.name for p in (path / "data_3d_raw").glob("*/velodyne_points"))
-    if not names:
-        raise InputError(
-            f"{path}: no KITTI-360; expected data_3d_raw/ with drives that hold velodyne_points/"
-        )
-    return Kitti360(path, checks.chosen_scene("kitti-360", path, scene, names))
+    none = "no KITTI-360; expected data_3d_raw/ with drives that hold velodyne_points/"
+    return Kitti360(path, checks.chosen_scene("kitti-360", path, scene, names, none))
 
 
 class Kitti360(Drive):
     """A KITTI-360 drive as a `LidarSequence`."""
 
     def __init__(self, path: Path, drive: str) -> None:
-        """Read stamps and calibration of a drive.
-
-        Args:
-            path: Folder that contains data_3d_raw/.
-            drive: Name of the drive, such as ``2013_05_28_drive_0000_sync``.
-
-        Raises:
-            InputError: The drive has no sweeps, or its stamps or the calibration of cameras with
-                images are missing or malformed.
-        """
+        """Read stamps and calibration of a drive, in the folder that contains data_3d_raw/."""
         velodyne = path / "data_3d_raw" / drive / "velodyne_points"
         around = path / "data_2d_raw" / drive
         images = {name: around / name / folder for name, folder in _FOLDERS.items()}

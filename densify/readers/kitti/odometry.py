@@ -45,34 +45,20 @@ _NUM_ROUNDS = 3  # the azimuth changes by degrees at most
 
 
 def open_recording(path: Path, scene: str | None) -> KittiOdometry:
-    """Open a KITTI odometry sequence; sweeps and images are read later, on request.
-
-    Args:
-        path: Folder of a sequence, folder of sequences, or folder that contains ``sequences/``.
-        scene: Number of the sequence, such as ``00``; None if ``path`` has a single sequence.
-    """
+    """Open a sequence by its folder, or by a folder of sequences and its number, such as 00."""
     if (path / "velodyne").is_dir() and scene is None:
         return KittiOdometry(path)
     folder = path / "sequences" if (path / "sequences").is_dir() else path
     names = sorted(found.parent.name for found in folder.glob("*/velodyne"))
-    if not names:
-        raise InputError(
-            f"{path}: no KITTI odometry; expected a folder with velodyne/, or sequences/ with such "
-            f"folders"
-        )
-    return KittiOdometry(folder / checks.chosen_scene("kitti-odometry", path, scene, names))
+    none = "no KITTI odometry; expected a folder with velodyne/, or sequences/ with such folders"
+    return KittiOdometry(folder / checks.chosen_scene("kitti-odometry", path, scene, names, none))
 
 
 class KittiOdometry(Drive):
     """A KITTI odometry sequence as a `LidarSequence`."""
 
     def __init__(self, path: Path) -> None:
-        """Read the stamps and the calibration in the folder of a sequence.
-
-        Raises:
-            InputError: There are no sweeps, or the stamps or the calibration of existing images are
-                missing or malformed.
-        """
+        """Read the stamps and the calibration in the folder of a sequence."""
         images = {p.name: p for p in sorted(path.glob("image_[0-3]"))}
         super().__init__(path.resolve().name, path, path / "velodyne", path, images)
         self._times = path / "times.txt"

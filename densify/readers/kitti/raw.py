@@ -44,21 +44,15 @@ def open_recording(path: Path, scene: str | None) -> KittiRaw:
 class KittiRaw(Drive):
     """A KITTI raw drive as a `LidarSequence`.
 
-    The stamp of a sweep is the middle of the revolution (``velodyne_points/timestamps.txt``, or k
-    times 100 ms). The firing time of a point follows from its azimuth, ``timestamps_start.txt`` and
-    ``timestamps_end.txt``; if a stamp file is missing, ``offset_ns`` is None. Poses come from
-    ``oxts/``. The world is the frame of the GPS/IMU unit at the first oxts file.
+    The stamp of a sweep is the middle of the revolution (``velodyne_points/timestamps.txt``, or
+    from its start and end, or k times 100 ms). The firing time of a point follows from its azimuth,
+    ``timestamps_start.txt`` and ``timestamps_end.txt``; if one of them is missing, ``offset_ns`` is
+    None. Poses come from ``oxts/``. The world is the frame of the GPS/IMU unit at the first oxts
+    file.
     """
 
     def __init__(self, path: Path | str) -> None:
-        """Read calibration and stamps; everything else is read on request.
-
-        Args:
-            path: Folder of the drive, ``.../2011_09_26/2011_09_26_drive_0013_sync``.
-
-        Raises:
-            InputError: The drive has no sweeps, or calibration or stamps are malformed.
-        """
+        """Read calibration and stamps of a drive's folder; everything else is read on request."""
         drive = Path(path)
         velodyne = drive / "velodyne_points"
         cameras = _read_cameras(drive)
@@ -68,14 +62,22 @@ class KittiRaw(Drive):
             name: velodyne / f"timestamps{name}.txt" for name in ("", "_start", "_end")
         }
         self._recorded = {n: read_stamps(p) for n, p in self._stamp_files.items() if p.exists()}
+        self._missing = [p.name for n, p in self._stamp_files.items() if n not in self._recorded]
+        if self._missing == [self._stamp_files[""].name]:
+            ends_ns = self._recorded["_end"]
+            self._recorded[""] = {
+                frame: (start_ns + ends_ns[frame]) // 2
+                for frame, start_ns in self._recorded["_start"].items()
+                if frame in ends_ns
+            }
         self._oxts = checks.numbered_files(drive / "oxts" / "data", ".txt")
         self.cameras = cameras
         self._exposed_ns = {name: self._exposures_ns(name) for name in self._image_files}
 
     def gaps(self) -> list[str]:
         """Return missing files and what is assumed instead, a sentence each."""
-        missing = [p.name for n, p in self._stamp_files.items() if n not in self._recorded]
-        told = [f"{self.where / 'velodyne_points'} has no {', '.join(missing)}"] * bool(missing)
+        velodyne = self.where / "velodyne_points"
+        told = [f"{velodyne} has no {', '.join(self._missing)}"] * bool(self._missing)
         if "" not in self._recorded:
             told.append(f"{self.where}: sweeps are taken for 100 ms apart")
         left_out = [name for name in _camera_folders(self.where) if name not in self.cameras]
@@ -86,7 +88,7 @@ class KittiRaw(Drive):
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep; raise InputError if the frame has no stamp."""
-        return self._recorded_ns("", frame) if self._recorded else frame * NOMINAL_PERIOD_NS
+        return self._recorded_ns("", frame) if "" in self._recorded else frame * NOMINAL_PERIOD_NS
 
     def _recorded_ns(self, kind: str, frame: int) -> int:
         return checks.of_frame(self._recorded[kind], frame, "stamp", self._stamp_files[kind])
@@ -106,11 +108,7 @@ class KittiRaw(Drive):
         return Returns(points, intensity, offset_ns)
 
     def _exposures_ns(self, camera: str) -> dict[int, int]:
-        """Return the exposure times of the camera's existing images, by frame number.
-
-        The exposure time is the recorded stamp minus `KITTI_TRIGGER_LATENCY_NS`, or the reference
-        time of the sweep if no stamp is recorded.
-        """
+        """Return the exposure times of the camera's existing images, by frame number."""
         path, numbers = self.where / camera / "timestamps.txt", self._image_files[camera]
         exposed_ns = self._recorded.get("", {f: f * NOMINAL_PERIOD_NS for f in numbers})
         if path.exists():
@@ -119,11 +117,8 @@ class KittiRaw(Drive):
         return {frame: exposed_ns[frame] for frame in numbers if frame in exposed_ns}
 
     def _pose(self, frame: int) -> Float:
-        """Return the (4,4) T_world_lidar, interpolated between oxts records.
-
-        The oxts record of a frame number is up to 20 ms away from the sweep, 0.3 m at 15 m/s.
-        Without usable stamps the record's own pose is returned.
-        """
+        """Return the (4,4) T_world_lidar, between oxts records if they have stamps."""
+        # The frame's own record is up to 20 ms away from the sweep, 0.3 m at 15 m/s.
         if not self._oxts:
             return super()._pose(frame)
         checks.of_frame(self._oxts, frame, "oxts record", self.where)
@@ -157,10 +152,7 @@ class KittiRaw(Drive):
 
 
 def _beside(drive: Path) -> Path:
-    """Return the folder of the calibration files, the parent of the drive.
-
-    If the drive is a link and its parent has no calibration, return the parent of its target.
-    """
+    """Return the folder of the calibration: the drive's parent, or that of the target of a link."""
     named, target = drive.absolute().parent, drive.resolve().parent
     return named if any(named.glob("calib_*.txt")) else target
 
@@ -170,11 +162,7 @@ def _camera_folders(drive: Path) -> list[str]:
 
 
 def _read_cameras(drive: Path) -> dict[str, Camera]:
-    """Return the rectified cameras, by name, that have images and a calibration.
-
-    A drive without folders of images gets all calibrated cameras. ``T_cam_lidar`` is the product of
-    the camera's offset in ``P_rect``, camera 0's rectification and ``calib_velo_to_cam``.
-    """
+    """Return the calibrated cameras with images by name; all if there are no folders of images."""
     folder, names = _beside(drive), _camera_folders(drive)
     files = [folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"]
     if not names and not all(file.is_file() for file in files):

@@ -25,7 +25,6 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.config.errors import InputError
 from densify.config.file_content import read_text
 from densify.geometry import poses
 from densify.geometry.types import Bool, Boxes, BoxView, Camera, Float
@@ -47,16 +46,10 @@ _T_CAM_UPRIGHT = np.array(  # from x right, y forward, z up
 
 
 def open_recording(path: Path, scene: str | None) -> KittiTracking:
-    """Open a KITTI tracking sequence; sweeps and images are read later, on request.
-
-    Args:
-        path: Folder that contains velodyne/.
-        scene: Name of the sequence, such as ``0000``; None if there is a single sequence.
-    """
+    """Open a sequence, by its name such as ``0000``, of the folder that contains velodyne/."""
     names = sorted(p.name for p in (path / "velodyne").glob("*") if p.is_dir())
-    if not names:
-        raise InputError(f"{path}: no KITTI tracking; expected folders such as velodyne/0000 in it")
-    return KittiTracking(path, checks.chosen_scene("kitti-tracking", path, scene, names))
+    none = "no KITTI tracking; expected folders such as velodyne/0000 in it"
+    return KittiTracking(path, checks.chosen_scene("kitti-tracking", path, scene, names, none))
 
 
 class KittiTracking(Drive):
@@ -66,12 +59,7 @@ class KittiTracking(Drive):
     """
 
     def __init__(self, path: Path, scene: str) -> None:
-        """Read the calibration of a sequence, in the folder ``path`` that contains velodyne/.
-
-        Raises:
-            InputError: There are no sweeps, or the calibration of existing images is missing or
-                malformed.
-        """
+        """Read the calibration of a sequence, in the folder ``path`` that contains velodyne/."""
         images = {folder.name: folder / scene for folder in sorted(path.glob("image_0[0-3]"))}
         name = f"{path.resolve().name}/{scene}"
         super().__init__(name, path, path / "velodyne" / scene, path, images)
@@ -107,9 +95,6 @@ class KittiTracking(Drive):
 
         Objects are labelled only in view of image_02; without images its smallest size is assumed.
         A box is where the object was when the scanner faced it, at the box's ``offset_ns``.
-
-        Raises:
-            InputError: Labels or the calibration are missing or malformed.
         """
         self.check_frame(frame)
         path = self.where / "label_02" / self._scene_file
@@ -144,14 +129,9 @@ class KittiTracking(Drive):
 
 
 def read_labels(path: Path) -> tuple[Float, Bool]:
-    """Read a label file with n lines.
+    """Return the (n,16) numbers of a label file's lines, and an (n,) mask of ``DontCare`` lines.
 
-    Returns:
-        (n,16) numbers of the lines, without the type and the score; (n,) mask, True for
-        ``DontCare`` rectangles, in which objects have no boxes.
-
-    Raises:
-        InputError: A line is malformed.
+    Numbers are without type and score. Objects in ``DontCare`` rectangles have no boxes.
     """
     rows, is_area = [], []
     for number, line in enumerate(read_text(path).splitlines(), 1):

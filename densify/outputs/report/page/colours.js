@@ -15,11 +15,9 @@ const DISTINCT = [
   [0, 114, 178], [213, 94, 0], [204, 121, 167], [200, 200, 200],
 ];
 const REASONS = {
-  1: ["seen through by the key sweep", [213, 94, 0]],
   3: ["occluded by another surface", [86, 180, 233]],
-  5: ["too few sweeps agree", [240, 228, 66]],
+  5: ["the key sweep does not agree", [240, 228, 66]],
   6: ["too close to a depth discontinuity", [0, 158, 115]],
-  7: ["behind a car window", [204, 121, 167]],
 };
 const EARLIER = [[255, 250, 240], [86, 180, 233], [0, 84, 150]];
 const LATER = [[255, 250, 240], [230, 159, 0], [150, 60, 0]];

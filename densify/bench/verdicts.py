@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: MIT
+"""Judge a change by figures of many keys, each known with its luck.
+
+Luck is the standard deviation σ of a figure when the poses of a window move by 2 mm and 0.01°. Two
+maps are compared key by key at equal coverage: the least confident pixels of either map are left
+out until both cover the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from densify.geometry.types import Bool, Float
+
+_NUM_STEPS = 200  # of a curve
+_BEYOND = 2.0  # standard deviations of luck, and standard errors between keys
+
+Curve = Mapping[str, Any]
+"""Outliers of a map over its coverage.
+
+``num``: number of pixels with a true depth. ``covered``: number of those with a depth.
+``outliers``: number of outliers among the most certain 0, 0.5, … 100 % of the covered pixels.
+"""
+
+
+def curve(num_true: int, confidence: Float, outliers: Bool) -> Curve:
+    """Return the outliers over the coverage.
+
+    Args:
+        num_true: Number of pixels with a true depth.
+        confidence: (K,) confidence of the covered pixels with a true depth.
+        outliers: (K,) True at outliers. Pixels of equal confidence share their outliers evenly.
+    """
+    _, level, size = np.unique(-confidence, return_inverse=True, return_counts=True)
+    of_level = np.bincount(level, outliers, len(size))
+    ends, sums = np.append(0, size.cumsum()), np.append(0, of_level.cumsum())
+    at = np.linspace(0, len(confidence), _NUM_STEPS + 1)
+    made = np.interp(at, ends, sums)
+    return {"num": num_true, "covered": len(confidence), "outliers": np.round(made, 2).tolist()}
+
+
+def coverage(of: Curve) -> float:
+    """Return the share of the true pixels with a depth in percent."""
+    return 100 * of["covered"] / max(of["num"], 1)
+
+
+def outliers_at(of: Curve, covered_percent: float) -> float:
+    """Return the share of outliers in percent among the most certain pixels of this coverage."""
+    num = covered_percent / 100 * of["num"]
+    steps = np.linspace(0, of["covered"], len(of["outliers"]))
+    return float(100 * np.interp(num, steps, of["outliers"]) / max(num, 1))
+
+
+def change(figure: str, before: Any, now: Any) -> dict[str, float]:
+    """Return name -> change of a figure: of a curve, its outliers at equal coverage and coverage.
+
+    ``before`` and ``now`` are both a `Curve`, a number, or numbers of repeated draws.
+    """
+    if isinstance(before, Mapping):
+        covered = min(coverage(before), coverage(now))
+        off = outliers_at(now, covered) - outliers_at(before, covered)
+        return {f"{figure} outliers": off, f"{figure} coverage": coverage(now) - coverage(before)}
+    return {figure: float(np.mean(now) - np.mean(before))}
+
+
+class Verdict(NamedTuple):
+    """The change of one figure over the keys of a group.
+
+    Attributes:
+        figure: Name of the figure, with its unit.
+        keys: Names of the keys.
+        before: Mean over the keys before the change.
+        now: Mean over the keys now.
+        change: Mean change; of outliers, at equal coverage.
+        error: Standard error of the mean change between keys; NaN with one key.
+        luck: Standard deviation of the mean change by luck.
+        worst: Name of the key with the worst change, and that change.
+        word: "better", "worse" or "no difference".
+    """
+
+    figure: str
+    keys: Sequence[str]
+    before: float
+    now: float
+    change: float
+    error: float
+    luck: float
+    worst: tuple[str, float]
+    word: str
+
+
+def verdicts(
+    before: Mapping[str, Any], now: Mapping[str, Any], luck: Mapping[str, Any]
+) -> Iterator[Verdict]:
+    """Yield the verdict of each figure over all keys that both measurements have.
+
+    Args:
+        before: Name of the key -> name of the figure -> `Curve`, number, or numbers of draws.
+        now: The same.
+        luck: Name of the key -> name of the change (see `change`) -> standard deviation.
+    """
+    rows: dict[str, dict[str, tuple[float, float, float, float]]] = defaultdict(dict)
+    for key in [k for k in before if k in now]:
+        for figure in [f for f in before[key] if f in now[key]]:
+            was, value = before[key][figure], now[key][figure]
+            for name, off in change(figure, was, value).items():
+                sigma = luck.get(key, {}).get(name, 0.0)
+                if isinstance(was, Sequence):
+                    sigma = float(np.hypot(np.std(was), np.std(value)) / math.sqrt(2 * len(was)))
+                rows[name][key] = _plain(name, was), _plain(name, value), off, sigma
+    for name, row in rows.items():
+        was, value, off, sigma = np.array(list(row.values())).T
+        bad = off if _is_cost(name) else -off
+        error = float(off.std(ddof=1) / math.sqrt(len(off))) if len(off) > 1 else math.nan
+        # Both measurements have luck.
+        by_luck = float(np.sqrt(2 * (sigma**2).sum()) / len(off))
+        beyond = _BEYOND * max(by_luck, 0.0 if math.isnan(error) else error)
+        mean, worst = float(off.mean()), list(row)[int(bad.argmax())]
+        word = "no difference"
+        if abs(mean) > beyond:
+            word = "worse" if bad.mean() > 0 else "better"
+        yield Verdict(
+            name,
+            list(row),
+            float(was.mean()),
+            float(value.mean()),
+            mean,
+            error,
+            by_luck,
+            (worst, float(row[worst][2])),
+            word,
+        )
+
+
+def beyond_luck(
+    before: Mapping[str, Any], now: Mapping[str, Any], luck: Mapping[str, float], sigmas: float
+) -> dict[str, float]:
+    """Return the changes of one key's figures for the worse beyond ``sigmas`` of both lucks."""
+    found = {}
+    for figure in before:
+        for name, off in change(figure, before[figure], now[figure]).items():
+            bad = off if _is_cost(name) else -off
+            if bad > sigmas * math.sqrt(2) * luck[name]:
+                found[name] = off
+    return found
+
+
+def _is_cost(name: str) -> bool:
+    """Return True if less of a figure is better."""
+    return not name.endswith(("coverage", "recall %"))
+
+
+def _plain(name: str, value: Any) -> float:
+    """Return a figure as a number: of a curve, its coverage or all its outliers in percent."""
+    if isinstance(value, Mapping):
+        covered = coverage(value)
+        return covered if name.endswith("coverage") else outliers_at(value, covered)
+    return float(np.mean(value))

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""Results of two recordings never share a folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from densify.config.errors import InputError
+from densify.outputs.export import export_run
+from densify.outputs.recording_folder import check_recording, default_folder, is_same
+from densify.readers.depth_trees import pair_depth_files
+from tests.command import exit_code, files_in, refused
+from tests.dataset_scenes import BORDER, DRIVE, copy_drive
+from tests.exported import write_views
+
+STREET = "street?sensor=vlp16"
+VERBS = {
+    "run": ["--key", "120", "--overwrite"],
+    "compare": ["--key", "120", "--overwrite"],
+    "flow": ["--all", "--overwrite"],
+    "dataset": [],
+}
+
+
+def test_each_recording_has_its_folder() -> None:
+    names = {
+        "street:street?seed=0&sensor=hdl64": "street",
+        "street:street?seed=1&sensor=hdl64": "street-street_seed-1_sensor-hdl64",
+        DRIVE: DRIVE,
+    }
+    for name, folder in names.items():
+        assert default_folder(name) == Path("densify-out") / folder
+
+
+def test_runs_go_there_by_default(border_drive: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(border_drive.parent)
+    monkeypatch.setattr("densify.outputs.recording_folder.RESULTS", tmp_path / "densify-out")
+    options = ["--key", BORDER, "--window", "1", "--method", "none"]
+    options += ["--set", "register.source=dataset"]
+    assert exit_code("run", DRIVE, *options) == 0
+    folder = tmp_path / "densify-out" / DRIVE / f"{BORDER:06d}"
+    record = yaml.safe_load((folder / "run.yaml").read_text("utf-8"))
+    # The path holds in every working folder.
+    assert (record["recording"], record["data"]) == (DRIVE, str(border_drive))
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("held", ["run.yaml", "compare.json", "dataset.json"])
+def test_a_folder_of_another_recording_is_refused(
+    verb: str, held: str, tmp_path: Path, capsys
+) -> None:
+    out = tmp_path / "out"
+    table = {"recording": DRIVE, "data": "/data/kitti"}
+    path = out / "000007" / held
+    if held == "dataset.json":
+        path, table = out / held, {"drives": {DRIVE: {"data": "/data/kitti"}}}
+    path.parent.mkdir(parents=True)
+    path.write_text(yaml.safe_dump(table) if held == "run.yaml" else json.dumps(table))
+    before = files_in(out)
+    line = refused(capsys, 2, verb, STREET, *VERBS[verb], "--out", out)
+    assert str(out) in line and files_in(out) == before
+    if verb != "dataset":  # which takes no folder of runs at all
+        assert DRIVE in line and "/data/kitti" in line and "another recording" in line
+
+
+def test_flow_files_name_their_recording(tmp_path: Path, capsys) -> None:
+    np.savez(tmp_path / "000001_000002.npz", recording=np.array("other"))
+    line = refused(capsys, 2, "flow", STREET, "--all", "--overwrite", "--out", tmp_path)
+    assert "000001_000002.npz is of another recording, other" in line
+
+
+def test_which_recordings_are_the_same(tmp_path: Path) -> None:
+    first, second = tmp_path / "a" / "drive", tmp_path / "b" / "drive"
+    for folder in (first, second):
+        (folder / "sweeps").mkdir(parents=True)
+    assert is_same("drive", str(first), "drive", str(first / "sweeps"))
+    assert is_same("drive", str(first), "drive", f"folder:{first}")
+    assert is_same("drive", str(first), "drive", str(tmp_path / "moved" / "drive"))
+    assert not is_same("drive", str(first), "drive", str(second))
+    assert not is_same("drive", str(first), "other", str(first))
+
+
+def test_damaged_files_and_older_results_do_not_hinder(tmp_path: Path) -> None:
+    for name, text in (("000001", "data: ["), ("000002", "data: street\nkey: 2\n")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.yaml").write_text(text)
+    check_recording(tmp_path, "street", "street", [1, 2])
+    check_recording(tmp_path / "new", "street", "street")
+
+
+def test_a_set_goes_on_with_its_recording_alone(border_drive: Path, tmp_path: Path, capsys):
+    out, options = tmp_path / "out", ["--method", "none", "--keys", "39:40"]
+    assert exit_code("dataset", border_drive, *options, "--out", out) == 0
+    capsys.readouterr()
+    same = copy_drive(border_drive, tmp_path / "2011_09_26")
+    line = refused(capsys, 2, "dataset", same, *options, "--out", out)
+    assert str(border_drive) in line and str(same) in line
+
+
+def test_an_export_within_a_run_is_no_second_prediction(tmp_path: Path) -> None:
+    run, _ = write_views(tmp_path, {"image_02": "plain"})
+    export_run(run, "kitti")
+    key = int(run.name)
+    pairs = pair_depth_files(run.parent, run.parent)
+    assert [pair.predicted for pair in pairs.pairs] == [run / "depth" / "image_02.png"]
+    exported = run / "export" / "kitti"
+    (pair,) = pair_depth_files(exported, exported).pairs
+    assert pair.predicted.name == f"{key:010d}.png"
+
+
+def test_a_set_of_maps_names_the_layout_that_exports(tmp_path: Path) -> None:
+    (tmp_path / "dataset.json").write_text("{}")
+    for to in ("npy", "kitti"):
+        with pytest.raises(InputError, match="--layout densify to export it"):
+            export_run(tmp_path, to)
