@@ -92,61 +92,37 @@ def thin(points: Float, voxel_m: float) -> Any:
     return small_gicp.voxelgrid_sampling(points, voxel_m)
 
 
-def align(target: Surface, source: Any, T_target_source: Float, match_m: float) -> Alignment:
-    """Align a source with a target surface, by generalized ICP or point to plane.
+def make_map() -> Any:
+    """Return an empty map of surfaces, a ``GaussianVoxelMap`` of small_gicp.
+
+    Each cubic voxel, 1 m wide, holds the mean and the covariance of its points (Koide et al.,
+    "Voxelized GICP for Fast and Accurate 3D Point Cloud Registration", ICRA 2021).
+    """
+    return small_gicp.GaussianVoxelMap(_LEAF_M)
+
+
+def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> Alignment:
+    """Align a source with a target, by generalized ICP or point to plane.
 
     Args:
-        target: Surface in its own frame.
-        source: A `Surface`, or points without normals (`thin`), in its own frame.
+        target: A `Surface` in its own frame, or a map (`make_map`) of surfaces.
+        source: A `Surface`, or points without covariances (`thin`), in its own frame.
         T_target_source: (4,4) initial pose of the source in the target's frame.
         match_m: Greatest distance in metres between corresponding points.
     """
     is_surface = isinstance(source, Surface)
     points = source.points if is_surface else source
-    found = small_gicp.align(
-        target.points,
-        points,
-        target.tree,
-        T_target_source,
-        registration_type="GICP" if is_surface else "PLANE_ICP",
-        max_correspondence_distance=match_m,
-    )
+    options: dict[str, Any] = {"max_correspondence_distance": match_m, "num_threads": 1}
+    if isinstance(target, Surface):
+        kind = "GICP" if is_surface else "PLANE_ICP"
+        found = small_gicp.align(
+            target.points, points, target.tree, T_target_source, kind, **options
+        )
+    else:
+        found = small_gicp.align(target, points, T_target_source, **options)
     num, per_m2 = max(int(found.num_inliers), 1), _NORMAL_M**2 if is_surface else 1.0
     overlap = found.num_inliers / max(int(points.size()), 1)
     return Alignment(np.asarray(found.T_target_source), overlap, np.asarray(found.H) * per_m2 / num)
-
-
-class SurfaceMap:
-    """A map of several surfaces in one common frame, the map frame.
-
-    Each cubic voxel, 1 m wide, holds the mean and the covariance of its points (Koide et al.,
-    "Voxelized GICP for Fast and Accurate 3D Point Cloud Registration", ICRA 2021).
-    """
-
-    def __init__(self) -> None:
-        """Begin with an empty map."""
-        self._voxels = small_gicp.GaussianVoxelMap(_LEAF_M)
-
-    def insert(self, surface: Surface, T_map_surface: Float) -> None:
-        """Add a surface to the map; ``T_map_surface`` (4,4) is its pose in the map frame."""
-        self._voxels.insert(surface.points, T_map_surface)
-
-    def align(self, source: Surface, T_map_source: Float, match_m: float) -> tuple[Float, float]:
-        """Align a surface with the map by generalized ICP.
-
-        Args:
-            source: Surface in its own frame.
-            T_map_source: (4,4) initial pose of the surface in the map frame.
-            match_m: Greatest distance in metres between corresponding points.
-
-        Returns:
-            The (4,4) pose in the map frame, and the share of points with a match in the map.
-        """
-        found = small_gicp.align(
-            self._voxels, source.points, T_map_source, max_correspondence_distance=match_m
-        )
-        overlap = found.num_inliers / max(int(source.points.size()), 1)
-        return np.asarray(found.T_target_source), overlap
 
 
 class Misfit(NamedTuple):

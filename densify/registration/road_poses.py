@@ -21,11 +21,12 @@ from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Sweep
-from densify.registration.alignment import Alignment, Surface, SurfaceMap, align, subsample
+from densify.registration.alignment import Alignment, Surface, align, make_map, subsample
 from densify.registration.deskew import deskew_sweep
 from densify.registration.trajectory import MIN_NUM_POINTS, MIN_OVERLAP, find_jump
 
 _CHAIN_MATCH_M = 2.0
+_FEW_POINTS = 15_000  # of a sweep, which find its pose in the chain
 _MAP_NS = 550_000_000  # known sweeps within this time make the first map
 _LONGEST_GAP_S = 0.4  # greatest time between two sweeps of the chain
 
@@ -65,10 +66,10 @@ def follow_road(
     Yields:
         The raw sweep with its pose, and its surface, deskewed, in its lidar frame.
     """
-    chain, T_world_lidar, last_ns = SurfaceMap(), known[-1].T_world_lidar, known[-1].sweep.stamp_ns
+    chain, T_world_lidar, last_ns = make_map(), known[-1].T_world_lidar, known[-1].sweep.stamp_ns
     for s, surface in zip(known, surfaces, strict=True):
         if abs(s.sweep.stamp_ns - last_ns) <= _MAP_NS:
-            chain.insert(surface, s.T_world_lidar)
+            chain.insert(surface.points, s.T_world_lidar)
     is_backwards = len(frames) > 0 and stamp_ns[0] < last_ns
     twist = known[-1].twist_before if is_backwards else known[-1].twist_after
     speed_m_s, travel_m = float(np.linalg.norm(twist[3:])), 0.0
@@ -84,17 +85,23 @@ def follow_road(
         if len(sweep) < MIN_NUM_POINTS:
             return
         step_s, twist_before = (time_ns - last_ns) * 1e-9, twist
-        deskewed = deskew_sweep(subsample(sweep), np.eye(4), twist, twist).sweep
-        T_guess, surface = T_world_lidar @ poses.exp(twist * step_s), Surface.of(deskewed.points)
-        T_found, overlap = chain.align(surface, T_guess, _CHAIN_MATCH_M)
+        T_guess = T_world_lidar @ poses.exp(twist * step_s)
+        surface = _surface(subsample(sweep, _FEW_POINTS), twist)
+        T_found, overlap, _ = align(chain, surface, T_guess, _CHAIN_MATCH_M)
         twist = poses.twist_between(T_world_lidar, T_found, step_s)
         if overlap < MIN_OVERLAP or find_jump(twist, twist_before, abs(step_s)):
             return
-        chain.insert(surface, T_found)
+        surface = _surface(subsample(sweep), twist)  # with the velocity that was found
+        chain.insert(surface.points, T_found)
         T_world_lidar, last_ns = T_found, time_ns
         speed_m_s = float(np.linalg.norm(twist[3:]))
         travel_m += speed_m_s * abs(step_s)
         yield RegisteredSweep(sweep, T_world_lidar, twist, twist), surface
+
+
+def _surface(sweep: Sweep, twist: Float) -> Surface:
+    """Return the surface of a raw sweep, deskewed by a (6,) velocity (rad/s, m/s)."""
+    return Surface.of(deskew_sweep(sweep, np.eye(4), twist, twist).sweep.points)
 
 
 class Relaxed(NamedTuple):

@@ -22,7 +22,7 @@ from densify.registration.odometry import search_twist
 
 _REACH_NS = 1_050_000_000
 _NUM_IN_REACH = 10  # sweeps of the last second; a larger number is thinned evenly
-_RENEWED_NS = 150_000_000  # age at which a surface is replaced by one with the newer sweeps
+_RENEWED = 0.15  # age at which a surface is replaced, as a share of the time that it covers
 _START_NS = 850_000_000  # time in which the start speed is found
 _NUM_START = 3  # sweeps of the first surfaces, at their expected poses
 _NUM_POINTS = 15_000  # number of points of a sweep
@@ -136,7 +136,8 @@ class _SweepRow:
     def _surface_of(self, i: int, others: range) -> tuple[Surface, Float]:
         """Return the surface of the other sweeps, and its (4,4) pose, near sweep i."""
         time_ns = int(self.stamp_ns[i])
-        if self._surface is None or abs(time_ns - self._surface[2]) > _RENEWED_NS:
+        covered_ns = abs(time_ns - int(self.stamp_ns[others[-1]]))
+        if self._surface is None or abs(time_ns - self._surface[2]) > _RENEWED * covered_ns:
             T_world_surface = self._T[i].copy()
             chosen = others[:: max(1, round(len(others) / _NUM_IN_REACH))]
             around = np.concatenate([self._points[j] for j in chosen])
