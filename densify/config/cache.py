@@ -30,7 +30,7 @@ T = TypeVar("T")
 _log = logging.getLogger("densify")
 # Raise a step's number when its result for the same inputs changes. Steps build on each other,
 # and an entry depends on all of them.
-_STEP_VERSIONS = "digests 1, registration 2, motion 12, far 4"
+_STEP_VERSIONS = "digests 1, registration 2, motion 12, far 5"
 _MOST_ENTRIES = 10_000
 
 
