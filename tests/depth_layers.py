@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from densify.depth.image_alignment import lab
+from densify.depth.boundary_pixels import lab
 from densify.depth.layers import Layers
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Boundary pixels by the image: panels before a wall, known exactly, and wrong images."""
+"""Boundary pixels by the image: panels before a wall, known exactly."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from densify.depth import boundary_pixels as stage
-from densify.depth.boundary_pixels import Voters, accept_boundary_pixels, vote
-from densify.depth.image_alignment import align_image, lab
+from densify.depth.boundary_pixels import Voters, accept_boundary_pixels, lab, vote
 from densify.depth.neighbours import DIRECTIONS, first_known
 from tests.depth_layers import layers_of
 
@@ -56,7 +54,6 @@ def test_rims_are_kept_on_the_side_where_the_image_has_them():
     made = decided(layers, image)
     rims, kept = layers.rim_m > 0, made.depth_m > 0
     right = np.isclose(layers.rim_m, truth)
-    assert not made.warnings
     assert (kept & rims & right).sum() > 0.15 * (rims & right).sum()
     assert (kept & rims & ~right).sum() < 0.04 * (rims & ~right).sum()
     assert np.array_equal(made.depth_m[layers.depth_m > 0], layers.depth_m[layers.depth_m > 0])
@@ -66,69 +63,16 @@ def test_rims_are_kept_on_the_side_where_the_image_has_them():
 def test_without_an_image_rims_are_left_out():
     layers, image, _ = scene()
     for made in (decided(layers, None), decided(layers, image, "strict")):
-        assert np.array_equal(made.depth_m, layers.depth_m) and not made.warnings
-
-
-@pytest.mark.parametrize("shift", [1, 3, 7])
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_shifted_image_does_no_harm(shift, axis):
-    """Either it is noticed, or hardly any wrong pixel is added."""
-    layers, image, truth = scene()
-    made = decided(layers, np.roll(image, shift, axis))
-    told = ["project.rims=strict"]
-    if shift < 5:
-        told.append(f"{shift} px {('too low', 'to the right')[axis]} of where depth has edges")
-    if shift > 2:  # right images are moved by as much
-        assert len(made.warnings) == 1 and any(text in made.warnings[0] for text in told)
-    if made.warnings and told[0] in made.warnings[0]:
         assert np.array_equal(made.depth_m, layers.depth_m)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_an_image_that_lies_a_little_aside_adds_hardly_any_wrong_pixel(axis):
+    layers, image, truth = scene()
+    made = decided(layers, np.roll(image, 2, axis))
     wrong = (made.depth_m > 0) & ~np.isclose(made.depth_m, truth)
     assert wrong.sum() < 0.005 * (made.depth_m > 0).sum()
     assert wrong.sum() < 0.1 * ((layers.rim_m > 0) & ~np.isclose(layers.rim_m, truth)).sum()
-
-
-def spoiled(image):
-    rng = np.random.default_rng(1)
-    return {
-        "noise": rng.integers(0, 256, image.shape).astype(np.uint8),
-        "black": np.zeros_like(image),
-        "another": scene(5)[1][::-1, ::-1],
-    }
-
-
-@pytest.mark.parametrize("how", ["noise", "black", "another"])
-def test_an_image_that_does_not_belong_is_noticed(how):
-    layers, image, _ = scene()
-    made = decided(layers, spoiled(image)[how])
-    assert made.warnings and np.array_equal(made.depth_m, layers.depth_m)
-
-
-def pictured(image, layers):
-    return align_image(replace(layers, lab=lab(image)))
-
-
-@pytest.mark.parametrize(("right", "down"), [(0, 0), (-3, 0), (2, 2)])
-def test_an_image_that_lies_aside_is_moved_back(right, down):
-    layers, image, _ = scene()
-    straight, *unmoved = pictured(image, layers)
-    moved, *by_px = pictured(np.roll(image, (down, right), (0, 1)), layers)
-    assert (unmoved, by_px) == ([0, 0], [right, down])
-    inside = (slice(8, -8), slice(8, -8))
-    off = [
-        np.abs(np.roll(moved, by, axis)[inside] - straight[inside]).mean()
-        for by, axis in ((0, 0), (1, 0), (-1, 0), (1, 1), (-1, 1))
-    ]
-    assert np.argmin(off) == 0
-
-
-@pytest.mark.parametrize("blur_px", [0.5, 2.0])
-def test_a_blurred_image_is_noticed(blur_px):
-    layers, image, _ = scene()
-    blurred = np.stack(
-        [ndimage.gaussian_filter(c.astype(float), blur_px) for c in np.moveaxis(image, 2, 0)], 2
-    ).astype(np.uint8)
-    made = decided(layers, blurred)
-    assert bool(made.warnings) == (blur_px > 1)
 
 
 def vote_twin(pixel, depth_m, known_m, tilt, colours, gap_px, surely):

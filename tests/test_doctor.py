@@ -15,12 +15,12 @@ from densify.bench import doctor as bench
 from densify.config import Config
 from densify.config.errors import InputError
 from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, clocks, paths, points, rings
-from densify.doctor.edge_fit import best_fit, turned
 from densify.doctor.paths import changed
 from densify.geometry import poses
 from densify.geometry.types import RegisteredSweep, Sweep, Trajectory
 from densify.readers.street import Street
 from densify.readers.timeline import Timeline
+from densify.scores.edge_fit import best_fit, turned
 from tests.command import exit_code
 from tests.recording_faults import FAULTS, Faulty
 

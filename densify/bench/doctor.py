@@ -14,11 +14,11 @@ from densify.config import Config
 from densify.config.errors import InputError
 from densify.doctor import Sample, Verdict
 from densify.doctor.cameras import camera_views, check_calibration
-from densify.doctor.edge_fit import Silhouettes, View, turned
 from densify.doctor.findings import Finding
 from densify.doctor.paths import check_poses
 from densify.geometry.types import Camera, Float, LidarSequence, Progress
 from densify.readers.recorded_poses import PoseTrack
+from densify.scores.edge_fit import Silhouettes, View, turned
 
 _TURNS_DEG, _SHIFTS_M = (0.5, 1.0, 2.0), (0.02, 0.05, 0.1)
 _CLOCKS_S, _SCALES, _CLIMBS_M_S = (0.01, 0.03, 0.1), (0.01, 0.03, 0.1), (0.2,)

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.depth.image_alignment import align_image
 from densify.depth.layers import Layers
 from densify.depth.neighbours import DIRECTIONS, NONE, extended, first_known, offset
 from densify.geometry.arrays import Bool, Float32, Int
@@ -26,7 +26,8 @@ from densify.geometry.compiled import Kernel, inlined
 MOST_CONFIDENCE = 0.2
 """Greatest confidence of a boundary pixel, least confidence of any other measured pixel."""
 _LEAST_SHARE = 0.97  # share of the votes for a pixel that is kept
-_FEW = 100  # number of boundary pixels below which the image is not aligned
+_BLUR_PX = 0.6  # standard deviation; it removes noise and the pattern of the colour filter
+_LEAST_LIGHT = 70.0  # L of the lightest hundredth; a darker image is lightened
 _SUREST = 2.5  # greatest -log10 of the share of the votes against
 VOTERS_REACH = 6.0
 """Greatest distance of a voting pixel, in spacings of neighbouring rays."""
@@ -38,64 +39,44 @@ _STRIDE = 3.0  # number of compared colours per spacing of rays, on the path to 
 _DOUBT = 0.04  # weight of a constant vote, half of it for the depth and half against
 _ASIDE = 0.6  # tested shift of the image, in spacings of neighbouring rays
 _ROUNDED = 1 - 1e-6  # tolerance for rounding of a share
-_MISFIT = (
-    "image edges do not lie where depth has edges (calibration, clock, blur?): pixels at depth "
-    "edges are left out as with project.rims=strict"
-)
-_MOVED = (
-    "image edges lie {place} of where depth has edges: the image is moved for "
-    "project.rims; are calibration and clock right?"
-)
+
+
+def lab(image: NDArray[np.uint8]) -> Float32:
+    """Convert an (H,W,3) RGB image to (H,W,3) float32 CIE L*a*b* with L from 0 to 100.
+
+    The result is slightly blurred, and lightened if it is dark. In L*a*b* the distance of two
+    colours measures how different they look.
+    """
+    blurred = cv2.GaussianBlur(image.astype(np.float32) / 255, (0, 0), _BLUR_PX)
+    colours = cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB).astype(np.float32, copy=False)
+    light = float(np.percentile(colours[..., 0], 99))
+    return colours * np.float32(max(1.0, _LEAST_LIGHT / max(light, 1.0)))
 
 
 def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
     """Return the layers with the boundary pixels (``rim_m``) accepted that the image confirms.
 
     A pixel is accepted if 97 % of the votes are for its depth. Its ``confidence`` becomes 0 to 0.2
-    by this share. An image that is offset by up to one spacing of rays is shifted, with a
-    warning. An image that is blurred or does not fit is ignored, with a warning. The returned
-    ``lab`` is None if the image was not used.
+    by this share.
 
     Args:
-        layers: Map with measured pixels (``depth_m``) and boundary pixels (``rim_m``).
+        layers: Map with measured pixels (``depth_m``), boundary pixels (``rim_m``) and the image.
         rims: ``image`` accepts pixels that the image confirms, ``keep`` all, ``strict`` none.
     """
     pixel = np.flatnonzero(layers.rim_m)
-    share, lab, warnings = np.full(len(pixel), np.float32(0.5)), None, layers.warnings
-    if layers.lab is not None and rims != "strict" and len(pixel) >= _FEW:
-        aligned = align_image(layers)
-        if aligned is None:
-            warnings = (*warnings, _MISFIT)
-        else:
-            lab = aligned.lab
-            share = vote(
-                replace(layers, lab=lab),
-                voters(layers.depth_m, layers.tilt),
-                pixel,
-                layers.rim_m.flat[pixel],
-                surely=True,
-            )
-            if aligned.right_px or aligned.down_px:
-                warnings = (*warnings, _MOVED.format(place=aligned))
-    believed = share >= _LEAST_SHARE
-    if rims == "strict":
-        believed[:] = False
-    elif rims == "keep":
-        believed[:] = True
-    kept = pixel[believed]
-    depth_m = layers.depth_m.copy()
-    depth_m.flat[kept] = layers.rim_m.flat[kept]
-    confidence = layers.confidence.copy()
+    share = np.full(len(pixel), np.float32(0.5))
+    if layers.lab is not None:
+        known = voters(layers.depth_m, layers.tilt)
+        share = vote(layers, known, pixel, layers.rim_m.flat[pixel], surely=True)
+    accepted = np.full(len(pixel), rims == "keep")
+    if rims == "image":
+        accepted = share >= _LEAST_SHARE
+    depth_m, confidence = layers.depth_m.copy(), layers.confidence.copy()
+    depth_m.flat[pixel[accepted]] = layers.rim_m.flat[pixel[accepted]]
     sure = np.clip(-np.log10(np.maximum(1 - share, 1e-9)) / _SUREST, 0, 1)
     confidence.flat[pixel] = sure * np.float32(MOST_CONFIDENCE)
-    return replace(
-        layers,
-        depth_m=depth_m,
-        filled_m=depth_m,
-        confidence=np.where(depth_m > 0, confidence, np.float32(0)),
-        lab=lab,
-        warnings=warnings,
-    )
+    confidence = np.where(depth_m > 0, confidence, np.float32(0))
+    return replace(layers, depth_m=depth_m, filled_m=depth_m, confidence=confidence)
 
 
 def voted_for(

@@ -102,15 +102,12 @@ def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
     return sides
 
 
-def standing(
-    sensors: Sensors, registered: RegisteredSweep, travel_m: float, gone: Bool
-) -> StandingWorld:
+def standing(sensors: Sensors, registered: RegisteredSweep, gone: Bool) -> StandingWorld:
     """Return the static points of one sweep in the world frame, each with its surface patch.
 
     Args:
         sensors: Scanners, with the angles between their rays.
         registered: Deskewed sweep.
-        travel_m: Position of the sweep along the road.
         gone: (N,) True for points to leave out, which another sweep saw through (`departed`).
     """
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
@@ -129,7 +126,6 @@ def standing(
         intensity=sweep.intensity,
         frames=(sweep.frame,),
         stamp_ns=np.array([sweep.stamp_ns], np.int64),
-        travel_m=np.array([travel_m]),
     ).select(~gone)
 
 
@@ -154,7 +150,6 @@ _NOTHING = StandingWorld(
     intensity=np.zeros(0, np.float32),
     frames=(),
     stamp_ns=np.zeros(0, np.int64),
-    travel_m=np.zeros(0),
 )
 
 

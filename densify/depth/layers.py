@@ -27,7 +27,6 @@ class Layers:
         spacing_px: (H,W,2) spacing of neighbouring rays of one sweep, across and down, at all
             pixels.
         lab: (H,W,3) camera image in L*a*b*, None if there is no image.
-        warnings: Messages on parts of the request that could not be done.
         solid: True on bodies of moving objects (`MovingBody`).
     """
 
@@ -39,7 +38,6 @@ class Layers:
     tilt: Float32
     spacing_px: Float32
     lab: Float32 | None = None
-    warnings: tuple[str, ...] = ()
     solid: Bool | None = None
 
     @property

@@ -51,7 +51,7 @@ def project(
         settings: Section ``project``. Without ``visibility`` each pixel takes its nearest point.
         patches: Surface patches of the cloud.
         filled: False leaves out the fill.
-        lab: (H,W,3) image in L*a*b*. If None, no boundary pixel is accepted.
+        lab: (H,W,3) image in L*a*b*. If None, no boundary pixel is accepted by it.
         rays: Rays of the window. If None, no pixel is rejected as seen through.
         bodies: Bodies of moving objects by instance number.
     """
@@ -162,6 +162,5 @@ def _finished(
         frame=frame,
         reason=reason,
         measure=exposure.measure,
-        warnings=layers.warnings,
         ranked=rank,
     )

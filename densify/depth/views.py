@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import Config, ProjectSettings
+from densify.depth.boundary_pixels import lab
 from densify.depth.confidence import reliability
 from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.far import far_cloud
-from densify.depth.image_alignment import lab
 from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.moving_bodies import (
     MovingBody,
@@ -46,6 +46,12 @@ from densify.geometry.types import (
     Truth,
 )
 from densify.scores import depth_metrics
+from densify.scores.edge_fit import is_off, silhouettes_of
+
+_OFF = (
+    "image edges do not lie on depth discontinuities (calibration, clock?): the image is not used, "
+    "and boundary pixels are left out as with project.rims=strict; densify doctor says more"
+)
 
 
 class SeenCloud(NamedTuple):
@@ -77,7 +83,8 @@ class Views:
         key: Frame number of the key sweep.
         origins: (S,3) of the scanners, key sweep's lidar frame, by frame number of the sweep.
         rays: Rays of the window's sweeps.
-        lab: (H,W,3) L*a*b* images of the maps that show an image.
+        lab: (H,W,3) L*a*b* images of the maps that use an image.
+        off: Names of the maps whose image does not lie where the depth discontinuities are.
     """
 
     key: int
@@ -87,6 +94,7 @@ class Views:
     rays: Rays
     settings: ProjectSettings
     lab: Mapping[str, Float32]
+    off: frozenset[str] = frozenset()
 
     @staticmethod
     def of(
@@ -97,14 +105,21 @@ class Views:
         images: Mapping[str, NDArray[np.uint8]],
         settings: Config,
     ) -> Views:
-        """Return the cameras and times of the maps of key sweep ``key``, shown by ``shots``."""
+        """Return the cameras and times of the maps of key sweep ``key``, shown by ``shots``.
+
+        Images are used if ``project.rims`` is not ``strict``, and if they are not off (`is_off`).
+        """
         sensors = Sensors.of(stretch.sweeps)
+        exposures = {n: Exposure.of(sequence, stretch, key, s, settings) for n, s in shots.items()}
+        used, off = {}, frozenset[str]()
+        if settings.project.rims != "strict" and images:
+            silhouettes = silhouettes_of(stretch[key].sweep)
+            cameras = {n: replace(e.camera, T_cam_lidar=e.T_cam_key) for n, e in exposures.items()}
+            off = frozenset(n for n, i in images.items() if is_off(cameras[n], silhouettes, i))
+            used = {name: lab(image) for name, image in images.items() if name not in off}
         return Views(
             key=key,
-            exposures={
-                name: Exposure.of(sequence, stretch, key, shot, settings)
-                for name, shot in shots.items()
-            },
+            exposures=exposures,
             sensors=sensors,
             origins={
                 f: poses.transform(stretch.T_target_source(key, f), sensors.origins_m)
@@ -112,7 +127,8 @@ class Views:
             },
             rays=Rays(stretch, key),
             settings=settings.project,
-            lab={name: lab(image) for name, image in images.items()},
+            lab=used,
+            off=off,
         )
 
     def see(self, cloud: Cloud) -> SeenCloud:
@@ -150,19 +166,12 @@ class Views:
             filled: True interpolates between measured pixels.
         """
         settings = replace(self.settings, visibility=visible)
-        return {
-            name: project(
-                seen.cloud,
-                view,
-                settings,
-                seen.patches,
-                filled,
-                self.lab.get(name),
-                self.rays,
-                seen.bodies,
-            )
-            for name, view in seen.in_view.items()
-        }
+        maps = {}
+        for name, view in seen.in_view.items():
+            shown = self.lab.get(name), self.rays, seen.bodies
+            made = project(seen.cloud, view, settings, seen.patches, filled, *shown)
+            maps[name] = replace(made, warnings=(_OFF,)) if name in self.off else made
+        return maps
 
     def coloured(
         self,

@@ -9,24 +9,23 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
-from densify.doctor.edge_fit import (
-    Fit,
-    Silhouettes,
-    View,
-    best_fit,
-    depth_edges,
-    image_edges,
-    score,
-    turned,
-)
 from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Verdict, finding
 from densify.doctor.paths import CAM_AXES, changed
 from densify.doctor.sample import Sample
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float, RegisteredSweep
 from densify.readers.timeline import format_frames
+from densify.scores.edge_fit import (
+    Fit,
+    Silhouettes,
+    View,
+    best_fit,
+    image_edges,
+    score,
+    silhouettes_of,
+    turned,
+)
 
-_NEAREST_M, _FARTHEST_M = 3.0, 100.0
 _MOST_IMAGES, _LEAST_IMAGES = 36, 4  # of all cameras; of one camera for a verdict
 _CLEARLY = 1.25
 _AS_MANY = 0.5  # least share of the edges visible as given; one object may match by chance
@@ -102,23 +101,11 @@ def camera_views(
             return views, str(error)
         frame = registered.sweep.frame
         if frame not in silhouettes:
-            silhouettes[frame] = _silhouettes(registered)
+            silhouettes[frame] = silhouettes_of(registered.sweep)
         twist = registered.twist_after if apart_s > 0 else registered.twist_before
         edges = image_edges(image, camera.focal_px)
         views.append(View(silhouettes[frame], *edges, twist, apart_s))
     return views, ""
-
-
-def _silhouettes(registered: RegisteredSweep) -> Silhouettes:
-    """Return the depth discontinuities of a sweep, found per scanner, in the lidar frame."""
-    sweep, parts = registered.sweep, []
-    for lidar in map(int, np.unique(sweep.lidar)):
-        origin_m, axes = sweep.origin_m(lidar), sweep.axes(lidar)
-        points = (sweep.points[sweep.lidar == lidar] - origin_m) @ axes.T
-        range_m = np.linalg.norm(points, axis=1)
-        edges = depth_edges(points[(range_m > _NEAREST_M) & (range_m < _FARTHEST_M)])
-        parts.append(edges._replace(places=edges.places @ axes + origin_m))
-    return Silhouettes(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def alternatives(T: Float) -> dict[str, Float]:

@@ -104,7 +104,7 @@ class Road:
             deskewed = list(pool.map(_deskewed, used))
             gone = far.departed(deskewed, travel_m)
             standing = partial(far.standing, sensors)
-            parts = list(pool.map(standing, deskewed, travel_m.tolist(), gone))
+            parts = list(pool.map(standing, deskewed, gone))
         return replace(far.joined(parts), left_out=tuple(sorted(left_out)))
 
     def _beyond(

@@ -130,7 +130,6 @@ class StandingWorld:
         intensity: (K,) float32 of 0 to 1.
         frames: Frame numbers of the n sweeps.
         stamp_ns: (n,) int64 reference times.
-        travel_m: (n,) float64 distance along the road from the window, negative before it.
         left_out: Frame numbers of sweeps without a reliable registration.
     """
 
@@ -143,7 +142,6 @@ class StandingWorld:
     intensity: Float32
     frames: tuple[int, ...]
     stamp_ns: Int
-    travel_m: Float
     left_out: tuple[int, ...] = ()
 
     def select(self, keep: Bool | Int) -> StandingWorld:

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
-from densify.geometry.types import Bool, Camera, Float, Float32
+from densify.geometry.types import Bool, Camera, Float, Float32, Sweep
 
-_NEAREST_M, _FARTHEST_M = 3.0, 50.0
+_NEAREST_M, _FARTHEST_M, _MOST_RANGE_M = 3.0, 50.0, 100.0  # of both surfaces, and of the far one
 _EDGE_M, _EDGE_SHARE = 0.6, 0.08
 _ROW_RAD = np.deg2rad(0.1)  # finer than any scanner's rings
 _APART_RAD = np.deg2rad(1.5)  # greatest angle between neighbouring returns at an edge
@@ -32,6 +32,7 @@ _MOST_STRENGTH = 4.0
 _REACH, _STEP = (2.7, 2.7, 2.0, 0.2), (0.3, 0.3, 1.0, 0.05)  # degrees and seconds of the grid
 _BLURRED = np.array([0.15, 0.15, 0.3, 0.015])  # an offset that moves edges by the blur
 _NUM_ON_GRID, _NUM_STARTS, _NUM_HALVINGS = 4000, 4, 4
+_CLEARLY = 2.0  # standard errors
 
 
 class Silhouettes(NamedTuple):
@@ -87,6 +88,18 @@ class Fit(NamedTuple):
     def clearness(self) -> float:
         """Height of the best score above the median, divided by the height of the rival."""
         return (self.score - self.usual) / max(self.rival - self.usual, 1e-9)
+
+
+def silhouettes_of(sweep: Sweep) -> Silhouettes:
+    """Return the depth discontinuities of a sweep, found per scanner, in the lidar frame."""
+    parts = []
+    for lidar in map(int, np.unique(sweep.lidar)):
+        origin_m, axes = sweep.origin_m(lidar), sweep.axes(lidar)
+        points = (sweep.points[sweep.lidar == lidar] - origin_m) @ axes.T
+        range_m = np.linalg.norm(points, axis=1)
+        edges = depth_edges(points[(range_m > _NEAREST_M) & (range_m < _MOST_RANGE_M)])
+        parts.append(edges._replace(places=edges.places @ axes + origin_m))
+    return Silhouettes(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def depth_edges(points: Float) -> Silhouettes:
@@ -154,6 +167,26 @@ def score(camera: Camera, views: Sequence[View]) -> tuple[float, int]:
     return total, sum(len(line.uv) for line in lines)
 
 
+def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -> bool:
+    """Return True if an image clearly does not lie where the depth discontinuities are.
+
+    The score of the given pose, the best within 0.3 degrees, is compared with all turns up to 2.7
+    degrees. The image is off if another turn is better by two standard errors, which are those of
+    the sum over the discontinuities of the difference between both.
+
+    Args:
+        camera: Camera with its pose at the exposure.
+        silhouettes: Depth discontinuities of the sweep nearest in time.
+        image: (H,W,3) RGB image.
+    """
+    view = View(silhouettes, *image_edges(image, camera.focal_px), np.zeros(6), 0.0)
+    lines, turns = _Lines.of(camera, view, np.zeros(4)), _turns(np.zeros(1), np.zeros(1))
+    scores, given = lines.scores(turns), (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
+    best = [turns[part][np.argmax(scores[part])] for part in (given, ~given)]
+    better = np.diff(lines.strengths(np.array(best)), axis=0)
+    return bool(better.sum() > _CLEARLY * np.sqrt((better**2).sum()))
+
+
 def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
     """Return the best fit of a camera to two or more views.
 
@@ -185,13 +218,19 @@ def _grid(free: Bool) -> Float:
 
     ``free`` (4,) is True for the parameters that are fitted.
     """
-    axes = [np.arange(-r, r + s / 2, s) for r, s in zip(_REACH, _STEP, strict=True)]
-    parts = []
-    for axis in (2, 3):
-        only = [values if i in (0, 1, axis) else np.zeros(1) for i, values in enumerate(axes)]
-        if free[axis]:
-            parts.append(np.stack(np.meshgrid(*only, indexing="ij"), axis=-1).reshape(-1, 4))
-    return np.concatenate(parts)
+    roll, delay = _steps(2), _steps(3)
+    parts = [_turns(roll, np.zeros(1))] if free[2] else []
+    return np.concatenate([*parts, *([_turns(np.zeros(1), delay)] if free[3] else [])])
+
+
+def _steps(axis: int) -> Float:
+    return np.arange(-_REACH[axis], _REACH[axis] + _STEP[axis] / 2, _STEP[axis])
+
+
+def _turns(roll: Float, delay: Float) -> Float:
+    """Return (M,4) offsets: all pitches and yaws of the grid, with each roll and each delay."""
+    axes = np.meshgrid(_steps(0), _steps(1), roll, delay, indexing="ij")
+    return np.stack(axes, axis=-1).reshape(-1, 4)
 
 
 class _Lines(NamedTuple):
@@ -238,7 +277,11 @@ class _Lines(NamedTuple):
         )
 
     def scores(self, offsets: Float, thin: int = 1) -> Float:
-        """Return (M,) sums of image gradients at the discontinuities, for M offsets.
+        """Return (M,) sums of `strengths` over the discontinuities."""
+        return self.strengths(offsets, thin).sum(axis=1, dtype=np.float64)
+
+    def strengths(self, offsets: Float, thin: int = 1) -> Float32:
+        """Return (M,E) image gradients at the discontinuities, for M offsets.
 
         Args:
             offsets: (M,4) as in `Fit`.
@@ -249,7 +292,7 @@ class _Lines(NamedTuple):
         moved = np.rint(uv + np.einsum("ma,eda->med", offsets, slope)).astype(np.int32) + 1
         column, row = np.clip(moved[..., 0], 0, width - 1), np.clip(moved[..., 1], 0, height - 1)
         place = (self.is_level[::thin] * height + row) * width + column
-        return self.strength.reshape(-1).take(place).sum(axis=1, dtype=np.float64)
+        return self.strength.reshape(-1).take(place)
 
 
 def _sum(lines: Sequence[_Lines], offset: Float) -> float:

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: MIT
+"""Whether one image lies where the depth discontinuities of one sweep are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from densify.config import resolve
+from densify.depth.exposure import Exposure, key_shots
+from densify.depth.views import Views
+from densify.pipeline.recording import Recording
+from densify.readers import open_sequence
+from densify.scores.edge_fit import is_off, silhouettes_of
+
+KEY, CAMERA = 60, "image_02"
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    sequence = open_sequence("street?seed=5&sensor=hdl64")
+    return Recording(sequence, resolve(None, ["register.source=dataset"]), 1, [KEY])
+
+
+@pytest.fixture(scope="module")
+def scene(recording):
+    """The camera at its exposure, the silhouettes of the sweep, and the image."""
+    sequence, stretch = recording.sequence, recording.window(KEY)
+    shot = key_shots(sequence, [sequence.cameras[CAMERA]], KEY)[CAMERA]
+    exposure = Exposure.of(sequence, stretch, KEY, shot, recording.settings)
+    camera = replace(exposure.camera, T_cam_lidar=exposure.T_cam_key)
+    return camera, silhouettes_of(stretch[KEY].sweep), sequence.image(CAMERA, shot.number)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (2, 0), (0, -2)])
+def test_an_image_in_its_place_is_not_off(scene, shift) -> None:
+    camera, silhouettes, image = scene
+    assert not is_off(camera, silhouettes, np.roll(image, shift, (0, 1)))
+
+
+@pytest.mark.parametrize("shift", [(12, 0), (-12, 0), (0, 12), (0, -12)])
+def test_an_image_that_lies_aside_is_off(scene, shift) -> None:
+    camera, silhouettes, image = scene
+    assert is_off(camera, silhouettes, np.roll(image, shift, (0, 1)))
+
+
+@pytest.mark.parametrize("shift_px", [0, 12])
+def test_a_map_says_that_its_image_is_off_and_does_not_use_it(recording, scene, shift_px) -> None:
+    sequence, stretch = recording.sequence, recording.window(KEY)
+    shots = key_shots(sequence, [sequence.cameras[CAMERA]], KEY)
+    images = {CAMERA: np.roll(scene[2], shift_px, 0)}
+    views = Views.of(sequence, stretch, KEY, shots, images, recording.settings)
+    maps = views.depth(views.see(recording.moment(KEY, False, None).cloud))[CAMERA]
+    assert (CAMERA in views.lab) == (shift_px == 0)
+    assert [w.split(" (")[0] for w in maps.warnings] == [
+        "image edges do not lie on depth discontinuities"
+    ] * (shift_px > 0)
+
+
+def test_a_few_discontinuities_judge_nothing(scene) -> None:
+    camera, silhouettes, image = scene
+    few = type(silhouettes)(*(column[::100] for column in silhouettes))
+    assert not is_off(camera, few, np.roll(image, 12, 0))
