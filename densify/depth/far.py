@@ -178,6 +178,7 @@ def far_cloud(
     stretch: Stretch,
     key: int,
     exposures: Mapping[str, Exposure],
+    standing_only: bool,
 ) -> tuple[Cloud, Patches]:
     """Return the points beyond the window that a camera observes, and their patches.
 
@@ -188,6 +189,8 @@ def far_cloud(
         T_key_found: (4,4) from the world frame of ``found`` to the key sweep's lidar frame.
         stretch: Registered sweeps of the window.
         key: Frame number of the key sweep.
+        standing_only: True leaves out points that the first or the last sweep of the window saw
+            through.
     """
     beyond = ~np.isin(found.frames, stretch.frames)
     rows = np.flatnonzero(beyond[found.source])
@@ -196,6 +199,10 @@ def far_cloud(
         needed[_seen(found.points, rows, T_key_found, exposure)] = True
     rows = np.flatnonzero(needed)
     points = poses.transform(T_key_found, found.points.take(rows, axis=0).astype(np.float64))
+    if standing_only:
+        ends = sorted({stretch.frames[0], stretch.frames[-1]} - {key})
+        stands = ~_gone(points, stretch, key, ends)
+        rows, points = rows[stands], points[stands]
     found = found.select(rows)
     num, since_key_ns = len(found), found.stamp_ns - stretch[key].sweep.stamp_ns
     cloud = Cloud(
@@ -238,3 +245,16 @@ def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) ->
     # A pixel is supported only by several sweeps, so neighbouring pixels take different sweeps.
     mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
     return rows[thinned(np.concatenate(cells), mixed, 1.0, 1)]
+
+
+def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:
+    """Return (M,) True for points (M,3), key sweep's lidar frame, that a given sweep saw through.
+
+    key: frame number of the key sweep. witnesses: frame numbers of the given sweeps.
+    """
+    free = np.zeros(len(points), bool)
+    for frame in witnesses:
+        there = poses.transform(stretch.T_target_source(frame, key), points)
+        image = RangeImage.of(stretch[frame])
+        free |= image.sees_through(there, *_FREE)
+    return free

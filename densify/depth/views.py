@@ -146,14 +146,19 @@ class Views:
         """Return the bodies of moving objects by instance number, from all points of the window."""
         return moving_bodies(cloud, self.rays, self.exposures.values())
 
-    def far(self, found: StandingWorld, T_key_found: Float, stretch: Stretch) -> SeenCloud:
+    def far(
+        self, found: StandingWorld, T_key_found: Float, stretch: Stretch, standing_only: bool
+    ) -> SeenCloud:
         """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`.
 
         Args:
             found: Static points along the road.
             T_key_found: (4,4) from the world of ``found`` to the key sweep's lidar frame.
+            standing_only: True leaves out points that a sweep of the window saw through.
         """
-        cloud, surface = far_cloud(found, T_key_found, stretch, self.key, self.exposures)
+        cloud, surface = far_cloud(
+            found, T_key_found, stretch, self.key, self.exposures, standing_only
+        )
         return SeenCloud(cloud, surface, self.in_view(cloud))
 
     def depth(
