@@ -31,7 +31,7 @@ def measured_at(uv, spacing_px):
     points = PointsInImage(
         *(index, uv, PLANE[row, column], np.ones((num, 2)), np.tile(TILT, (num, 1))),
         np.stack([spacing, 9 * spacing], 1),
-        *(nothing > 0, nothing, nothing, nothing > 0),
+        *(nothing, nothing, nothing > 0),
     )
     layers = layers_of(PLANE, depth_m > 0, confidence=0.5, tilt=TILT)
     layers = replace(layers, point=point)

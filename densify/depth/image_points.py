@@ -33,7 +33,6 @@ class PointsInImage:
         focal_px: (K,2) local scale, px per metre at a depth of 1 m.
         slope: (K,2) slope of the tangent plane's inverse depth to the right and down, 1/m per px.
         spacing_px: (K,2) spacing of neighbouring rays, across and down.
-        moving: (K,) True for moving points.
         frame: (K,) frame number of the source sweep.
         age_ns: (K,) time between the source sweep and the key sweep, see `_ages_ns`.
         far: (K,) True for points of sweeps beyond the window.
@@ -45,7 +44,6 @@ class PointsInImage:
     focal_px: Float
     slope: Float
     spacing_px: Float
-    moving: Bool
     frame: np.ndarray
     age_ns: Int
     far: Bool
@@ -91,7 +89,6 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInIma
         focal_px=focal_px,
         slope=np.nan_to_num(slope, posinf=0.0, neginf=0.0),
         spacing_px=spacing_px,
-        moving=cloud.moving[index],
         frame=frame,
         age_ns=_ages_ns(cloud.since_key_ns[index], frame, far),
         far=far,

@@ -33,7 +33,8 @@ AGREE_M, AGREE_FRACTION = 0.1, 0.02
 _REACH = 0.65  # radius of the plane and of the sweeps that agree, in spacings of rays
 _SLACK_M = 0.015  # added to the radius of a discontinuity, for errors of registration
 _EDGE_WINDOW_PX = 1.5  # width beyond the edge in which points must continue the surface
-_FAR_EDGE = 1.5  # radii; points beyond the window continue a surface behind a nearer one
+# Sweeps beyond the window share errors, and continue a surface behind a nearer one.
+_FAR_SWEEPS, _FAR_EDGE = 6, 1.5
 # Greatest loss of confidence by few sweeps, few points, a near edge, a rough fit, occlusion.
 _DOUBTS = np.array([0.45, 0.25, 0.20, 0.10, 0.10])
 _MANY_POINTS, _ROUGH_M = 20, 0.10
@@ -123,7 +124,7 @@ def _settled(
     Args:
         many: Number of agreeing sweeps that leaves no doubt.
         taken: (H·W,) pixels to leave alone. If given, the rules for points beyond the window hold:
-            the sweep nearest to the key need not agree, but no depth discontinuity may be near.
+            the sweep nearest to the key need not agree, but six sweeps must.
     """
     behind = distance_behind(points, camera)
     hidden = behind > 1
@@ -134,7 +135,7 @@ def _settled(
         supported = youngest_ns <= np.float32(points.age_ns.min(initial=_NEVER_NS))
         inside = edge >= 1
     else:
-        supported, inside = np.ones(len(pixel), bool), edge >= _FAR_EDGE
+        supported, inside = num_sweeps >= _FAR_SWEEPS, edge >= _FAR_EDGE
         reason[winner[~inside]] = Reason.EDGE
     reason[winner[~supported]] = Reason.UNSUPPORTED
     doubts = np.stack(
