@@ -138,7 +138,7 @@ def test_bad_override(override: str, parts: list[str]) -> None:
         (b"flow: {engine: pairs}\nflow: {engine: paper}\n", ["flow is given twice"]),
         (b"objective: {alpha: .nan}\n", ["objective.alpha: got nan"]),
         (b"3: {alpha: 1}\n", ["unknown section 3"]),
-        (b"\xff\xfe\x00\x80", ["not a text file"]),
+        (b"\xff\xfe\x00\x80", ["UTF-16"]),
     ],
 )
 def test_bad_file_is_named(tmp_path: Path, text: bytes, parts: list[str]) -> None:

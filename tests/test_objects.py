@@ -8,7 +8,7 @@ import pytest
 
 from densify.flow.surface_matching import apply
 from densify.flow.tracking.groups import GroupMotion
-from densify.flow.tracking.objects import Shape, Track
+from densify.flow.tracking.objects import MovingObject, Observation, Shape, Track
 from densify.flow.tracking.paths import Path
 from densify.free_space.ground import HeightMap
 from densify.geometry import poses
@@ -126,3 +126,41 @@ def test_the_rim_reaches_as_far_as_all_points_however_turned(yaw: float) -> None
     everything, rim = apply(state, points, centre), apply(state, shape.rim, centre)
     np.testing.assert_array_equal(rim.min(0), everything.min(0))
     np.testing.assert_array_equal(rim.max(0), everything.max(0))
+
+
+def two_sides(length_m: float, width_m: float, yaw_rad: float) -> np.ndarray:
+    """(N,3) an upright rectangle seen from one corner, with 2 cm of noise: as many points on the
+    short side as on the long one."""
+    rng = np.random.default_rng(3)
+    along = np.stack([rng.uniform(0, length_m, 300), np.zeros(300), rng.uniform(0, 2, 300)], 1)
+    across = np.stack([np.zeros(300), rng.uniform(0, width_m, 300), rng.uniform(0, 2, 300)], 1)
+    points = np.concatenate([along, across]) + rng.normal(0, 0.02, (600, 3))
+    return apply(np.array([5.0, -3.0, 0.0, yaw_rad]), points, np.zeros(3))
+
+
+@pytest.mark.parametrize("yaw_deg", [0, 31, 44, 89, 200])
+@pytest.mark.parametrize("size_m", [(13.0, 2.5), (4.5, 1.8), (6.0, 0.01)])
+def test_sides_are_found_however_the_object_is_turned(yaw_deg: float, size_m: tuple) -> None:
+    shape = Shape.of(two_sides(*size_m, np.deg2rad(yaw_deg)))
+    off_deg = (np.rad2deg(shape.side_rad) - yaw_deg + 45) % 90 - 45
+    assert abs(off_deg) <= 0.75
+
+
+@pytest.mark.parametrize(
+    ("length_m", "aside_deg", "heading_deg"), [(6.0, 25, 40), (6.0, -30, 40), (2.4, 25, 65)]
+)
+def test_a_long_object_heads_along_its_side_and_a_short_one_where_it_moves(
+    length_m: float, aside_deg: float, heading_deg: float
+) -> None:
+    """It is turned by 40 degrees and moves aside of that; at 45 it would be its other side."""
+    shape = Shape.of(two_sides(length_m, 1.0, np.deg2rad(40)))
+    way = np.deg2rad(40 + aside_deg)
+    track = Track(np.zeros(3))
+    for i in range(5):
+        state = np.array([0.5 * i * np.cos(way), 0.5 * i * np.sin(way), 0.0, 0.0])
+        track.observations[i] = Observation(state, 0.1 * i, i * 100_000_000, (i,))
+        track.claimed[i] = np.arange(8)
+    track.smooth()
+    x, y = MovingObject(track, shape).heading(0.2)
+    assert np.hypot(x, y) == pytest.approx(1)
+    assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(heading_deg, abs=1)

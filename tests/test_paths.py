@@ -144,3 +144,14 @@ def test_points_are_placed_each_at_its_time_and_brought_back():
         np.testing.assert_allclose(track.place(points, when), apply(state, points, track.centre))
         np.testing.assert_allclose(track.undo(points, when), undo(state, points, track.centre))
         np.testing.assert_allclose(track.undo(track.place(points, when), when), points)
+
+
+def test_rounding_of_the_last_knot_leaves_the_last_state_on_the_path():
+    """0.1 s times the number of spans may end a rounding error before the last time."""
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        times_s = np.sort(rng.uniform(-1, 1, 2))
+        found = Path.fit(times_s, rng.normal(size=(2, 4)), np.ones(2))
+        assert np.isfinite(found.residual_m)
+    exact = np.array([-0.09193036, -0.01289429])
+    assert np.isfinite(Path.fit(exact, np.zeros((2, 4)), np.ones(2)).residual_m)

@@ -206,15 +206,17 @@ def test_tiny_sweeps_know_little_and_never_fail(num_points):
 # --- rings one by one ----------------------------------------------------------------------------
 
 
-def test_dense_rings_tell_of_a_slit_between_them():
-    """What is seen over a wall close by, by few rings, if each ring is a row."""
+def test_far_away_dense_rings_tell_of_a_slit_between_them():
+    """What is seen over a wall close by, by few rings: far away each ring is a row, nearby two."""
     wall = Box((0.4, 8.0, LIDAR_HEIGHT_M), Arc(5.0, 0.0))  # as high as the scanner: up to 0 degrees
     low = Box((0.4, 4.0, LIDAR_HEIGHT_M + 0.6), Arc(18.0, 0.0))  # up to 1.93 degrees
     scanner = Scanner(128, 900, elevation_deg=(-15.0, 15.0))  # 0.236 degrees apart
     sweep = Scene(World((*ROOM, wall, low)), Arc(0, 0), scanner).stretch(2, 0).sweeps[0]
     usual, finer = RangeImage.of(sweep), RangeImage.of(sweep, by_ring=True)
-    joined, single = usual.scanners[0].row_edges_rad, finer.scanners[0].row_edges_rad
-    assert len(usual.scanners) == len(finer.scanners) == 1 and len(joined) < len(single)
+    near, far = finer.scanners
+    assert len(usual.scanners) == 1
+    assert len(near.row_edges_rad) == len(usual.scanners[0].row_edges_rad) < len(far.row_edges_rad)
+    assert near.to_m == far.from_m == pytest.approx(0.1 / (1.5 * np.deg2rad(30 / 127)), rel=0.02)
 
     def share(image: RangeImage, elevation_deg: float, range_m: float, azimuth_deg: float) -> float:
         azimuths_deg = np.linspace(-azimuth_deg, azimuth_deg, 50)
@@ -222,6 +224,7 @@ def test_dense_rings_tell_of_a_slit_between_them():
         return float(image.sees_through(hung, *MARGIN).mean())
 
     assert share(finer, 0.4, 17.0, 4) == 1 and share(usual, 0.4, 17.0, 4) == 0
+    assert share(finer, 0.4, 10.0, 4) == 0  # a slight error of registration is more than two rings
     assert share(finer, 3.0, 10.0, 4) == share(usual, 3.0, 10.0, 4) == 1
     highest_deg = 7.5 * 30 / 127  # of the rings that meet what stands there
     for off_m in (-0.05, 0.0, 0.05):  # badly registered

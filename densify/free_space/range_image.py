@@ -25,11 +25,15 @@ from densify.free_space.rings import FEW_POINTS, Aimed, aimed, fires_by_azimuth,
 from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
 
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
-_MIN_ROW_RAD, _RING_RAD = np.deg2rad([0.45, 0.15])  # least height of a row; of one ring
+_CELLS_PER_LINE = 1.14  # the even step of lines is 1 % longer than the usual one
+_MIN_ROW_RAD = np.deg2rad(0.45)
+# Closer rings always share a row. Other rings have their own rows from the range at
+# which three rings span more than the error of registration.
+_MIN_FAR_ROW_RAD, _SLACK_M = np.deg2rad(0.15), 0.1
 # A ring this far from all others observes free space only at its rays. Three full cells suffice.
-_LONE_RAD, _OF_ONE_RING = np.deg2rad(1.0), 2
+_LONE_RAD, _ON_RING_RAD, _OF_ONE_RING = np.deg2rad(1.0), np.deg2rad(0.15), 2
 _SETTLED = 0.1  # share of a turn
-_MAX_COLUMNS = 8192
+_MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
 _DENSEST = 10  # percent of the returns of an unordered scanner that set its finest cells
 MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
 _VOUCHED, _MAX_SIZES = 0.8, 5  # share of returns with enough filled cells; number of cell sizes
@@ -51,6 +55,8 @@ class ScannerImage(NamedTuple):
         origin_m: (3,) float32 position of the scanner in the lidar frame.
         axes: (3,3) float32 rotation from the lidar frame to the scanner's axes.
         twists: (2,6) float32 twist of the lidar before and after the reference time.
+        from_m: Least range at which the image is used.
+        to_m: Greatest range at which the image is used.
     """
 
     offset_s: Float32
@@ -62,6 +68,16 @@ class ScannerImage(NamedTuple):
     origin_m: Float32
     axes: Float32
     twists: Float32
+    from_m: float
+    to_m: float
+
+    def in_range(self, points: Float32) -> Bool:
+        """Return (N,) True for points (N,3), lidar frame, at whose range the image is used."""
+        if self.from_m == 0 and self.to_m == np.inf:
+            return np.ones(len(points), bool)
+        away = points - self.origin_m
+        squared = np.einsum("ij,ij->i", away, away)
+        return np.asarray((squared >= self.from_m**2) & (squared < self.to_m**2))
 
 
 @dataclass(frozen=True)
@@ -77,8 +93,9 @@ class RangeImage:
         Args:
             num_together: Number of sweeps whose counts are added up. The columns are finer by this
                 factor.
-            by_ring: True gives each dense ring a row of its own, and also uses isolated rings,
-                right at their rays. False joins rings closer than 0.45 degrees.
+            by_ring: True also uses single rings: dense rings for far points, where an error of
+                registration is smaller than the spacing of rings, and isolated rings right at their
+                rays.
         """
         scanners: list[ScannerImage] = []
         for lidar in np.unique(registered.sweep.lidar).tolist():
@@ -132,13 +149,19 @@ class RangeImage:
             velocity = np.ascontiguousarray(velocity_m_s, np.float32)
         margins = np.array(margins_m, np.float32)
         beyond = np.zeros((len(self.scanners), len(points)), np.int16)
-        for scanner, num in zip(self.scanners, beyond, strict=True):
-            see_beyond.over_rows(len(num), points32, velocity, scanner, margins, least, num)
+        for scanner, own in zip(self.scanners, beyond, strict=True):
+            used = scanner.in_range(points32)
+            some, velocity_of_some = points32, velocity
+            if not used.all():
+                some, velocity_of_some = points32[used], velocity[used[: len(velocity)]]
+            num = np.zeros(len(some), np.int16)
+            see_beyond.over_rows(len(num), some, velocity_of_some, scanner, margins, least, num)
+            own[used] = num
         return beyond
 
 
 class _Cells(NamedTuple):
-    """The cells of one image: edges of the rows (R+1,), and number of columns.
+    """The cells of one image: edges of the rows (R+1,), and the range in which it is used.
 
     lone: True if every other row is a single ring, and the rows between hold no ring. coarser: True
     if used only where the previous image has too many empty cells.
@@ -146,6 +169,8 @@ class _Cells(NamedTuple):
 
     row_edges_rad: Float32
     num_columns: int
+    from_m: float = 0.0
+    to_m: float = np.inf
     lone: bool = False
     coarser: bool = False
 
@@ -198,6 +223,8 @@ def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) 
         origin_m=sweep.origin_m(lidar).astype(np.float32),
         axes=sweep.axes(lidar).astype(np.float32, order="C"),
         twists=np.stack([registered.twist_before, registered.twist_after]).astype(np.float32),
+        from_m=cells.from_m,
+        to_m=cells.to_m,
     )
 
 
@@ -241,8 +268,8 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     if layout.rings_rad is not None:
         return _cells_of_rings(layout.rings_rad, _CELLS_PER_STEP * step, by_ring)
     if not layout.unordered:
-        row_step = _CELLS_PER_STEP * float(np.median(layout.table.along))
-        return [_grid(_uniform_edges(rays.elevation, row_step), _CELLS_PER_STEP * step)]
+        row_step = _CELLS_PER_LINE * float(np.median(layout.table.along))
+        return [_grid(_uniform_edges(rays.elevation, row_step), _CELLS_PER_LINE * step)]
     spacing = layout.table.at(rays.azimuth, rays.elevation)[:, 1]
     finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
     flatten = float(np.cos(np.median(rays.elevation)))
@@ -260,17 +287,20 @@ def _cells_of_rings(rings: Float, step: float, by_ring: bool) -> list[_Cells]:
     middle = 0.5 * (rings[1:] + rings[:-1])
     outer: Float = 2 * rings[[0, -1]] - middle[[0, -1]]
     edges: Float = np.concatenate([outer[:1], middle, outer[1:]])
-    rows = _no_closer(edges, _RING_RAD if by_ring else _MIN_ROW_RAD)
+    near, far = (_no_closer(edges, least) for least in (_MIN_ROW_RAD, _MIN_FAR_ROW_RAD))
+    if by_ring and len(near) != len(far):
+        far_m = _SLACK_M / (1.5 * float(np.diff(far).min()))
+        return [_grid(near, step)._replace(to_m=far_m), _grid(far, step)._replace(from_m=far_m)]
     gaps = np.diff(rings, prepend=-np.inf, append=np.inf)
     lone = rings[np.minimum(gaps[:-1], gaps[1:]) >= _LONE_RAD]
     if not by_ring or not len(lone):
-        return [_grid(rows, step)]
-    on_rings: Float = (lone[:, None] + [-_RING_RAD, _RING_RAD]).ravel()
-    return [_grid(rows, step), _grid(on_rings, step)._replace(lone=True)]
+        return [_grid(near, step)]
+    on_rings: Float = (lone[:, None] + [-_ON_RING_RAD, _ON_RING_RAD]).ravel()
+    return [_grid(near, step), _grid(on_rings, step)._replace(lone=True)]
 
 
 def _grid(edges: NDArray[np.floating], step: float) -> _Cells:
-    num_columns = min(max(1, round(2 * np.pi / step)), _MAX_COLUMNS)
+    num_columns = int(np.clip(round(2 * np.pi / step), _MIN_COLUMNS, _MAX_COLUMNS))
     return _Cells(edges.astype(np.float32), num_columns)
 
 

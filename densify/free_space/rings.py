@@ -20,23 +20,28 @@ from densify.geometry.arrays import Float, Float32
 from densify.geometry.types import RegisteredSweep
 
 FEW_POINTS = 200  # too few to measure anything
-_DEFAULT_RAD = np.deg2rad(0.3)  # spacing of rays that cannot be measured
+_DEFAULT_RAD = tuple(np.deg2rad([0.18, 0.40]))  # of a 64-beam scanner, along and between its rings
 _MANY_POINTS = 15_000
 _SECTOR_RAD = np.deg2rad(5.0)
 
-_RING_BIN_RAD, _CELL_RAD = np.deg2rad([0.02, 1.0])
+_RING_BIN_RAD, _LINE_BIN_RAD, _CELL_RAD = np.deg2rad([0.02, 0.5, 1.0])
 _MIN_PROMINENCE = 0.5
+_MIN_RETURNS_PER_RING = 30
 _MIN_RING_SHARE = 0.8
 _NEAR_RING = 0.2  # share of the gap to the next ring
-_LEAST_GAP_RAD = np.deg2rad(0.02)
+_LEAST_STEP_RAD = np.deg2rad(0.02)
+_BEYOND_RAD = np.deg2rad(1.0)
 
-_BAND_RAD = np.deg2rad(0.1)
+_BAND_RAD, _COLUMN_RAD = np.deg2rad([0.1, 1.0])
+_LEAST_GAP_RAD, _MAX_GAP_RAD = 1e-4, np.deg2rad(4.0)
 _EVEN, _MIN_EVEN_SHARE = 0.2, 0.5  # share of the usual gap; share of the returns
+_MIN_GAPS_PER_BIN = 30
+_MIN_PER_COLUMN = 5
 _APART_RAD = 4 * np.pi  # more than twice the range of angles
 _AT_ONCE = 0.03  # share of the duration of a sweep
 
 _MIN_COUNT = 24  # least number of returns for a density
-_WINDOWS = (1, 3, 9, 27)  # cells
+_WINDOWS = (1, 3, 5, 9, 17, 33)  # cells
 
 
 class Aimed(NamedTuple):
@@ -123,8 +128,8 @@ def measure(sweeps: Sequence[Aimed]) -> Layout:
     returns still follow at even steps along the azimuth: such a scanner samples in lines.
     """
     if sum(len(rays.azimuth) for rays in sweeps) < FEW_POINTS:
-        step = np.array([_DEFAULT_RAD])
-        return Layout(None, False, _DEFAULT_RAD, _table(0.0, 1.0, step, step))
+        step, along = _DEFAULT_RAD
+        return Layout(None, False, step, _table(0.0, 1.0, np.array([step]), np.array([along])))
     some = [_some_sectors(rays) for rays in sweeps]
     rings = find_rings(np.concatenate([rays.elevation for rays in some]))
     if rings is not None:
@@ -152,7 +157,7 @@ def find_rings(elevation: Float32) -> Float | None:
     count = ndimage.gaussian_filter1d(returns, 1.0)
     peaks, found = signal.find_peaks(count, prominence=0)
     peaks = peaks[found["prominences"] >= _MIN_PROMINENCE * count[peaks]]
-    if len(peaks) < 3:
+    if not 3 <= len(peaks) <= len(elevation) / _MIN_RETURNS_PER_RING:
         return None
     rings: Float = (peaks + 0.5) * _RING_BIN_RAD - 0.5 * np.pi
     nearest = np.searchsorted(0.5 * (rings[1:] + rings[:-1]), elevation)
@@ -171,15 +176,21 @@ def fires_by_azimuth(rays: Aimed) -> bool:
     duration_s = float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
     if duration_s == 0.0:
         return True
-    column = ((rays.azimuth + np.pi) / _CELL_RAD).astype(np.int64)
-    mean_s = np.bincount(column, rays.offset_s) / np.maximum(np.bincount(column), 1)
-    return bool(np.mean(np.abs(rays.offset_s - mean_s[column]) < _AT_ONCE * duration_s) > 0.5)
+    column = ((rays.azimuth + np.pi) / _COLUMN_RAD).astype(np.int64)
+    num = np.bincount(column)
+    mean_s = np.bincount(column, rays.offset_s) / np.maximum(num, 1)
+    square = np.bincount(column, (rays.offset_s - mean_s[column]) ** 2)
+    spread_s = np.sqrt(square / np.maximum(num, 1))[num >= _MIN_PER_COLUMN]
+    return not len(spread_s) or bool(np.mean(spread_s < _AT_ONCE * duration_s) > 0.5)
 
 
 def _some_sectors(rays: Aimed) -> Aimed:
-    """Return the rays in every n-th sector of azimuth, which are enough evidence."""
-    some = np.floor(rays.azimuth / _SECTOR_RAD) % (len(rays.azimuth) // _MANY_POINTS + 1) == 0
-    return Aimed(*(column[some] for column in rays))
+    """Return every fourth sector of an all-round view, which is enough evidence."""
+    if len(rays.azimuth) > _MANY_POINTS:
+        some = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
+        if some.mean() > 0.1:
+            return Aimed(*(column[some] for column in rays))
+    return rays
 
 
 def _in_groups(group: NDArray[Any], angle: Float32) -> Float:
@@ -199,8 +210,8 @@ def _gaps(group: NDArray[Any], angle: Float32) -> Float:
 def _step_along(azimuth: Float32, ring: NDArray[Any]) -> float:
     """Return the median azimuth difference between neighbours on a ring."""
     along = _gaps(ring, azimuth)
-    along = along[along > _LEAST_GAP_RAD]
-    return float(np.median(along)) if len(along) else _DEFAULT_RAD
+    along = along[along > _LEAST_STEP_RAD]
+    return float(np.median(along)) if len(along) else _DEFAULT_RAD[0]
 
 
 def _even_step(rays: Aimed) -> tuple[float, float]:
@@ -212,41 +223,44 @@ def _even_step(rays: Aimed) -> tuple[float, float]:
     gap = _gaps(np.floor(rays.elevation / _BAND_RAD), rays.azimuth)
     gap = gap[gap > _LEAST_GAP_RAD]
     if not len(gap):
-        return _DEFAULT_RAD, 0.0
+        return _DEFAULT_RAD[0], 0.0
     usual = float(np.median(gap))
     return usual, float(np.mean(np.abs(gap - usual) < _EVEN * usual))
 
 
 def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
     """Return the table whose spacing at a ring is the mean distance to both neighbouring rings."""
-    low = float(rings[0]) - _CELL_RAD
-    num_bins = int((float(rings[-1]) + _CELL_RAD - low) / _RING_BIN_RAD) + 1
+    low = float(rings[0]) - _BEYOND_RAD
+    num_bins = int((float(rings[-1]) + _BEYOND_RAD - low) / _RING_BIN_RAD) + 1
     elevation = low + (np.arange(num_bins) + 0.5) * _RING_BIN_RAD
     along = np.interp(elevation, rings, np.gradient(rings, edge_order=1))
     return _table(low, _RING_BIN_RAD, step_rad * np.cos(elevation), along)
 
 
 def _table_of_lines(sweeps: Sequence[Aimed], step_rad: float) -> RayTable:
-    """Return the table of median elevation differences within a degree of azimuth, by elevation.
+    """Return the table of median elevation differences within sectors of 1 degree, by elevation.
 
-    Differences within one line are left out.
+    Differences within one line and across missing returns are left out.
     """
     gaps, middles = [], []
     for rays in sweeps:
-        ordered = _in_groups(np.floor(rays.azimuth / _CELL_RAD), rays.elevation)
+        ordered = _in_groups(np.floor(rays.azimuth / _COLUMN_RAD), rays.elevation)
         gap = np.diff(ordered)
-        kept = (gap < np.pi) & (gap > step_rad / 2)
+        kept = (gap < _MAX_GAP_RAD) & (gap > max(step_rad / 2, _LEAST_GAP_RAD))
         gaps.append(gap[kept])
         middle = ordered[:-1][kept] + gap[kept] / 2
         middles.append(middle - _APART_RAD * np.rint(middle / _APART_RAD))
-    low = float(min(r.elevation.min() for r in sweeps)) - _CELL_RAD
-    in_bin = ((np.concatenate(middles) - low) / _CELL_RAD).astype(np.int64)
-    bins = np.unique(in_bin)
-    num_bins = int((float(max(r.elevation.max() for r in sweeps)) - low) / _CELL_RAD) + 2
-    medians = ndimage.median(np.concatenate(gaps), in_bin, bins)
-    along = np.interp(np.arange(num_bins), bins, medians)
-    elevation = low + (np.arange(num_bins) + 0.5) * _CELL_RAD
-    return _table(low, _CELL_RAD, step_rad * np.cos(elevation), along)
+    low = float(min(r.elevation.min() for r in sweeps)) - _LINE_BIN_RAD
+    high = float(max(r.elevation.max() for r in sweeps)) + _LINE_BIN_RAD
+    num_bins = int((high - low) / _LINE_BIN_RAD) + 2
+    in_bin = ((np.concatenate(middles) - low) / _LINE_BIN_RAD).astype(np.int64)
+    bins = np.flatnonzero(np.bincount(in_bin, minlength=num_bins) >= _MIN_GAPS_PER_BIN)
+    along = np.full(num_bins, _DEFAULT_RAD[1])
+    if len(bins):
+        medians = ndimage.median(np.concatenate(gaps), in_bin, bins)
+        along = np.interp(np.arange(num_bins), bins, medians)
+    elevation = low + (np.arange(num_bins) + 0.5) * _LINE_BIN_RAD
+    return _table(low, _LINE_BIN_RAD, step_rad * np.cos(elevation), along)
 
 
 def _table(low: float, bin_rad: float, across: Float, along: Float) -> RayTable:

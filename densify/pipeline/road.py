@@ -171,8 +171,9 @@ class Road:
         if self.settings.source == "dataset":
             return self._recorded(known[-1], frames)
         stamp_ns = np.array([self.timeline.stamp_of(f) for f in frames], np.int64)
-        of_known, read = [surfaces[s.frame] for s in known], self.sweeps.read
-        return follow_road(known, of_known, frames, stamp_ns, read, self.far_m, _STEP_M)
+        read, prepare = self.sweeps.read, self.sweeps.prepare
+        own = [surfaces[s.frame] for s in known]
+        return follow_road(known, own, frames, stamp_ns, read, prepare, self.far_m, _STEP_M)
 
     def _most_sweeps(self, near: Stretch) -> int:
         """Return the number of sweeps that cover ``far_m`` at half the speed of the window."""

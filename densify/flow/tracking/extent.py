@@ -17,17 +17,22 @@ from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
-from densify.geometry.nearest import nearest
+from densify.geometry.linking import close_to_seeds
+from densify.geometry.nearest import is_near, nearest, nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 
 Instance = NDArray[np.int32]
 
 _REACH = 1.5  # of candidates to an object, in neighbour distances (`near_m`)
-_LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M = 0.08, 0.1
+_LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M, _AS_LOW_AS_ROAD_M = 0.08, 0.1, 0.15
 _WALKS_M_S = 2.0
-# Columns of rays that may be missing along a side that recedes from the scanner.
-_NUM_COLUMNS, _LONGEST_HOLE_M = 2.0, 2.0
-_MAX_VIOLATIONS = 0.05  # share of an extension's points that a sweep may see through
+_LEAST_SEEDS, _WALKER_M = 0.1, 1.5
+_WIDER_M, _MOSTLY = 0.5, 0.5  # least share of moving points within this distance
+_ALONE_GAPS, _NUM_BESIDE = 2.0, 2
+NUM_COLUMNS = 2.0
+"""Columns of rays that may be missing along a side that recedes from the scanner."""
+_LONGEST_HOLE_M = 2.0
+_MAX_VIOLATIONS = 0.05
 _PREDICTED_S = 0.2  # an object is known so long before the first and after the last observation
 
 
@@ -40,6 +45,7 @@ class SweepPoints:
         points: (N,3) world.
         time_s: (N,) firing time since the first sweep's reference time.
         height_m: (N,) height above the ground.
+        gap_m: (N,) distance between neighbouring rings at the point.
         reach_m: (N,) greatest distance from the shape of an object that may own the point.
     """
 
@@ -47,6 +53,7 @@ class SweepPoints:
     points: Float
     time_s: Float
     height_m: Float32
+    gap_m: Float
     reach_m: Float
 
     @staticmethod
@@ -63,7 +70,7 @@ class SweepPoints:
         candidate[obstacles.row[obstacles.candidate]] = True
         reach_m = np.where(candidate[row], _REACH, 1.0) * near_m(gap_m)
         time_s = firing_times_s(stretch, i, row)
-        return SweepPoints(row, points[row], time_s, height_m[row], reach_m)
+        return SweepPoints(row, points[row], time_s, height_m[row], gap_m, reach_m)
 
     @staticmethod
     def together(parts: Sequence[SweepPoints]) -> SweepPoints:
@@ -77,18 +84,60 @@ class SweepPoints:
         return Strips(self.points)
 
 
-def find_shape(track: Track, obstacles: Sequence[Obstacles], clock: Clock) -> Shape:
-    """Return the accumulated shape of a track.
+def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Shape:
+    """Return the accumulated shape of a track; shapes of walkers exclude their surroundings.
 
-    Objects of at most 2 m/s keep only the points that other sweeps saw through, because a wall
-    beside a walker is hardly ever seen through.
+    Objects faster than 2 m/s keep all points. Otherwise three kinds of points are dropped. Echoes
+    merged with the echoes of a wall occur only in even or only in odd sweeps. Points of a bush are
+    static or lie among static points. Points of a wall are hardly ever seen through. The same holds
+    for sides of slow cars: this cut applies only if the rest is shorter than 1.5 m.
     """
     sweeps = sorted(track.claimed)
-    points = track.points_in(obstacles, sweeps)
-    if _speed_m_s(track, sweeps[len(sweeps) // 2], clock) <= _WALKS_M_S:
-        seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
-        points = points[seed] if seed.any() else points
-    return Shape.of(points)
+    parts = {j: track.points_in(obstacles, [j]) for j in sweeps}
+    points = np.concatenate(list(parts.values()))
+    if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
+        return Shape.of(points)
+    within_m = near_m(space.gap_m(track.centre, sweeps[0]))
+    of = np.repeat(np.arange(len(sweeps)), [len(part) for part in parts.values()])
+    again = np.zeros(len(points), bool)
+    for odd in (False, True):
+        mine = of % 2 == odd
+        if not mine.all():
+            tree = tree_of(points[~mine])
+            again[mine] = is_near(tree, points[mine], _REACH * within_m)
+    moves = ~_is_static(track, obstacles, parts, of, within_m)
+    again &= moves & close_to_seeds(points, moves, _WIDER_M, _MOSTLY)
+    seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
+    own = again & close_to_seeds(points, seed, _REACH * within_m, _LEAST_SEEDS)
+    if own.any() and np.linalg.norm(np.ptp(points[own, :2], axis=0)) < _WALKER_M:
+        return Shape.of(points[own])
+    return Shape.of(points[again] if again.any() else points)
+
+
+def _is_static(
+    track: Track, obstacles: Sequence[Obstacles], parts: dict[int, Float], of: Int, reach_m: float
+) -> Bool:
+    """Return (N,) True for points that other sweeps confirm as static.
+
+    More of the other sweeps have a return at the measured position of such a point than at its
+    position moved along with the object.
+
+    Args:
+        parts: Points of the object by sweep index, in the object's frame, N in all.
+        of: (N,) position of the point's sweep in ``parts``.
+        reach_m: Greatest distance from a position to a return that occupies it.
+    """
+    in_object = np.concatenate(list(parts.values()))
+    places = np.concatenate([obstacles[j].points[track.claimed[j]] for j in parts])
+    low, high = places.min(0) - reach_m, places.max(0) + reach_m
+    static, moved = np.zeros((2, len(places)), np.int64)
+    for number, (j, own) in enumerate(parts.items()):
+        others, c = of != number, obstacles[j]
+        there = c.points[c.strips.rows_inside(low, high)]
+        for num, asked, among in ((static, places, there), (moved, in_object, own)):
+            if len(among):
+                num[others] += is_near(tree_of(among), asked[others], reach_m)
+    return np.asarray(static > moved)
 
 
 def assign_points(
@@ -118,6 +167,7 @@ def assign_points(
     attached = np.split(joined, np.cumsum([len(mine) for mine in attached])[:-1])
     instances = []
     for i, points, mine in zip(batch, parts, attached, strict=True):
+        leave_out_isolated(mine, points, i, objects, space.clock)
         instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
         instance[points.row] = mine
         instances.append(instance)
@@ -153,6 +203,28 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
     return instance
 
 
+def leave_out_isolated(
+    instance: Instance, seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock
+) -> None:
+    """Detach isolated points that are low or belong to a slow object (``instance`` = -1).
+
+    They are echoes merged with the echoes of a wall, or the road behind an edge.
+
+    Args:
+        instance: (N,) index of each point's object, -1 for none; changed in place.
+    """
+    low = seen.height_m < _AS_LOW_AS_ROAD_M
+    for k in np.unique(instance[instance >= 0]):
+        mine = np.flatnonzero(instance == k)
+        doubtful = mine
+        if _speed_m_s(objects[k].track, i, clock) > _WALKS_M_S:
+            doubtful = mine[low[mine]]
+        if len(mine) <= _NUM_BESIDE or not len(doubtful):
+            continue
+        away_m, _ = nearest_k(tree_of(seen.points[mine]), seen.points[doubtful], 1 + _NUM_BESIDE)
+        instance[doubtful[away_m[:, -1] > _ALONE_GAPS * seen.gap_m[doubtful]]] = -1
+
+
 def lengthen(
     instance: Instance,
     seen: SweepPoints,
@@ -186,17 +258,12 @@ def lengthen(
         fits = lane.holds(at_once)
         rows, along = rows[fits], at_once[fits, :2] @ lane.ahead
         own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ lane.ahead
-        hole_m = longest_hole_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
+        columns_m = columns_apart_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
+        hole_m = float(np.clip(NUM_COLUMNS * columns_m, LINK_M, _LONGEST_HOLE_M))
         linked = _is_linked(along, own, hole_m)
         if linked.any():
             rows, along = rows[linked], along[linked] - np.median(own)
             instance[rows[_is_free_of_violations(track, seen, rows, along, i, space)]] = k
-
-
-def longest_hole_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
-    """Return the longest hole in the side of one object; arguments as in `columns_apart_m`."""
-    columns_m = columns_apart_m(place, ahead, T_lidar_world, sensors)
-    return float(np.clip(_NUM_COLUMNS * columns_m, LINK_M, _LONGEST_HOLE_M))
 
 
 def columns_apart_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:

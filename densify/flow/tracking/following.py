@@ -7,22 +7,26 @@ pose that constant speed and turn rate predict. A batch holds consecutive sweeps
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
 from densify.flow.tracking.candidates import Batch, Obstacles
-from densify.flow.tracking.objects import FIT_M, Track
+from densify.flow.tracking.objects import MovingObject, Track
 from densify.free_space.ground import HeightMap
 from densify.geometry.clock import Clock
+from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 MIN_POINTS = 8  # to start a track
 _MIN_SEED_SHARE = 0.4
 _AROUND_S = 0.5  # farther than this from both ends of the recording, starts are equally good
 _NEARER_END, _NEARER_END_S = 0.7, 0.1  # closer to an end, a start is worth 0.7 per 0.1 s
+_BESIDE_M = 1.0  # from a towing vehicle to what it tows
+FIT_M = 0.3
+"""Greatest distance of a point from the object that claims it."""
 _SHARE_UNSEEN = 0.5  # least share of the object's usual number of points
 # Standard deviation (m, m, rad) of a prediction over 0.25 s; it grows with longer times.
 _PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
@@ -59,6 +63,26 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
         good = np.flatnonzero((size >= MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
         starts += [(n, np.flatnonzero(c.cluster == k)) for k in good]
     return sorted(starts, key=worth, reverse=True)
+
+
+def velocities_beside(
+    batch: Batch, members: Int, objects: Sequence[MovingObject]
+) -> Iterator[Float]:
+    """Yield the velocity (3,), m/s, of each object within 1 m of a cluster, as of a tow car.
+
+    The measurements alone hardly show how fast a long side slides along itself.
+
+    Args:
+        batch: Batch of the cluster.
+        members: Indices of the cluster's points in the batch's obstacles.
+        objects: Moving objects found so far.
+    """
+    points = batch.obstacles.points[members]
+    tree, middle = tree_of(points), points.mean(0, keepdims=True)
+    for track, shape in objects:
+        at_s = track.seen_at(batch.time_ns)
+        if is_near(tree, track.place(shape.points, at_s), _BESIDE_M).any():
+            yield track.velocity_m_s(middle, at_s)[0]
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ import numpy as np
 from densify.config import Config
 from densify.flow.engines import Scene
 from densify.flow.tracking.candidates import Candidates, Obstacles, firing_times_s
-from densify.flow.tracking.extent import Instance, assign_points, is_known_at
-from densify.flow.tracking.objects import Track
+from densify.flow.tracking.extent import Instance, assign_points, find_shape, is_known_at
+from densify.flow.tracking.objects import MovingObject, Track
 from densify.flow.tracking.soften import Part, Softened, soften
-from densify.flow.tracking.tracks import find_objects
+from densify.flow.tracking.tracks import find_tracks
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.types import Float, FlowField, Int, Stretch
@@ -130,8 +130,8 @@ def motion_of(
     """
     stretch, space = scene.stretch, scene.space
     obstacles = [Obstacles.of(stretch, i, found) for i, found in enumerate(candidates)]
-    objects = find_objects(obstacles, space, scene.ground, velocities_m_s)
-    tracks = [track for track, _ in objects]
+    tracks = find_tracks(obstacles, space, scene.ground, velocities_m_s)
+    objects = [MovingObject(track, find_shape(track, obstacles, space)) for track in tracks]
 
     def members(batch: Sequence[int]) -> list[Instance]:
         if any(map(scene.is_asked, batch)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,10 +23,13 @@ _NEAR_M, _NEAR_GAPS = 0.2, 0.5
 _MANY_POINTS = 100  # more points do not locate an object better
 _BESIDE_M = 1.0
 _OUTLINE_M = 0.05
-FIT_M = 0.3
-"""Greatest distance of a point from the object that claims it."""
+LONG_M = 3.0
+"""Objects shorter than this may bend, and need not move where they point."""
 LANE_M = 15.0
 """Distance ahead of and behind an object within which its parts are searched."""
+_SIDE_M = 0.1
+_QUARTERS_RAD = np.arange(4) * np.pi / 2
+_SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
 
 
 def near_m(gap_m: Float | float) -> Any:
@@ -215,6 +219,27 @@ class Shape:
         """
         return is_near(self.tree, points, within_m) | self.within_outline(points)
 
+    @cached_property
+    def side_rad(self) -> float:
+        """The direction of one side seen from above, in [0, pi / 2), object's frame.
+
+        The other sides are taken as parallel or perpendicular. The direction makes the histograms
+        of the points along both axes most peaked (greatest sum of squares).
+        """
+        points = self.points[:: len(self.points) // _SOME_POINTS + 1, :2]
+        points = points - points.mean(axis=0)
+        reach_m = float(np.linalg.norm(points, axis=1).max())
+        num = int(2 * reach_m / _BIN_M) + 2
+        angles = np.deg2rad(np.arange(0.0, 90.0, _ANGLE_DEG))
+        score = np.zeros(len(angles))
+        for turned in (angles, angles + np.pi / 2):
+            across = np.outer(np.cos(turned), points[:, 0]) + np.outer(np.sin(turned), points[:, 1])
+            place = ((across + reach_m) / _BIN_M).astype(np.int64)
+            place += num * np.arange(len(angles))[:, None]
+            counts = np.bincount(place.ravel(), minlength=num * len(angles))
+            score += (counts.reshape(-1, num) ** 2).sum(axis=1)
+        return float(angles[np.argmax(score)])
+
 
 class MovingObject(NamedTuple):
     """A confirmed track with its shape."""
@@ -222,20 +247,35 @@ class MovingObject(NamedTuple):
     track: Track
     shape: Shape
 
-    def lane(self, at_s: float) -> Lane:
-        """Return the space ahead of and behind the object at a time (s), see `Lane`."""
+    def heading(self, at_s: float) -> Float:
+        """Return (2,) the unit vector along the object at a time, world.
+
+        An object longer than 3 m points along the side closest to its velocity, because a turning
+        trailer does not move where it points. Other objects point along their velocity.
+        """
         ahead = self.track.path.rate(at_s)[:2]
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
+        rim = self.track.place(self.shape.rim, at_s)[:, :2]
+        if np.linalg.norm(np.ptp(rim, axis=0)) < LONG_M:
+            return ahead
+        sides_rad = self.shape.side_rad + float(self.track.path(at_s)[3]) + _QUARTERS_RAD
+        sides = np.stack([np.cos(sides_rad), np.sin(sides_rad)], axis=1)
+        side: Float = sides[np.argmax(sides @ ahead)]
+        return side if np.ptp(rim @ side) >= LONG_M else ahead
+
+    def lane(self, at_s: float) -> Lane:
+        """Return the space ahead of and behind the object at a time (s), see `Lane`."""
+        ahead = self.heading(at_s)
         rim = self.track.place(self.shape.rim, at_s)
         aside = rim[:, :2] @ [-ahead[1], ahead[0]]
-        return Lane(ahead, aside.min() - FIT_M, aside.max() + FIT_M, rim[:, 2].max() + FIT_M)
+        return Lane(ahead, aside.min() - _SIDE_M, aside.max() + _SIDE_M, rim[:, 2].max() + _SIDE_M)
 
 
 class Lane(NamedTuple):
     """The space ahead of and behind an object, as wide and as high as the object.
 
     Attributes:
-        ahead: (2,) unit vector of the horizontal velocity, world.
+        ahead: (2,) unit vector of the heading, world.
         right_m: Right border: coordinate along the left normal of ``ahead``, m from the world's
             origin.
         left_m: Left border, as ``right_m``.

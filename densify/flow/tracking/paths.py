@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import factorial
 
 import numpy as np
 from scipy.interpolate import BSpline, PPoly
@@ -18,13 +17,15 @@ from scipy.interpolate import BSpline, PPoly
 from densify.geometry.types import Float
 
 _KNOT_S = 0.1
-# (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03 and 10 m/s³.
-_STIFFNESSES = (1e6, 10.0)
+# (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03, 2 and 10 m/s³.
+_STIFFNESSES = (1e6, 200.0, 10.0)
 _WORTH_SOFTENING = 0.8  # a softer path must lower the leave-one-out error to this share
 # Fewer states, or a shorter time, determine no acceleration, or no jerk.
 _ACCELERATION_STATES, _ACCELERATION_S = 5, 0.35
 _JERK_STATES, _JERK_S = 8, 0.65
 _DEGREE = 3
+# Powers 3 to 0 of the time since a span began, by the coefficients of the four B-splines on it.
+_CUBIC = np.array([[-1, 3, -3, 1], [3, -6, 3, 0], [-3, 0, 3, 0], [1, 4, 1, 0]]) / 6
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,8 @@ class Path:
         num_spans = max(1, round((end_s - begin_s) / _KNOT_S))
         width_s = (end_s - begin_s) / num_spans
         knots: Float = begin_s + width_s * np.arange(-_DEGREE, num_spans + _DEGREE + 1.0)
-        inside = np.clip(times_s, begin_s, np.nextafter(end_s, begin_s))
+        last_s = min(end_s, knots[-_DEGREE - 1])  # rounding may put the last knot before the end
+        inside = np.clip(times_s, begin_s, np.nextafter(last_s, begin_s))
         B = BSpline.design_matrix(inside, knots, _DEGREE).toarray()
         num_states, duration_s = len(times_s), end_s - begin_s
         accelerates = num_states >= _ACCELERATION_STATES and duration_s >= _ACCELERATION_S
@@ -89,15 +91,18 @@ class Path:
 
     @cached_property
     def _pieces(self) -> PPoly:
-        """The path as polynomials in time; its first and its last piece are tangents."""
-        spline = BSpline(self.knots_s, self.coefficients, _DEGREE)
-        starts_s = self.knots_s[_DEGREE:-_DEGREE]
-        pieces = np.stack([spline(starts_s, k) / factorial(k) for k in range(_DEGREE, -1, -1)])
-        pieces[:2, -1] = 0.0
-        first = pieces[:, :1] * [[[0.0]], [[0.0]], [[1.0]], [[1.0]]]
-        first[3] -= first[2]  # it starts a second before the path
-        times_s = np.concatenate([starts_s[:1] - 1, starts_s, starts_s[-1:] + 1])
-        return PPoly(np.concatenate([first, pieces], axis=1), times_s)
+        """The path as polynomials in time; the first and the last piece are its ends' tangents."""
+        num_spans = len(self.coefficients) - _DEGREE
+        width_s = (self.end_s - self.begin_s) / num_spans
+        controls = np.stack([self.coefficients[k : k + num_spans] for k in range(_DEGREE + 1)])
+        cubic = np.einsum("pk,knd->pnd", _CUBIC, controls)
+        first, last = np.zeros((2, _DEGREE + 1, 1, cubic.shape[2]))
+        first[2:] = cubic[2:, :1]
+        first[3] -= first[2]
+        last[3], last[2] = cubic[:, -1:].sum(axis=0), np.arange(3.0, -1.0, -1) @ cubic[:, -1]
+        powers = width_s ** -np.arange(_DEGREE, -1.0, -1)
+        pieces = np.concatenate([first, cubic, last], axis=1) * powers[:, None, None]
+        return PPoly(pieces, self.begin_s + width_s * np.arange(-1.0, num_spans + 2))
 
     def __call__(self, time_s: float | Float) -> Float:
         """Return the states (..., d) at the given times (...) in seconds."""

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
+from densify.flow.tracking.objects import LONG_M
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Float, Int
 
@@ -25,15 +26,17 @@ _ALPHAS = tuple(np.geomspace(100.0, 0.5, 7).tolist())  # from stiff to soft
 _REACHES_M = np.geomspace(0.5, 0.25, len(_ALPHAS))  # targets farther away do not pull
 _BLURS_M = np.geomspace(0.2, 0.08, len(_ALPHAS))
 _NODE_M = 0.07  # one node per voxel, so that dense regions are not stiffer than sparse regions
-_NUM_NEIGHBORS = 8
+_NUM_NEIGHBORS, _LINK_M = 6, 0.5
+_NUM_BLURRED = 8
+_STEADY = 1.0  # weight of equal velocities before and after
 _ANCHOR, _ANCHOR_M = 2.0, 0.02  # weight of the rigid position, and distance at which it fades
 _MAX_PRODUCTS, _RESIDUAL_DROP = 30, 0.02
 _NUM_LOOKED_UP = 3
-_MIN_PARTS, _MIN_POINTS = 5, 20
-_LONG_M = 3.0  # longer objects are rigid
+_MIN_PARTS, _MIN_SEEN_S, _MIN_POINTS = 5, 0.35, 20
+_CAP_M = 0.3  # greatest distance that a stray point counts
 # On eight streets parts of vehicles gained up to 0.045 of the squared distance, walkers within
 # 20 m mostly 0.06 to 0.4.
-_MIN_GAIN = 0.05
+_MIN_GAIN, _MIN_SHARE_BETTER = 0.05, 0.75
 
 
 @dataclass(frozen=True)
@@ -104,8 +107,9 @@ def soften(parts: Sequence[Part]) -> Softened:
 
     The stiffness is lowered while held-out parts confirm it: every second part is left out, and
     predicted from the bending between its neighbours. The softest stiffness is taken that predicts
-    clearly better than the rigid object. Otherwise the object stays rigid. Objects longer than 3 m,
-    with fewer than 5 parts, or with a median of fewer than 20 points per part stay rigid.
+    clearly better than the rigid object, in most parts. Otherwise the object stays rigid. Objects
+    longer than 3 m always stay rigid. Objects with fewer than 5 parts, less than 0.35 s, or a
+    median of fewer than 20 points per part stay rigid too.
     """
     parts = tuple(parts)
     still = tuple(np.zeros_like(part.points) for part in parts)
@@ -114,7 +118,9 @@ def soften(parts: Sequence[Part]) -> Softened:
     squared = _held_out(parts)
     rms_m = np.sqrt(squared.mean(axis=0)).tolist()
     held_out_m = dict(zip((np.inf, *_ALPHAS), rms_m, strict=True))
-    confirmed = np.flatnonzero(squared.mean(axis=0) < (1 - _MIN_GAIN) * squared[:, 0].mean())
+    clearly = squared.mean(axis=0) < (1 - _MIN_GAIN) * squared[:, 0].mean()
+    mostly = (squared < squared[:, :1]).mean(axis=0) >= _MIN_SHARE_BETTER
+    confirmed = np.flatnonzero(clearly & mostly)
     if not len(confirmed):
         return Softened(parts, still, still, np.inf, held_out_m)
     softest = int(confirmed[-1]) - 1
@@ -127,10 +133,12 @@ def soften(parts: Sequence[Part]) -> Softened:
 
 def _may_bend(parts: tuple[Part, ...]) -> bool:
     """Return True if the object is shorter than 3 m and was observed often enough."""
-    if len(parts) < _MIN_PARTS or np.median([len(p.points) for p in parts]) < _MIN_POINTS:
+    if len(parts) < _MIN_PARTS or parts[-1].time_s - parts[0].time_s < _MIN_SEEN_S:
+        return False
+    if np.median([len(p.points) for p in parts]) < _MIN_POINTS:
         return False
     lengths_m = [np.linalg.norm(np.ptp(p.points, axis=0)) for p in parts]
-    return bool(np.median(lengths_m) < _LONG_M)
+    return bool(np.median(lengths_m) < LONG_M)
 
 
 def _held_out(parts: tuple[Part, ...]) -> Float:
@@ -153,8 +161,9 @@ def _held_out(parts: tuple[Part, ...]) -> Float:
 
 
 def _squared_distance(a: Float, b: Float) -> float:
-    """Return the mean squared distance (m²) of nearest points, both ways."""
-    there, back = nearest(tree_of(b), a)[0], nearest(tree_of(a), b)[0]
+    """Return the mean squared, capped distance (m²) of nearest points, both ways."""
+    there = np.minimum(nearest(tree_of(b), a)[0], _CAP_M)
+    back = np.minimum(nearest(tree_of(a), b)[0], _CAP_M)
     return float((there**2).mean() + (back**2).mean()) / 2
 
 
@@ -187,7 +196,7 @@ class _Bending:
         self._start = np.cumsum([0] + [len(self._nodes[a]) for a, _ in self._hops])
         self._source = self._side_by_side([self._nodes[a] for a, _ in self._hops])
         self._laplacian = _laplacian(self._source)
-        self._around = nearest_k(tree_of(self._source), self._source, _NUM_NEIGHBORS)[1]
+        self._around = nearest_k(tree_of(self._source), self._source, _NUM_BLURRED)[1]
         self._steady = self._steadiness()
         self._flow = np.zeros_like(self._source)
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
@@ -199,7 +208,7 @@ class _Bending:
             level: Index of the stiffness in `_ALPHAS`, 0 for the stiffest.
         """
         moved = self._source + self._flow
-        near = nearest_k(tree_of(self._target), moved, _NUM_NEIGHBORS)[1]
+        near = nearest_k(tree_of(self._target), moved, _NUM_BLURRED)[1]
         there, distance_m = _blurred(self._target, near, moved, _BLURS_M[level])
         own, _ = _blurred(moved, self._around, moved, _BLURS_M[level])
         weight = np.clip(1 - (distance_m / _REACHES_M[level]) ** 2, 0, 1) ** 2  # Tukey
@@ -266,7 +275,7 @@ class _Bending:
             rows = slice(self._start[k], self._start[k + 1])
             opposite[rows] = np.arange(self._start[other], self._start[other + 1])
             u, v = 1 / abs(times_s[b] - times_s[a]), 1 / abs(times_s[2 * a - b] - times_s[a])
-            scale = 2 / (u * u + v * v)
+            scale = 2 * _STEADY / (u * u + v * v)
             own[rows], crossed[rows] = scale * u * u, scale * u * v
         row = np.arange(len(opposite))
         coupling = coo_array((crossed, (row, opposite)), shape=(len(row), len(row)))
@@ -276,14 +285,14 @@ class _Bending:
 def _laplacian(points: Float) -> csr_array:
     """Return the (n,n) Laplacian ``(D - W) / mean(D)`` of the neighbour graph of (n,3) points.
 
-    ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is among the 8 nearest of the other,
-    itself included. D holds the row sums of W.
+    ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is among the 6 nearest of the other,
+    within 0.5 m. The diagonal of W is 1. D holds the row sums of W.
     """
     n = len(points)
-    distance_m, near = nearest_k(tree_of(points), points, _NUM_NEIGHBORS)
-    row = np.repeat(np.arange(n), near.shape[1])
+    distance_m, near = nearest_k(tree_of(points), points, _NUM_NEIGHBORS + 1)
+    row, rank = np.nonzero(distance_m <= _LINK_M)
     weights = coo_array(
-        (np.exp(-(distance_m**2)).ravel(), (row, near.ravel())), shape=(n, n)
+        (np.exp(-(distance_m[row, rank] ** 2)), (row, near[row, rank])), shape=(n, n)
     ).tocsr()
     weights = weights.maximum(weights.T)
     degree = weights.sum(axis=1)

@@ -8,7 +8,7 @@ in time. It is confirmed only if the smooth motion explains the measurements.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +16,16 @@ from scipy import ndimage
 
 from densify.flow.surface_matching import Model
 from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles
-from densify.flow.tracking.extent import find_shape, longest_hole_m
-from densify.flow.tracking.following import MIN_POINTS, Follower, find_starts
+from densify.flow.tracking.extent import NUM_COLUMNS, columns_apart_m
+from densify.flow.tracking.following import (
+    FIT_M,
+    MIN_POINTS,
+    Follower,
+    find_starts,
+    velocities_beside,
+)
 from densify.flow.tracking.likelihood import Judge, Verdict, judge
-from densify.flow.tracking.objects import FIT_M, LANE_M, MovingObject, Shape, Track
+from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track
 from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
@@ -30,20 +36,20 @@ from densify.geometry.linking import link
 from densify.geometry.types import Bool, Float, Int
 
 _NEAR_S = 0.3
-_BESIDE_M = 1.0  # from a towing vehicle to what it tows
 _REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: standard deviation of the smooth motion
 _AS_WHOLE = 0.9  # share of the known track's points that a better track must keep
+_GAPS_IN_LINE_M = (1.5, 4.0)
 _ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of a single ring or column, in steps
 
 
-def find_objects(
+def find_tracks(
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
     ground: HeightMap,
     velocities_m_s: Sequence[Float] | None = None,
     judged: Judge | None = None,
-) -> list[MovingObject]:
-    """Return all moving objects in the stretch (consecutive sweeps).
+) -> list[Track]:
+    """Return the confirmed tracks of all moving objects in the stretch (consecutive sweeps).
 
     Args:
         obstacles: Points above the ground of each sweep.
@@ -51,7 +57,7 @@ def find_objects(
             clusters start. None lets the neighbouring sweeps vote.
         judged: Function called with each track that was tried, and its evidence.
     """
-    return _Search(obstacles, space, ground, velocities_m_s, judged).objects()
+    return _Search(obstacles, space, ground, velocities_m_s, judged).tracks()
 
 
 class _Search:
@@ -85,8 +91,8 @@ class _Search:
     def _all_points(self) -> list[Bool]:
         return [np.ones(len(c.points), bool) for c in self._obstacles]
 
-    def objects(self) -> list[MovingObject]:
-        """Return the confirmed objects; those from the best starting clusters come first."""
+    def tracks(self) -> list[Track]:
+        """Return the confirmed tracks; tracks from the best starting clusters come first."""
         untried = self._all_points()
         for n, cluster in find_starts([batch.obstacles for batch in self.batches], self.clock):
             batch = self.batches[n]
@@ -99,7 +105,7 @@ class _Search:
                 untried[j][rows] = False
             if verdict.moves:
                 self._keep(track)
-        return self._objects
+        return [track for track, _ in self._objects]
 
     def _keep(self, track: Track) -> None:
         """Keep a confirmed track, with all points that its motion explains."""
@@ -111,7 +117,7 @@ class _Search:
         self._objects.append(MovingObject(track, self._shape_of(track)))
 
     def _shape_of(self, track: Track) -> Shape:
-        return find_shape(track, self._obstacles, self._space.clock)
+        return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
 
     def _velocity_of(self, members: Int, n: int) -> Float:
         """Return the likely velocity (3,), m/s, world frame, of a cluster.
@@ -136,7 +142,7 @@ class _Search:
         along itself.
         """
         best = self._follow(members, n, self._velocity_of(members, n))
-        for velocity in self._velocities_beside(members, n):
+        for velocity in velocities_beside(self.batches[n], members, self._objects):
             if best[1].is_clearly_below(best[1].at_most):
                 best = _better(best, self._follow(members, n, velocity))
         track, verdict = best
@@ -148,15 +154,6 @@ class _Search:
                     if found[0].total_points() >= _AS_WHOLE * track.total_points():
                         best = _better(best, found)
         return best
-
-    def _velocities_beside(self, members: Int, n: int) -> Iterator[Float]:
-        """Yield the velocity (3,), m/s, of each object beside a cluster, as of a towing vehicle."""
-        batch = self.batches[n]
-        points = batch.obstacles.points[members]
-        for track, shape in self._objects:
-            at_s = track.seen_at(batch.time_ns)
-            if shape.near(track.undo(points, at_s), _BESIDE_M).any():
-                yield track.velocity_m_s(points.mean(axis=0, keepdims=True), at_s)[0]
 
     def _follow(self, members: Int, n: int, velocity: Float) -> tuple[Track, Verdict]:
         track = self._follower.follow(members, n, velocity)
@@ -171,7 +168,10 @@ class _Search:
         """
         shape = self._shape_of(track)
         for j, own in track.claimed.items():
-            c, rows = self._obstacles[j], self._unclaimed(track, shape, j, LINK_M)
+            c = self._obstacles[j]
+            there = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
+            rows = c.strips.rows_inside(there.min(0) - LINK_M, there.max(0) + LINK_M)
+            rows = self._unclaimed(j, rows, own)
             rows = rows[shape.near(track.undo(c.points[rows], c.time_s[rows]), FIT_M)]
             track.claimed[j] = np.concatenate([own, self._without_violations(track, j, rows)])
 
@@ -185,29 +185,33 @@ class _Search:
         at_s = next(iter(track.observations.values())).seen_s
         lane = MovingObject(track, shape).lane(at_s)
         found, parts = {}, [track.place(shape.points, at_s)]
-        for j in track.claimed:
-            c, rows = self._obstacles[j], self._unclaimed(track, shape, j, LANE_M)
+        for j, own in track.claimed.items():
+            c = self._obstacles[j]
+            there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
+            rows = c.strips.rows_inside(there.min(0) - LANE_M, there.max(0) + LANE_M)
+            rows = self._unclaimed(j, rows, own)
             rows = rows[_few_rays(c, rows, space.T_lidar_world[j], space.sensors)]
             rows = rows[lane.holds(track.carry(c.points[rows], c.time_s[rows], at_s))]
             found[j] = rows = self._without_violations(track, j, rows)
             parts.append(track.carry(c.points[rows], c.time_s[rows], at_s))
-        T_lidar_world = space.T_lidar_world[next(iter(track.claimed))]
-        hole_m = longest_hole_m(track.centre, lane.ahead, T_lidar_world, space.sensors)
+        j = next(iter(track.claimed))
+        columns_m = columns_apart_m(track.centre, lane.ahead, space.T_lidar_world[j], space.sensors)
+        gap_m = float(np.clip(NUM_COLUMNS * columns_m, *_GAPS_IN_LINE_M))
         points = np.concatenate(parts)
-        points[:, :2] -= (1 - LINK_M / hole_m) * (points[:, :2] @ lane.ahead)[:, None] * lane.ahead
+        points[:, :2] -= (1 - LINK_M / gap_m) * (points[:, :2] @ lane.ahead)[:, None] * lane.ahead
         _, group = link(points, LINK_M)
         linked = np.isin(group, group[: len(shape.points)])
         ends = np.cumsum([len(part) for part in parts])
         for (j, rows), together in zip(found.items(), np.split(linked, ends)[1:-1], strict=True):
             track.claimed[j] = np.concatenate([track.claimed[j], rows[together]])
 
-    def _unclaimed(self, track: Track, shape: Shape, j: int, reach_m: float) -> Int:
-        """Return the free candidates of sweep j around the object that it does not have yet."""
-        c = self._obstacles[j]
-        there = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
-        rows = c.strips.rows_inside(there.min(0) - reach_m, there.max(0) + reach_m)
-        rows = rows[self._free[j][rows] & (c.cluster[rows] >= 0)]
-        return np.setdiff1d(rows, track.claimed[j], assume_unique=True)
+    def _unclaimed(self, j: int, rows: Int, own: Int) -> Int:
+        """Return those ``rows`` of sweep j that are free candidates, without ``own``.
+
+        Both are indices into the obstacles of sweep j; ``own`` belong to the track already.
+        """
+        rows = rows[self._free[j][rows] & (self._obstacles[j].cluster[rows] >= 0)]
+        return np.setdiff1d(rows, own, assume_unique=True)
 
     def _without_violations(self, track: Track, j: int, rows: Int) -> Int:
         """Return those ``rows`` of sweep j that, moved with the track, are never seen through.

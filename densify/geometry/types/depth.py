@@ -317,7 +317,7 @@ class DepthMap:
 
     def counts(self) -> dict[str, int]:
         """Return the number of points per `Reason`, by its name in lower case."""
-        counts = np.bincount(self.reason, minlength=len(Reason))
+        counts = np.bincount(self.reason, minlength=max(Reason) + 1)
         return {which.name.lower(): int(counts[which]) for which in Reason}
 
 
