@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from test_project import KEY, T_CAM_LIDAR, make_camera, make_cloud, patches_of
@@ -12,10 +10,9 @@ from test_project import KEY, T_CAM_LIDAR, make_camera, make_cloud, patches_of
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure
 from densify.depth.project import project
-from densify.depth.seen_through import Rays, crossings, without_seen_through
+from densify.depth.seen_through import Rays, crossings
 from densify.geometry.poses import exp, transform
-from densify.geometry.types import Reason, RegisteredSweep, Stretch, Sweep
-from tests.depth_layers import layers_of
+from densify.geometry.types import RegisteredSweep, Stretch, Sweep
 
 FRONT_M, WALL_M = 12.0, 20.0
 PICKET_M, STEP_M = 0.09, 0.17
@@ -33,10 +30,6 @@ def board(y, z):
 
 def pole(y, z):
     return np.abs(y) < 0.06
-
-
-def legs(y, z):
-    return (np.abs(y) < 0.5) & (np.abs(y) > 0.12)
 
 
 def scanned(solid, of_others=None):
@@ -110,28 +103,6 @@ def test_solid_things_stay_though_sweeps_saw_what_is_behind_them(solid):
     lost = (before.filled_m > 0) & (after.filled_m == 0)
     assert lost[there].mean() < 0.001
     assert lost.mean() < 0.002
-
-
-def shut(measured):
-    """The plane before the wall, without a hole."""
-    depth_m = np.full((CAMERA.height_px, CAMERA.width_px), FRONT_M)
-    return layers_of(depth_m, depth_m > 0 if measured else depth_m < 0, spacing_px=(2.1, 5.0))
-
-
-def test_what_only_the_key_sweep_measured_stays():
-    """Rays of other sweeps went through where an object was that moved without being noticed."""
-    cloud, _, rays = scanned(board, legs)
-    view = Exposure(CAMERA, T_CAM_LIDAR).sees(cloud)
-    front = cloud.points[:, 0] < 0.5 * (FRONT_M + WALL_M)
-    reason = np.where(front, Reason.KEPT, Reason.HIDDEN).astype(np.uint8)
-    u = np.arange(CAMERA.width_px)
-    between = np.abs((u - CAMERA.K[0, 2]) / CAMERA.K[0, 0] * FRONT_M) < 0.09
-    only = np.broadcast_to(between, (CAMERA.height_px, CAMERA.width_px))
-    for key_only in (None, only):
-        layers = replace(shut(measured=False), key_only=key_only)
-        made = without_seen_through(layers, cloud, view, rays, reason)
-        lost = (made.filled_m == 0)[10:50, between]
-        assert lost.mean() > 0.95 if key_only is None else not lost.any()
 
 
 @pytest.mark.parametrize("measure", ["z", "range"])
