@@ -34,6 +34,7 @@ from densify.geometry.types import (
     Bool,
     DepthMap,
     Float,
+    Float32,
     LidarSequence,
     Progress,
     Sweep,
@@ -336,7 +337,7 @@ class _Thinned:
 
 
 def _curve_of(
-    depth: DepthMap, depth_m: Float, truth: TruthMap, part: str, focal_px: float
+    depth: DepthMap, depth_m: Float32, truth: TruthMap, part: str, focal_px: float
 ) -> Curve:
     """Return the curve of one part of the pixels: all, moving, or all but widened posts (aside)."""
     known = truth.depth_m > 0

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from densify.geometry.types import Bool, Float
+from densify.geometry.types import Bool, Float, Float32
 
 _NUM_STEPS = 200  # of a curve
 _BEYOND = 2.0  # standard deviations of luck, and standard errors between keys
@@ -28,7 +28,7 @@ Curve = Mapping[str, Any]
 """
 
 
-def curve(num_true: int, confidence: Float, outliers: Bool) -> Curve:
+def curve(num_true: int, confidence: Float | Float32, outliers: Bool) -> Curve:
     """Return the outliers over the coverage.
 
     Args:

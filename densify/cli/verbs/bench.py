@@ -210,8 +210,11 @@ def _answer_gate(options: argparse.Namespace) -> Iterator[Answer]:
         now = gate.measure(options.data, kinds, options.keys, options.draws, progress, Cache())
     luck = now.luck if options.draws else stored.luck
     for group, names in gate.GROUPS.items():
-        parts = ({k: f for k, f in x.items() if k in names} for x in (stored.figures, now.figures))
-        rows = list(verdicts(*parts, luck))
+        before, after = (
+            {k: f for k, f in known.items() if k in names}
+            for known in (stored.figures, now.figures)
+        )
+        rows = list(verdicts(before, after, luck))
         if rows:
             titles = [group, "keys", "before", "now", "change", "error", "luck", "worst", ""]
             yield Answer(aligned([titles, *map(_verdict_cells, rows)]) + "\n")
