@@ -43,38 +43,26 @@ _View = tuple[Camera, Float]
 
 
 class _Passed(NamedTuple):
-    """A sweep along the road.
+    """A sweep along the road."""
 
-    Attributes:
-        registered: Returns in view of a camera, with the pose; deskewed if ``known``, else raw.
-        surface: Surface of all returns, deskewed, in the lidar frame; None with recorded poses.
-        travel_m: Distance along the road from the window's first sweep, negative before it.
-        known: True if the sweep is in the window, where poses are known.
-    """
-
+    # Returns in view of a camera, with the pose; deskewed if ``known``, else raw
     registered: RegisteredSweep
+    # Surface of all returns, deskewed, in the lidar frame; None with recorded poses
     surface: Surface | None
-    travel_m: float
-    known: bool
+    travel_m: float  # distance along the road from the window's first sweep, negative before it
+    known: bool  # true if the sweep is in the window, where poses are known
 
 
 @dataclass(frozen=True)
 class Road:
-    """The road before and after a window.
+    """The road before and after a window."""
 
-    Attributes:
-        timeline: Times of the recording's sweeps.
-        sweeps: Reader of the raw sweeps.
-        cameras: Cameras that must see a point for it to be kept.
-        settings: Settings of registration.
-        far_m: Distance along the road on each side of the window where a camera looks. Half of
-            it is covered where no camera looks.
-    """
-
-    timeline: Timeline
-    sweeps: Sweeps
-    cameras: Sequence[Camera]
-    settings: RegisterSettings
+    timeline: Timeline  # times of the recording's sweeps
+    sweeps: Sweeps  # reader of the raw sweeps
+    cameras: Sequence[Camera]  # cameras that must see a point for it to be kept
+    settings: RegisterSettings  # settings of registration
+    # Distance along the road on each side of the window where a camera looks. Half of it is covered
+    # where no camera looks.
     far_m: float
 
     def find_standing(self, near: Stretch, keys: Sequence[int], with_near: bool) -> StandingWorld:
@@ -171,9 +159,8 @@ class Road:
         if self.settings.source == "dataset":
             return self._recorded(known[-1], frames)
         stamp_ns = np.array([self.timeline.stamp_of(f) for f in frames], np.int64)
-        read, prepare = self.sweeps.read, self.sweeps.prepare
-        own = [surfaces[s.frame] for s in known]
-        return follow_road(known, own, frames, stamp_ns, read, prepare, self.far_m, _STEP_M)
+        of_known, read = [surfaces[s.frame] for s in known], self.sweeps.read
+        return follow_road(known, of_known, frames, stamp_ns, read, self.far_m, _STEP_M)
 
     def _most_sweeps(self, near: Stretch) -> int:
         """Return the number of sweeps that cover ``far_m`` at half the speed of the window."""

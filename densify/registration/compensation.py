@@ -28,19 +28,12 @@ _BIN_RAD = np.deg2rad(0.02)
 
 
 class Rings(NamedTuple):
-    """The sharpness of a sweep's rings under three assumptions, see `sharpness`.
+    """The sharpness of a sweep's rings under three assumptions, see `sharpness`."""
 
-    Attributes:
-        as_stored: Sharpness of the points as they are.
-        undone: Sharpness after undoing a motion compensation to ``moment``.
-        done: Sharpness after compensating the motion.
-        moment: Time within the sweep, in words.
-    """
-
-    as_stored: float
-    undone: float
-    done: float
-    moment: str
+    as_stored: float  # sharpness of the points as they are
+    undone: float  # sharpness after undoing a motion compensation to ``moment``
+    done: float  # sharpness after compensating the motion
+    moment: str  # time within the sweep, in words
 
     @property
     def are_distinct(self) -> bool:

@@ -48,6 +48,11 @@ def deskew_sweep(
     return RegisteredSweep(deskewed, T_world_lidar, twist_before, twist_after)
 
 
+def deskew_points(sweep: Sweep, twist: Float) -> Float:
+    """Return the (N,3) points deskewed by a (6,) velocity (rad/s, m/s), lidar frame."""
+    return deskew_sweep(sweep, np.eye(4), twist, twist).sweep.points
+
+
 def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
     """Return the (6,) velocities (rad/s, m/s) before and after sweep i, in its lidar frame.
 

@@ -21,22 +21,20 @@ from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Sweep
-from densify.registration.alignment import Alignment, Surface, SurfaceMap, align, subsample
-from densify.registration.deskew import deskew_sweep
+from densify.registration.alignment import Alignment, Surface, align, make_map, subsample
+from densify.registration.deskew import deskew_points
 from densify.registration.trajectory import MIN_NUM_POINTS, MIN_OVERLAP, find_jump
 
 _CHAIN_MATCH_M = 2.0
 _FEW_POINTS = 15_000  # of a sweep, which find its pose in the chain
-_MAP_NS = 550_000_000  # known sweeps within this time make the first map
 _LONGEST_GAP_S = 0.4  # greatest time between two sweeps of the chain
-_TOGETHER = 6  # sweeps that are chosen together, at one speed
 
 _LEAST_POINTS = 80_000  # points of a submap; rings of fewer points slide onto each other
 _MOST_SWEEPS = 5
 _APART = (1, 4, 8)  # distances of the pairs, in submaps
 _MATCH_M = 0.6
 _USUAL_M = 0.02  # usual error of a pair; a pair with a much larger error has less weight
-_MOST_STEPS, _CONVERGED = 10, 1e-6
+_NUM_STEPS = 10  # of Gauss-Newton
 _LEAST_OVERLAP, _MOST_LEFT_M, _MOST_WRONG = 0.5, 0.1, 0.25
 
 
@@ -46,7 +44,6 @@ def follow_road(
     frames: Sequence[int],
     stamp_ns: Int,
     read: Callable[[int], Sweep],
-    prepare: Callable[[Sequence[int]], None],
     reach_m: float,
     step_m: float,
 ) -> Iterator[tuple[RegisteredSweep, Surface]]:
@@ -62,110 +59,50 @@ def follow_road(
         frames: Frame numbers along the road, ascending or descending in time, nearest first.
         stamp_ns: (n,) reference times of ``frames``.
         read: Returns the raw sweep of a frame.
-        prepare: Called with the frames that are read next.
         reach_m: Distance along the road to cover.
         step_m: Approximate distance between sweeps. Sweeps in between are not read.
 
     Yields:
         The raw sweep with its pose, and its surface, deskewed, in its lidar frame.
     """
-    backwards = len(frames) > 0 and int(stamp_ns[0]) < known[-1].sweep.stamp_ns
-    end, travel_m, row = _ChainEnd(known, surfaces, backwards), 0.0, 0
-    while travel_m < reach_m and row < len(frames):
-        rows = _next_rows(stamp_ns, row, end.stamp_ns, step_m, end.speed_m_s)
-        prepare([frames[r] for r in rows])
-        for r in rows:
-            try:
-                sweep = read(frames[r])
-            except InputError:
-                return
-            before_ns = end.stamp_ns
-            surface = end.move_to(sweep)
-            if surface is None:
-                return
-            travel_m += end.speed_m_s * abs(end.stamp_ns - before_ns) * 1e-9
-            yield RegisteredSweep(sweep, end.T_world_lidar, end.twist, end.twist), surface
-            if travel_m >= reach_m:
-                return
-        row = rows[-1] + 1
-
-
-class _ChainEnd:
-    """The map of all sweeps registered so far, and pose, time and velocity of the last sweep."""
-
-    def __init__(
-        self, known: Sequence[RegisteredSweep], surfaces: Sequence[Surface], backwards: bool
-    ) -> None:
-        """Begin with the ``known`` sweeps; ``backwards`` if the chain goes back in time."""
-        self._map, last = SurfaceMap(), known[-1]
-        for s, surface in zip(known, surfaces, strict=True):
-            if abs(s.sweep.stamp_ns - last.sweep.stamp_ns) <= _MAP_NS:
-                self._map.insert(surface, s.T_world_lidar)
-        self.T_world_lidar, self.stamp_ns = last.T_world_lidar, last.sweep.stamp_ns
-        self.twist = last.twist_before if backwards else last.twist_after
-
-    @property
-    def speed_m_s(self) -> float:
-        return float(np.linalg.norm(self.twist[3:]))
-
-    def move_to(self, sweep: Sweep) -> Surface | None:
-        """Align the next sweep with the map, add it, and return its surface; None if that fails."""
+    chain, T_world_lidar, last_ns = make_map(), known[-1].T_world_lidar, known[-1].sweep.stamp_ns
+    for s, surface in zip(known, surfaces, strict=True):
+        chain.insert(surface.points, s.T_world_lidar)
+    is_backwards = len(frames) > 0 and stamp_ns[0] < last_ns
+    twist = known[-1].twist_before if is_backwards else known[-1].twist_after
+    speed_m_s, travel_m = float(np.linalg.norm(twist[3:])), 0.0
+    middle_ns = stamp_ns + np.diff(stamp_ns, append=stamp_ns[-1:]) / 2
+    for frame, time_ns, until_ns in zip(frames, stamp_ns.tolist(), middle_ns, strict=True):
+        gap_s = min(_LONGEST_GAP_S, step_m / max(speed_m_s, 1e-3))
+        is_near = abs(until_ns - last_ns) < 1e9 * gap_s and frame != frames[-1]
+        if travel_m >= reach_m or is_near:
+            continue  # the next sweep is nearer to the wanted gap
+        try:
+            sweep = read(frame)
+        except InputError:
+            return
         if len(sweep) < MIN_NUM_POINTS:
-            return None
-        step_s = (sweep.stamp_ns - self.stamp_ns) * 1e-9
-        guess = self.T_world_lidar @ poses.exp(self.twist * step_s)
-        surface = _surface(subsample(sweep, _FEW_POINTS), self.twist)
-        found = self._map.align(surface, guess, _CHAIN_MATCH_M)
-        twist = poses.twist_between(self.T_world_lidar, found.T_target_source, step_s)
-        if found.overlap < MIN_OVERLAP or find_jump(twist, self.twist, abs(step_s)):
-            return None
-        self.T_world_lidar, self.stamp_ns = found.T_target_source, sweep.stamp_ns
-        self.twist, surface = twist, _surface(subsample(sweep), twist)
-        self._map.insert(surface, self.T_world_lidar)
-        return surface
-
-
-def _surface(sweep: Sweep, twist: Float) -> Surface:
-    """Return the surface of a raw sweep, deskewed by a (6,) velocity (rad/s, m/s)."""
-    return Surface.of(deskew_sweep(sweep, np.eye(4), twist, twist).sweep.points)
-
-
-def _next_rows(stamp_ns: Int, row: int, last_ns: int, step_m: float, speed_m_s: float) -> list[int]:
-    """Return the indices in ``stamp_ns`` of up to six sweeps to register next.
-
-    The sweeps are about ``step_m`` apart at the present speed, and at most about 0.4 s. If no sweep
-    is far enough away, the last one is returned.
-
-    Args:
-        stamp_ns: (n,) reference times of the sweeps along the road, nearest first.
-        row: Index of the first sweep that may be chosen.
-        last_ns: Reference time of the sweep registered last.
-        step_m: Wanted distance between sweeps.
-        speed_m_s: Speed of the vehicle.
-    """
-    gap_ns = 1e9 * min(_LONGEST_GAP_S, step_m / max(speed_m_s, 1e-3))
-    rows: list[int] = []
-    for r in range(row, len(stamp_ns)):
-        # The next sweep is nearer to the wanted gap.
-        beyond = abs(int(stamp_ns[min(r + 1, len(stamp_ns) - 1)]) - last_ns)
-        if (abs(int(stamp_ns[r]) - last_ns) + beyond) / 2 >= gap_ns:
-            rows.append(r)
-            last_ns = int(stamp_ns[r])
-        if len(rows) == _TOGETHER:
-            break
-    return rows or [len(stamp_ns) - 1]
+            return
+        step_s, twist_before = (time_ns - last_ns) * 1e-9, twist
+        T_guess = T_world_lidar @ poses.exp(twist * step_s)
+        surface = Surface.of(deskew_points(subsample(sweep, _FEW_POINTS), twist))
+        T_found, overlap, _ = align(chain, surface, T_guess, _CHAIN_MATCH_M)
+        twist = poses.twist_between(T_world_lidar, T_found, step_s)
+        if overlap < MIN_OVERLAP or find_jump(twist, twist_before, abs(step_s)):
+            return
+        surface = Surface.of(deskew_points(subsample(sweep), twist))  # by the velocity found
+        chain.insert(surface.points, T_found)
+        T_world_lidar, last_ns = T_found, time_ns
+        speed_m_s = float(np.linalg.norm(twist[3:]))
+        travel_m += speed_m_s * abs(step_s)
+        yield RegisteredSweep(sweep, T_world_lidar, twist, twist), surface
 
 
 class Relaxed(NamedTuple):
-    """Consistent poses of n sweeps.
+    """Consistent poses of n sweeps."""
 
-    Attributes:
-        T_world_lidar: (n,4,4) poses.
-        holds: (n,) True if reliable alignments connect the sweep to the sweeps with known poses.
-    """
-
-    T_world_lidar: Float
-    holds: Bool
+    T_world_lidar: Float  # (n,4,4) poses
+    holds: Bool  # (n,) True if reliable alignments connect the sweep to the sweeps with known poses
 
 
 def num_in_submap(num_points: float) -> int:
@@ -264,11 +201,8 @@ class _Graph:
         T, free = T_world_submap.copy(), ~self._fixed
         if not free.any():
             return T
-        for _ in range(_MOST_STEPS):
-            step = self._step(T)
-            T[free] = T[free] @ poses.exp(step)
-            if abs(step).max() < _CONVERGED:
-                break
+        for _ in range(_NUM_STEPS):
+            T[free] = T[free] @ poses.exp(self._step(T))
         return T
 
     def holds(self, T: Float) -> Bool:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -18,9 +17,8 @@ from densify.free_space.ground import find_upright
 from densify.geometry import poses
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
-from densify.registration.deskew import deskew
 from densify.registration.odometry import MAX_SPEED_M_S, above_ground, find_odometry
-from densify.registration.surfaces import refine, register_on_surfaces
+from densify.registration.surfaces import register_on_surfaces
 
 MIN_OVERLAP = 0.55
 """Least share of a sweep's points above the ground that overlap the sweeps of the third of a second
@@ -36,16 +34,11 @@ _OVERLAP_NS = 350_000_000  # time in which a pattern that does not repeat fills 
 
 
 class LeftOut(NamedTuple):
-    """The reason why a sweep is not used.
+    """The reason why a sweep is not used."""
 
-    Attributes:
-        reason: Sentence for the user.
-        unreadable: True if the sweep could not be read, False if it could not be registered.
-        unfit: True if the sweep's own content prevents registration, as with too few points.
-    """
-
-    reason: str
-    unreadable: bool
+    reason: str  # sentence for the user
+    unreadable: bool  # true if the sweep could not be read, False if it could not be registered
+    # True if the sweep's own content prevents registration, as with too few points
     unfit: bool = False
 
     def error(self, frame: int) -> InputError | SweepError:
@@ -57,16 +50,12 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True)
 class Registration:
-    """The poses of a block: consecutive sweeps that are registered together.
+    """The poses of a block: consecutive sweeps that are registered together."""
 
-    Attributes:
-        pieces: Trajectories of consecutive sweeps, each in a world of its own, including the
-            lead-in sweeps before the block.
-        bad: Frame number -> reason why the sweep is not used.
-    """
-
+    # Trajectories of consecutive sweeps, each in a world of its own, including the lead-in sweeps
+    # before the block
     pieces: tuple[Trajectory, ...]
-    bad: Mapping[int, LeftOut]
+    bad: Mapping[int, LeftOut]  # frame number -> reason why the sweep is not used
 
 
 def find_trajectory(
@@ -74,8 +63,8 @@ def find_trajectory(
 ) -> Trajectory:
     """Return the poses of raw sweeps.
 
-    Dense sweeps are registered point to point, then aligned with the surfaces of earlier sweeps.
-    Sparse sweeps are registered on surfaces only.
+    Each sweep is aligned with the surfaces of earlier sweeps. KISS-ICP predicts the motion of dense
+    sweeps.
 
     Args:
         sweeps: Raw sweeps, ascending in time.
@@ -84,22 +73,22 @@ def find_trajectory(
     Raises:
         SweepError: The poses are implausible. The message names the frame.
     """
-    _check_stamps([s.frame for s in sweeps], np.array([s.stamp_ns for s in sweeps], np.int64))
+    frames = tuple(s.frame for s in sweeps)
+    stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
+    _check_stamps(frames, stamp_ns)
     if recorded is not None:
         check_plausible(recorded, settings)
-        check_overlap(sweeps, recorded, settings)
+        in_world = zip(recorded.T_world_lidar, sweeps, strict=True)
+        check_overlap([poses.transform(T, s.points) for T, s in in_world], recorded, settings)
         return replace(recorded, R_level_lidar=find_upright(sweeps))
     _check_number_of_points(sweeps, settings)
-    dense = bool(np.median([len(sweep) for sweep in sweeps]) >= _MANY_POINTS)
-    if dense:
-        odometry, deskewed = find_odometry(sweeps, settings)
-        found = refine(sweeps, odometry)
-    else:
-        found = register_on_surfaces(sweeps)
-        deskewed = [s.sweep for s in deskew(sweeps, found).sweeps]
-    check_plausible(found, settings)
-    check_overlap(deskewed, found, settings)
-    return replace(found, R_level_lidar=find_upright(sweeps))
+    is_dense = len(sweeps) > 1 and np.median([len(s) for s in sweeps]) >= _MANY_POINTS
+    twists = find_odometry(sweeps, settings) if is_dense else None
+    T_world_lidar, points = register_on_surfaces(sweeps, twists)
+    trajectory = Trajectory(frames, stamp_ns, T_world_lidar, R_level_lidar=find_upright(sweeps))
+    check_plausible(trajectory, settings)
+    check_overlap(points, trajectory, settings)
+    return trajectory
 
 
 def _check_number_of_points(sweeps: Sequence[Sweep], settings: RegisterSettings) -> None:
@@ -168,7 +157,7 @@ def find_jump(twist: Float, before: Float | None, step_s: float) -> str:
 
 
 def check_overlap(
-    sweeps: Sequence[Sweep], trajectory: Trajectory, settings: RegisterSettings
+    points: Sequence[Float], trajectory: Trajectory, settings: RegisterSettings
 ) -> None:
     """Raise UnplacedSweepError if a sweep overlaps too little with the sweeps just before it.
 
@@ -177,29 +166,20 @@ def check_overlap(
     repeat. Near the start, the following third of a second is tested too. Very sparse sweeps pass.
 
     Args:
-        sweeps: Deskewed sweeps.
-        trajectory: Poses of these sweeps.
+        points: (N,3) points of each sweep in the world.
+        trajectory: Frame numbers and times of these sweeps.
     """
     frames, stamp_ns = trajectory.frames, trajectory.stamp_ns
-
-    def in_world(i: int) -> Float:
-        return poses.transform(trajectory.T_world_lidar[i], above_ground(sweeps[i].points))
-
-    before: deque[tuple[int, cKDTree]] = deque()
-    for i in range(len(sweeps)):
-        points = in_world(i)
-        while len(before) > 1 and stamp_ns[i] - before[0][0] > _OVERLAP_NS:
-            before.popleft()
-        trees = [tree for _, tree in before]
-        share = _share_on(points, trees)
+    above = [above_ground(p) for p in points]
+    trees = [tree_of(p) for p in above]
+    for i in range(1, len(points)):
+        first = min(int(np.searchsorted(stamp_ns, stamp_ns[i] - _OVERLAP_NS)), i - 1)
+        share = _share_on(above[i], trees[first:i])
         if share < MIN_OVERLAP and stamp_ns[i] - stamp_ns[0] < _OVERLAP_NS:
-            end = np.searchsorted(stamp_ns, stamp_ns[i] + _OVERLAP_NS)
-            after = [tree_of(in_world(j)) for j in range(i + 1, int(end))]
-            own = tree_of(points)
-            both_ways = min(
-                _share_on(points, trees + after), _share_on(in_world(i - 1), [own, *after])
-            )
-            share = max(share, both_ways)
+            end = int(np.searchsorted(stamp_ns, stamp_ns[i] + _OVERLAP_NS))
+            others = trees[first:i] + trees[i + 1 : end]
+            both_ways = _share_on(above[i], others), _share_on(above[i - 1], trees[i:end])
+            share = max(share, min(both_ways))
         if share < MIN_OVERLAP:
             raise UnplacedSweepError(
                 f"registration fails from frame {frames[i - 1]} to {frames[i]}: only "
@@ -207,7 +187,6 @@ def check_overlap(
                 f"expected at least {100 * MIN_OVERLAP:.1f} %; {_advice(settings)}",
                 frames[i],
             )
-        before.append((int(stamp_ns[i]), tree_of(points)))
 
 
 def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
