@@ -22,17 +22,11 @@ from densify.flow.objective.graph import checked_cloud
 
 
 class Energy(NamedTuple):
-    """Terms of the objective E, 0-d tensors that carry the gradient.
+    """Terms of the objective E, 0-d tensors that carry the gradient."""
 
-    Attributes:
-        total: ``data + alpha * smoothness``, m².
-        data: Data term E_d, m².
-        smoothness: Smoothness term tr(FᵀLF), m².
-    """
-
-    total: Tensor
-    data: Tensor
-    smoothness: Tensor
+    total: Tensor  # ``data + alpha * smoothness``, m²
+    data: Tensor  # data term E_d, m²
+    smoothness: Tensor  # smoothness term tr(FᵀLF), m²
 
 
 def energy(
@@ -54,9 +48,6 @@ def energy(
         target: (m,3) metres, points q, in the frame of the source.
         laplacian: (n,n) L of `densify.flow.objective.graph.laplacian`.
         alpha: Weight of the smoothness term; a smaller weight leaves each point freer.
-
-    Raises:
-        InputError: A shape is wrong, a cloud is empty, or a value is NaN.
     """
     if flow.shape != source.shape:
         raise InputError(

@@ -1,15 +1,30 @@
 # SPDX-License-Identifier: MIT
-"""Engine ``paper``: solve the published objective between neighbouring sweeps, above the ground."""
+"""Solve the published objective between two clouds.
+
+Source: Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020. The
+engine ``paper`` solves it between neighbouring sweeps, above the ground.
+"""
 
 from __future__ import annotations
 
-from densify.config import Config
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from densify.config import Config, ObjectiveSettings
 from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
-from densify.flow.pairs.estimate import flow_between
+from densify.flow.objective.solvers import SolverSettings, solve
+from densify.flow.pairs.motions import RigidMotion, judge
+from densify.flow.pairs.surface import PairCloud
 from densify.free_space.ground import ABOVE_GROUND_M
 from densify.geometry import poses
-from densify.geometry.types import FlowField, Motion
+from densify.geometry.linking import link
+from densify.geometry.types import Float, FlowField, Motion
+
+_LEAST_MOTION_M = 0.15
+_LINK_M = 0.6
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
@@ -34,4 +49,49 @@ def _step(scene: Scene, here: int, there: int, settings: Config) -> FlowField:
         R_world_lidar = scene.stretch.sweeps[here].T_world_lidar[:3, :3]
         field.displacement[above] = pair.displacement @ R_world_lidar
         field.moving[above] = pair.moving
+    return field
+
+
+def flow_between(
+    source: ArrayLike,
+    target: ArrayLike,
+    settings: ObjectiveSettings,
+    initial: ArrayLike | None = None,
+) -> FlowField:
+    """Return the flow of a source cloud (N,3) to a target (M,3), by the published objective.
+
+    With ``static_prior`` only groups that certainly move have flow. The arguments are as in
+    `densify.estimate_flow`; ``settings`` is its section ``objective``.
+    """
+    objective = SolverSettings(
+        solver=settings.solver,
+        alpha=settings.alpha,
+        num_neighbors=settings.num_neighbors,
+    )
+    flow = solve(source, target, objective, initial).flow
+    if settings.static_prior:
+        return _only_proven((np.asarray(source, float), np.asarray(target, float)), flow)
+    still = FlowField.zero(len(flow))
+    return replace(still, displacement=flow, moving=np.ones(len(flow), bool))
+
+
+def _only_proven(clouds: tuple[Float, Float], flow: Float) -> FlowField:
+    """Keep the flow (N,3) of groups of source points that certainly move. Other points get flow 0.
+
+    A group is judged by its common translation. The free flow of each point cannot decide, because
+    it always comes closer to the target.
+    """
+    field = FlowField.zero(len(flow))
+    source, target = (PairCloud(c, np.full(len(c), float(i))) for i, c in enumerate(clouds))
+    moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > _LEAST_MOTION_M)
+    num_groups, group = link(source.points[moved], _LINK_M)
+    instance = 0
+    for k in range(num_groups):
+        rows = moved[group == k]
+        state, centre = np.append(np.median(flow[rows], axis=0), 0.0), source.points[rows].mean(0)
+        if judge(k, rows, RigidMotion(state, centre), source, target).moves():
+            field.displacement[rows] = flow[rows]
+            field.moving[rows] = True
+            field.instance[rows] = instance
+            instance += 1
     return field

@@ -17,11 +17,7 @@ from densify.geometry.types import Float
 
 
 def checked_cloud(values: ArrayLike, name: str) -> Float:
-    """Return a copy of a cloud as (n,3) float64 metres.
-
-    Raises:
-        InputError: There are no points, the shape is not (n,3), or a coordinate is not finite.
-    """
+    """Return a copy of a cloud as (n,3) float64 metres."""
     try:
         points = np.array(values, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
@@ -49,9 +45,6 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
         points: (n,3) metres.
         num_neighbors: Number k of neighbours without the point itself, at most n - 1. A larger k
             couples the flow of points farther apart.
-
-    Raises:
-        InputError: There are no points, a coordinate is NaN, or k < 1.
     """
     if num_neighbors < 1:
         raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")

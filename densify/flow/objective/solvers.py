@@ -42,9 +42,6 @@ class SolverSettings:
         alpha: Weight of smoothness, at least 0. A larger weight moves neighbours more alike.
         num_neighbors: Number k of neighbours in the graph. A larger k is stiffer and slower.
         adam_num_steps: Number of steps of Adam. 200 usually reach the lowest energy.
-
-    Raises:
-        InputError: A value is out of range.
     """
 
     solver: str = "pcg"
@@ -64,22 +61,14 @@ class SolverSettings:
 
 @dataclass(frozen=True)
 class Solution:
-    """A flow and its energy at the requested alpha.
+    """A flow and its energy at the requested alpha."""
 
-    Attributes:
-        flow: (n,3) float64 metres, in the frame of the clouds.
-        energy: Value of the objective ``data + alpha * smoothness``, m².
-        data: Data term of the objective, m².
-        smoothness: Smoothness term tr(FᵀLF), m².
-        energies: Energy before each step and after the last step. A step is an Adam step or an
-            alternation of pcg. Adam's energy may rise; its minimum is ``energy``. Pcg's never rises
-            on the last level.
-    """
-
-    flow: Float
-    energy: float
-    data: float
-    smoothness: float
+    flow: Float  # (n,3) float64 metres, in the frame of the clouds
+    energy: float  # value of the objective ``data + alpha * smoothness``, m²
+    data: float  # data term of the objective, m²
+    smoothness: float  # smoothness term tr(FᵀLF), m²
+    # Energy before each step and after the last step. A step is an Adam step or an alternation of
+    # pcg. Adam's energy may rise; its minimum is ``energy``. Pcg's never rises on the last level.
     energies: tuple[float, ...]
 
 
@@ -98,9 +87,6 @@ def solve(
         target: (m,3) metres, in the same frame.
         settings: Settings of the solver; None for the defaults.
         initial: (n,3) flow to start from, None for 0. With it, pcg uses the final alpha at once.
-
-    Raises:
-        InputError: There are no points, wrong shapes, or NaN.
     """
     settings = settings or SolverSettings()
     moving, fixed = checked_cloud(source, "source"), checked_cloud(target, "target")

@@ -10,36 +10,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
-from densify.config import Config, ObjectiveSettings, resolve
+from densify.config import Config, resolve
 from densify.config.errors import InputError
 from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
+from densify.flow.objective.engine import flow_between
 from densify.flow.objective.graph import checked_cloud
-from densify.flow.objective.solvers import SolverSettings, solve
-from densify.flow.pairs.hypotheses import PairCloud
 from densify.flow.pairs.movers import find_movers
+from densify.flow.pairs.surface import PairCloud
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.geometry import poses
-from densify.geometry.linking import link
 from densify.geometry.nearest import nearest, tree_of
-from densify.geometry.types import Float, FlowField, Int, Motion, Stretch, Sweep
+from densify.geometry.types import Float, FlowField, Int, Motion, Stretch
 
-_LEAST_MOTION_M = 0.15
-_LINK_M = 0.6
-_MIN_POINTS = 8
-_REACH_M = 0.5
-_MIN_GAIN_M = 0.07
-_MAX_EXTENT_M = 400.0
-_MIN_LOW_M = 0.04
-_BELOW_M = 0.3
-_MIDDLE_M = 3.0  # closer points have no direction from a scanner
-_MIN_AGREEMENT, _MAX_SINGLE = 0.8, 0.3
+_MAX_EXTENT_M = 400.0  # of the points that are searched, from the middle
+_MIN_LOW_M = 0.04  # least height of points below a moving group
+_SCANNERS_APART_M = 1000.0  # lifts each scanner's points out of reach of the others'
+_BELOW_M = 0.3  # horizontal distance of points below a moving group
 
 
 def estimate_flow(
@@ -78,9 +70,6 @@ def estimate_flow(
     Returns:
         Flow from the middle of the source's times to the target's middle, in the common frame. With
             times, ``to_reference`` is the motion from a point's own time to the source's middle.
-
-    Raises:
-        InputError: No points, a wrong shape, NaN, or an engine that needs a recording.
     """
     settings = resolve(config)
     if settings.flow.engine not in ("groups", "paper"):
@@ -89,10 +78,8 @@ def estimate_flow(
             "alone are no recording"
         )
     clouds = checked_cloud(source, "source"), checked_cloud(target, "target")
-    times = _times(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
+    times = _shares(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
-    if lidars is None and times is not None:
-        lidars = _tell_scanners(clouds, times.lag)
     if not settings.objective.static_prior or settings.flow.engine == "paper":
         return flow_between(*clouds, settings.objective, initial)
     start = None if initial is None else checked_cloud(initial, "initial")
@@ -100,37 +87,13 @@ def estimate_flow(
         raise InputError(
             f"initial: got shape {start.shape}, expected the source's {clouds[0].shape}"
         )
-    return _flow_of_groups(clouds, settings, start, times, lidars)
-
-
-def flow_between(
-    source: ArrayLike,
-    target: ArrayLike,
-    settings: ObjectiveSettings,
-    initial: ArrayLike | None = None,
-) -> FlowField:
-    """Return the flow (N,3) of a source cloud to a target, by the published objective.
-
-    Source: Pontes, Hays, Lucey, 3DV 2020. With ``static_prior`` only groups that certainly move
-    have flow. The arguments are as in `estimate_flow`; ``settings`` is its section ``objective``.
-    """
-    objective = SolverSettings(
-        solver=settings.solver,
-        alpha=settings.alpha,
-        num_neighbors=settings.num_neighbors,
-    )
-    flow = solve(source, target, objective, initial).flow
-    if settings.static_prior:
-        return _only_proven(np.asarray(source, float), np.asarray(target, float), flow)
-    still = FlowField.zero(len(flow))
-    return replace(still, displacement=flow, moving=np.ones(len(flow), bool))
+    return _flow_of_groups(clouds, start, times, lidars)
 
 
 def _flow_of_groups(
     clouds: tuple[Float, Float],
-    settings: Config,
     initial: Float | None,
-    times: _Times | None,
+    times: tuple[list[Float], float] | None,
     lidars: tuple[Int, Int] | None,
 ) -> FlowField:
     middle = np.median(clouds[0], axis=0)  # map coordinates lose nothing
@@ -143,22 +106,25 @@ def _flow_of_groups(
     field = FlowField.zero(len(clouds[0]))
     if not (len(above[0]) and len(above[1])):
         return field
-    lag = times.lag if times else (np.zeros(len(clouds[0])), np.zeros(len(clouds[1])))
-    source, target = (
-        PairCloud(points[i][rows], lag[i][rows], None if lidars is None else lidars[i][rows])
-        for i, rows in enumerate(above)
-    )
+    share, apart_s = times or ([np.full(len(c), float(i)) for i, c in enumerate(clouds)], None)
+    if lidars is not None and times is None:  # each measures an object at another time
+        _, number = np.unique(np.concatenate(lidars), return_inverse=True)
+        for cloud, lidar in zip(points, np.split(number, [len(clouds[0])]), strict=True):
+            cloud[:, 2] += _SCANNERS_APART_M * lidar
+    source, target = (PairCloud(points[i][rows], share[i][rows]) for i, rows in enumerate(above))
     start = None if initial is None else initial[above[0]]
-    apart_s = times.apart_s if times else None
-    motions, field.instance[above[0]] = find_movers(source, target, ground, start, apart_s)
+    height_m = heights_m[0][heights_m[0] >= ABOVE_GROUND_M]
+    motions, field.instance[above[0]] = find_movers(
+        source, target, height_m, ground, apart_s, start
+    )
     low = (heights_m[0] < ABOVE_GROUND_M) & (heights_m[0] > _MIN_LOW_M)
     _attach_below(points[0], field, inside[0][low])
     to_reference = np.zeros_like(clouds[0])
     for k, motion in enumerate(motions):
         rows = np.flatnonzero(field.instance == k)
         measured = points[0][rows]
-        at_reference = motion.carry(measured, -lag[0][rows])
-        field.displacement[rows] = motion.carry(measured, 1 - lag[0][rows]) - at_reference
+        at_reference = motion.undo(measured, share[0][rows])
+        field.displacement[rows] = motion.place(at_reference, 1.0) - at_reference
         to_reference[rows] = at_reference - measured
     field.moving[:] = field.instance >= 0
     return field if times is None else replace(field, to_reference=to_reference)
@@ -170,32 +136,6 @@ def _attach_below(points: Float, field: FlowField, low: Int) -> None:
     if len(members) and len(low):
         _, row = nearest(tree_of(points[members, :2]), points[low, :2], _BELOW_M)
         field.instance[low[row >= 0]] = field.instance[members[row[row >= 0]]]
-
-
-def _tell_scanners(clouds: tuple[Float, Float], lag: tuple[Float, Float]) -> tuple[Int, Int] | None:
-    """Return (N,) and (M,) scanner numbers 0 or 1 for two scanners half a turn apart, else None.
-
-    A spinning scanner has a phase: time plus or minus azimuth is constant over its points. If the
-    phases of two scanners are half a turn apart, only the doubled phases agree.
-
-    Args:
-        clouds: The (N,3) and (M,3) points.
-        lag: (N,) and (M,) firing times as a share of the time between the clouds (whole turns).
-    """
-    both = np.concatenate(clouds)
-    far = np.hypot(both[:, 0], both[:, 1]) > _MIDDLE_M
-    share = max(float(np.ptp(late)) for late in lag)  # of a sweep in the time between the clouds
-    if not far.any() or share <= 0:
-        return None
-    turned = np.concatenate(lag) * (2 * np.pi * max(1, round(1 / share)))
-    azimuth = np.arctan2(both[:, 1], both[:, 0])
-    for phase in (turned + azimuth, turned - azimuth):
-        doubled = np.exp(2j * phase[far]).mean()
-        if abs(doubled) < _MIN_AGREEMENT or abs(np.exp(1j * phase[far]).mean()) > _MAX_SINGLE:
-            continue
-        lidar = (np.cos(phase - np.angle(doubled) / 2) < 0).astype(np.int64)
-        return lidar[: len(clouds[0])], lidar[len(clouds[0]) :]
-    return None
 
 
 def _columns(
@@ -223,20 +163,16 @@ def _columns(
     return columns[0], columns[1]
 
 
-class _Times(NamedTuple):
-    """The firing times of two clouds.
+def _shares(times_ns: tuple[Int, Int] | None) -> tuple[list[Float], float] | None:
+    """Return the firing times of two clouds as shares of the time between the clouds.
 
-    Attributes:
-        lag: (N,) and (M,) times after the middle of the own cloud's times, in units of ``apart_s``.
-        apart_s: Seconds from the middle of one cloud's times to the middle of the other's.
+    Args:
+        times_ns: (N,) and (M,) firing times.
+
+    Returns:
+        (N,) and (M,) times after the middle of the source's times, in units of the time from there
+            to the middle of the target's times, and this time in s. None if unknown or equal.
     """
-
-    lag: tuple[Float, Float]
-    apart_s: float
-
-
-def _times(times_ns: tuple[Int, Int] | None) -> _Times | None:
-    """Return the times of two clouds from (N,) and (M,) ns, None if unknown or equal."""
     if times_ns is None:
         return None
     low, high = (np.array([int(of(times)) for times in times_ns]) for of in (np.min, np.max))
@@ -246,52 +182,10 @@ def _times(times_ns: tuple[Int, Int] | None) -> _Times | None:
         gap = span  # each from its own reference time: the next revolution
     if gap == 0:
         return None
-    first, second = ((times - m) / gap for times, m in zip(times_ns, middle, strict=True))
-    return _Times((first, second), abs(gap) * 1e-9)
-
-
-def _only_proven(source: Float, target: Float, flow: Float) -> FlowField:
-    """Keep the flow (N,3) of groups of source points that fit the target better if moved.
-
-    The fit is tested from group to target and back. All other points get flow 0.
-    """
-    field = FlowField.zero(len(source))
-    moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > _LEAST_MOTION_M)
-    num_groups, group = link(source[moved], _LINK_M)
-    trees = cKDTree(source), cKDTree(target)
-    instance = 0
-    for k in range(num_groups):
-        rows = moved[group == k]
-        if len(rows) < _MIN_POINTS:
-            continue
-        if _beats_standing_still(source[rows], target, flow[rows], trees):
-            field.displacement[rows] = flow[rows]
-            field.moving[rows] = True
-            field.instance[rows] = instance
-            instance += 1
-    return field
-
-
-def _beats_standing_still(
-    group: Float, target: Float, flow: Float, trees: tuple[cKDTree, cKDTree]
-) -> bool:
-    """Return True if the group's common translation fits the target better than no motion.
-
-    The free flow of each point cannot decide this, because it always comes closer to the target.
-    """
-    source_tree, target_tree = trees
-    arrived = group + np.median(flow, axis=0)
-
-    def mean_distance(tree: cKDTree, points: Float) -> float:
-        return float(np.minimum(tree.query(points)[0], _REACH_M).mean())
-
-    reached = np.unique(np.concatenate(target_tree.query_ball_point(arrived, _REACH_M))).astype(int)
-    if not len(reached):
-        return False
-    forward = mean_distance(target_tree, group) - mean_distance(target_tree, arrived)
-    there = target[reached]
-    backward = mean_distance(source_tree, there) - mean_distance(cKDTree(arrived), there)
-    return min(forward, backward) >= _MIN_GAIN_M
+    shares = [
+        i + (times - m) / gap for i, (times, m) in enumerate(zip(times_ns, middle, strict=True))
+    ]
+    return shares, abs(gap) * 1e-9
 
 
 # --- The engine ``pairs``
@@ -317,7 +211,12 @@ def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowFiel
     if min(map(len, sweeps)) == 0:
         return FlowField.zero(len(sweeps[0]))
     source, target = (poses.transform(s.T_world_lidar, s.sweep.points) for s in pair)
-    times_ns = _offsets_ns(*sweeps)
+    times_ns = [s.offset_ns for s in sweeps]
+    apart_ns = sweeps[1].stamp_ns - sweeps[0].stamp_ns
+    if times_ns[0] is None or times_ns[1] is None:
+        times_ns = [None, None]
+    else:
+        times_ns[1] = times_ns[1] + apart_ns
     lidars = [s.lidar for s in sweeps] if any(s.lidar.any() for s in sweeps) else [None, None]
     field = estimate_flow(source, target, settings, None, *times_ns, *lidars)
     R_lidar_world = pair[0].T_world_lidar[:3, :3].T
@@ -326,13 +225,5 @@ def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowFiel
     if field.to_reference is not None and times_ns[0] is not None:
         # It leads to the middle of the firing times, which need not be the stamp of a sweep.
         late = int(times_ns[0].min()) + np.ptp(times_ns[0]) / 2
-        apart_ns = sweeps[1].stamp_ns - sweeps[0].stamp_ns
         to_reference = field.to_reference @ R_lidar_world.T - displacement * (late / apart_ns)
     return replace(field, displacement=displacement, to_reference=to_reference)
-
-
-def _offsets_ns(source: Sweep, target: Sweep) -> tuple[Int | None, Int | None]:
-    """Return firing times (N,) and (M,) since the source's reference time, None if unknown."""
-    if source.offset_ns is None or target.offset_ns is None:
-        return None, None
-    return source.offset_ns, target.offset_ns + (target.stamp_ns - source.stamp_ns)
