@@ -179,6 +179,8 @@ def track_of(instance: int, heading: float = 0.3) -> ObjectTrack:
         T_key_object=np.stack([T, T @ poses.exp(np.array([0, 0, 0, 0.5, 0.25, 0]))]),
         velocity_m_s=np.array([[5.0, 2.5, 0.0]] * 2),
         num_points=np.array([33, 20]),
+        seen_size_m=np.array([2.5, 1.75, 1.25]),
+        sides_seen=("rear", "left", "right", "top"),
     )
 
 

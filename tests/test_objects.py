@@ -52,7 +52,7 @@ def alone(track) -> GroupMotion:
     stretch = Scene(World(street()), ego, Scanner(8, 60)).stretch(5, 3)
     track.claimed[3] = np.arange(5)
     instance = tuple(np.arange(len(s.sweep), dtype=np.int32) % 2 - 1 for s in stretch.sweeps)
-    return GroupMotion(stretch, (track,), instance, {})
+    return GroupMotion(stretch, (track,), instance, {}, np.zeros(1, np.int64))
 
 
 @pytest.mark.parametrize(("frame", "target"), [(2, 7), (6, 3), (4, 4)])

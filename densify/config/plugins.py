@@ -262,6 +262,9 @@ EXPORTS = {
     "kitti": Form(
         "maps_and_clouds", ("train", "val", "files.txt", "annotations.json"), of_drive=True
     ),
+    "kitti-tracking": Form(
+        "kitti_tracking", ("label_02", "calib", "velodyne", "image_02"), of_drive=True
+    ),
     "rrd": Form("rrd", ("recording.rrd",), of_drive=True),
     "mcap": Form("mcap", ("recording.mcap",), of_drive=True),
 }

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from densify.flow.tracking.objects import LONG_M
 from densify.geometry import poses
 from densify.geometry.types import (
     Cloud,
@@ -23,7 +24,8 @@ from densify.geometry.types import (
 )
 
 _LEAST_SEEN = 3  # points of an object in one sweep; fewer do not determine its rotation
-_BEYOND_PERCENT = 1.0  # percent of the points outside the object's box, on each side
+_AXLE = 0.3  # of the length, from the middle of a vehicle to its rear axle, which does not slip
+_BEYOND_PERCENT = 0.2  # percent of the points outside the object's box, on each side
 
 
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
@@ -90,17 +92,11 @@ def _empty_cloud(num: int) -> Cloud:
 
 
 class _ObjectPoints(NamedTuple):
-    """The N points of an object in one sweep, key sweep's lidar frame.
+    """The N points of an object in one sweep, key sweep's lidar frame."""
 
-    Attributes:
-        there: (N,3) positions in metres at the reference time of this sweep.
-        at_key: (N,3) positions in metres at the reference time of the key sweep.
-        velocity_m_s: (3,) median velocity of the points.
-    """
-
-    there: Float
-    at_key: Float
-    velocity_m_s: Float
+    there: Float  # (N,3) positions in metres at the reference time of this sweep
+    at_key: Float  # (N,3) positions in metres at the reference time of the key sweep
+    velocity_m_s: Float  # (3,) median velocity of the points
 
 
 def object_tracks(
@@ -111,7 +107,8 @@ def object_tracks(
     The pose at a sweep comes from the rigid motion that best fits, in least squares, the flow of
     the object's points to the key sweep. Sweeps with fewer than three of these points have no pose.
     Objects without such a sweep are left out. The x axis of an object points along its velocity, or
-    along its path over the window if that is longer.
+    along its path over the window if that is longer. For objects of 3 m and more these are taken at
+    the rear axle, where a vehicle that turns moves where it points.
 
     Args:
         stretch: Registered sweeps of the window.
@@ -165,10 +162,18 @@ def _track(
     duration_s = (stamps_ns[frames[-1]] - stamps_ns[frames[0]]) * 1e-9
     way = velocity_m_s * duration_s if duration_s else velocity_m_s
     way = max(way, ends[1] - ends[0], key=lambda way: float(np.hypot(*way[:2])))
-    heading = np.arctan2(way[1], way[0])
-    T_key_object = poses.exp(np.array([0, 0, heading, 0, 0, 0]))
-    body = poses.rotate(poses.inverse(T_key_object), at_key)
-    low, high = np.percentile(body, [_BEYOND_PERCENT, 100 - _BEYOND_PERCENT], axis=0)
+    first, last = (poses.log(T_there_key[f])[2] for f in (frames[0], frames[-1]))
+    for _ in range(2):
+        heading = np.arctan2(way[1], way[0])
+        T_key_object = poses.exp(np.array([0, 0, heading, 0, 0, 0]))
+        body = poses.rotate(poses.inverse(T_key_object), at_key)
+        low, high = np.percentile(body, [_BEYOND_PERCENT, 100 - _BEYOND_PERCENT], axis=0)
+        if high[0] - low[0] < LONG_M:
+            break
+        axle = (low + high) / 2 - [_AXLE * (high[0] - low[0]), 0, 0]
+        x, y, _ = T_key_object[:3, :3] @ axle - middle
+        middle = middle + [x, y, 0]
+        way = way + (last - first) * np.array([-y, x, 0])
     T_key_object[:3, 3] = T_key_object[:3, :3] @ ((low + high) / 2)
     T = np.stack([T_there_key[frame] @ T_key_object for frame in frames])
     stamp_ns = np.array([stamps_ns[frame] for frame in frames], np.int64)
@@ -183,4 +188,5 @@ def _track(
         T_key_object=T,
         velocity_m_s=speeds_m_s,
         num_points=np.array([len(seen[f].there) if f in seen else 0 for f in frames], np.int64),
+        seen_size_m=high - low,
     )

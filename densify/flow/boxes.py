@@ -22,18 +22,14 @@ MOVES_M_S = 0.5
 
 @dataclass(frozen=True)
 class BoxMargins:
-    """Margins around a box.
+    """Margins around a box."""
 
-    Attributes:
-        grown_m: Margin added to each side of a box. A larger margin takes in mirrors and feet, and
-            more of the ground.
-        unsure_m: Width of the zone outside the grown box where flow is uncertain.
-        foot_m: Height above the bottom of a moving box below which flow is uncertain: the points
-            may be the road.
-    """
-
+    # Margin added to each side of a box. A larger margin takes in mirrors and feet, and more of the
+    # ground.
     grown_m: float = 0.1
-    unsure_m: float = 0.3
+    unsure_m: float = 0.3  # width of the zone outside the grown box where flow is uncertain
+    # Height above the bottom of a moving box below which flow is uncertain: the points may be the
+    # road
     foot_m: float = 0.1
 
 

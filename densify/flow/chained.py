@@ -19,15 +19,11 @@ _MAX_GAP_M = 0.5
 
 @dataclass(frozen=True)
 class ChainedMotion:
-    """Motion of a stretch, chained from flow between neighbouring sweeps: a `Motion`.
+    """Motion of a stretch, chained from flow between neighbouring sweeps: a `Motion`."""
 
-    Attributes:
-        stretch: Consecutive registered sweeps.
-        step: Function that returns the flow of sweep index i to index j = i ± 1, in the lidar frame
-            of sweep i. It is called on demand, once for each (i, j).
-    """
-
-    stretch: Stretch
+    stretch: Stretch  # consecutive registered sweeps
+    # Function that returns the flow of sweep index i to index j = i ± 1, in the lidar frame of
+    # sweep i. It is called on demand, once for each (i, j).
     step: Callable[[int, int], FlowField]
     _found: dict[tuple[int, int], FlowField] = field(default_factory=dict, repr=False)
 

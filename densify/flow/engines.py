@@ -18,17 +18,11 @@ from densify.geometry.types import Motion, Stretch
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Input of a scene flow engine: registered sweeps in one world, their ground and free space.
+    """Input of a scene flow engine: registered sweeps in one world, their ground and free space."""
 
-    Attributes:
-        stretch: Consecutive registered sweeps.
-        ground: Height map of the ground under all sweeps.
-        asked: Frame numbers whose flow is needed, None for all. The other sweeps only help to find
-            motion.
-    """
-
-    stretch: Stretch
-    ground: HeightMap
+    stretch: Stretch  # consecutive registered sweeps
+    ground: HeightMap  # height map of the ground under all sweeps
+    # Frame numbers whose flow is needed, None for all. The other sweeps only help to find motion.
     asked: Collection[int] | None = None
 
     @cached_property
@@ -92,11 +86,7 @@ def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> 
 
 
 def check_engine(spec: str) -> None:
-    """Import an engine ``NAME[:ARGUMENT]`` and check its argument.
-
-    Raises:
-        InputError: The engine does not exist, or it cannot use the argument.
-    """
+    """Import an engine ``NAME[:ARGUMENT]`` and check its argument."""
     row, argument = engine(spec)
     check = getattr(row.work(), "check_argument", None)
     if check is not None:

@@ -21,9 +21,10 @@ from ``frames`` on for each method, under ``methods``. A score is null where it 
     baselines   simpler method on the same registration -> the fields from ``frames`` on
 
 movers.json, by `ObjectTrack`: schema_version, key, objects. An object has instance (as in
-cloud.laz), size_m (length, width, height) and poses. Poses are at each sweep that observed the
-object and at the key sweep: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,)
-without ego-motion, in the key sweep's lidar frame.
+cloud.laz), size_m (length, width, height of the completed box), seen_size_m (of the box around its
+points), sides_seen and poses. Poses are at each sweep that observed the object and at the key
+sweep: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,) without ego-motion, in the
+key sweep's lidar frame.
 
 scene/, for pages, viewers and other tools::
 
@@ -155,7 +156,8 @@ def write_tracks(result: Result, context: Context, folder: Path) -> None:
             {"frame": frame, **{name: getattr(track, name)[i] for name in names}}
             for i, frame in enumerate(track.frames)
         ]
-        objects.append({"instance": track.instance, "size_m": track.size_m, "poses": poses})
+        fields = ("instance", "size_m", "seen_size_m", "sides_seen")
+        objects.append({**{name: getattr(track, name) for name in fields}, "poses": poses})
     table = {"schema_version": SCHEMA_VERSION, "key": result.key, "objects": objects}
     write_json(folder / "movers.json", table)
 

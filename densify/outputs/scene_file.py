@@ -89,6 +89,8 @@ def _track(entry: Mapping[str, Any]) -> ObjectTrack:
         ),
         velocity_m_s=_array([pose["velocity_m_s"] for pose in poses], len(poses), 3),
         num_points=np.array([pose["num_points"] for pose in poses], np.int64),
+        seen_size_m=_array(entry["seen_size_m"], 3),
+        sides_seen=tuple(map(str, entry["sides_seen"])),
     )
 
 

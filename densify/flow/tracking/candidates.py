@@ -66,23 +66,14 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Obstacles:
-    """The C points above the ground (obstacles) in one sweep, or in a `Batch` of sweeps.
+    """The C points above the ground (obstacles) in one sweep, or in a `Batch` of sweeps."""
 
-    Attributes:
-        row: (C,) index into the sweep's points.
-        points: (C,3) world, registered and deskewed for ego-motion only.
-        time_s: (C,) firing time since the first sweep's reference time.
-        seed: (C,) True if another sweep saw through the point.
-        cluster: (C,) label of the cluster of candidates, -1 for other points.
-        num_clusters: Number of clusters; labels are below it.
-    """
-
-    row: Int
-    points: Float
-    time_s: Float
-    seed: Bool
-    cluster: Int
-    num_clusters: int
+    row: Int  # (C,) index into the sweep's points
+    points: Float  # (C,3) world, registered and deskewed for ego-motion only
+    time_s: Float  # (C,) firing time since the first sweep's reference time
+    seed: Bool  # (C,) True if another sweep saw through the point
+    cluster: Int  # (C,) label of the cluster of candidates, -1 for other points
+    num_clusters: int  # number of clusters; labels are below it
 
     @staticmethod
     def of(stretch: Stretch, i: int, found: Candidates) -> Obstacles:
@@ -118,21 +109,14 @@ class Batch:
     """A few consecutive sweeps within 0.1 s, searched together, and their obstacles.
 
     At 10 Hz a batch is one sweep, see `Clock.batches`.
-
-    Attributes:
-        sweeps: Indices of the sweeps in the stretch.
-        time_ns: Middle between the first and the last reference time, since the stretch's first
-            sweep.
-        half_s: Half the time between the first and the last sweep.
-        obstacles: Obstacles of all sweeps, concatenated; clusters that touch are merged.
-        begins: First row of each sweep in ``obstacles``.
     """
 
-    sweeps: tuple[int, ...]
+    sweeps: tuple[int, ...]  # indices of the sweeps in the stretch
+    # Middle between the first and the last reference time, since the stretch's first sweep
     time_ns: int
-    half_s: float
-    obstacles: Obstacles
-    begins: tuple[int, ...]
+    half_s: float  # half the time between the first and the last sweep
+    obstacles: Obstacles  # obstacles of all sweeps, concatenated; clusters that touch are merged
+    begins: tuple[int, ...]  # first row of each sweep in ``obstacles``
 
     @staticmethod
     def of(sweeps: Sequence[int], obstacles: Sequence[Obstacles], clock: Clock) -> Batch:

@@ -38,23 +38,14 @@ _PREDICTED_S = 0.2  # an object is known so long before the first and after the 
 
 @dataclass(frozen=True)
 class SweepPoints:
-    """The N points of a sweep, or of a batch of sweeps, that may belong to an object.
+    """The N points of a sweep, or of a batch of sweeps, that may belong to an object."""
 
-    Attributes:
-        row: (N,) index into the sweep's points.
-        points: (N,3) world.
-        time_s: (N,) firing time since the first sweep's reference time.
-        height_m: (N,) height above the ground.
-        gap_m: (N,) distance between neighbouring rings at the point.
-        reach_m: (N,) greatest distance from the shape of an object that may own the point.
-    """
-
-    row: Int
-    points: Float
-    time_s: Float
-    height_m: Float32
-    gap_m: Float
-    reach_m: Float
+    row: Int  # (N,) index into the sweep's points
+    points: Float  # (N,3) world
+    time_s: Float  # (N,) firing time since the first sweep's reference time
+    height_m: Float32  # (N,) height above the ground
+    gap_m: Float  # (N,) distance between neighbouring rings at the point
+    reach_m: Float  # (N,) greatest distance from the shape of an object that may own the point
 
     @staticmethod
     def of(

@@ -87,18 +87,12 @@ def velocities_beside(
 
 @dataclass(frozen=True)
 class Follower:
-    """Tracker of clusters through the batches.
+    """Tracker of clusters through the batches."""
 
-    Attributes:
-        batches: Groups of consecutive sweeps within 0.1 s.
-        free: For each sweep (C,) True for obstacles that no track has claimed.
-        clock: Times of the batches.
-    """
-
-    batches: Sequence[Batch]
-    free: Sequence[Bool]
+    batches: Sequence[Batch]  # groups of consecutive sweeps within 0.1 s
+    free: Sequence[Bool]  # for each sweep (C,) True for obstacles that no track has claimed
     ground: HeightMap
-    clock: Clock
+    clock: Clock  # times of the batches
 
     def follow(self, members: Int, start: int, velocity: Float) -> Track:
         """Track a cluster forwards, then backwards; the model is made of all points found so far.

@@ -15,6 +15,7 @@ from densify.flow.engines import Scene
 from densify.flow.tracking.candidates import Candidates, Obstacles, firing_times_s
 from densify.flow.tracking.extent import Instance, assign_points, find_shape, is_known_at
 from densify.flow.tracking.objects import MovingObject, Track
+from densify.flow.tracking.pieces import join_pieces
 from densify.flow.tracking.soften import Part, Softened, soften
 from densify.flow.tracking.tracks import find_tracks
 from densify.geometry import poses
@@ -26,19 +27,15 @@ _FINE_M = 0.3  # ring gap up to which a limb has returns of several rings
 
 @dataclass(frozen=True)
 class GroupMotion:
-    """The motion of all objects in a stretch (consecutive registered sweeps): a `Motion`.
+    """The motion of all objects in a stretch (consecutive registered sweeps): a `Motion`."""
 
-    Attributes:
-        stretch: The sweeps, in one world.
-        tracks: Tracks of the confirmed moving objects.
-        instance: For each sweep (N,) int32, the index in ``tracks`` for each point, -1 for static.
-        bendings: Non-rigid motion of the tracks that have one, by index in ``tracks``.
-    """
-
-    stretch: Stretch
-    tracks: tuple[Track, ...]
+    stretch: Stretch  # the sweeps, in one world
+    tracks: tuple[Track, ...]  # tracks of the confirmed moving objects
+    # For each sweep (N,) int32, the index of the track with which each point moves, -1 for static
     instance: tuple[Instance, ...]
+    # Non-rigid motion of the tracks that have one, by index in ``tracks``
     bendings: Mapping[int, Bending]
+    number: Int  # (K,) number of the object that each track belongs to
 
     def with_stretch(self, stretch: Stretch) -> GroupMotion:
         """Return the same motion on another copy of its stretch, see `SharedMotion`."""
@@ -73,20 +70,17 @@ class GroupMotion:
             displacement[mine] = (arrived - at_reference) @ R_lidar_world.T
             velocity_m_s[mine] = track.velocity_m_s(arrived, there_s) @ R_lidar_world.T
             lost[mine] = not is_known_at(track, there, clock)
-        return FlowField(displacement, instance >= 0, instance, lost, to_reference, velocity_m_s)
+        moving = instance >= 0
+        number = np.append(self.number, -1)[instance].astype(np.int32)
+        return FlowField(displacement, moving, number, lost, to_reference, velocity_m_s)
 
 
 @dataclass(frozen=True)
 class Bending:
-    """The non-rigid motion of one object.
+    """The non-rigid motion of one object."""
 
-    Attributes:
-        sweeps: Sweep index of each part of ``softened``, ascending.
-        softened: Points of the object in each of these sweeps, and how the points bend.
-    """
-
-    sweeps: tuple[int, ...]
-    softened: Softened
+    sweeps: tuple[int, ...]  # sweep index of each part of ``softened``, ascending
+    softened: Softened  # points of the object in each of these sweeps, and how the points bend
 
     def carry(self, here: int, there: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
         """Return the (N,3) points of a sweep at two times, both in the object's own frame.
@@ -151,6 +145,9 @@ def motion_of(
 
     with ThreadPoolExecutor() as pool:
         instance = tuple(chain.from_iterable(pool.map(members, space.batches)))
+        number, carrier = join_pieces(stretch, tracks, instance, space)
+        moved_with: Instance = np.append(carrier, -1).astype(np.int32)
+        instance = tuple(moved_with[of_point] for of_point in instance)
         fine = [
             k
             for k, track in enumerate(tracks)
@@ -158,7 +155,7 @@ def motion_of(
         ]
         found = dict(zip(fine, pool.map(bending, fine), strict=True))
     bent = {k: b for k, b in found.items() if np.isfinite(b.softened.alpha)}
-    return GroupMotion(stretch, tuple(tracks), instance, bent)
+    return GroupMotion(stretch, tuple(tracks), instance, bent, number)
 
 
 def _rows_of(instance: Instance) -> list[tuple[int, Int]]:

@@ -38,15 +38,10 @@ Judge = Callable[[Track, "Evidence"], None]
 
 
 class Places(NamedTuple):
-    """Counts of what other sweeps observed at positions where the object is at another time.
+    """Counts of what other sweeps observed at positions where the object is at another time."""
 
-    Attributes:
-        taken: Number of positions with a return of something else.
-        empty: Number of positions in observed free space.
-    """
-
-    taken: int
-    empty: int
+    taken: int  # number of positions with a return of something else
+    empty: int  # number of positions in observed free space
 
     def log_taken(self) -> float:
         """Return the log odds that a position is taken, near 0 for few observations."""
@@ -54,17 +49,11 @@ class Places(NamedTuple):
 
 
 class Violations(NamedTuple):
-    """How often another sweep saw through the points of a track.
+    """How often another sweep saw through the points of a track."""
 
-    Attributes:
-        static: Number of tests in which the measured position of a point is seen through.
-        moved: Number of tests in which the position predicted by the motion is seen through.
-        tests: Number of tests, each of both positions.
-    """
-
-    static: int
-    moved: int
-    tests: int
+    static: int  # number of tests in which the measured position of a point is seen through
+    moved: int  # number of tests in which the position predicted by the motion is seen through
+    tests: int  # number of tests, each of both positions
 
 
 class Evidence(NamedTuple):
@@ -72,22 +61,14 @@ class Evidence(NamedTuple):
 
     Lengths are divided by the neighbour distance: the distance up to which points count as
     neighbours at the track (`near_m`).
-
-    Attributes:
-        violations: Seen-through counts of the track's points, as static and as moved.
-        before: Observations at positions of the object before it arrives there.
-        after: Observations at positions of the object after it leaves.
-        travelled: Distance between begin and end of the path, in neighbour distances.
-        rough: Residual of the states about the path, in neighbour distances.
-        slender: Ratio of extent along the motion to height, at least 1.
     """
 
-    violations: Violations
-    before: Places
-    after: Places
-    travelled: float
-    rough: float
-    slender: float
+    violations: Violations  # seen-through counts of the track's points, as static and as moved
+    before: Places  # observations at positions of the object before it arrives there
+    after: Places  # observations at positions of the object after it leaves
+    travelled: float  # distance between begin and end of the path, in neighbour distances
+    rough: float  # residual of the states about the path, in neighbour distances
+    slender: float  # ratio of extent along the motion to height, at least 1
 
     def terms(self) -> dict[str, float]:
         """Return the value of each term of the log odds, by its name in ``likelihood.json``."""
@@ -113,15 +94,10 @@ class Evidence(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """The log odds that a track moves.
+    """The log odds that a track moves."""
 
-    Attributes:
-        log_odds: Log odds that the track moves; above 0 it is confirmed.
-        at_most: Log odds that the track would have if its motion left no violations.
-    """
-
-    log_odds: float
-    at_most: float
+    log_odds: float  # log odds that the track moves; above 0 it is confirmed
+    at_most: float  # log odds that the track would have if its motion left no violations
 
     @property
     def moves(self) -> bool:

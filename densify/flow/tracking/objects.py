@@ -43,20 +43,14 @@ def near_m(gap_m: Float | float) -> Any:
 
 @dataclass(frozen=True)
 class Observation:
-    """The pose of an object in one `Batch` (some consecutive sweeps within 0.1 s).
+    """The pose of an object in one `Batch` (some consecutive sweeps within 0.1 s)."""
 
-    Attributes:
-        state: (4,) displacement x, y, z (m) and yaw (rad) since the first observation, world axes;
-            z follows the ground.
-        seen_s: Mean firing time of the object's points, since the first sweep of the stretch.
-        time_ns: Middle time of the batch, ns since the first sweep of the stretch.
-        sweeps: Indices of the sweeps of the batch in which the object has points.
-    """
-
+    # (4,) displacement x, y, z (m) and yaw (rad) since the first observation, world axes; z follows
+    # the ground
     state: Float
-    seen_s: float
-    time_ns: int
-    sweeps: tuple[int, ...]
+    seen_s: float  # mean firing time of the object's points, since the first sweep of the stretch
+    time_ns: int  # middle time of the batch, ns since the first sweep of the stretch
+    sweeps: tuple[int, ...]  # indices of the sweeps of the batch in which the object has points
 
 
 @dataclass
@@ -65,17 +59,14 @@ class Track:
 
     The object's frame coincides with the world at the first observation. From there the object
     moves by a state: displacement x, y, z (m) and yaw (rad) about ``centre``.
-
-    Attributes:
-        centre: (3,) position about which the object rotates, in the object's frame.
-        observations: Batch index -> pose of the object, in the order of tracking.
-        claimed: Sweep index -> indices, in this sweep's `Obstacles`, of the object's points.
-        path: Smooth motion through the states over time; exists after `smooth`.
     """
 
-    centre: Float
+    centre: Float  # (3,) position about which the object rotates, in the object's frame
+    # Batch index -> pose of the object, in the order of tracking
     observations: dict[int, Observation] = field(default_factory=dict)
+    # Sweep index -> indices, in this sweep's `Obstacles`, of the object's points
     claimed: dict[int, Int] = field(default_factory=dict)
+    # Smooth motion through the states over time; exists after `smooth`
     path: Path = field(init=False)
 
     def add(self, n: int, batch: Batch, state: Float, seen_s: float, rows: Int) -> None:
@@ -178,20 +169,14 @@ class Track:
 
 @dataclass(frozen=True)
 class Shape:
-    """The accumulated points of one object, in the object's frame with z up.
+    """The accumulated points of one object, in the object's frame with z up."""
 
-    Attributes:
-        points: (M,3) metres.
-        tree: Search tree of the points.
-        rim: (K,3) points that bound the others: corners of the convex outline, lowest and highest
-            point.
-        edges: (E,3) lines of the convex outline seen from above: outward normal x, y and offset, so
-            that ``normal · xy + offset`` is below 0 inside; (0,3) if the points span no area.
-    """
-
-    points: Float
-    tree: cKDTree
+    points: Float  # (M,3) metres
+    tree: cKDTree  # search tree of the points
+    # (K,3) points that bound the others: corners of the convex outline, lowest and highest point
     rim: Float
+    # (E,3) lines of the convex outline seen from above: outward normal x, y and offset, so that
+    # ``normal · xy + offset`` is below 0 inside; (0,3) if the points span no area
     edges: Float
 
     @staticmethod
@@ -272,20 +257,13 @@ class MovingObject(NamedTuple):
 
 
 class Lane(NamedTuple):
-    """The space ahead of and behind an object, as wide and as high as the object.
+    """The space ahead of and behind an object, as wide and as high as the object."""
 
-    Attributes:
-        ahead: (2,) unit vector of the heading, world.
-        right_m: Right border: coordinate along the left normal of ``ahead``, m from the world's
-            origin.
-        left_m: Left border, as ``right_m``.
-        top_m: Upper border: height in the world, m.
-    """
-
-    ahead: Float
+    ahead: Float  # (2,) unit vector of the heading, world
+    # Right border: coordinate along the left normal of ``ahead``, m from the world's origin
     right_m: float
-    left_m: float
-    top_m: float
+    left_m: float  # left border, as ``right_m``
+    top_m: float  # upper border: height in the world, m
 
     def holds(self, points: Float, slack_m: float = 0.0) -> Bool:
         """Return (N,) True for points (N,3, world) inside the lane or within ``slack_m`` of it."""

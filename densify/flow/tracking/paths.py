@@ -34,20 +34,14 @@ class Path:
 
     The first coordinates are x and y in metres; a `Track` uses d = 4, its state x, y, z (m), yaw
     (rad).
-
-    Attributes:
-        knots_s: (n + 4,) knots of the n B-splines, s.
-        coefficients: (n,d) coefficients of the B-splines.
-        begin_s: First time of the fit. The path continues at constant velocity before it.
-        end_s: Last time of the fit. The path continues at constant velocity after it.
-        residual_m: Root mean square distance of the states in x and y from the path, corrected for
-            the degrees of freedom.
     """
 
-    knots_s: Float
-    coefficients: Float
-    begin_s: float
-    end_s: float
+    knots_s: Float  # (n + 4,) knots of the n B-splines, s
+    coefficients: Float  # (n,d) coefficients of the B-splines
+    begin_s: float  # first time of the fit. The path continues at constant velocity before it.
+    end_s: float  # last time of the fit. The path continues at constant velocity after it.
+    # Root mean square distance of the states in x and y from the path, corrected for the degrees of
+    # freedom
     residual_m: float
 
     @staticmethod

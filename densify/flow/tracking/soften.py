@@ -41,36 +41,25 @@ _MIN_GAIN, _MIN_SHARE_BETTER = 0.05, 0.75
 
 @dataclass(frozen=True)
 class Part:
-    """The points of one object in one sweep.
+    """The points of one object in one sweep."""
 
-    Attributes:
-        points: (n,3) metres, n >= 1, in the object's own frame (rigid motion removed).
-        time_s: Mean firing time of the points.
-    """
-
-    points: Float
-    time_s: float
+    points: Float  # (n,3) metres, n >= 1, in the object's own frame (rigid motion removed)
+    time_s: float  # mean firing time of the points
 
 
 @dataclass(frozen=True)
 class Softened:
-    """How an object bends from sweep to sweep; its points in one sweep are a `Part`.
+    """How an object bends from sweep to sweep; its points in one sweep are a `Part`."""
 
-    Attributes:
-        to_next: For each part (n,3) metres, displacement of its points to the time of the next part
-            relative to the rigid motion, object's frame. It is 0 for the last part and for a rigid
-            object.
-        to_previous: As ``to_next``, to the time of the previous part; 0 for the first part.
-        parts: Points of the object in each sweep, by ascending time.
-        alpha: Weight of smoothness (stiffness) that held-out parts confirmed, inf for rigid.
-        held_out_m: Root mean square distance of held-out parts from their prediction, by the alpha
-            tried, inf first; empty if nothing was tried.
-    """
-
-    parts: tuple[Part, ...]
+    parts: tuple[Part, ...]  # points of the object in each sweep, by ascending time
+    # For each part (n,3) metres, displacement of its points to the time of the next part relative
+    # to the rigid motion, object's frame. It is 0 for the last part and for a rigid object.
     to_next: tuple[Float, ...]
+    # As ``to_next``, to the time of the previous part; 0 for the first part
     to_previous: tuple[Float, ...]
-    alpha: float
+    alpha: float  # weight of smoothness (stiffness) that held-out parts confirmed, inf for rigid
+    # Root mean square distance of held-out parts from their prediction, by the alpha tried, inf
+    # first; empty if nothing was tried
     held_out_m: dict[float, float]
 
     def velocity_m_s(self, i: int) -> Float:

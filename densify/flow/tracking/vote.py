@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from densify.flow.tracking.candidates import LINK_M
+from densify.geometry.arrays import bulk
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import Kernel
 from densify.geometry.nearest import nearest, tree_of
@@ -21,40 +22,35 @@ Bytes = NDArray[np.uint8]
 _MAX_SPEED_M_S = 38.0
 _NEAR_S = 0.1  # time to the nearer batches; the others are twice as far
 _STEP_M = 0.2  # side of a voxel
+_MOST_VOXELS = 1 << 28  # of a sweep, a byte each: 250 m x 250 m x 34 m
 _FEW_POINTS, _MANY_POINTS = 60, 600
 _FINE_S, _FINE_M_S = 0.5, 0.2  # time span and velocity step of the last vote
 
 
 @dataclass(frozen=True)
 class DistanceField:
-    """A voxel grid of the distance to the nearest candidate of a sweep.
+    """A voxel grid of the distance to the nearest candidate of a sweep."""
 
-    Attributes:
-        nearness: (X,Y,Z) voxels of 0.2 m: 255 at a candidate, falling to 0 at 0.6 m from it.
-        low: (3,) corner of the grid, world.
-        tree: Search tree of the N candidates; None without candidates.
-        time_s: (N,) firing times of the candidates.
-    """
-
-    nearness: Bytes
-    low: Float
-    tree: cKDTree | None
-    time_s: Float
+    nearness: Bytes  # (X,Y,Z) voxels of 0.2 m: 255 at a candidate, falling to 0 at 0.6 m from it
+    low: Float  # (3,) corner of the grid, world
+    tree: cKDTree | None  # search tree of the N candidates; None without candidates
+    time_s: Float  # (N,) firing times of the candidates
 
     @staticmethod
     def of(points: Float, time_s: Float) -> DistanceField:
         """Build the field of N candidates from points (N,3, world) and firing times (N,)."""
         if not len(points):
             return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3), None, time_s)
-        low = points.min(0) - 2 * LINK_M
-        shape = tuple(np.ceil((points.max(0) + 2 * LINK_M - low) / _STEP_M).astype(int) + 1)
+        inside = points[bulk(points, _STEP_M, _MOST_VOXELS)]
+        low = inside.min(0) - 2 * LINK_M
+        shape = tuple(np.ceil((inside.max(0) + 2 * LINK_M - low) / _STEP_M).astype(int) + 1)
         nearness = np.zeros(shape, np.uint8)
         n = int(np.ceil(LINK_M / _STEP_M))
         span = np.arange(-n, n + 1)
         offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), -1).reshape(-1, 3)
         far = np.linalg.norm(offsets, axis=1) * _STEP_M / LINK_M
         values = (255 - np.round(255 * far[far < 1])).astype(np.uint8)
-        _spread(points, low, _STEP_M, offsets[far < 1], values, nearness)
+        _spread(inside, low, _STEP_M, offsets[far < 1], values, nearness)
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_to(self, found: Bytes, group: Group, velocities: Float) -> None:
@@ -88,19 +84,12 @@ class DistanceField:
 
 @dataclass(frozen=True)
 class Group:
-    """The N points of a cluster in one batch (consecutive sweeps within 0.1 s).
+    """The N points of a cluster in one batch (consecutive sweeps within 0.1 s)."""
 
-    Attributes:
-        points: (N,3) world.
-        late_s: (N,) firing times relative to ``middle_s``.
-        middle_s: Mean firing time of the points.
-        middle: (3,) mean of the points.
-    """
-
-    points: Float
-    late_s: Float
-    middle_s: float
-    middle: Float
+    points: Float  # (N,3) world
+    late_s: Float  # (N,) firing times relative to ``middle_s``
+    middle_s: float  # mean firing time of the points
+    middle: Float  # (3,) mean of the points
 
     @staticmethod
     def of(points: Float, time_s: Float) -> Group:

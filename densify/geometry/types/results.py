@@ -27,12 +27,15 @@ class ObjectTrack:
 
     Attributes:
         instance: Number of the object, as in `Cloud`.
-        size_m: (3,) length, width and height of the box around its points.
+        size_m: (3,) length, width and height of the box. It stands on the ground, and is completed
+            to the usual size of a vehicle where no ray passed.
         frames: Frame numbers of the n sweeps, ascending.
         stamp_ns: (n,) int64 reference times.
         T_key_object: (n,4,4) poses in the key frame, ego-motion removed.
         velocity_m_s: (n,3) velocity of the middle of the box, key frame, ego-motion removed.
         num_points: (n,) number of points of the object in each sweep.
+        seen_size_m: (3,) size of the box around its points.
+        sides_seen: Sides of the box that were seen: of front, rear, left, right and top.
     """
 
     instance: int
@@ -42,6 +45,8 @@ class ObjectTrack:
     T_key_object: Float
     velocity_m_s: Float
     num_points: Int
+    seen_size_m: Float
+    sides_seen: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

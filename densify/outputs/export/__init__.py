@@ -74,7 +74,9 @@ def export_run(
     folder = out or run / "export" / to
     if (folder / "run.yaml").exists():
         raise InputError(f"--out {folder}: holds a run and is kept; choose another folder")
-    write = getattr(import_module(f"densify.outputs.export.{form.module}"), f"write_{to}")
+    write = getattr(
+        import_module(f"densify.outputs.export.{form.module}"), f"write_{to.replace('-', '_')}"
+    )
     owned = (*form.owned, _RECORD)
     with writing(folder, owned, folder, overwrite) as staging:
         write(runs if form.of_drive else runs[0], staging)

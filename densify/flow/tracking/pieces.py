@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: MIT
+"""Join the tracks of one object: pieces that touch and move alike are one object.
+
+A side that slides along itself, a mirror, or a roof between two rings may be tracked by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from densify.flow.tracking.candidates import firing_times_s
+from densify.flow.tracking.extent import Instance
+from densify.flow.tracking.objects import MovingObject, Shape, Track, near_m
+from densify.free_space.seen_through import FreeSpace
+from densify.geometry import poses
+from densify.geometry.nearest import nearest
+from densify.geometry.types import Float, Int, Stretch
+
+_MOSTLY = 0.7  # least share of the common sweeps, or of the points of a piece
+_BUMPERS_M = 1.5  # traffic that moves keeps a greater distance
+# Pieces that move alike part by less, or by less than their neighbour distance, within this time of
+# the middle of the common sweeps, beyond the noise of their paths. A side that slides along itself
+# is not followed better.
+_DRIFT_M, _BESIDE_S, _SIGMAS = 0.5, 0.5, 3.0
+_AS_LONG = 0.75  # share of an object's observations; the error of a velocity falls with time^1.5
+_SAME_M_S = 0.4  # twice the error of a velocity that is well known
+
+
+class Joined(NamedTuple):
+    """The objects of K tracks."""
+
+    number: Int  # (K,) number of the object that each track belongs to
+    carrier: Int  # (K,) index of the track with which the points of each track move
+
+
+class _Piece(NamedTuple):
+    """The points of one track, by sweep index."""
+
+    track: Track  # the track
+    points: dict[int, Float]  # sweep index -> (N,3) measured positions, world
+    seen_s: dict[int, Float]  # sweep index -> (N,) firing times
+    near_m: dict[int, Float]  # sweep index -> (N,) neighbour distances
+
+    @property
+    def num_points(self) -> int:
+        """The number of points in all sweeps."""
+        return sum(map(len, self.points.values()))
+
+    def within(self, track: Track, sweeps: Sequence[int]) -> Float:
+        """Return the (N,3) points of some sweeps in the object's frame of a track."""
+        parts = [track.undo(self.points[i], self.seen_s[i]) for i in sweeps]
+        return np.concatenate([np.zeros((0, 3)), *parts])
+
+
+def join_pieces(
+    stretch: Stretch, tracks: Sequence[Track], instance: Sequence[Instance], space: FreeSpace
+) -> Joined:
+    """Find the object that each of the K tracks belongs to, and the motion of its points.
+
+    An object has the number of its piece with most points. Tracks without points are on their own.
+
+    Args:
+        stretch: The sweeps of the tracks.
+        tracks: Confirmed tracks.
+        instance: For each sweep (N,) int32, the index in ``tracks`` for each point, -1 for static.
+        space: Free space that the sweeps observed.
+    """
+    pieces = _pieces(stretch, tracks, instance, space)
+    number, carrier = np.arange(len(tracks)), np.arange(len(tracks))
+    left = sorted(pieces, key=lambda k: (-pieces[k].num_points, k))
+    while left:
+        k = left.pop(0)
+        joined, grows = [pieces[k]], True
+        while grows:
+            every = np.concatenate([p.within(tracks[k], list(p.points)) for p in joined])
+            whole = MovingObject(tracks[k], Shape.of(every))
+            times = set().union(*(p.points for p in joined))
+            same = [other for other in left if _is_part(pieces[other], whole, times, space)]
+            number[same] = k
+            for other in same:
+                if not _moves_by_itself(pieces[other], tracks[k], space):
+                    carrier[other] = k
+            joined += [pieces[other] for other in same]
+            left = [other for other in left if other not in same]
+            grows = bool(same)
+    return Joined(number, carrier)
+
+
+def _moves_by_itself(piece: _Piece, track: Track, space: FreeSpace) -> bool:
+    """Return True if the motion of a piece is known as well as that of its object's ``track``.
+
+    A shorter path is known less well, and a side that slides along itself is wrong. The halves of a
+    turning truck move by themselves.
+    """
+    if len(piece.track.observations) < _AS_LONG * len(track.observations):
+        return False
+    middle = sorted(piece.points)[len(piece.points) // 2]
+    at_s = space.clock.time_s[middle]
+    there = piece.track.place(piece.within(piece.track, [middle]), at_s)
+    off_m_s = piece.track.velocity_m_s(there, at_s) - track.velocity_m_s(there, at_s)
+    return bool(np.linalg.norm(off_m_s[:, :2], axis=1).max() <= _SAME_M_S)
+
+
+def _pieces(
+    stretch: Stretch, tracks: Sequence[Track], instance: Sequence[Instance], space: FreeSpace
+) -> dict[int, _Piece]:
+    """Return the pieces by index in ``tracks``; arguments as in `join_pieces`."""
+    pieces: dict[int, _Piece] = {}
+    for i, (registered, of_point) in enumerate(zip(stretch.sweeps, instance, strict=True)):
+        for k in np.unique(of_point[of_point >= 0]).tolist():
+            rows = np.flatnonzero(of_point == k)
+            sweep = registered.sweep
+            piece = pieces.setdefault(k, _Piece(tracks[k], {}, {}, {}))
+            piece.points[i] = poses.transform(registered.T_world_lidar, sweep.points[rows])
+            piece.seen_s[i] = firing_times_s(stretch, i, rows)
+            piece.near_m[i] = near_m(space.sensors.gap_m(sweep.points[rows], sweep.lidar[rows]))
+    return pieces
+
+
+def _is_part(piece: _Piece, whole: MovingObject, times: set[int], space: FreeSpace) -> bool:
+    """Return True if a piece belongs to an object that is seen in the sweeps ``times``.
+
+    It touches the object in most common sweeps, and moves alike or lies in the object's box; or it
+    moves alike in the object's lane, at most 0.5 m from the box, or 1.5 m if nothing was seen
+    through between.
+    """
+    common = sorted(times & piece.points.keys())
+    if not common:
+        return False
+    middle = common[len(common) // 2]
+    if _is_away(piece, whole, middle):
+        return False
+    track, shape = whole
+    middle_s = space.clock.time_s[middle]
+    lane = whole.lane(middle_s)
+    own = track.place(shape.points, middle_s)[:, :2] @ lane.ahead
+    touches, inside = [], []
+    for i in common:
+        in_object = piece.within(track, [i])
+        there = track.place(in_object, middle_s)
+        along = there[:, :2] @ lane.ahead
+        inside.append(lane.holds(there) & (along >= own.min()) & (along <= own.max()))
+        close = nearest(shape.tree, in_object)[0] < piece.near_m[i]
+        touches.append((close | shape.within_outline(in_object)).any())
+    touching = bool(np.mean(touches) >= _MOSTLY)
+    if touching and np.concatenate(inside).mean() >= _MOSTLY:
+        return True
+    there = piece.track.place(piece.within(piece.track, common), middle_s)
+    beside = [i for i in common if space.clock.near(i, middle, _BESIDE_S)]
+    drift = [
+        track.carry(there, middle_s, end_s) - piece.track.carry(there, middle_s, end_s)
+        for end_s in space.clock.time_s[[beside[0], beside[-1]]]
+    ]
+    least_m = max(_DRIFT_M, float(np.median(np.concatenate([piece.near_m[i] for i in common]))))
+    unsure_m = _SIGMAS * np.hypot(track.path.residual_m, piece.track.path.residual_m)
+    if np.linalg.norm(np.concatenate(drift)[:, :2], axis=1).max() > least_m + unsure_m:
+        return False
+    if touching:
+        return True
+    along = there[:, :2] @ lane.ahead
+    gap_m = max(along.min() - own.max(), own.min() - along.max())
+    if gap_m > _BUMPERS_M or lane.holds(there).mean() < _MOSTLY:
+        return False
+    if gap_m <= least_m:
+        return True
+    return not _is_seen_between(track.undo(there, middle_s), whole, common, space)
+
+
+def _is_away(piece: _Piece, whole: MovingObject, i: int) -> bool:
+    """Return True if a piece is more than 1.5 m away from the box around an object in sweep i."""
+    here, rim = piece.within(whole.track, [i]), whole.shape.rim
+    return bool(
+        (here.min(axis=0) > rim.max(axis=0) + _BUMPERS_M).any()
+        or (here.max(axis=0) < rim.min(axis=0) - _BUMPERS_M).any()
+    )
+
+
+def _is_seen_between(
+    points: Float, whole: MovingObject, sweeps: Sequence[int], space: FreeSpace
+) -> bool:
+    """Return True if a sweep saw through the middle between an object and a piece.
+
+    points: (N,3) points of the piece, object's frame. sweeps: indices of the sweeps.
+    """
+    away_m, beside = nearest(whole.shape.tree, points)
+    closest = points[away_m.argmin()], whole.shape.points[beside[away_m.argmin()]]
+    between = np.mean(closest, axis=0, keepdims=True)
+    return any(whole.track.seen_through(between, i, space).any() for i in sweeps)
