@@ -1,128 +1,129 @@
 # SPDX-License-Identifier: MIT
-"""Fits the tables of confidence to maps of simulated streets, checks them on others, and writes a
-file such as densify/depth/confidence.json.
+"""Fit the weights of the confidence to the gate's keys, and check them on recordings left out.
 
-python examples/fit_confidence.py OUT.json [--fit SPEC@KEY …] [--check SPEC@KEY …] [--window W]
+python examples/fit_confidence.py [--data DIR] [--keys NAME …]
+
+The weights are printed as ``WEIGHTS`` of densify/depth/confidence.py has them, each with its
+standard error between recordings (jackknife).
 """
 
 import argparse
-import json
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
 
-import densify
-from densify.config import resolve
-from densify.depth import confidence as scale
-from densify.scores.depth_metrics import is_outlier_depth
+from densify.bench.gate import judged_maps
+from densify.config.cache import Cache
+from densify.depth.confidence import WEIGHTS, confidence_of, wrong
 
-FITTED = """
-    street?seed=51@60 street:crossing?seed=52@80 street:highway?seed=53@70 street:static?seed=58@60
-    street?seed=54&sensor=hdl32@60 street:crossing?seed=55&sensor=vlp16@80 street?seed=71@60
-    street?seed=56&sensor=os128@60 street:highway?seed=57&sensor=hdl32@80 street:crossing?seed=72@70
-    street:highway?seed=73@60 street?seed=74&sensor=hdl32@80 street?seed=77&sensor=vlp16@60
-    street:crossing?seed=75&sensor=hdl32@60
-"""
-CHECKED = """
-    street?seed=41@70 street:crossing?seed=42@90 street:highway?seed=43@60 street?seed=44@100
-    street:crossing@120 street:crossing?seed=32@120 street?seed=61&sensor=hdl32@80
-    street:crossing?seed=62&sensor=vlp16@80 street?seed=63&sensor=vlp16@60
-    street:highway?seed=64&sensor=hdl32@70
-"""
-STEPS = np.array([0.0, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.7, 0.8, 0.9])
+NUM_RIGHT = 15_000  # of a map, a random sample; with their weight they stand for all
+FREE = ("every pixel", "filled pixel")  # weights of either sign; the others raise the risk
+SMALL = 1e-3  # penalty on the squares of the weights
+STEPS = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8)
 
 
 class Evidence(NamedTuple):
-    """The (G,R) numbers of pixels of one map, see `num_pixels` in densify.depth.confidence.
+    """The features (P,8) of the pixels of one map with a true depth, and whether each is wrong.
 
-    shown: all pixels. compared: those with a truth. outliers: the outliers among the latter.
+    group: maps of one group are of one recording, and are left out together.
     """
 
-    where: dict
-    shown: np.ndarray
-    compared: np.ndarray
-    outliers: np.ndarray
+    name: str
+    group: str
+    features: np.ndarray
+    outlier: np.ndarray
+    measured: np.ndarray
+    moving: np.ndarray
 
 
-def evidence(text, window, changes):
-    """Yield the evidence of each camera's map of ``SPEC@KEY``, against exact truth."""
-    spec, _, key = text.rpartition("@")
-    print(f"making {text}", file=sys.stderr, flush=True)
-    sequence, config = densify.open_sequence(spec), resolve(None, changes)
-    if sequence.truth is None:
-        raise SystemExit(f"{spec}: no exact truth; expected a simulated recording")
-    result = densify.run(sequence, int(key), window, config=config)
-    for camera, maps in result.depth.items():
-        known_m, found = result.truth_m[camera], maps.ranked
-        shown = maps.filled_m > 0
-        compared = shown & (known_m > 0)
-        bad = compared.copy()
-        focal_px = sequence.cameras[maps.camera].focal_px
-        bad[compared] = is_outlier_depth(maps.filled_m[compared], known_m[compared], focal_px)
+def collected(folder, names):
+    """Yield the evidence of each of the gate's keys."""
+    for key, depth, truth, outlier in judged_maps(folder, names, Cache()):
+        shown = depth.filled_m > 0
+        known = (truth.depth_m > 0)[shown]
+        parts = (outlier, depth.depth_m > 0, truth.moving)
         yield Evidence(
-            {"data": sequence.name, "key": int(key), "camera": camera},
-            *(scale.num_pixels(found, part) for part in (shown, compared, bad)),
+            key.name,
+            key.data,
+            depth.evidence[known].astype(np.float64),
+            *(part[shown][known] for part in parts),
         )
 
 
 def fit(maps):
-    """Return the (G,R) share of outliers by group and step of the rank, made to fall with the rank.
+    """Return the (8,) weights of the logistic regression in which every map counts alike."""
+    rng = np.random.default_rng(0)
+    x, y, weight = [], [], []
+    for one in maps:
+        bad, right = (np.flatnonzero(one.outlier == is_bad) for is_bad in (True, False))
+        some = rng.choice(right, min(len(right), NUM_RIGHT), replace=False)
+        rows = np.concatenate([bad, some])
+        x.append(one.features[rows])
+        y.append(one.outlier[rows])
+        stands_for = np.where(one.outlier[rows], 1.0, len(right) / max(len(some), 1))
+        weight.append(stands_for / len(one.outlier) / len(maps))
+    x, y, weight = (np.concatenate(part) for part in (x, y, weight))
+    penalty = SMALL * np.array([name != "every pixel" for name in WEIGHTS])
 
-    Every map counts alike.
-    """
-    weights = [1 / max(e.compared.sum(), 1) for e in maps]
-    num, bad = (
-        sum(w * part for w, part in zip(weights, parts, strict=True))
-        for parts in ([e.compared for e in maps], [e.outliers for e in maps])
-    )
-    return np.array([scale.falling(n, b) for n, b in zip(num, bad, strict=True)])
+    def loss(w):
+        score = x @ w
+        value = weight @ np.logaddexp(0, np.where(y, -score, score))
+        slope = x.T @ (weight * (1 / (1 + np.exp(-score)) - y))
+        return 100 * value + penalty @ w**2, 100 * slope + 2 * penalty * w
+
+    bounds = [(None if name in FREE else 0, None) for name in WEIGHTS]
+    start = np.array([*WEIGHTS.values()])
+    return minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B").x
 
 
-def knots(shares):
-    """Return rank and share wherever the (R,) curve bends."""
-    kept = np.concatenate([[True], np.abs(np.diff(shares, 2)) > 1e-12, [True]])
-    ranks = (np.flatnonzero(kept) + 0.5) / scale.NUM_RANKS
-    return [
-        [round(float(r), 4), float(f"{s:.4g}")] for r, s in zip(ranks, shares[kept], strict=True)
-    ]
+def left_out(maps):
+    """Return group -> weights fitted without the maps of this group."""
+    groups = dict.fromkeys(one.group for one in maps)
+    return {g: fit([one for one in maps if one.group != g]) for g in groups}
 
 
-def check(maps, tables):
-    """Print, by confidence, the pixels and the expected and the true share of outliers."""
-    sums = np.zeros((3, len(STEPS)))
-    is_measured = (np.arange(len(scale.GROUPS)) < scale.NUM_MEASURED)[:, None]
-    for e in maps:
-        log = np.where(is_measured, *scale.curves(e.shown, tables)[:, None])
-        step = np.searchsorted(STEPS, np.clip(-log / scale.DECADES, 0, 1), side="right") - 1
-        parts = e.compared, e.compared * 10.0**log, e.outliers
-        for total, part in zip(sums, parts, strict=True):
-            total += np.bincount(step.ravel(), part.ravel(), len(STEPS))
-    print("confidence from      pixels  expected  outliers")
-    for least, num, expected, bad in zip(STEPS, *sums, strict=True):
-        if num:
-            print(f"{least:15.2f} {num:11,.0f} {expected / num:9.3%} {bad / num:9.3%}")
+def area(risk, outlier):
+    """Return the probability that an outlier has a higher risk than another pixel."""
+    order = np.argsort(risk, kind="stable")
+    place = np.empty(len(risk))
+    place[order] = np.arange(len(risk))
+    num = int(outlier.sum())
+    return (place[outlier].sum() - num * (num - 1) / 2) / max(num * (len(risk) - num), 1)
+
+
+def check(maps, weights):
+    """Print expected and found outliers of each map with the weights fitted without it."""
+    off, areas = [], []
+    title = ("all", "measured", "moving")
+    print(f"{'expected / found %':34s}" + "".join(f"{part:>16s}" for part in title) + "   area")
+    for one in maps:
+        risk = wrong(confidence_of(one.features, weights[one.group]))
+        every = np.ones(len(risk), bool)
+        parts = [
+            (100 * risk[p].mean(), 100 * one.outlier[p].mean()) if p.any() else None
+            for p in (every, one.measured, one.moving)
+        ]
+        areas.append(area(risk, one.outlier))
+        off.append(abs(np.log2(parts[0][0] / max(parts[0][1], 1e-3))))
+        cells = "".join(f"{'':>16s}" if p is None else f"{p[0]:9.2f} / {p[1]:4.2f}" for p in parts)
+        print(f"{one.name[-34:]:34s}{cells}   {areas[-1]:.3f}")
+    print(f"mean |log2(expected / found)| {np.mean(off):.2f}, mean area {np.mean(areas):.3f}")
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--fit", nargs="+", default=FITTED.split())
-    parser.add_argument("--check", nargs="+", default=CHECKED.split())
-    parser.add_argument("--window", type=int, default=5)
-    parser.add_argument("--set", nargs="+", default=[], dest="changes")
+    parser.add_argument("--data", type=Path, help="folder of the real recordings")
+    parser.add_argument("--keys", nargs="+", help="names of the gate's keys (default: all)")
     given = parser.parse_args()
-    fitted, checked = (
-        [e for text in texts for e in evidence(text, given.window, given.changes)]
-        for texts in (given.fit, given.check)
-    )
-    tables = {g: knots(share) for g, share in zip(scale.GROUPS, fit(fitted), strict=True)}
-    written = {"densify": densify.__version__, "maps": [e.where for e in fitted], "tables": tables}
-    given.out.write_text(json.dumps(written, indent=2) + "\n")
-    for title, maps in (("fitted to:", fitted), ("others:", checked)):
-        print(title)
-        check(maps, scale.tables_of(written))
+    maps = list(collected(given.data, given.keys))
+    weights, without = fit(maps), left_out(maps)
+    each = np.stack([*without.values()])
+    error = np.sqrt((len(each) - 1) * each.var(axis=0))
+    for name, value, off in zip(WEIGHTS, weights, error, strict=True):
+        print(f'    "{name}": {value:.2f},  # ± {off:.2f}')
+    check(maps, without)
 
 
 if __name__ == "__main__":

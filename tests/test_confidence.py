@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 from densify.depth import confidence as scale
-from densify.geometry.types import DepthMap, Ranked
+from densify.depth.layers import Layers
+from densify.geometry.types import DepthMap
 from densify.scores.depth_metrics import is_outlier_depth
 from tests.scenes import CAMERA
-
-SMOOTH, FENCE, FILLED = 0, 1, 7
-"""Of `scale.GROUPS`: of the window, smooth and rough from .1; filled, rough from .1."""
 
 
 def made(confidence, filled_m) -> DepthMap:
@@ -26,46 +24,47 @@ def test_a_fifth_more_is_ten_times_less_wrong():
     assert scale.wrong(np.array([0, 0.2, 0.4, 1.0])) == pytest.approx([1, 0.1, 0.01, 1e-5])
 
 
-def tables() -> np.ndarray:
-    """(G,R) shares, which fall by a decade over the ranks, and are higher at rough places."""
-    at_zero = np.array([0.001, 0.03, 0.1] * (len(scale.GROUPS) // 3))
-    return at_zero[:, None] * 10.0 ** -np.linspace(0, 1, scale.NUM_RANKS)
+def layers(rank: np.ndarray, filled: np.ndarray, rejected: np.ndarray) -> Layers:
+    """A wall at 10 m, with rays 4 px apart."""
+    shape = rank.shape
+    wall_m = np.full(shape, 10.0, np.float32)
+    return Layers(
+        depth_m=np.where(filled | rejected, 0, wall_m),
+        rim_m=np.where(rejected, wall_m, 0),
+        filled_m=np.where(rejected, 0, wall_m),
+        confidence=rank.astype(np.float32),
+        point=np.zeros(shape, np.int32),
+        tilt=np.zeros((*shape, 2), np.float32),
+        spacing_px=np.full((*shape, 2), 4, np.float32),
+    )
 
 
-@pytest.mark.parametrize("groups", [(SMOOTH,), (SMOOTH, FENCE), (FILLED,)])
-def test_calibration_keeps_the_order(groups):
-    """Of pixels measured, and of pixels filled, wherever they are."""
-    rng = np.random.default_rng(3)
-    rank = np.linspace(0, 1, 4000, dtype=np.float32).reshape(40, 100)
-    ranked = Ranked(rank, rng.choice(groups, rank.shape).astype(np.uint8))
-    confidence = scale.calibrated(ranked, np.ones(rank.shape, bool))
-    assert confidence.dtype == np.float32
-    assert (np.diff(confidence.ravel()) > 0).all()
-    assert confidence.min() >= 0 and confidence.max() <= 1
+def outlier_probability(made: Layers) -> np.ndarray:
+    wrong = np.full(made.filled_m.shape, np.nan)
+    wrong[made.filled_m > 0] = scale.wrong(scale.confidence_of(scale.features(made)))
+    return wrong
 
 
-def test_a_map_expects_what_its_own_pixels_are_worth():
-    """Hedges cost a map as much confidence as there are of them, and empty pixels nothing."""
-    rng = np.random.default_rng(4)
-    worth = tables()
-    rank = rng.uniform(size=(200, 300)).astype(np.float32)
-    for share in (0.0, 0.2, 0.9):
-        hedge, filled = rng.uniform(size=(2, *rank.shape)) < [[[share]], [[0.5]]]
-        group = (np.where(filled, FILLED, SMOOTH) + hedge).astype(np.uint8)
-        shown = rng.uniform(size=rank.shape) < 0.6
-        confidence = scale.calibrated(Ranked(rank, group), shown, worth)
-        assert (confidence[~shown] == 0).all()
-        step = np.minimum((rank * scale.NUM_RANKS).astype(int), scale.NUM_RANKS - 1)
-        for part in (shown & filled, shown & ~filled):
-            expected = worth[group[part], step[part]].mean()
-            assert scale.wrong(confidence[part]).mean() == pytest.approx(expected, rel=0.03)
+def test_doubt_foliage_and_steps_raise_the_probability_of_an_outlier():
+    rng, shape = np.random.default_rng(3), (120, 160)
+    rank = np.linspace(0, 1, shape[1]) * np.ones(shape)
+    none = np.zeros(shape, bool)
+    for filled in (none, ~none):
+        wrong = outlier_probability(layers(rank, filled, none))
+        assert (np.diff(wrong, axis=1) < 0).all() and 0 < wrong.min() < wrong.max() < 0.2
+    half = np.ones(shape) / 2
+    hedge = (rng.random(shape) < 0.4) & (np.arange(shape[1]) > 110)
+    wrong = outlier_probability(layers(half, none, hedge))
+    assert np.nanmean(wrong[:, 120:]) > 5 * np.nanmean(wrong[:, :40])
+    step = layers(half, none, none)
+    step.filled_m[:, 80:] = 20.0
+    wrong = outlier_probability(step)
+    assert wrong[:, 78:82].mean() > 1.5 * wrong[:, :40].mean()
 
 
-def test_the_packages_own_tables_fall_with_the_rank():
-    own = scale.tables_of(scale.own_file())
-    assert own.shape == (len(scale.GROUPS), scale.NUM_RANKS)
-    assert (np.diff(own) <= 1e-9).all() and own.min() >= 0
-    assert own[2::3].mean() > 3 * own[::3].mean()
+def test_no_weight_rewards_what_speaks_against_a_pixel():
+    names = [name for name in scale.WEIGHTS if name not in ("every pixel", "filled pixel")]
+    assert all(scale.WEIGHTS[name] >= 0 for name in names)
 
 
 def test_reliability_counts_what_is_wrong():

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.depth import confidence as scale
 from densify.readers.street import Street
 from tests.writers import write_street
 
@@ -87,25 +86,23 @@ def test_train_completion(output_of, tmp_path: Path) -> None:
     assert {p.name for p in (tmp_path / "completion").iterdir()} == {"icp", "flow", "test"}
 
 
-def test_the_tables_of_confidence_are_found_again(monkeypatch) -> None:
-    """Outliers are drawn from known tables: shares that fall with the rank, one for each group."""
+def test_the_weights_of_confidence_are_found_again(monkeypatch) -> None:
+    """Outliers are drawn from known odds, with weights of the other recordings for each."""
     monkeypatch.syspath_prepend(EXAMPLES)
     import fit_confidence as example
 
-    at_zero = np.array([0.01, 0.1, 0.3] * 3)[:, None]
-    known = at_zero * 10.0 ** (-1.2 * np.linspace(0, 1, scale.NUM_RANKS))
+    known = np.array([-4.0, 1.5, 0.4, 1.0, 0.8, 0.5, 0.7, 0.6])
 
     def drawn(seed: int) -> example.Evidence:
         rng = np.random.default_rng(seed)
-        shown = rng.poisson(800, known.shape)
-        return example.Evidence({}, shown, shown, rng.binomial(shown, known))
+        features = np.column_stack([np.ones(40_000), rng.uniform(0, 1.5, (40_000, 7))])
+        outlier = rng.random(len(features)) < 1 / (1 + np.exp(-features @ known))
+        return example.Evidence(str(seed), str(seed % 3), features, outlier, outlier, outlier)
 
-    shares = example.fit([drawn(seed) for seed in range(4)])
-    assert (np.diff(shares) <= 1e-12).all() and shares.min() >= 0
-    off = np.log10(shares[..., 10:-10]) - np.log10(known[..., 10:-10])
-    assert np.abs(off.mean(axis=1)).max() < 0.06
-    written = {g: example.knots(row) for g, row in zip(scale.GROUPS, shares, strict=True)}
-    np.testing.assert_allclose(scale.tables_of({"tables": written}), shares, rtol=2e-3, atol=1e-9)
+    maps = [drawn(seed) for seed in range(6)]
+    np.testing.assert_allclose(example.fit(maps), known, atol=0.25)
+    assert [*example.left_out(maps)] == ["0", "1", "2"]
+    assert example.area(maps[0].features @ known, maps[0].outlier) > 0.65
 
 
 def test_the_weights_of_tracks_are_found_again(monkeypatch) -> None:

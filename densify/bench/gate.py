@@ -8,7 +8,7 @@ measurements.
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -63,19 +63,12 @@ _CAR_FLOW_M = (0.83, 0.0, 0.0)  # by its profile, which both sweeps measured
 
 
 class GateKey(NamedTuple):
-    """A key sweep with ground truth.
+    """A key sweep with ground truth."""
 
-    Attributes:
-        data: Recording; a real one is a path below the folder of recordings.
-        key: Frame number.
-        truth: "exact", "stereo", "scanner" or "held out".
-        camera: Name of the camera.
-    """
-
-    data: str
-    key: int
-    truth: str = "exact"
-    camera: str = "image_02"
+    data: str  # Recording; a real one is a path below the folder of recordings
+    key: int  # frame number
+    truth: str = "exact"  # "exact", "stereo", "scanner" or "held out"
+    camera: str = "image_02"  # name of the camera
 
     @property
     def name(self) -> str:
@@ -119,23 +112,15 @@ GROUPS: Mapping[str, frozenset[str]] = {
 
 
 class Stored(NamedTuple):
-    """Figures and their luck, each by name of the key.
+    """Figures and their luck, each by name of the key."""
 
-    Attributes:
-        figures: Name of the key -> name of the figure -> value, see `measure`.
-        luck: Name of the key -> name of the change -> standard deviation.
-    """
-
+    # Name of the key -> name of the figure -> value, see `measure`
     figures: dict[str, dict[str, Any]]
-    luck: dict[str, dict[str, float]]
+    luck: dict[str, dict[str, float]]  # name of the key -> name of the change -> standard deviation
 
 
 def read(path: Path) -> Stored:
-    """Return stored figures.
-
-    Raises:
-        InputError: The file is not what `write` wrote.
-    """
+    """Return stored figures."""
     try:
         return Stored(**json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, TypeError) as error:
@@ -180,21 +165,12 @@ def measure(
         draws: Number of times that the poses are moved by 2 mm and 0.01°, to measure luck.
         progress: Callback (stage, done, total).
         cache: Keeps registration and flow on disk, which pays if only depth changes.
-
-    Raises:
-        InputError: No key has such a name, or a recording cannot be read.
     """
-    chosen = [k for k in (*KEYS, *PAIRS) if k.truth == "exact" or folder is not None]
-    if names is not None:
-        known = {k.name for k in chosen}
-        for name in set(names) - known:
-            raise InputError(f"--keys {name}: no such key; expected of {', '.join(sorted(known))}")
-        chosen = [k for k in chosen if k.name in names]
+    chosen = _chosen((*KEYS, *PAIRS), folder, names)
     figures: dict[str, dict[str, Any]] = {}
     luck: dict[str, dict[str, float]] = {}
     for number, key in enumerate(chosen):
-        data = str(folder / key.data) if key.truth != "exact" and folder else key.data
-        sequence = open_sequence(data)
+        sequence = _opened(key, folder)
         if key in PAIRS:
             if "flow" in kinds:
                 figures[key.name] = _pair_figures(sequence, key)
@@ -206,6 +182,51 @@ def measure(
         if progress is not None:
             progress("gate", number + 1, len(chosen))
     return Stored(figures, luck)
+
+
+class JudgedMap(NamedTuple):
+    """The depth map of a key, its ground truth, and which (H,W) pixels with both are outliers.
+
+    An outlier beside which the true depth agrees within 10 px along the row does not count for the
+    stereo truth, which widens posts.
+    """
+
+    key: GateKey
+    depth: DepthMap
+    truth: TruthMap
+    outlier: Bool
+
+
+def judged_maps(
+    folder: Path | None, names: Collection[str] | None = None, cache: Cache | None = None
+) -> Iterator[JudgedMap]:
+    """Yield the depth map of each of `KEYS` with its ground truth; arguments as for `measure`."""
+    for key in _chosen(KEYS, folder, names):
+        sequence = _opened(key, folder)
+        focal_px = sequence.cameras[key.camera].focal_px
+        depth, truth = _Still(sequence, key, folder, cache).made()
+        both = (truth.depth_m > 0) & (depth.filled_m > 0)
+        outlier = np.zeros(both.shape, bool)
+        outlier[both] = truth.outliers(depth.filled_m, both, focal_px)
+        if key.truth == "stereo":
+            outlier &= ~agrees_beside(truth, depth.filled_m, _ASIDE_PX, focal_px)
+        yield JudgedMap(key, depth, truth, outlier)
+
+
+def _chosen(
+    keys: Iterable[GateKey], folder: Path | None, names: Collection[str] | None
+) -> list[GateKey]:
+    """Return the keys with these names, None for all; real ones only with a folder."""
+    there = [key for key in keys if not key.is_real or folder is not None]
+    known = {key.name for key in there}
+    for name in set(names or ()) - known:
+        raise InputError(f"--keys {name}: no such key; expected of {', '.join(sorted(known))}")
+    return [key for key in there if names is None or key.name in names]
+
+
+def _opened(key: GateKey, folder: Path | None) -> LidarSequence:
+    """Return the recording of a key."""
+    return open_sequence(str(folder / key.data) if key.is_real and folder else key.data)
 
 
 def _luck(still: Mapping[str, Any], moved: list[dict[str, Any]]) -> dict[str, float]:
@@ -273,7 +294,7 @@ class _Still:
         return exact_truth(self._sequence, key_sweep, shots, config)[key.camera]
 
     def _depth(self) -> dict[str, Curve]:
-        depth, truth = self._made()
+        depth, truth = self.made()
         focal_px = self._whole.cameras[self._key.camera].focal_px
         parts = ["all", "moving"] + ["aside"] * (self._key.truth == "stereo")
         return {
@@ -283,7 +304,7 @@ class _Still:
             if part != "moving" or truth.moving[truth.depth_m > 0].any()
         }
 
-    def _made(self) -> tuple[DepthMap, TruthMap]:
+    def made(self) -> tuple[DepthMap, TruthMap]:
         """Return the depth map of the key, and its ground truth."""
         recording, key, camera = self._recording, self._key.key, self._key.camera
         sequence, settings = recording.sequence, recording.settings

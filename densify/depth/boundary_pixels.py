@@ -110,18 +110,13 @@ def voted_for(
 
 
 class Voters(NamedTuple):
-    """Pixels with a known depth, which vote on the depths of pixels around them.
+    """Pixels with a known depth, which vote on the depths of pixels around them."""
 
-    Attributes:
-        steps: (16,H,W) number of steps from each pixel to the first known pixel in 16 directions,
-            from `densify.depth.neighbours.first_known`.
-        inverse: (H,W) inverse depth in 1/m, 0 where the depth is unknown.
-        tilt: (H,W,2) slope of the inverse depth to the right and down, 1/m per px.
-    """
-
+    # (16,H,W) number of steps from each pixel to the first known pixel in 16 directions, from
+    # `densify.depth.neighbours.first_known`
     steps: NDArray[np.uint8]
-    inverse: Float32
-    tilt: Float32
+    inverse: Float32  # (H,W) inverse depth in 1/m, 0 where the depth is unknown
+    tilt: Float32  # (H,W,2) slope of the inverse depth to the right and down, 1/m per px
 
 
 def voters(known_m: Float32, tilt: Float32) -> Voters:

@@ -1,33 +1,28 @@
 # SPDX-License-Identifier: MIT
 """Compute the confidence of pixels: the probability that a pixel is an outlier by KITTI's rule.
 
-The stages of a map rank its pixels. The rank rises with the number of sweeps and points that agree,
-the distance to a depth discontinuity and the votes of the image. It falls with roughness and with
-the distance over which a pixel is filled.
+The probability P is that of a logistic regression (Cox, "The regression analysis of binary
+sequences", 1958) on physical features of the pixel:
 
-The share of outliers of a rank falls with the rank. It was measured against exact ground truth for
-each group of pixels, by the origin of the depth and the roughness around.
-``examples/fit_confidence.py`` writes these tables to ``confidence.json`` beside this file.
+    P = 1 / (1 + exp(-(w0 + w1 x1 + ... + w7 x7)))
 
-Within the measured and within the filled pixels of a map, confidence keeps the order of the ranks.
-Each rank gets the mean probability of the map's own pixels at that rank, made to fall with the
-rank.
+The weights `WEIGHTS` were fitted to exact truth of simulated streets and to the truth of real
+recordings, each recording with equal weight, by ``examples/fit_confidence.py``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.optimize import isotonic_regression
 
-from densify.config.file_content import read_json
+from densify.depth.boundary_pixels import MOST_CONFIDENCE
 from densify.depth.layers import Layers
-from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32, Ranked
+from densify.geometry.types import Camera, DepthMap, Float, Float32
 from densify.scores.depth_metrics import (
     KITTI_BASELINE_M,
     OUTLIER_FRACTION,
@@ -37,118 +32,73 @@ from densify.scores.depth_metrics import (
 
 DECADES = 5.0
 """Confidence 1 means one outlier in 10^5 pixels; each 0.2 less means ten times as many."""
-_RAGGED = np.array([0.1, 0.5])
-GROUPS = tuple(
-    f"{how}, rough from {ragged:g}"
-    for how in ("window", "beyond", "filled")
-    for ragged in (0, *_RAGGED)
-)
-"""Origin of a pixel's depth, and share of boundary pixels among the measured pixels around."""
-NUM_RANKS = 200
-NUM_MEASURED = sum(not group.startswith("filled") for group in GROUPS)
-"""Number of groups of measured pixels; the other groups are of filled pixels."""
 
-_FILE = Path(__file__).with_name("confidence.json")
-_AROUND = 4.0  # half size of the surroundings, in spacings of neighbouring rays
-_TILT = 0.01  # decades from rank 0 to 1, so that different ranks have different confidences
+WEIGHTS: Mapping[str, float] = {
+    "every pixel": -8.51,
+    "boundary pixel that the image confirms": 2.40,
+    "filled pixel": -0.46,
+    "doubt of a measured pixel": 1.95,
+    "doubt of a filled pixel": 2.24,
+    "rejected boundary pixels within 2 spacings": 1.11,
+    "rejected boundary pixels within 8 spacings": 0.62,
+    "step of depth within a spacing": 1.68,
+}
+"""Weight of each feature, see `features`."""
+_LEAST_DOUBT, _LEAST_SHARE = 0.03, 0.005  # smaller values are not told apart
 _NUM_STEPS = 20
 
 
-def rank_pixels(layers: Layers, far: Bool) -> Ranked:
-    """Return the rank and the group of each pixel of a map.
+def features(layers: Layers) -> Float32:
+    """Return the (P,8) features of the P pixels with a depth, row by row, as named in `WEIGHTS`.
 
-    Roughness is a mean within four spacings of rays to all sides.
-
-    far: (H,W) True at pixels measured by sweeps beyond the window.
+    Doubt is 1 minus the rank that the stages give a pixel: by the number of sweeps and points that
+    agree, the distance to a depth discontinuity, the residual, and the distance over which it is
+    filled. Doubts and shares enter by their logarithm to base 10, because probabilities of errors
+    are proportional to powers of them. The step is the logarithm of the ratio of the greatest to
+    the least depth around. Spacings are those of neighbouring rays.
     """
-    rim, shown = layers.rim_m > 0, layers.filled_m > 0
-    size = 2 * max(2, round(_AROUND * float(np.median(layers.gap_px)))) + 1
-    num_rim, num = (
-        ndimage.uniform_filter(part.astype(np.float32), size, mode="constant")
-        for part in (rim, rim | (layers.depth_m > 0))
-    )
-    ragged = np.searchsorted(_RAGGED, num_rim / np.maximum(num, 1 / size**2), side="right")
-    how = np.where(layers.depth_m > 0, far.astype(np.uint8), np.uint8(2))
-    group = np.where(shown, how * (len(_RAGGED) + 1) + ragged, 0).astype(np.uint8)
-    rank = np.where(shown, np.clip(layers.confidence, 0, 1), np.float32(0))
-    return Ranked(rank, group)
-
-
-def calibrated(found: Ranked, shown: Bool, tables: Float | None = None) -> Float32:
-    """Return the (H,W) confidence ``-log10(P) / 5`` with the probability P of an outlier.
-
-    Args:
-        found: Rank and group of each pixel, from `rank_pixels`.
-        shown: (H,W) True at pixels with a depth; the confidence is 0 elsewhere.
-        tables: (G,R) share of outliers by group (`GROUPS`) and step of the rank; None for the
-            package's own.
-    """
-    rank, group = found.rank[shown], found.group[shown]
-    log_wrong = curves(num_pixels(found, shown), _own_tables() if tables is None else tables)
-    place = rank.astype(np.float64) * NUM_RANKS - 0.5
-    steps = np.arange(NUM_RANKS)
-    measured, filled = (np.interp(place, steps, curve) for curve in log_wrong)
-    confidence = np.zeros(shown.shape, np.float32)
-    log = np.where(group < NUM_MEASURED, measured, filled) + _TILT * (0.5 - rank)
-    confidence[shown] = np.clip(-log / DECADES, 0, 1)
-    return confidence
-
-
-def num_pixels(found: Ranked, of: Bool) -> Float:
-    """Return the (G,R) number of pixels by group and step of the rank, of R = `NUM_RANKS`.
-
-    of: (H,W) True at pixels that count.
-    """
-    step = np.minimum((found.rank[of] * NUM_RANKS).astype(np.int64), NUM_RANKS - 1)
-    place = found.group[of].astype(np.int64) * NUM_RANKS + step
-    num = np.bincount(place, minlength=len(GROUPS) * NUM_RANKS)
-    return num.reshape(len(GROUPS), NUM_RANKS).astype(np.float64)
-
-
-def curves(num: Float, tables: Float) -> Float:
-    """Return (2,R) log10 of the probability of an outlier by step of the rank.
-
-    The rows are for measured and for filled pixels.
-
-    Args:
-        num: (G,R) numbers of `num_pixels`.
-        tables: (G,R) shares of outliers.
-    """
-    shares = [
-        falling(num[part].sum(axis=0), (num * tables)[part].sum(axis=0))
-        for part in (slice(NUM_MEASURED), slice(NUM_MEASURED, None))
+    shown, measured = layers.filled_m > 0, layers.depth_m > 0
+    boundary = measured & (layers.rim_m > 0)
+    rank = np.where(boundary, MOST_CONFIDENCE, np.clip(layers.confidence, 0, 1))
+    doubt = np.log10((1 - rank) / _LEAST_DOUBT + 1)
+    gap_px = float(np.median(layers.gap_px))
+    inverse = np.divide(1, layers.filled_m, out=np.zeros_like(layers.filled_m), where=shown)
+    size = _size(1, gap_px)
+    nearest = ndimage.maximum_filter(inverse, size)
+    farthest = ndimage.minimum_filter(np.where(shown, inverse, np.float32(np.inf)), size)
+    columns = [
+        np.ones(shown.shape, np.float32),
+        boundary,
+        ~measured,
+        doubt * (measured & ~boundary),
+        doubt * ~measured,
+        *(_rejected(layers, _size(reach, gap_px)) for reach in (2, 8)),
+        np.log1p(np.log(nearest / farthest, out=np.zeros_like(nearest), where=shown)),
     ]
-    return np.log10(np.clip(shares, 10.0 ** (_TILT - DECADES), 1))
+    return np.stack([column[shown] for column in columns], axis=1).astype(np.float32)
 
 
-def falling(num: Float, wrong_num: Float) -> Float:
-    """Return the (R,) ratio ``wrong_num / num``, made to fall with the rank by isotonic regression.
-
-    Steps without pixels are interpolated. num and wrong_num: (R,) pixels, outliers among them.
-    """
-    some = num > 0
-    if not some.any():
-        return np.zeros(len(num))
-    share = isotonic_regression(wrong_num[some] / num[some], weights=num[some], increasing=False).x
-    steps = np.arange(len(num))
-    between: Float = np.interp(steps, steps[some], share)
-    return between
+def _size(spacings: float, gap_px: float) -> int:
+    """Return the width in pixels of a window that reaches so many spacings to all sides."""
+    return 2 * max(2, round(spacings * gap_px)) + 1
 
 
-@cache
-def _own_tables() -> Float:
-    return tables_of(own_file())
+def _rejected(layers: Layers, size_px: int) -> Float32:
+    """Return the (H,W) logarithm of the share of boundary pixels around that are not accepted."""
+    rejected, measured = (layers.rim_m > 0) & (layers.depth_m == 0), layers.depth_m > 0
+    share, some = (
+        ndimage.uniform_filter(part.astype(np.float32), size_px, mode="constant")
+        for part in (rejected, rejected | measured)
+    )
+    logarithm: Float32 = np.log10(share / np.maximum(some, 1e-4) / _LEAST_SHARE + 1)
+    return logarithm
 
 
-def own_file() -> dict[str, Any]:
-    """Return the content of the package's tables, written by examples/fit_confidence.py."""
-    return read_json(_FILE)
-
-
-def tables_of(written: dict[str, Any]) -> Float:
-    """Return the (G,R) share of outliers from the content of a file as `own_file` returns."""
-    middle = (np.arange(NUM_RANKS) + 0.5) / NUM_RANKS
-    return np.array([np.interp(middle, *np.array(written["tables"][g]).T) for g in GROUPS])
+def confidence_of(evidence: NDArray[np.floating], weights: Float | None = None) -> Float32:
+    """Return the (P,) confidence ``-log10(P) / 5`` of pixels with `features` (P,8)."""
+    used = np.array([*WEIGHTS.values()]) if weights is None else weights
+    log_p = -np.logaddexp(0, -(evidence @ used)) / np.log(10)
+    return np.clip(-log_p / DECADES, 0, 1).astype(np.float32)
 
 
 def wrong(confidence: Float | Float32) -> Float:

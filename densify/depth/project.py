@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from densify.config import ProjectSettings
 from densify.depth.boundary_pixels import accept_boundary_pixels
-from densify.depth.confidence import calibrated, rank_pixels
+from densify.depth.confidence import confidence_of, features
 from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import fill, fill_stars
 from densify.depth.image_points import PointsInImage, points_in_image
@@ -25,7 +25,7 @@ from densify.depth.measured_pixels import MeasuredPixels, nearest_pixels, visibl
 from densify.depth.moving_bodies import MovingBody, close_bodies
 from densify.depth.seen_through import Rays, without_seen_through
 from densify.depth.spots import measure_spots
-from densify.geometry.types import Camera, Cloud, DepthMap, Float32, Patches, Ranked, Reason
+from densify.geometry.types import Camera, Cloud, DepthMap, Float32, Patches, Reason
 
 _BLOCK_PX = 16  # blocks within which the density of rays is about constant
 _JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
@@ -68,19 +68,18 @@ def project(
         layers = fill_stars(layers)
         if visible and bodies:
             layers = close_bodies(layers, cloud, exposure, bodies)
-    rank = None
+    evidence = None
     if visible:
         if rays is not None:
             layers = without_seen_through(layers, cloud, view, rays, reason)
-        measured = layers.depth_m > 0
-        far = np.zeros(measured.shape, bool)
-        far[measured] = cloud.far[layers.point[measured]]
-        rank = rank_pixels(layers, far)
-        layers = replace(layers, confidence=calibrated(rank, layers.filled_m > 0))
+        evidence = features(layers)
+        confidence = np.zeros(layers.filled_m.shape, np.float32)
+        confidence[layers.filled_m > 0] = confidence_of(evidence)
+        layers = replace(layers, confidence=confidence)
     _set_reasons(layers, reason)
     if visible and filled:
         layers = measure_spots(layers, points)
-    return _finished(layers, cloud, exposure, reason, rank)
+    return _finished(layers, cloud, exposure, reason, evidence)
 
 
 def _layers_of(
@@ -148,7 +147,7 @@ def _finished(
     cloud: Cloud,
     exposure: Exposure,
     reason: NDArray[np.uint8],
-    rank: Ranked | None,
+    evidence: Float32 | None,
 ) -> DepthMap:
     """Return the layers as a depth map, with the sweep that measured each pixel."""
     measured, shown = layers.depth_m > 0, layers.filled_m > 0
@@ -162,5 +161,5 @@ def _finished(
         frame=frame,
         reason=reason,
         measure=exposure.measure,
-        ranked=rank,
+        evidence=evidence,
     )

@@ -15,7 +15,6 @@ from densify.geometry.types.depth import (
     DepthMap,
     Mover,
     Patches,
-    Ranked,
     Reason,
     StandingWorld,
 )

@@ -230,18 +230,6 @@ class Camera:
         return float(self.K[0, 0] / (1 + xi))
 
 
-class Ranked(NamedTuple):
-    """The inputs of the calibrated confidence of a map (`densify.depth.confidence`).
-
-    Attributes:
-        rank: (H,W) float32 of 0 to 1, larger is more certain; 0 where ``filled_m`` has no depth.
-        group: (H,W) uint8 kind of the pixel, each kind with a calibration of its own.
-    """
-
-    rank: Float32
-    group: NDArray[np.uint8]
-
-
 @dataclass(frozen=True)
 class CameraView:
     """The viewpoint of a depth map.
@@ -275,7 +263,8 @@ class DepthMap:
             `densify.depth.views.with_ages` computes it.
         measure: ``z`` for depth along the optical axis, ``range`` for distance from the lens.
         warnings: Sentences about requested steps that could not be done.
-        ranked: Inputs of the calibrated confidence; None if the confidence is not calibrated.
+        evidence: (P,8) `densify.depth.confidence.features` of the pixels with a depth, before laser
+            spots are added to the measured pixels; None if the confidence is not calibrated.
     """
 
     camera: str
@@ -287,7 +276,7 @@ class DepthMap:
     age_s: Float32 | None = None
     measure: str = "z"
     warnings: tuple[str, ...] = ()
-    ranked: Ranked | None = None
+    evidence: Float32 | None = None
 
     def to_points(self, view: CameraView, filled: bool = True) -> Float:
         """Return the map's pixels as points (K,3) in the key frame, metres, row by row.
