@@ -48,7 +48,9 @@ def test_sweeps_that_are_not_asked_for_tell_what_moves_all_the_same(driving: Sce
         got, wanted = part.flow(frame, 5), whole.flow(frame, 5)
         assert wanted.moving.any()
         if frame in asked:
-            np.testing.assert_array_equal(got.displacement, wanted.displacement)
+            np.testing.assert_array_equal(got.moving, wanted.moving)
+            # an object that bends is softened by the points of the sweeps that are asked for
+            np.testing.assert_allclose(got.displacement, wanted.displacement, atol=0.02)
         else:
             assert not got.moving.any()
     alone = Scene(Stretch(driving.stretch.sweeps[1:4]), driving.ground)

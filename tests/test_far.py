@@ -134,7 +134,7 @@ def test_the_chain_finds_the_true_poses(side, monkeypatch):
 
     read = sequence.__getitem__
     surfaces = [Surface.of_sweep(s.sweep) for s in known]
-    found = follow_road(known, surfaces, list(frames), stamp_ns, read, lambda _: None, 12.0, 2.0)
+    found = follow_road(known, surfaces, list(frames), stamp_ns, read, 12.0, 2.0)
     first = [one for one, _ in found]
     steps = np.diff([one.frame for one in first])
     assert set(np.abs(steps[:-1])) <= {2, 3} and len(first) >= 4

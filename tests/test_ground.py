@@ -71,6 +71,36 @@ def test_stray_low_points_do_not_dig_holes():
     assert dirty.above(stray).max() < -1.5  # they are below it, not it
 
 
+def test_returns_from_below_the_road_are_not_the_ground_but_below_it():
+    """One in a hundred returns of every sweep is a mirror image: many in a cell over all sweeps."""
+    scene = Scene(World(street()), Arc(0, -1.5, 0.0, 8.0), Scanner(sigma_m=0.01))
+    stretch, rng = scene.stretch(4, 2), np.random.default_rng(0)
+    clouds = [in_world(stretch, f) for f in stretch.frames]
+    dirty, ghosts = [], []
+    for points in clouds:
+        near = np.flatnonzero(np.hypot(*points[:, :2].T) < 20)
+        rows = rng.choice(near, len(near) // 100, replace=False)
+        ghosts.append(points[rows] - [0, 0, 1] * rng.uniform(1.5, 4.0, (len(rows), 1)))
+        dirty.append(np.concatenate([points, ghosts[-1]]))
+    clean, found = HeightMap.of(clouds), HeightMap.of(dirty)
+    for points, images, pose in zip(clouds, ghosts, stretch.sweeps, strict=True):
+        near = points[np.hypot(*points[:, :2].T) < 20]
+        assert np.quantile(np.abs(found.above(near) - clean.above(near)), 0.99) < 0.1
+        T_lidar_world = poses.inverse(pose.T_world_lidar)
+        both = poses.transform(T_lidar_world, np.concatenate([near, images]))
+        deep = found.below(both, pose.T_world_lidar)
+        assert deep[: len(near)].mean() < 0.001 and deep[len(near) :].mean() > 0.9
+
+
+def test_a_stray_return_far_away_leaves_the_grid_as_it_is():
+    points = np.random.default_rng(0).uniform(-50, 50, (40000, 3)) * [1, 1, 0.001]
+    far = HeightMap.of([np.concatenate([points, [[50_000.0, 400.0, 5.0]]])])
+    near = HeightMap.of([points])
+    assert far.heights_m.shape == near.heights_m.shape
+    np.testing.assert_allclose(far.heights_m, near.heights_m, atol=0.05)
+    assert far.under(np.array([[50_000.0, 400.0]])) == pytest.approx(0, abs=0.2)
+
+
 # --- the map itself -------------------------------------------------------------------------------
 
 

@@ -146,7 +146,7 @@ def test_what_moves_rises_and_falls_with_the_ground(hill):
         for instance in (1, 2):
             on = (hill.scene.scan(frame).instance == instance) & flow.moving
             assert np.abs(true[on, 2]).min() > 0.09
-            np.testing.assert_allclose(flow.displacement[on, 2], true[on, 2], atol=0.01)
+            np.testing.assert_allclose(flow.displacement[on, 2], true[on, 2], atol=0.015)
 
 
 def test_an_object_is_one_object_on_a_hill(hill):

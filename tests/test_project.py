@@ -321,21 +321,22 @@ def test_stamps_not_numbers_say_which_sweep_is_nearest_in_time(since_key_ms, win
     assert depth.frame[20, 30] == winner
 
 
-def test_what_the_sweep_nearest_to_the_key_does_not_see_is_unsupported():
+def test_of_the_sweeps_with_rays_there_the_one_nearest_to_the_key_vouches():
     camera = make_camera(60, 40)
 
-    def kept(frames, elsewhere=()):
+    def kept(frames, key_sees_m=None):
         points, frame = wall(camera, 10.0, frames)
-        num = len(elsewhere)
-        beside = at_pixel(camera, [0] * num, [0] * num, 90.0)
-        points, frame = np.vstack([points, beside]), [*frame, *elsewhere]
+        num = len(points)
+        if key_sees_m is not None:
+            seen, by_key = wall(camera, key_sees_m, [KEY])
+            points, frame = np.vstack([points, seen]), np.append(frame, by_key)
         depth = see(camera, points, frame, ProjectSettings(), (2.0, 2.0))
-        return (depth.reason[: len(points) - num] == Reason.KEPT).any()
+        return (depth.reason[:num] == Reason.KEPT).any()
 
-    assert kept([KEY, KEY + 1])
-    assert not kept([KEY + 1, KEY + 2, KEY + 3, KEY + 4], [KEY, KEY - 1, KEY - 2, KEY - 3])
-    assert kept([KEY + 1, KEY + 2, KEY - 1, KEY - 2])  # a key held out asks for its neighbours
-    assert kept([KEY])
+    others = [KEY + 1, KEY + 2, KEY + 3, KEY + 4]
+    assert kept([KEY, KEY + 1]) and kept([KEY])
+    assert kept(others) and kept(others, 10.0)  # lost packets of the key sweep are no evidence
+    assert not kept(others, 10.5)  # what it measured behind the wall is
 
 
 def test_no_point_is_believed_at_the_edge_of_its_surface():

@@ -206,6 +206,42 @@ def test_compensation_is_undone_with_stamped_poses(tmp_path):
     assert "left out" in dict(sequence.findings())["times"]
 
 
+@pytest.mark.parametrize("timed", [True, False])
+def test_sweeps_in_the_frame_of_their_poses_are_taken_back(timed, tmp_path):
+    """Each point was placed with the pose of its moment; without times, with that of the stamp."""
+    fired, time_s = scan().astype(float), np.linspace(0, 0.0999, 600) * timed
+    turn = Rotation.from_euler("z", 40, degrees=True)
+    placed = turn.apply(fired) + (5 + time_s[:, None] * 10) * [1.0, 0, 0]
+    q = " ".join(map(str, turn.as_quat()))
+    names = "x, y, z, intensity, time" if timed else "x, y, z, intensity"
+    columns = [placed, np.zeros(600), time_s] if timed else [placed, np.zeros(600)]
+    bare(tmp_path, ["0.bin", "1.bin"], np.column_stack(columns))
+    config(tmp_path, f"sweeps: {{columns: [{names}], frame: poses}}\n")
+    with pytest.raises(InputError, match="there are no poses"):
+        Folder(tmp_path)
+    (tmp_path / "poses.txt").write_text(f"0 5 0 0 {q}\n0.1 6 0 0 {q}\n0.2 7 0 0 {q}\n")
+    np.testing.assert_allclose(Folder(tmp_path)[0].points, fired, atol=1e-5)
+
+
+def test_viewpoints_of_pcd_files_are_poses(tmp_path):
+    def write(name, viewpoint):
+        write_pcd(tmp_path / name, "binary")
+        data = (tmp_path / name).read_bytes()
+        lines = re.sub(rb"VIEWPOINT [^\n]*", f"VIEWPOINT {viewpoint}".encode(), data, count=1)
+        (tmp_path / name).write_bytes(lines)
+
+    default = "0 0 0 1 0 0 0"
+    write("0.pcd", default)
+    write("1.pcd", default)
+    with pytest.raises(InputError, match="no poses"):
+        Folder(tmp_path).T_world_lidar(1)
+    write("1.pcd", f"{PLACE} {QW} {QX} {QY} {QZ}")
+    sequence = Folder(tmp_path)
+    np.testing.assert_allclose(sequence.T_world_lidar(0), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(sequence.T_world_lidar(1), POSE, atol=1e-12)
+    assert "VIEWPOINT" in dict(sequence.findings())["poses from"]
+
+
 # --- cameras, the example -------------------------------------------------------------------------
 
 

@@ -46,6 +46,16 @@ def capture(num_turns: float, order: str = "<", magic: int = 0xA1B2C3D4) -> byte
     return data
 
 
+def packets_of(data: bytes) -> list[bytes]:
+    """The records of a little-endian capture, its file header first."""
+    records, at = [data[:24]], 24
+    while at < len(data):
+        end = at + 16 + struct.unpack_from("<I", data, at + 8)[0]
+        records.append(data[at:end])
+        at = end
+    return records
+
+
 @pytest.fixture
 def vlp16(tmp_path):
     path = tmp_path / "drive.pcap"
@@ -80,6 +90,25 @@ def test_turns_begin_straight_behind(tmp_path, order, magic):
     share = (sweep.offset_ns - sweep.offset_ns.min()) / period_ns
     off = (azimuth - (np.pi - 2 * np.pi * share) + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(np.degrees(off)).max() < 1
+
+
+def test_lost_and_doubled_packets_are_told_and_doubled_ones_read_once(tmp_path):
+    pytest.importorskip("velodyne_decoder")
+    whole, path = packets_of(capture(2.75)), tmp_path / "drive.pcap"
+    path.write_bytes(b"".join(whole))
+    complete = open_sequence(f"velodyne:{path}#VLP-16")
+    num_complete = len(complete[0])
+    sizes = {len(packet) for packet in whole[1:]}
+    returns = [i for i, p in enumerate(whole) if i and len(p) == max(sizes)]
+    middle = returns[60:100]  # of the first whole turn
+    faulty = [p for i, p in enumerate(whole) if i not in middle[:3]]
+    again = faulty.index(whole[middle[20]])
+    path.write_bytes(b"".join([*faulty[: again + 1], *faulty[again:]]))
+    sequence = open_sequence(f"velodyne:{path}#VLP-16")
+    (_, told), num = sequence.findings()[0], len(returns) - 3
+    assert told.startswith(f"{num}, 3 lost (1.4 %)") and "1 captured twice" in told
+    assert len(sequence[0]) == num_complete - 3 * 12 * 32
+    assert "0 lost (0.0 %), 0 captured" in complete.findings()[0][1]
 
 
 def test_what_is_cut_off_is_left_out(vlp16):

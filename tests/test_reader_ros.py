@@ -277,6 +277,20 @@ def test_odometry_is_brought_to_the_lidar(tmp_path):
         open_sequence(f"ros:{place}#poses=none").T_world_lidar(0)
 
 
+def test_registered_clouds_are_taken_back_out_of_the_world_of_their_odometry(tmp_path):
+    maker, columns = Maker(), scan()
+    points = np.column_stack([columns[axis] for axis in "xyz"])
+    T = pose(30.0, 4.0, -2.0, 0.5)
+    placed = (points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    for i in range(3):
+        maker.cloud(dict(zip("xyz", placed.T, strict=True)), STAMP_NS + i * PERIOD_NS, frame="odom")
+        maker.odometry(T, STAMP_NS + i * PERIOD_NS, child="body")
+    sequence = open_sequence(maker.write(tmp_path))
+    np.testing.assert_allclose(sequence[1].points, points, atol=1e-4)
+    np.testing.assert_allclose(sequence.T_world_lidar(1), T, atol=1e-9)
+    assert "out of the world of /odom" in dict(sequence.findings())["lidar"]
+
+
 def test_transforms_are_poses_and_the_smooth_frame_is_the_world(tmp_path):
     def both(maker, i, stamp_ns):
         maker.transform("odom", "base", at(i), "/tf", stamp_ns)

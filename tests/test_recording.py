@@ -272,7 +272,7 @@ def test_of_two_sweeps_the_pair_alone_tells_what_moves() -> None:
     field, row = found.steps[100, 101], found.stretch[100].sweep.row
     true_m = simulated.truth.displacement(100, 101)[row]
     moves = np.linalg.norm(true_m, axis=1) > 0.05
-    assert np.mean(field.moving[moves]) > 0.85 and field.moving[~moves].sum() < 10
+    assert np.mean(field.moving[moves]) > 0.85 and field.moving[~moves].mean() < 0.005
     off_m = np.linalg.norm(field.displacement - true_m, axis=1)
-    assert off_m[moves].mean() < 0.09 and off_m[moves & field.moving].mean() < 0.03
+    assert off_m[moves].mean() < 0.09 and off_m[moves & field.moving].mean() < 0.04
     assert any("two sweeps" in told for told in _of_window(recording, 100, follows=True))

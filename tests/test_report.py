@@ -148,7 +148,7 @@ class TestPage:
         way = np.diff([p["position_m"] for p in mover["path"]], axis=0)
         speed = np.linalg.norm(mover["velocity_m_s"])
         assert len(way) == 4 and np.linalg.norm(way, axis=1) == pytest.approx(
-            [0.1 * speed] * 4, abs=0.05
+            [0.1 * speed] * 4, abs=0.06
         )
         assert abs(speed - 8) < 0.3
 

@@ -179,9 +179,9 @@ def test_real_sweeps_are_told_as_they_are(drive, test_data):
 
 
 WRONG_POSES = {
-    "climbing": lambda T, s: shifted(0, 0, 0.3 * s) @ T,
-    "too long": lambda T, s: shifted(*(0.11 * T[:3, 3])) @ T,
-    "turning": lambda T, s: T @ poses.exp(np.array([0, 0, np.deg2rad(2) * s, 0, 0, 0])),
+    "m/s up beside": lambda T, s: shifted(0, 0, 0.2 * s) @ T,
+    "% too long": lambda T, s: shifted(*(0.04 * T[:3, 3])) @ T,
+    "deg from": lambda T, s: T @ poses.exp(np.array([0, 0, np.deg2rad(2) * s, 0, 0, 0])),
 }
 
 
@@ -194,8 +194,8 @@ def test_poses_that_the_sweeps_contradict_are_told(kind):
 
     usual = one_car()
     told = run(Wrong(usual.scene, usual.frames), KEY, 3, "icp", config=POSES_GIVEN).warnings
-    (found,) = [w for w in told if "the recording's poses lay sweep" in w]
-    assert "m and" in found and "--set register.source=kiss-icp does without" in found
+    (found,) = [w for w in told if "the recording's poses are off by" in w]
+    assert kind in found and "--set register.source=kiss-icp" in found
     own = POSES_GIVEN | {"register": {"source": "kiss-icp"}}
     told = run(Wrong(usual.scene, usual.frames), KEY, 3, "icp", config=own).warnings
     assert not any("poses" in w for w in told)

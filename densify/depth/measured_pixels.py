@@ -3,8 +3,9 @@
 
 Among the points in a pixel that are not occluded, the point measured nearest in time to the key
 sweep wins. A plane is fitted to the surrounding points that agree with it, and the pixel gets the
-depth of the plane at its centre. The pixel is measured if the sweep nearest to the key is among
-those that agree. Close to a depth discontinuity it becomes a boundary pixel.
+depth of the plane at its centre. The pixel is measured if, of all sweeps with points around it, the
+one nearest to the key is among those that agree. Close to a depth discontinuity it becomes a
+boundary pixel.
 """
 
 from __future__ import annotations
@@ -42,23 +43,15 @@ _RIDGE_PX2 = 0.02
 _LEAST_PX, _MOST_PX = 3, 24  # limits of the radius
 _ALL_ROUND = 3.0  # in radii of a discontinuity; farther than this none is near
 _NUM_BITS = np.iinfo(np.int64).bits - 1  # sweeps are counted by their frame number modulo 63
-_NEVER_NS = int(np.iinfo(np.int64).max)
 
 
 class MeasuredPixels(NamedTuple):
-    """The H·W pixels of an image, row by row.
+    """The H·W pixels of an image, row by row."""
 
-    Attributes:
-        winner: (H·W,) index, in `PointsInImage`, of the point that gives the depth; -1 none.
-        depth_m: (H·W,) float32 depth in metres.
-        confidence: (H·W,) float32 rank from 0 to 1.
-        inside: (H·W,) True if no depth discontinuity is near.
-    """
-
-    winner: Int
-    depth_m: Float32
-    confidence: Float32
-    inside: Bool
+    winner: Int  # (H·W,) index, in `PointsInImage`, of the point that gives the depth; -1 none
+    depth_m: Float32  # (H·W,) float32 depth in metres
+    confidence: Float32  # (H·W,) float32 rank from 0 to 1
+    inside: Bool  # (H·W,) True if no depth discontinuity is near
 
     @staticmethod
     def at(camera: Camera, pixel: Int, *columns: np.ndarray) -> MeasuredPixels:
@@ -130,9 +123,9 @@ def _settled(
     hidden = behind > 1
     reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
     pixel, winner, found = _found(points, hidden, camera, taken)
-    depth_m, num_sweeps, youngest_ns, num_points, residual_m, edge = found
+    depth_m, num_sweeps, supported, num_points, residual_m, edge = found
     if taken is None:
-        supported = youngest_ns <= np.float32(points.age_ns.min(initial=_NEVER_NS))
+        supported = supported > 0
         inside = edge >= 1
     else:
         supported, inside = num_sweeps >= _FAR_SWEEPS, edge >= _FAR_EDGE
@@ -153,28 +146,17 @@ def _settled(
 
 
 class _Visible(NamedTuple):
-    """K points in an image, sorted by pixel, occluded points last in each pixel.
+    """K points in an image, sorted by pixel, occluded points last in each pixel."""
 
-    Attributes:
-        start: (H·W+1,) index of each pixel's first point, of `sorted_by_pixel`.
-        uv: (K,2) column and row in px.
-        inverse: (K,) inverse depth in 1/m.
-        slope: (K,2) slope of the inverse depth, 1/m per px.
-        edge_px: (K,) radius of a depth discontinuity.
-        spacing_px: (K,2) spacing of neighbouring rays.
-        sweep: (K,) frame number of the source sweep modulo 63.
-        age_ns: (K,) time from the key sweep.
-    """
-
-    start: Int
-    uv: Float
-    inverse: Float
-    slope: Float
-    edge_px: Float
-    spacing_px: Float
-    sweep: NDArray[np.integer]
+    start: Int  # (H·W+1,) index of each pixel's first point, of `sorted_by_pixel`
+    uv: Float  # (K,2) column and row in px
+    inverse: Float  # (K,) inverse depth in 1/m
+    slope: Float  # (K,2) slope of the inverse depth, 1/m per px
+    edge_px: Float  # (K,) radius of a depth discontinuity
+    spacing_px: Float  # (K,2) spacing of neighbouring rays
+    sweep: NDArray[np.integer]  # (K,) frame number of the source sweep modulo 63
     hidden: Bool
-    age_ns: Int
+    age_ns: Int  # (K,) time from the key sweep
 
 
 def _found(
@@ -239,8 +221,9 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
     The plane has inverse depth ``centre`` (1/m) in the pixel, and visible points within ``agree``
     (1/m) of it agree. Points farther behind it within ``outer`` (px) show a discontinuity. The
     moments m (9,) of the fit and the extent of the surface, reach (8,), are filled in. Return a bit
-    for each sweep that agrees, the age of the youngest of these sweeps, and the number of points in
-    the fit. Return also their weighted sum of squares, and True if a point is close behind.
+    for each sweep that agrees, and True if none of the other sweeps with points there is nearer to
+    the key. Return also the number of points in the fit, their weighted sum of squares, and True if
+    a point is close behind.
     """
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
@@ -249,7 +232,8 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
     reach_u = _window(_REACH * points.spacing_px[i, 0])
     reach_v = _window(_REACH * points.spacing_px[i, 1])
     wide_u, wide_v = max(reach_u, _window(outer)), max(reach_v, _window(outer))
-    seen, num, youngest, behind, squares = np.int64(0), 0, age_ns[i], False, 0.0
+    seen, num, behind, squares = np.int64(0), 0, False, 0.0
+    agree_ns = other_ns = age_ns[i]
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
         for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
@@ -257,13 +241,14 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
             du, dv = uv[k, 0] - u0, uv[k, 1] - v0
             off = inverse[k] - (centre + su * du + sv * dv)
             close = abs(du) <= outer and abs(dv) <= outer
+            vouches = abs(du) <= reach_u + 0.5 and abs(v - v0) <= reach_v
             if hidden[k] or abs(off) > agree:
                 behind |= close and off < -far
+                other_ns = min(other_ns, age_ns[k]) if vouches else other_ns
                 continue
             # No branches: half of them would be predicted wrongly.
-            vouches = abs(du) <= reach_u + 0.5 and abs(v - v0) <= reach_v
             seen |= np.int64(vouches) << np.int64(points.sweep[k])
-            youngest = min(youngest, age_ns[k]) if vouches else youngest
+            agree_ns = min(agree_ns, age_ns[k]) if vouches else agree_ns
             _extend(reach, du if close else 0.0, dv if close else 0.0)
             weight = max(1 - abs(du) / (reach_u + 1), 0.0) * max(1 - abs(dv) / (reach_v + 1), 0.0)
             m[0] += weight
@@ -277,7 +262,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
             m[8] += weight * dv * off
             squares += weight * off * off
             num += vouches
-    return seen, youngest, num, squares, behind
+    return seen, agree_ns <= other_ns, num, squares, behind
 
 
 @Kernel
@@ -285,9 +270,9 @@ def _settle(first, last, points, shape, taken, found):  # type: ignore[no-untype
     """Find the depth of each pixel from the surrounding points that agree with its first point.
 
     points: `_Visible`. taken: (P,) pixels to leave alone. found: (6,P) float32 output: depth (m),
-    number of sweeps that agree, age of the youngest (ns), number of points in the fit, their root
-    mean square residual (m), and extent of the surface as a multiple of the radius of
-    discontinuities.
+    number of sweeps that agree, 1 if no sweep nearer to the key disagrees, number of points in the
+    fit, their root mean square residual (m), and extent of the surface as a multiple of the radius
+    of discontinuities.
     """
     m, reach = np.empty(9), np.empty(8)
     for p in range(first, last):
@@ -300,12 +285,12 @@ def _settle(first, last, points, shape, taken, found):  # type: ignore[no-untype
         agree = (AGREE_M + AGREE_FRACTION / w0) * w0 * w0
         inner = points.edge_px[i]
         m[:], reach[:] = 0.0, 0.0
-        seen, youngest, num, squares, behind = _look_round(
+        seen, supported, num, squares, behind = _look_round(
             points, shape, i, u0, v0, centre, agree, inner + _EDGE_WINDOW_PX, m, reach
         )
         off, _, _ = plane(m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], _RIDGE_PX2)
         found[0, p] = 1 / limited(centre + min(max(off, -agree), agree), w0)
-        found[1, p], found[2, p], found[3, p] = _count(seen), youngest, num
+        found[1, p], found[2, p], found[3, p] = _count(seen), supported, num
         mean = m[6] / m[0]
         found[4, p] = np.sqrt(max(squares / m[0] - mean * mean, 0.0)) / (w0 * w0)
         found[5, p] = _ALL_ROUND

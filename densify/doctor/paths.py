@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,9 +14,8 @@ from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 from densify.readers.recorded_poses import PoseTrack
+from densify.scores.recorded_error import RecordedError, main_error
 
-# Tolerance over a spot of five sweeps; an error of 1 % shifts surfaces by 0.1 m over 10 m.
-_OFF_M, _OFF_PER_M, _OFF_DEG = 0.03, 0.01, 0.3
 _LEAST_WAY_M = 1.5  # an error of 3 % of this distance exceeds the tolerance
 _WRONG = 4.0  # as a multiple of the tolerance
 _CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.3, 0.02, 0.04
@@ -70,11 +68,11 @@ def check_poses(sample: Sample) -> list[Finding]:
         return [finding("poses", UNKNOWN, "no sweeps could be registered to compare with")]
     found = [_between([s.stretch.sweeps[row].T_world_lidar for row in (0, -1)]) for s in spots]
     between = [_between(pair) for pair in given]
-    off = _Off.of(between, found)
+    off = RecordedError.of(between, found)
     text = f"off by {off.m:.2f} m and {off.deg:.2f} deg from odometry over {off.way_m:.1f} m"
     values = {"off_m": off.m, "off_deg": off.deg, "way_m": off.way_m}
     others = {
-        name: _Off.of([_between([change(T) for T in pair]) for pair in given], found)
+        name: RecordedError.of([_between([change(T) for T in pair]) for pair in given], found)
         for name, change in HYPOTHESES.items()
     }
     best = min(others, key=lambda name: others[name].cost)
@@ -85,28 +83,12 @@ def check_poses(sample: Sample) -> list[Finding]:
     verdict = FINE if off.way_m >= _LEAST_WAY_M else UNKNOWN
     if off.cost > 1:
         verdict = WRONG if off.cost > _WRONG else SUSPICIOUS
-        told, mended = _described(between, found, spots)
+        duration_s = np.mean([(b.stamp_ns - a.stamp_ns) * 1e-9 for a, b in map(_ends, spots)])
+        told, mended = main_error(between, found, float(duration_s))
         text, remedy = text + told, mended + remedy
     elif verdict == UNKNOWN:
         text += "; the vehicle hardly moves"
     return [finding("poses", verdict, text, remedy, **values), *_check_clock(sample, found)]
-
-
-def _described(given: list[Float], found: list[Float], spots: list[Spot]) -> tuple[str, str]:
-    """Return the main error of the poses, scale or drift, and its correction, as texts."""
-    given_m, found_m = (np.array([T[:3, 3] for T in steps]) for steps in (given, found))
-    off_m, way_m = (given_m - found_m).mean(axis=0), found_m.mean(axis=0)
-    if np.linalg.norm(off_m) < 0.5 * np.linalg.norm(given_m - found_m, axis=1).mean():
-        told = "; no usual mistake explains it (another frame than the points', another clock, or"
-        return f"{told} noise)", ""
-    longer = float(off_m @ way_m / (way_m @ way_m))
-    if abs(longer) * np.linalg.norm(way_m) > 0.7 * np.linalg.norm(off_m):
-        told = f": their ways are {abs(longer) * 100:.1f} % too {'long' if longer > 0 else 'short'}"
-        return told, f"divide their translations by {1 + longer:.3f}, or "
-    axis = int(np.argmax(np.abs(off_m)))
-    way = (("forward", "back"), ("left", "right"), ("up", "down"))[axis][int(off_m[axis] < 0)]
-    seconds = np.mean([(b.stamp_ns - a.stamp_ns) * 1e-9 for a, b in map(_ends, spots)])
-    return f": they go {abs(off_m[axis]) / seconds:.2f} m/s {way} beside the sweeps", ""
 
 
 def _check_clock(sample: Sample, found: list[Float]) -> list[Finding]:
@@ -163,21 +145,3 @@ def _ends(spot: Spot) -> tuple[Sweep, Sweep]:
 
 def _between(pair: list[Float]) -> Float:
     return poses.inverse(pair[0]) @ pair[1]
-
-
-class _Off(NamedTuple):
-    """Errors of the given relative poses against odometry."""
-
-    m: float  # median translation error over the spots
-    deg: float  # median rotation error over the spots
-    cost: float  # the larger error, as a multiple of its tolerance
-    way_m: float  # longest distance driven within a spot
-
-    @staticmethod
-    def of(given: list[Float], found: list[Float]) -> _Off:
-        apart = [poses.log(poses.inverse(a) @ b) for a, b in zip(given, found, strict=True)]
-        way_m = np.array([np.linalg.norm(T[:3, 3]) for T in found])
-        off_m = np.array([np.linalg.norm(d[3:]) for d in apart])
-        off_deg = float(np.rad2deg(np.median([np.linalg.norm(d[:3]) for d in apart])))
-        cost = max(float(np.median(off_m / (_OFF_M + _OFF_PER_M * way_m))), off_deg / _OFF_DEG)
-        return _Off(float(np.median(off_m)), off_deg, cost, float(way_m.max()))

@@ -9,9 +9,11 @@ import numpy as np
 
 from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
 from densify.doctor.sample import Sample, Spot
+from densify.free_space.sectors import LOST_DEG, blind_sector, lost_deg
 from densify.free_space.sensor import Sensors
+from densify.free_space.sweep_frame import MAP_FRAME_REMEDY, is_still, way_in_map
 from densify.geometry.types import Float
-from densify.readers.timeline import in_range
+from densify.readers.timeline import format_frames, in_range
 
 _MEDIAN_RANGE_M = (1.5, 60.0)
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
@@ -51,7 +53,7 @@ def check_units(sample: Sample) -> list[Finding]:
         text += f", and within {around_m:.1f} m of each other's middle, as if they were in a map's"
         text += " coordinates"
         verdict = WRONG
-        remedy = "bring each sweep into its scanner's frame, by the inverse of its pose"
+        remedy = MAP_FRAME_REMEDY
     else:
         text += f", expected {least_m} to {most_m:.0f} m"
         if fits:
@@ -61,6 +63,20 @@ def check_units(sample: Sample) -> list[Finding]:
 
 def _median_range_m(points: Float) -> float:
     return float(np.median(np.linalg.norm(points, axis=1)))
+
+
+def check_frame(sample: Sample) -> list[Finding]:
+    """Check that each sweep is in the frame of its own scanner, not in that of a map."""
+    name, tracks = "frame of sweeps", [s.trajectory for s in sample.spots if s.trajectory]
+    if not tracks:
+        return [finding(name, UNKNOWN, "no sweeps could be registered")]
+    if not all(is_still(track.T_world_lidar) for track in tracks):
+        return [finding(name, FINE, "the scanner's own: odometry finds motion")]
+    way_m = way_in_map(sample.spots[0].sweeps[0], sample.spots[-1].sweeps[-1])
+    if not way_m:
+        return [finding(name, FINE, "the scanner's own: all rays begin there")]
+    text = f"that of a map: odometry finds no motion, but rays begin up to {way_m:.1f} m apart"
+    return [finding(name, WRONG, text, MAP_FRAME_REMEDY, way_m=way_m)]
 
 
 def check_axes(sample: Sample) -> list[Finding]:
@@ -150,6 +166,25 @@ def _own_returns(spots: list[Spot]) -> tuple[float, int]:
         return 0.0, 0
     range_m = np.linalg.norm((mine + 0.5) * _CELL_M, axis=1)
     return float(np.percentile(range_m, 99)), len(mine)
+
+
+def check_directions(sample: Sample) -> list[Finding]:
+    """Check that sweeps have returns in all directions, as far as the scanner sees."""
+    width_deg = [float(lost_deg(spot.sweeps).max()) for spot in sample.spots]
+    sectors = [blind_sector(spot.sweeps) for spot in sample.spots]
+    name, worst = "directions", max(width_deg)
+    if worst >= LOST_DEG:
+        frames = format_frames(s.frame for s in sample.spots[int(np.argmax(width_deg))].sweeps)
+        text = (
+            f"one of the sweeps {frames} lacks {worst:.0f} deg of azimuth that the others measured"
+        )
+        remedy = "lost packets: record with a larger buffer of the socket, or leave sweeps out"
+        return [finding(name, SUSPICIOUS, text, remedy, lost_deg=worst)]
+    if sectors[0] is not None and None not in sectors:
+        text = f"no returns from {sectors[0][0]} to {sectors[0][1]} deg of azimuth in any sweep"
+        remedy = "a blind sector: something covers the scanner, or the sweeps were cropped"
+        return [finding(name, SUSPICIOUS, text, remedy)]
+    return [finding(name, FINE, "returns all around, as far as the scanner sees")]
 
 
 def check_intensity(sample: Sample) -> list[Finding]:

@@ -106,13 +106,21 @@ class Sample:
 
 
 def _chosen(timeline: Timeline) -> list[list[int]]:
-    """Return the frame numbers of each spot: separate groups of sweeps about 0.1 s apart."""
-    frames = timeline.frames
+    """Return the frame numbers of each spot: separate groups of sweeps about 0.1 s apart.
+
+    A spot lies between two holes in time. If all of these stretches are short, spots are shorter.
+    """
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
-    length = min(len(frames), stride * (_NUM_SWEEPS - 1) + 1)
-    most = max(1, len(frames) // length)
-    starts = np.rint(np.linspace(0, len(frames) - length, min(_NUM_SPOTS, most))).astype(int)
-    return [list(frames[start : start + length : stride]) for start in np.unique(starts)]
+    unbroken = timeline.runs(timeline.frames)
+    length = min(max(map(len, unbroken)), stride * (_NUM_SWEEPS - 1) + 1)
+    spots = [
+        run[start : start + length : stride]
+        for run in unbroken
+        for start in range(len(run) - length + 1)
+    ]
+    most = max(1, len(timeline.frames) // length)
+    rows = np.rint(np.linspace(0, len(spots) - 1, min(_NUM_SPOTS, most))).astype(int)
+    return [spots[row] for row in np.unique(rows)]
 
 
 def spot_of(sweeps: tuple[Sweep, ...], settings: RegisterSettings) -> Spot:

@@ -11,10 +11,15 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from densify.geometry import poses
-from densify.geometry.types import Float, Float32, Int, Stretch, Sweep
+from densify.geometry.arrays import bulk
+from densify.geometry.types import Bool, Float, Float32, Int, Stretch, Sweep
 
 ABOVE_GROUND_M = 0.2
 """Height above the ground below which points are part of it and never start a moving object."""
+_BELOW_M = 0.5  # points this far below the ground are no surface: mirror images, multipath
+_STRAY = 0.02  # largest share of the points of a cell that are mirror images or noise
+_DENSE_M = 30.0  # range within which every sweep measures the ground
+_MOST_CELLS = 1 << 18  # 512 m x 512 m
 CELL_M = 1.0  # smaller cells follow kerbs, larger ones bridge holes
 MAX_SLOPE = 0.15  # rise per metre; steeper surfaces are objects
 _WINDOW = 7  # cells; a narrower hump or pit is not ground
@@ -30,39 +35,32 @@ def ground(stretch: Stretch) -> HeightMap:
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Ground heights on a grid of square cells, in a world frame with z up.
+    """Ground heights on a grid of square cells, in a world frame with z up."""
 
-    Attributes:
-        heights_m: (X,Y) z of the ground in metres at the centres of X by Y cells.
-        low_m: (2,) x and y of the grid's lower corner.
-        cell_m: Side of a cell.
-    """
-
-    heights_m: Float
-    low_m: Float
-    cell_m: float
+    heights_m: Float  # (X,Y) z of the ground in metres at the centres of X by Y cells
+    low_m: Float  # (2,) x and y of the grid's lower corner
+    cell_m: float  # side of a cell
 
     @staticmethod
     def of(clouds: Sequence[Float]) -> HeightMap:
         """Return the ground height under point clouds.
 
-        The second lowest point of a cell is its ground, because the lowest may be a stray
-        reflection. A cell far below the median of its surroundings is repaired. A limit on the
-        slope then removes cars and walls, and narrow humps are removed. The points near the
-        resulting lower hull are averaged.
+        The ground of a cell is the median, over the clouds, of a cloud's lowest point after its
+        second lowest and its lowest 2 %, because these may be mirror images from below the
+        road. A cell far below the median of its surroundings is repaired. A limit on the slope then
+        removes cars and walls, and narrow humps are removed. The points near the resulting lower
+        hull are averaged.
 
         Args:
             clouds: Clouds of (N,3) points in metres, z up, with at least one point in all.
         """
+        inside = bulk(np.concatenate([points[:, :2] for points in clouds]), CELL_M, _MOST_CELLS)
+        ends = np.cumsum([len(points) for points in clouds])[:-1]
+        each = zip(clouds, np.split(inside, ends), strict=True)
+        clouds = [points[rows] for points, rows in each]
         low, shape = _grid(clouds)
         cells = [_cells(points, low, shape[1]) for points in clouds]
-        lowest, second = np.full((2, shape[0] * shape[1]), np.inf)
-        for points, cell in zip(clouds, cells, strict=True):
-            np.minimum.at(lowest, cell, points[:, 2])
-        for points, cell in zip(clouds, cells, strict=True):
-            rows = np.flatnonzero(points[:, 2] > lowest[cell])
-            np.minimum.at(second, cell[rows], points[rows, 2])
-        heights = np.where(np.isfinite(second), second, lowest).reshape(shape)
+        heights = _median_of_low(clouds, cells, shape[0] * shape[1]).reshape(shape)
 
         known = np.isfinite(heights)
         nearest = ndimage.distance_transform_edt(
@@ -88,6 +86,20 @@ class HeightMap:
         height_m: Float32 = (points[:, 2] - self.under(points)).astype(np.float32)
         return height_m
 
+    def below(self, points: Float, T_world_lidar: Float) -> Bool:
+        """Return (N,) True for points clearly below the ground, such as mirror images.
+
+        Only points within 30 m of the lidar are judged, where the ground is measured densely.
+
+        Args:
+            points: (N,3) metres, lidar frame.
+            T_world_lidar: (4,4) pose of the lidar.
+        """
+        near = np.flatnonzero(np.hypot(points[:, 0], points[:, 1]) < _DENSE_M)
+        deep = np.zeros(len(points), bool)
+        deep[near] = self.above(poses.transform(T_world_lidar, points[near])) < -_BELOW_M
+        return deep
+
 
 def _grid(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
     """Return the (2,) lower corner of a grid around all points, and its numbers of cells."""
@@ -102,6 +114,20 @@ def _cells(points: Float, low_m: Float, num_y: int) -> Int:
     """Return the (N,) number of each point's grid cell; a row of the grid has ``num_y`` cells."""
     x, y = (((points[:, i] - low_m[i]) / CELL_M).astype(np.int64) for i in (0, 1))
     return x * num_y + y
+
+
+def _median_of_low(clouds: Sequence[Float], cells: Sequence[Int], num_cells: int) -> Float:
+    """Return the (num_cells,) median over clouds of their low points, inf in empty cells."""
+    low = np.full((len(clouds), num_cells), np.nan, np.float32)
+    for points, cell, low_m in zip(clouds, cells, low, strict=True):
+        order = np.lexsort((points[:, 2], cell))
+        occupied, first, count = np.unique(cell[order], return_index=True, return_counts=True)
+        stray = np.maximum(1, (_STRAY * count).astype(int))
+        low_m[occupied] = points[order[first + np.minimum(count - 1, stray)], 2]
+    known = ~np.isnan(low).all(axis=0)
+    heights = np.full(num_cells, np.inf)
+    heights[known] = np.nanmedian(low[:, known], axis=0)
+    return heights
 
 
 def _averaged(hull: HeightMap, clouds: Sequence[Float], cells: Sequence[Int]) -> Float:

@@ -41,35 +41,24 @@ _PI = np.float32(np.pi)
 
 
 class ScannerImage(NamedTuple):
-    """The range image of one scanner, R rows by C columns. Columns start at azimuth -pi and wrap.
+    """The range image of one scanner, R rows by C columns that start at azimuth -pi and wrap."""
 
-    Attributes:
-        offset_s: (1,C) or (R,C) float32 seconds after the reference time at which the scanner faced
-            the column or cell, middle of all such times.
-        spread_s: Greatest difference from that time in seconds, same shape.
-        settled_s: Greatest difference between two estimates of the time at which a point is faced,
-            if each column has one time. A larger difference is at the seam between two turns.
-        nearest_m: (R,C) float32 nearest return in the 3 x 3 cells around each cell, inf if none.
-        num_filled: (R,C) uint8 number of these nine cells with a return.
-        row_edges_rad: (R+1,) float32 elevations of the row borders, ascending.
-        origin_m: (3,) float32 position of the scanner in the lidar frame.
-        axes: (3,3) float32 rotation from the lidar frame to the scanner's axes.
-        twists: (2,6) float32 twist of the lidar before and after the reference time.
-        from_m: Least range at which the image is used.
-        to_m: Greatest range at which the image is used.
-    """
-
+    # (1,C) or (R,C) float32 seconds after the reference time at which the scanner faced the column
+    # or cell, middle of all such times
     offset_s: Float32
-    spread_s: Float32
+    spread_s: Float32  # greatest difference from that time in seconds, same shape
+    # Greatest difference between two estimates of the time at which a point is faced, if each
+    # column has one time. A larger difference is at the seam between two turns.
     settled_s: float
+    # (R,C) float32 nearest return in the 3 x 3 cells around each cell, inf if none
     nearest_m: Float32
-    num_filled: NDArray[np.uint8]
-    row_edges_rad: Float32
-    origin_m: Float32
-    axes: Float32
-    twists: Float32
-    from_m: float
-    to_m: float
+    num_filled: NDArray[np.uint8]  # (R,C) uint8 number of these nine cells with a return
+    row_edges_rad: Float32  # (R+1,) float32 elevations of the row borders, ascending
+    origin_m: Float32  # (3,) float32 position of the scanner in the lidar frame
+    axes: Float32  # (3,3) float32 rotation from the lidar frame to the scanner's axes
+    twists: Float32  # (2,6) float32 twist of the lidar before and after the reference time
+    from_m: float  # least range at which the image is used
+    to_m: float  # greatest range at which the image is used
 
     def in_range(self, points: Float32) -> Bool:
         """Return (N,) True for points (N,3), lidar frame, at whose range the image is used."""

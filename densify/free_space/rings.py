@@ -45,18 +45,12 @@ _WINDOWS = (1, 3, 5, 9, 17, 33)  # cells
 
 
 class Aimed(NamedTuple):
-    """The N rays of one scanner at their firing times, in its frame; (N,) float32 each.
+    """The N rays of one scanner at their firing times, in its frame; (N,) float32 each."""
 
-    Attributes:
-        azimuth: Azimuth in radians, positive to the left.
-        elevation: Elevation in radians, positive upwards.
-        offset_s: Firing time in seconds after the reference time of the sweep.
-    """
-
-    azimuth: Float32
-    elevation: Float32
+    azimuth: Float32  # azimuth in radians, positive to the left
+    elevation: Float32  # elevation in radians, positive upwards
     range_m: Float32
-    offset_s: Float32
+    offset_s: Float32  # firing time in seconds after the reference time of the sweep
 
 
 def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
@@ -80,19 +74,14 @@ def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
 
 
 class RayTable(NamedTuple):
-    """Angles between neighbouring rays in B bins of elevation by C bins of azimuth, radians.
+    """Angles between neighbouring rays in B bins of elevation by C bins of azimuth, radians."""
 
-    Attributes:
-        low_rad: Lowest elevation of bin 0. The outermost bins also stand for all elevations beyond.
-        bin_rad: Height of a bin of elevation.
-        across: (B,C) float32 angle between rays along the azimuth.
-        along: (B,C) float32 angle between rays along the elevation. Bins of azimuth start at -pi; C
-            is 1 if the azimuth does not matter.
-    """
-
+    # Lowest elevation of bin 0. The outermost bins also stand for all elevations beyond.
     low_rad: float
-    bin_rad: float
-    across: Float32
+    bin_rad: float  # height of a bin of elevation
+    across: Float32  # (B,C) float32 angle between rays along the azimuth
+    # (B,C) float32 angle between rays along the elevation. Bins of azimuth start at -pi; C is 1 if
+    # the azimuth does not matter.
     along: Float32
 
     def at(self, azimuth: NDArray[np.floating], elevation: NDArray[np.floating]) -> Float:
@@ -105,20 +94,15 @@ class RayTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """The pattern in which a scanner samples directions.
+    """The pattern in which a scanner samples directions."""
 
-    Attributes:
-        rings_rad: (K,) elevation of every ring, ascending; None if there are no distinct rings.
-        unordered: True if there are no lines either, or if the firing time does not follow the
-            azimuth (solid state, rosettes).
-        azimuth_step_rad: Angle between rays of a ring or line, usual spacing if unordered.
-        table: Angles between neighbouring rays by direction.
-    """
-
+    # (K,) elevation of every ring, ascending; None if there are no distinct rings
     rings_rad: Float | None
+    # True if there are no lines either, or if the firing time does not follow the azimuth (solid
+    # state, rosettes)
     unordered: bool
-    azimuth_step_rad: float
-    table: RayTable
+    azimuth_step_rad: float  # angle between rays of a ring or line, usual spacing if unordered
+    table: RayTable  # angles between neighbouring rays by direction
 
 
 def measure(sweeps: Sequence[Aimed]) -> Layout:

@@ -35,20 +35,14 @@ def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[R
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """The free space that each of the W sweeps of a window observed.
+    """The free space that each of the W sweeps of a window observed."""
 
-    Attributes:
-        images: W range images.
-        T_lidar_world: W transforms (4,4) from the world to the lidar at the reference time.
-        clock: Reference times of the sweeps.
-        sensors: Scanners, with the angles between their rays.
-        batches: Indices of consecutive sweeps that are tested together, see `Clock.batches`.
-    """
-
-    images: tuple[RangeImage, ...]
+    images: tuple[RangeImage, ...]  # w range images
+    # W transforms (4,4) from the world to the lidar at the reference time
     T_lidar_world: tuple[Float, ...]
-    clock: Clock
-    sensors: Sensors
+    clock: Clock  # reference times of the sweeps
+    sensors: Sensors  # scanners, with the angles between their rays
+    # Indices of consecutive sweeps that are tested together, see `Clock.batches`
     batches: tuple[tuple[int, ...], ...]
 
     @staticmethod

@@ -23,36 +23,25 @@ class RayGrid(NamedTuple):
     """A grid of directions whose cells hold about one ray of a sweep each.
 
     Columns go left from azimuth -pi, all round. Rows go up.
-
-    Attributes:
-        low_rad: Lowest elevation of the first bin.
-        bin_rad: Height of a bin of elevation.
-        row_of: (B+1,) number of rows below each border of a bin, may be a fraction.
     """
 
-    low_rad: float
-    bin_rad: float
-    row_of: Float
+    low_rad: float  # lowest elevation of the first bin
+    bin_rad: float  # height of a bin of elevation
+    row_of: Float  # (B+1,) number of rows below each border of a bin, may be a fraction
     num_rows: int
     num_columns: int
 
 
 @dataclass(frozen=True)
 class SensorModel(Layout):
-    """One scanner, with its pattern of rays.
+    """One scanner, with its pattern of rays."""
 
-    Attributes:
-        origin_m: (3,) origin of its rays, lidar frame.
-        axes: (3,3) rotation from the lidar frame to the scanner's axes, in which angles are
-            measured.
-        elevation_rad: (2,) elevations of the lowest and the highest ray.
-        azimuth_rad: (2,) azimuths of the rightmost and the leftmost ray: -pi and pi for an
-            all-round view, right > left if the view includes the backward direction.
-    """
-
-    origin_m: Float
+    origin_m: Float  # (3,) origin of its rays, lidar frame
+    # (3,3) rotation from the lidar frame to the scanner's axes, in which angles are measured
     axes: Float
-    elevation_rad: tuple[float, float]
+    elevation_rad: tuple[float, float]  # (2,) elevations of the lowest and the highest ray
+    # (2,) azimuths of the rightmost and the leftmost ray: -pi and pi for an all-round view, right >
+    # left if the view includes the backward direction
     azimuth_rad: tuple[float, float]
 
     @staticmethod

@@ -14,6 +14,8 @@ Float32 = NDArray[np.float32]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
+_SHARES = (0.9999, 0.999, 0.99)  # of the points that stay in a grid
+
 
 def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
     """Return an (M,) structured array of (M,) columns, by field name, without padding."""
@@ -23,3 +25,26 @@ def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
     for name, column in columns.items():
         rows[name] = column
     return rows
+
+
+def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
+    """Return (N,) True for the points around which a grid fits into memory.
+
+    These are all points if the box around them has at most ``most_cells`` cells. Otherwise up to
+    1 % of them, the farthest from their median, are left out, such as a few stray returns. If their
+    box is still too large, the points are spread out, and none is left out.
+
+    Args:
+        points: (N,D) positions.
+        cell: Side of a cell, in the unit of the points.
+        most_cells: Greatest number of cells of the grid.
+    """
+    everything = np.ones(len(points), bool)
+    if not len(points) or np.prod(np.ptp(points, axis=0) / cell + 1) <= most_cells:
+        return everything
+    distance = np.abs(points - np.median(points, axis=0)).max(axis=1)
+    for share in _SHARES:
+        near = distance <= np.quantile(distance, share)
+        if np.prod(np.ptp(points[near], axis=0) / cell + 1) <= most_cells:
+            return near
+    return everything

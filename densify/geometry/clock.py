@@ -19,12 +19,9 @@ class Clock:
     """Reference times of W sweeps, at any rate and with missing sweeps.
 
     Its methods take and return sweep indices, 0 to W - 1.
-
-    Attributes:
-        time_ns: (W,) int64, ascending.
     """
 
-    time_ns: Int
+    time_ns: Int  # (W,) int64, ascending
 
     @staticmethod
     def of(stretch: Stretch) -> Clock:

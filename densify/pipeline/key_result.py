@@ -23,20 +23,14 @@ from densify.scores.cloud_scores import ghost_scores
 
 
 class Method(NamedTuple):
-    """The stages that a method uses.
+    """The stages that a method uses."""
 
-    Attributes:
-        all_sweeps: Use all sweeps of the window, else the key sweep alone.
-        engine: Name of the scene-flow engine (``flow.engine``), "" for the configured engine, None
-            for rigid accumulation.
-        visible: Reject occluded and unsupported points, else each pixel shows its nearest point.
-        far: Add static surfaces beyond the window (``accumulate.far_m``).
-    """
-
-    all_sweeps: bool
+    all_sweeps: bool  # use all sweeps of the window, else the key sweep alone
+    # Name of the scene-flow engine (``flow.engine``), "" for the configured engine, None for rigid
+    # accumulation
     engine: str | None
-    visible: bool
-    far: bool
+    visible: bool  # reject occluded and unsupported points, else each pixel shows its nearest point
+    far: bool  # add static surfaces beyond the window (``accumulate.far_m``)
 
 
 METHODS = {
@@ -58,11 +52,7 @@ COMPARED = ("none", "icp", "icp-far", "paper", "flow")
 
 
 def methods_of_run(method: str, settings: Config) -> tuple[str, ...]:
-    """Return the method of `RUN`, preceded by its simpler baselines if results are scored.
-
-    Raises:
-        InputError: The method is not in `RUN`.
-    """
+    """Return the method of `RUN`, preceded by its simpler baselines if results are scored."""
     if method not in RUN:
         raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
     return RUN[: RUN.index(method) + 1] if settings.is_scored else (method,)
@@ -74,31 +64,20 @@ def looks_around(methods: Sequence[str]) -> bool:
 
 
 class KeyScene(NamedTuple):
-    """The inputs that all methods of a key share.
+    """The inputs that all methods of a key share."""
 
-    Attributes:
-        settings: All settings.
-        key: Frame number of the key sweep.
-        stretch: Registered sweeps of the key's window.
-        beyond: Static surfaces beyond the window; None if unknown or not requested.
-        key_image: Range image of the key sweep.
-        views: Viewpoints of the depth maps.
-        images: Map name -> (H,W,3) RGB image that colours the cloud.
-        truth: Map name -> ground-truth depth (H,W) in metres and mask (H,W) of moving pixels.
-        held_out: The key sweep as ground truth for maps made without it; None without scores.
-        watch: Measures the stages.
-    """
-
-    settings: Config
-    key: int
-    stretch: Stretch
-    beyond: Beyond | None
-    key_image: RangeImage
-    views: Views
-    images: Mapping[str, NDArray[np.uint8]]
+    settings: Config  # all settings
+    key: int  # frame number of the key sweep
+    stretch: Stretch  # registered sweeps of the key's window
+    beyond: Beyond | None  # static surfaces beyond the window; None if unknown or not requested
+    key_image: RangeImage  # range image of the key sweep
+    views: Views  # viewpoints of the depth maps
+    images: Mapping[str, NDArray[np.uint8]]  # map name -> (H,W,3) RGB image that colours the cloud
+    # Map name -> ground-truth depth (H,W) in metres and mask (H,W) of moving pixels
     truth: Mapping[str, tuple[Float32, Bool]]
+    # The key sweep as ground truth for maps made without it; None without scores
     held_out: HeldOut | None
-    watch: Watch
+    watch: Watch  # measures the stages
 
 
 def result_of_method(

@@ -38,9 +38,6 @@ def complete_with_prior(
         truth: Map name -> ground-truth depth (H,W) in metres and mask (H,W) of moving pixels.
             Maps without ground truth are missing.
         kind: Setting ``prior.kind``.
-
-    Raises:
-        InputError: No map has a prior.
     """
     full, metrics = {}, copy.deepcopy(dict(result.metrics))
     for name, prior in _read(files, shots, result.key).items():

@@ -26,8 +26,11 @@ from densify.config.cache import Cache, code_digest, kept
 from densify.config.errors import InputError, SweepError, UnfitSweepError
 from densify.config.plugins import engine as engine_row
 from densify.depth.accumulate import accumulate, object_tracks
+from densify.depth.object_boxes import complete_boxes
+from densify.depth.seen_through import Rays
 from densify.flow.engines import Scene, SharedMotion, estimate_motion
 from densify.free_space.ground import HeightMap, ground
+from densify.free_space.sweep_frame import MAP_FRAME_REMEDY, are_placed, is_still, way_in_map
 from densify.geometry import poses
 from densify.geometry.types import (
     Cloud,
@@ -46,7 +49,12 @@ from densify.geometry.types import (
 from densify.pipeline.costs import Watch
 from densify.pipeline.road import Road
 from densify.pipeline.sweeps import Cut, Sweeps
-from densify.readers.timeline import Timeline, WindowFrames, recorded_trajectory
+from densify.readers.timeline import (
+    Timeline,
+    WindowFrames,
+    format_frames,
+    recorded_trajectory,
+)
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import LeftOut, Registration, find_trajectory
 
@@ -107,9 +115,6 @@ class Recording:
             run: Name of a run whose processes share results through the cache; None for no sharing.
             watch: Measures the cost of each step.
             looks_around: True also searches motion ``flow.look_around_s`` beyond the windows.
-
-        Raises:
-            InputError: A key does not exist.
         """
         self.sequence, self.settings = sequence, settings
         self.timeline = timeline = Timeline.of(sequence)
@@ -247,7 +252,20 @@ class Recording:
                     flow = StretchFlow.towards(key, stretch, motion)
         with self._watch.stage("accumulate"):
             drop_lost = self.settings.accumulate.unfollowed == "drop"
-            return Moment(accumulate(used, fields, key, drop_lost), flow, tracks)
+            cloud = accumulate(used, fields, key, drop_lost)
+            tracks = complete_boxes(tracks, cloud, Rays(used, key), self._ground_of(key))
+            deep = self._ground_of(key).below(cloud.rigid_points, stretch[key].T_world_lidar)
+            return Moment(cloud.select(~deep) if deep.any() else cloud, flow, tracks)
+
+    def share_below(self, key: int) -> float:
+        """Return the share of the points of a key's window that lie below the ground."""
+        heights, sweeps = self._ground_of(key), self.window(key).sweeps
+        deep = [heights.below(s.sweep.points, s.T_world_lidar) for s in sweeps]
+        return float(np.concatenate(deep).mean())
+
+    def _ground_of(self, key: int) -> HeightMap:
+        piece = self._piece(key)
+        return self._ground(piece.number, piece.row)
 
     def standing(self, key: int) -> Beyond | None:
         """Return the static surfaces along the road before and after the key's window.
@@ -290,7 +308,9 @@ class Recording:
                     recorded = recorded_trajectory(self.sequence, run)
                 try:
                     with self._watch.stage("register"):
-                        pieces.append(find_trajectory(run, settings, recorded))
+                        piece = find_trajectory(run, settings, recorded)
+                    self._check_frame(run, piece, recorded)
+                    pieces.append(piece)
                 except SweepError as error:
                     unfit = isinstance(error, UnfitSweepError)
                     bad[error.frame] = LeftOut(str(error), unreadable=False, unfit=unfit)
@@ -298,6 +318,23 @@ class Recording:
             return Registration(tuple(sorted(pieces, key=lambda p: p.frames)), bad)
 
         return self._kept("registration", frames, make)
+
+    def _check_frame(
+        self, sweeps: Sequence[Sweep], found: Trajectory, recorded: Trajectory | None
+    ) -> None:
+        """Raise InputError if sweeps are not in the scanner's frame but in the frame of a map."""
+        ends, told = (sweeps[0], sweeps[-1]), ""
+        if recorded is not None:
+            if are_placed(sweeps, recorded.T_world_lidar):
+                told = "the rays begin at the sweeps' poses"
+        elif is_still(found.T_world_lidar) and (way_m := way_in_map(*ends)):
+            told = f"odometry finds no motion, but the rays of both begin {way_m:.1f} m apart"
+        if told:
+            raise InputError(
+                f"{self.sequence.name}: sweeps {format_frames([s.frame for s in ends])} are in the "
+                f"frame of a map: {told}; expected each in its scanner's own frame: "
+                f"{MAP_FRAME_REMEDY}"
+            )
 
     def _registered_together(self, number: int) -> list[int]:
         """Return the frames of a block's lead-in, then of the block."""

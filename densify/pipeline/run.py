@@ -81,10 +81,6 @@ def run(
     Returns:
         The result. With ``output.score`` it also has the simpler methods as ``baselines``, and
         scores of maps made without the key sweep.
-
-    Raises:
-        InputError: The recording or the settings cannot be used.
-        ComputationError: Registration fails.
     """
     made = run_keys(sequence, [key], window, method, cameras, config, progress, prior=prior)
     ((_, result),) = made
@@ -113,9 +109,6 @@ def run_keys(
         keys: Frame numbers, in any order.
         window: Number of sweeps on each side of a key. The other arguments are as in `run`.
         cache: Keeps shared results on disk.
-
-    Raises:
-        InputError: The arguments are invalid; raised at the call, before the first key.
     """
     methods, watch = methods_of_run(method, resolve(config)), Watch(progress)
     recording = _open(sequence, keys, window, methods, cameras, config, cache, watch)
@@ -153,10 +146,6 @@ def compare(
 
     Returns:
         Method -> result. Each result has the results before it as ``baselines``.
-
-    Raises:
-        InputError: The recording or the settings cannot be used.
-        ComputationError: Registration fails.
     """
     watch, settings = Watch(progress), resolve(config).scored()
     recording = _open(sequence, [key], window, methods, cameras, settings, cache, watch)
@@ -181,9 +170,6 @@ def flow_steps(
         config: Settings, see `densify.config.resolve`.
         progress: Callback (stage, done, total).
         cache: Keeps the results of steps on disk.
-
-    Raises:
-        InputError: The arguments are invalid; raised at the call, before the first frame.
     """
     recording = _open(sequence, frames, 1, ["flow"], None, config, cache, None)
 
@@ -219,10 +205,6 @@ def densify(
         with_images: Colour the cloud, and score depth if there is ground truth. The maps are the
             same either way.
         priors: Depth images that complete the maps of the last method.
-
-    Raises:
-        InputError: As in `run`.
-        ComputationError: As in `run`.
     """
     methods = tuple(dict.fromkeys(methods))
     watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings

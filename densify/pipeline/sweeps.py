@@ -55,11 +55,7 @@ class Sweeps:
                 self._sequence.prepare(frames)
 
     def recorded_pose(self, frame: int) -> Float | None:
-        """Return the recording's own ``T_world_lidar`` (4,4), None if the settings ignore it.
-
-        Raises:
-            InputError: The recording has no pose for the frame.
-        """
+        """Return the recording's own ``T_world_lidar`` (4,4), None if the settings ignore it."""
         if self._settings.source != "dataset":
             return None
         return self._sequence.T_world_lidar(frame)
@@ -89,16 +85,11 @@ class Sweeps:
 
 @dataclass(frozen=True)
 class Cut:
-    """Blocks of consecutive sweeps that are computed together, in time order; they may overlap.
+    """Blocks of consecutive sweeps that are computed together, in time order; they may overlap."""
 
-    Attributes:
-        blocks: Frame numbers of each block: the windows of its keys, and the sweeps between and
-            around them.
-        number_of: Key -> index of its block.
-    """
-
+    # Frame numbers of each block: the windows of its keys, and the sweeps between and around them
     blocks: tuple[tuple[int, ...], ...]
-    number_of: Mapping[int, int]
+    number_of: Mapping[int, int]  # key -> index of its block
 
     def keys_of(self, number: int) -> list[int]:
         """Return the keys of a block."""
@@ -114,9 +105,6 @@ class Cut:
             timeline: Times of the sweeps.
             window: Number of sweeps on each side of a key.
             keys: Frame numbers, in any order.
-
-        Raises:
-            InputError: A key does not exist.
         """
         check_window(window)
         groups: list[list[int]] = []

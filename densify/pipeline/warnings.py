@@ -3,26 +3,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from densify.config import Config
+from densify.config.errors import InputError
 from densify.depth.exposure import Shot
-from densify.geometry.types import LidarSequence, Result, Stretch
+from densify.free_space.sectors import LOST_DEG, blind_sector, lost_deg
+from densify.geometry import poses
+from densify.geometry.types import LidarSequence, Result, Stretch, Sweep
 from densify.pipeline.key_result import METHODS, looks_around
 from densify.pipeline.recording import Recording
 from densify.readers.timeline import format_frames
-from densify.registration.alignment import find_misfit
 from densify.registration.compensation import find_compensated
+from densify.registration.trajectory import find_trajectory
 from densify.scores.depth_metrics import image_density
+from densify.scores.recorded_error import RecordedError, main_error
 
 _LEAST_DENSITY = 0.001  # sixteen rings alone measure 0.5 % of an image
 _SLOW_S = 0.15  # period; at 5 Hz the motion of a truck along its own side is ambiguous
 _OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image
-_LIFTED_M = 0.04  # correct poses leave surfaces up to 0.03 m apart after half a second
+_LEAST_SIDE = 2  # sweeps on each side of the key, over which recorded poses are compared
 _MUCH_NEAR = 0.2  # share of the points; a car's own returns were 0 to 14 %
+_MUCH_BELOW = 0.002  # share of the points; clean recordings have up to 0.0015
 _MUCH_MOVES = 1 / 3  # share of the points; most returns are of ground and buildings
 
 
@@ -51,6 +56,8 @@ def add_warnings(
             if name not in cameras and not sequence.image_stamps_ns(name)
         ),
         *_of_sweeps(stretch, recording.settings),
+        *_of_sectors([recording.raw(frame) for frame in stretch.frames]),
+        *_of_ground(recording, key),
         *_of_motion(recording, key),
         *_of_images(sequence, shots),
     ]
@@ -85,13 +92,48 @@ def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
             f"{100 * share:.0f} % of the points are lone returns, as of snow, rain or dust; they "
             f"are left out, and motion is less certain"
         )
-    num_near = sum(sweep.num_near for sweep in sweeps)
-    share = num_near / max(num_near + sum(len(sweep) for sweep in sweeps), 1)
+    share = _share_near(sweeps)
     if share > _MUCH_NEAR:
         yield (
             f"register.min_range_m = {settings.register.min_range_m:g} takes {100 * share:.0f} % "
             f"of the points as the own vehicle's; indoors and on small robots set it to the reach "
             f"of the vehicle"
+        )
+
+
+def _share_near(sweeps: Sequence[Sweep]) -> float:
+    """Return the share of the returns that are left out as the own vehicle's."""
+    num_near = sum(sweep.num_near for sweep in sweeps)
+    return num_near / max(num_near + sum(len(sweep) for sweep in sweeps), 1)
+
+
+def _of_sectors(sweeps: Sequence[Sweep]) -> Iterator[str]:
+    """Yield warnings about directions in which raw sweeps lack returns."""
+    if _share_near(sweeps) > _MUCH_NEAR:
+        return  # they may lack those left out
+    width_deg = lost_deg(sweeps)
+    lacking = {s.frame: w for s, w in zip(sweeps, width_deg, strict=True) if w >= LOST_DEG}
+    if lacking:
+        yield (
+            f"sweeps {format_frames(lacking)} have no returns in up to {max(lacking.values()):.0f} "
+            f"deg of azimuth where others have some, as after lost packets: static surfaces there "
+            f"are of other sweeps, and motion is less certain"
+        )
+    sector = blind_sector(sweeps)
+    if sector is not None:
+        yield (
+            f"no sweep has a return from {sector[0]} to {sector[1]} deg of azimuth "
+            f"(counterclockwise from x): a blind sector; depth there is filled in or missing"
+        )
+
+
+def _of_ground(recording: Recording, key: int) -> Iterator[str]:
+    """Yield a warning if many points lie below the ground."""
+    share = recording.share_below(key)
+    if share > _MUCH_BELOW:
+        yield (
+            f"{100 * share:.1f} % of the points lie below the ground, as mirror images of a wet "
+            f"road and echoes over two surfaces do; they are left out"
         )
 
 
@@ -111,15 +153,30 @@ def _of_motion(recording: Recording, key: int) -> Iterator[str]:
         )
     if settings.source != "dataset":
         return
-    ends = {s.sweep.frame: s for s in (stretch.sweeps[0], stretch.sweeps[-1]) if s is not at}
-    misfits = {frame: find_misfit(at, end) for frame, end in ends.items()}
-    frame = max(misfits, key=lambda f: misfits[f].lift_m, default=key)
-    if frame != key and misfits[frame].lift_m > _LIFTED_M:
-        off_m, off_deg, lift_m = misfits[frame]
+    yield from _of_recorded(recording, key)
+
+
+def _of_recorded(recording: Recording, key: int) -> Iterator[str]:
+    """Yield a warning if odometry does not confirm the recording's poses around the key."""
+    frames = recording.timeline.frames
+    row, num = recording.timeline.row[key], max(len(recording.window(key).frames) // 2, _LEAST_SIDE)
+    around = frames[max(row - num, 0) : row + num + 1]
+    settings = replace(recording.settings.register, source="kiss-icp")
+    try:
+        sweeps = [recording.raw(frame) for frame in around]
+        odometry = find_trajectory(sweeps, settings).T_world_lidar
+        recorded = [recording.sequence.T_world_lidar(frame) for frame in (around[0], around[-1])]
+    except InputError:
+        return  # too short or too poor to compare
+    motions = [poses.inverse(ends[0]) @ ends[-1] for ends in (recorded, odometry)]
+    error = RecordedError.of(motions[:1], motions[1:])
+    if error.cost > 1:
+        duration_s = (sweeps[-1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
+        told, remedy = main_error(motions[:1], motions[1:], duration_s)
         yield (
-            f"the recording's poses lay sweep {frame} {off_m:.2f} m and {off_deg:.1f} deg from "
-            f"where it fits on sweep {key}, surfaces {100 * lift_m:.0f} cm apart: are they the "
-            f"lidar's, by its clock? --set register.source=kiss-icp does without them"
+            f"the recording's poses are off by {error.m:.2f} m and {error.deg:.1f} deg from "
+            f"odometry over {error.way_m:.1f} m around sweep {key}{told}; {remedy}leave them out "
+            f"with --set register.source=kiss-icp"
         )
 
 

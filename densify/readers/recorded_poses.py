@@ -10,19 +10,22 @@ smears moving objects, hides the points' times, and bends rings. `PoseTrack.as_f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from densify.config.errors import InputError
-from densify.config.file_content import read_text
+from densify.config.file_content import open_file, read_text
 from densify.geometry import poses
 from densify.geometry.types import Float, Int
 from densify.readers import checks
+from densify.readers.file_sequence import Returns
 from densify.readers.stamp_files import TIME_COLUMNS, TextTable, check_digits
 
+_PCD_HEADER = 4096  # bytes that hold the header of a .pcd file
+_NO_VIEWPOINT = "0 0 0 1 0 0 0"
 _MAX_BEYOND_NS = 200_000_000  # longest extrapolation of a pose, at constant velocity
 
 _PLACES = tuple((a, f"t{a}", f"p{a}", f"pos_{a}", f"position_{a}") for a in "xyz")
@@ -69,6 +72,20 @@ class PoseTrack:
         """
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
+
+    def taken_back(self, placed: Returns, stamp_ns: int) -> Returns:
+        """Undo that points were moved to the world with the poses of this path.
+
+        Args:
+            placed: Points of one sweep in the world. Without times they are compensated to the
+                stamp, and the result is too.
+            stamp_ns: Reference time of the sweep.
+        """
+        at_stamp = poses.transform(poses.inverse(self.at(stamp_ns)), placed.points)
+        at_stamp[~placed.points.any(axis=1)] = 0.0
+        if placed.offset_ns is not None:
+            at_stamp = self.as_fired(at_stamp, stamp_ns, placed.offset_ns)
+        return replace(placed, points=at_stamp)
 
     def compensated(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
         """Move (N,3) points as fired to the vehicle frame at ``stamp_ns``; undoes `as_fired`."""
@@ -148,6 +165,24 @@ class PoseFile:
                     f"7 (x y z qx qy qz qw); write them as lines of a file poses.txt instead"
                 )
         return PoseFile(paths[0], "one file for each sweep", np.stack(T))
+
+    @staticmethod
+    def of_viewpoints(paths: Sequence[Path]) -> PoseFile | None:
+        """Read the poses in VIEWPOINT of .pcd files; None if all are the default, or for others."""
+        if not all(path.suffix.lower() == ".pcd" for path in paths):
+            return None
+        T = []
+        for path in paths:
+            with open_file(path) as file:
+                header = file.read(_PCD_HEADER).split(b"\nDATA")[0].decode("ascii", "replace")
+            lines = (line.split(maxsplit=1) for line in header.splitlines())
+            found = [line[1] for line in lines if len(line) == 2 and line[0] == "VIEWPOINT"]
+            where = f"{path}: VIEWPOINT"
+            values = checks.parse_numbers(found[0] if found else _NO_VIEWPOINT, where, 7)
+            T.append(checks.quaternion_pose(values[3:], values[:3], where))
+        if np.allclose(T, np.eye(4)):
+            return None
+        return PoseFile(paths[0], "VIEWPOINT of each sweep", np.stack(T))
 
 
 def _numbers(table: TextTable, columns: Sequence[int] | None = None) -> Float:

@@ -58,7 +58,8 @@ class Lidar(NamedTuple):
     """A lidar of the bag."""
 
     topic: str
-    frame: str  # frame in the header of the messages
+    frame: str  # frame in the header of the messages; that of odometry's body for placed messages
+    placed: bool  # True if odometry placed the messages in its own world: registered clouds
     entries: list[Entry]  # index of the messages, by ascending stamp
     T_first_lidar: Float  # (4,4) pose of this lidar in the frame of the first lidar
     period_ns: int  # median time between consecutive messages
@@ -106,7 +107,8 @@ class RosBag(FileSequence):
         for lidar in self._lidars:
             found = lidar.layout
             used = [f"{part} = {name}" for part, name in vars(found.fields).items() if name]
-            lines.append(("lidar", f"{lidar.topic} in {lidar.frame}: {', '.join(used)}"))
+            undone = f", out of the world of {self._topics.poses}" if lidar.placed else ""
+            lines.append(("lidar", f"{lidar.topic} in {lidar.frame}{undone}: {', '.join(used)}"))
             scale = f"intensity divided by {found.intensity_scale:g}"
             lines.append(("times", f"{found.time_words}; {scale}"))
         lines += [("images", f"{topic} ({name})") for name, topic in self._image_topics.items()]
@@ -137,12 +139,21 @@ class RosBag(FileSequence):
         where = f"{self._bag.path}: {lidar.topic} at {entry.stamp_ns} ns"
         columns = cloud_columns(self._bag.message(lidar.topic, entry), where)
         found, valid = lidar.layout.returns(columns, where, entry.stamp_ns)
+        if lidar.placed:
+            found = self._taken_back(found, entry.stamp_ns)
         points = np.zeros_like(found.points)
         points[valid] = poses.transform(lidar.T_first_lidar, found.points[valid])
         offset_ns = found.offset_ns
         if offset_ns is not None:
             offset_ns = offset_ns + (entry.stamp_ns - stamp_ns)
         return replace(found, points=points, offset_ns=offset_ns)
+
+    def _taken_back(self, placed: Returns, stamp_ns: int) -> Returns:
+        """Return points of the world of odometry as fired, in the frame that odometry places."""
+        track, words = self._track_and_words
+        if track is None:
+            raise InputError(f"{self._bag.path}: registered clouds need their odometry: {words}")
+        return track.taken_back(placed, stamp_ns)
 
     def gaps(self) -> list[str]:
         """Return a sentence for each topic whose headers lack stamps."""
@@ -215,6 +226,8 @@ class RosBag(FileSequence):
         if not found:
             raise InputError(f"{where}: the messages looked at hold no points")
         frame = plain(self._bag.message(topic, next(iter(found))).header.frame_id)
+        body = self._placed_in(frame)
+        frame = body or frame
         first = self._lidars[0].frame if self._lidars else frame
         T = self._transforms.between(first, frame)
         if T is None:
@@ -226,7 +239,16 @@ class RosBag(FileSequence):
         period_ns = max(1, int(np.median(steps))) if len(steps) else _USUAL_PERIOD_NS
         stamps_ns = [entry.stamp_ns for entry in found]
         layout = PointLayout.find([*found.values()], where, period_ns, stamps_ns)
-        return Lidar(topic, frame, entries, T, period_ns, layout)
+        return Lidar(topic, frame, bool(body), entries, T, period_ns, layout)
+
+    def _placed_in(self, frame: str) -> str:
+        """Return the frame that the chosen odometry places in ``frame``, "" if in another."""
+        if self._topics.poses in ("", "tf"):
+            return ""
+        message = next(self._bag.messages(self._topics.poses), None)
+        if message is None or plain(message.header.frame_id) != frame:
+            return ""
+        return plain(getattr(message, "child_frame_id", "")) or "lidar"
 
     def _camera(self, topic: str) -> Camera:
         """Return the camera of a topic; raise InputError without images, CameraInfo or mounting."""

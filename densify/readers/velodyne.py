@@ -9,11 +9,13 @@ Sweeps are numbered from 0 and decoded on demand. Incomplete turns at the ends o
 out. The stamp of a sweep is the time at which the computer captured its last packet. ``offset_ns``
 is computed from the packets' clock and the firing order of the model. Points are as measured, in
 the scanner's frame: x forward (azimuth 0), y left, z up. There are no cameras and no poses.
+A packet that was captured twice is read once.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -40,6 +42,8 @@ _PAYLOAD = 1206  # bytes of a packet with returns
 _MAX_HEADERS = 64  # bytes of Ethernet, VLAN, IP and UDP headers before the packet
 _FLAGS = (b"\xff\xee", b"\xff\xdd")  # first bytes of a packet with returns
 _BEHIND = 18_000  # azimuth straight behind, hundredths of a degree
+_HOUR_US = 3_600_000_000  # the packets' clock counts microseconds within the hour
+_TWICE_NS = 10**9  # a packet of the same direction and time comes again after an hour at least
 _WHOLE = 0.9  # smallest share of the usual packets in a complete turn
 _PCAP = {  # magic number -> byte order, nanoseconds per unit of the fraction
     b"\xd4\xc3\xb2\xa1": ("<", 1000),
@@ -67,7 +71,9 @@ class Velodyne(FileSequence):
         """Find the packets and turns of a capture; sweeps are decoded on demand."""
         self._library = needed("velodyne_decoder", "velodyne", "Velodyne captures")
         self._model = getattr(self._library.Model, MODELS[model])
-        self._begin, self._captured_ns, azimuth = _find_packets(path)
+        packets, self._num_twice = _once(_find_packets(path))
+        self._begin, self._captured_ns, azimuth, clock_us = packets
+        self._num_packets, self._num_lost = len(azimuth), _num_lost(clock_us)
         self._turns = _turns(azimuth)
         if not self._turns:
             raise InputError(
@@ -76,6 +82,12 @@ class Velodyne(FileSequence):
             )
         self._stamps_ns = [int(self._captured_ns[turn.stop - 1]) for turn in self._turns]
         super().__init__(path.stem, path, range(len(self._turns)))
+
+    def findings(self) -> Sequence[tuple[str, str]]:
+        """Return the number of packets, and of those that are lost or were captured twice."""
+        share = 100 * self._num_lost / (self._num_packets + self._num_lost)
+        text = f"{self._num_packets:,}, {self._num_lost:,} lost ({share:.1f} %)"
+        return [("packets", f"{text}, {self._num_twice:,} captured twice and read once")]
 
     def _returns(self, frame: int) -> Returns:
         library, packets = self._library, []
@@ -99,8 +111,8 @@ class Velodyne(FileSequence):
         )
 
 
-def _find_packets(path: Path) -> tuple[Int, Int, Int]:
-    """Return (P,) file offsets, capture times (ns) and azimuths (0.01 deg) of the packets."""
+def _find_packets(path: Path) -> Int:
+    """Return offset, capture time (ns), azimuth (0.01 deg) and clock (us) of packets, (4,P)."""
     found = []
     with open_file(path) as file:
         magic = file.read(24)[:4]
@@ -122,14 +134,34 @@ def _find_packets(path: Path) -> tuple[Int, Int, Int]:
                 break  # cut off
             if payload[:2] in _FLAGS:
                 azimuth = payload[2] + 256 * payload[3]
-                found.append((at - _PAYLOAD, seconds * 10**9 + fraction * unit_ns, azimuth))
+                (clock_us,) = struct.unpack_from("<I", payload, _PAYLOAD - 6)
+                captured_ns = seconds * 10**9 + fraction * unit_ns
+                found.append((at - _PAYLOAD, captured_ns, azimuth, clock_us))
     if not found:
         raise InputError(
             f"{path}: no Velodyne packets (of {_PAYLOAD} bytes); is it an Ouster's? Then put its "
             f"metadata .json beside it"
         )
-    begin, captured_ns, azimuths = np.array(found, np.int64).T
-    return begin, captured_ns, azimuths
+    return np.array(found, np.int64).T
+
+
+def _once(packets: Int) -> tuple[Int, int]:
+    """Return packets (4,P) without those captured a second time, and the number of these."""
+    _, captured_ns, azimuth, clock_us = packets
+    order = np.lexsort((captured_ns, azimuth, clock_us))
+    same = (np.diff(packets[2:, order]) == 0).all(axis=0)
+    twice = np.concatenate([[False], same & (np.diff(captured_ns[order]) < _TWICE_NS)])
+    kept = np.sort(order[~twice])
+    return packets[:, kept], int(twice.sum())
+
+
+def _num_lost(clock_us: Int) -> int:
+    """Return the number of packets missing between others, from their clock (P,)."""
+    step_us = np.diff(clock_us) % _HOUR_US
+    step_us = step_us[step_us > 0]  # two packets of a dual return have one time
+    if not len(step_us):
+        return 0
+    return int(np.maximum(np.rint(step_us / np.median(step_us)) - 1, 0).sum())
 
 
 def _turns(azimuth: Int) -> list[range]:

@@ -110,6 +110,7 @@ _CHECKS: dict[str, Check] = {
     "stamps_unit": _choice(UNIT_NS),
     "rate_hz": _ABOVE_0,
     "compensated": _FLAG,
+    "frame": _choice(("lidar", "poses")),
     "scanner_origins": (lambda value: _array(value, -1, 3), "finite numbers of shape (N, 3)"),
     "T_frame_lidar": _MOTION,
     "inverse": _FLAG,
@@ -147,6 +148,8 @@ class SweepFiles:
     stamps_unit: str = ""  # unit of the stamps
     rate_hz: float = 0.0  # rate of sweeps without stamps; 0 for 10 Hz
     compensated: bool = False  # True if the points are ego-motion compensated to the stamp
+    # Frame of the points: "lidar", or "poses" if each was placed with the pose of its moment
+    frame: str = "lidar"
     # (S,3) metres, start of each scanner's rays; None for 0 0 0
     scanner_origins: Float | None = None
 

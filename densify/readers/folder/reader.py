@@ -11,8 +11,8 @@ numbers and stamps: as the file names state. If the names are times
     names, a file such as ``timestamps.txt``, or the rate. The stamp is the reference time. Times
     of points count from the stamp, or are absolute on its clock. Their unit is the unit in which a
     sweep takes about a period.
-poses: KITTI's 3x4, 4x4, TUM, or tables with quaternions. Poses with stamps are interpolated. Poses
-    without stamps belong to the sweeps in order, or to the numbers from 0.
+poses: KITTI's 3x4, 4x4, TUM, tables with quaternions, or VIEWPOINT of PCD files. Poses with stamps
+    are interpolated. Poses without stamps belong to the sweeps in order, or to the numbers from 0.
 images: need a calibration; stamped by names, a file, or the sweeps of the same numbers.
 """
 
@@ -264,6 +264,12 @@ class Folder(FileSequence):
     def _returns(self, frame: int) -> Returns:
         stamp_ns = self.stamp_ns(frame)
         found = self._columns.returns(frame, stamp_ns)
+        if self._config.sweeps.frame == "poses":
+            if self._track is not None:
+                return self._track.taken_back(found, stamp_ns)
+            T_lidar_world = poses.inverse(self._pose(frame))
+            points = poses.transform(T_lidar_world, found.points)
+            return replace(found, points=points, offset_ns=None)  # compensated to the pose
         if not self._config.sweeps.compensated or found.offset_ns is None:
             return found
         if self._track is None:  # _is_untimed
@@ -285,21 +291,28 @@ class Folder(FileSequence):
         self._track: PoseTrack | None = None
         path = find_pose_file(self.where, known.file)
         each = {f: p for f in frames if (p := self._files[f].with_suffix(".pose")).is_file()}
-        if path is None and not each:
+        found = PoseFile.of_viewpoints([*self._files.values()]) if not path and not each else None
+        if path is None and not each and found is None:
+            if self._config.sweeps.frame == "poses":
+                raise InputError(
+                    f"{self._config.path}: sweeps.frame: got poses, but there are no poses; give "
+                    f"those that placed the sweeps (poses: {{file: NAME}})"
+                )
             return
-        if path is None:
-            path, frames = next(iter(each.values())), [*each]
-            self._poses = found = PoseFile.read_each([*each.values()])
-        else:
-            self._poses = found = PoseFile.read(path, known.stamps_unit)
+        if path is not None:
+            found = PoseFile.read(path, known.stamps_unit)
+        elif found is None:
+            frames = [*each]
+            found = PoseFile.read_each([*each.values()])
+        self._poses = found
         T = poses.inverse(found.T) if known.inverse else found.T
         T = T if known.T_frame_lidar is None else T @ known.T_frame_lidar
         if found.stamps_ns is not None:
-            self._track = PoseTrack(str(path), np.array(found.stamps_ns, np.int64), T)
+            self._track = PoseTrack(str(found.path), np.array(found.stamps_ns, np.int64), T)
             return
         if len(T) != len(frames) and len(T) <= frames[-1]:
             raise InputError(
-                f"{path}: got {len(T)} poses for {len(frames)} sweeps numbered "
+                f"{found.path}: got {len(T)} poses for {len(frames)} sweeps numbered "
                 f"{format_frames(frames)}, expected one for each, or for each number from 0"
             )
         numbers = frames if len(T) == len(frames) else range(len(T))

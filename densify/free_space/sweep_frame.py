@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""Find the place from which a sweep was measured: a ray ends once.
+
+Seen from the scanner, hardly any return lies behind another return in the same direction. Seen from
+elsewhere many do. The place where their share is least is the scanner's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from densify.geometry.types import Float, Sweep
+
+MAP_FRAME_REMEDY = (
+    "give the poses that placed the sweeps, with sweeps: {frame: poses} in densify.yaml; of a bag, "
+    "name the topic of the sweeps as measured (#points=) or the odometry (#poses=)"
+)
+_CELL_RAD = np.radians(0.4)
+_BEHIND, _BEHIND_M = 0.15, 1.0  # farther than the nearest return of the cell: share, metres
+_STEPS_M = (4.0, 2.0, 1.0, 0.5)
+_NUM_WAYS = 8  # directions of a step
+_MOST_MOVES = 20  # of each step
+_LESS = 0.8  # of the occluded returns of a sweep remain at a place that is not the origin
+_APART_M = 1.0  # least distance between the scanner's places that shows its motion
+_STILL_M = 0.5
+
+
+def _around(place: Float, step_m: float, num: int = _NUM_WAYS) -> Float:
+    """Return (num,3) places at the distance ``step_m`` from a place (3,), at its height."""
+    way_rad = np.arange(num) * (2 * np.pi / num)
+    return place + step_m * np.stack([np.cos(way_rad), np.sin(way_rad), 0 * way_rad], axis=1)
+
+
+def share_behind(points: Float, origin: Float) -> float:
+    """Return the share of points (N,3) that lie behind others, seen from ``origin`` (3,)."""
+    way = points - origin
+    range_m = np.linalg.norm(way, axis=1)
+    way, range_m = way[range_m > 0], range_m[range_m > 0]
+    if not len(way):
+        return 0.0
+    azimuth = np.floor(np.arctan2(way[:, 1], way[:, 0]) / _CELL_RAD).astype(np.int64)
+    elevation = np.floor(np.arcsin(np.clip(way[:, 2] / range_m, -1, 1)) / _CELL_RAD)
+    cell = (azimuth - azimuth.min()) * 1000 + elevation.astype(np.int64) + 500
+    nearest_m = np.full(int(cell.max()) + 1, np.inf)
+    np.minimum.at(nearest_m, cell, range_m)
+    return float(np.mean(range_m > (1 + _BEHIND) * nearest_m[cell] + _BEHIND_M))
+
+
+def scanner_place(points: Float, start: Float) -> Float:
+    """Return the place (3,) at the height of ``start`` (3,) from which a sweep was measured.
+
+    The search is a descent in steps of 4 m to 0.5 m. A place counts only if clearly fewer returns
+    are occluded there than at ``start``.
+    """
+    at_start = share_behind(points, start)
+    best, least = start, at_start
+    for step_m in _STEPS_M:
+        for _ in range(_MOST_MOVES):
+            places = _around(best, step_m)
+            shares = [share_behind(points, place) for place in places]
+            if min(shares) >= least:
+                break
+            best, least = places[int(np.argmin(shares))], min(shares)
+    return best if least < _LESS * at_start else start
+
+
+def is_still(T_world_lidar: Float) -> bool:
+    """Return True if the poses (n,4,4) of odometry hardly move, as between sweeps in a map."""
+    return bool(np.linalg.norm(np.ptp(T_world_lidar[:, :3, 3], axis=0)) <= _STILL_M)
+
+
+def way_in_map(first: Sweep, last: Sweep) -> float:
+    """Return the distance (m) between the places from which two raw sweeps were measured.
+
+    It is 0 for sweeps in their scanner's own frame, whose rays begin at one place. Sweeps between
+    which odometry finds no motion are in the frame of a map if their rays begin apart.
+    """
+    end = scanner_place(last.points[::2], last.origin_m(0))
+    if np.linalg.norm(end - last.origin_m(0)) < _APART_M:
+        return 0.0
+    way_m = float(np.linalg.norm(end - scanner_place(first.points[::2], first.origin_m(0))))
+    return way_m if way_m > _APART_M else 0.0
+
+
+def are_placed(sweeps: Sequence[Sweep], T_world_lidar: Float) -> bool:
+    """Return True if the rays of sweeps begin at their poses (n,4,4), in the world.
+
+    The sweeps then are in the frame of their poses, which must not be applied again. The two sweeps
+    whose poses are farthest from the origin of the points tell, if they are more than 4 m away,
+    where no scanner is mounted. Fewer returns lie behind others seen from the pose than seen from
+    places around it at the same height, and fewer than seen from the origin.
+    """
+    pairs = [
+        (s.points, s.origin_m(0), T[:3, 3]) for s, T in zip(sweeps, T_world_lidar, strict=True)
+    ]
+    farthest = sorted(pairs, key=lambda p: float(np.linalg.norm(p[2] - p[1])))[-2:]
+    return all(
+        np.linalg.norm(pose_m - origin) > _STEPS_M[0] and _is_scanner(points, pose_m, origin)
+        for points, origin, pose_m in farthest
+    )
+
+
+def _is_scanner(points: Float, place: Float, origin: Float) -> bool:
+    others = [origin, *_around(place, _STEPS_M[0], 4)]
+    least = min(share_behind(points, other) for other in others)
+    return share_behind(points, place) < _LESS * least

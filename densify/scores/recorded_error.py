@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""Compare the recorded motion between two sweeps with odometry from the sweeps themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from densify.geometry import poses
+from densify.geometry.types import Float
+
+# Tolerance over half a second; an error of 1 % shifts surfaces by 0.1 m over 10 m.
+_OFF_M, _OFF_PER_M, _OFF_DEG = 0.03, 0.01, 0.3
+
+
+class RecordedError(NamedTuple):
+    """Error of recorded motions against odometry."""
+
+    m: float  # median translation error
+    deg: float  # median rotation error
+    cost: float  # the larger error, as a multiple of its tolerance
+    way_m: float  # longest motion
+
+    @staticmethod
+    def of(recorded: Sequence[Float], odometry: Sequence[Float]) -> RecordedError:
+        """Compare the motions (4,4), one or more, from the first to the last sweep of a stretch."""
+        pairs = zip(recorded, odometry, strict=True)
+        apart = [poses.log(poses.inverse(a) @ b) for a, b in pairs]
+        way_m = np.array([np.linalg.norm(T[:3, 3]) for T in odometry])
+        off_m = np.array([np.linalg.norm(d[3:]) for d in apart])
+        off_deg = float(np.rad2deg(np.median([np.linalg.norm(d[:3]) for d in apart])))
+        cost = max(float(np.median(off_m / (_OFF_M + _OFF_PER_M * way_m))), off_deg / _OFF_DEG)
+        return RecordedError(float(np.median(off_m)), off_deg, cost, float(way_m.max()))
+
+
+def main_error(
+    recorded: Sequence[Float], odometry: Sequence[Float], duration_s: float
+) -> tuple[str, str]:
+    """Return the main error of the recorded motions, scale or drift, and its correction, as texts.
+
+    ``recorded`` and ``odometry`` are as in `RecordedError.of`, each over ``duration_s``.
+    """
+    recorded_m, odometry_m = (
+        np.array([T[:3, 3] for T in motions]) for motions in (recorded, odometry)
+    )
+    off_m, way_m = (recorded_m - odometry_m).mean(axis=0), odometry_m.mean(axis=0)
+    if np.linalg.norm(off_m) < 0.5 * np.linalg.norm(recorded_m - odometry_m, axis=1).mean():
+        told = "; no usual mistake explains it (another frame than the points', another clock, or"
+        return f"{told} noise)", ""
+    longer = float(off_m @ way_m / (way_m @ way_m))
+    if abs(longer) * np.linalg.norm(way_m) > 0.7 * np.linalg.norm(off_m):
+        told = f": their ways are {abs(longer) * 100:.1f} % too {'long' if longer > 0 else 'short'}"
+        return told, f"divide their translations by {1 + longer:.3f}, or "
+    axis = int(np.argmax(np.abs(off_m)))
+    way = (("forward", "back"), ("left", "right"), ("up", "down"))[axis][int(off_m[axis] < 0)]
+    return f": they go {abs(off_m[axis]) / duration_s:.2f} m/s {way} beside the sweeps", ""

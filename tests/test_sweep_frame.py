@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""The place from which a sweep was measured, found in walls and posts of a street."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from densify.config import resolve
+from densify.config.errors import InputError
+from densify.free_space.sweep_frame import are_placed, is_still, share_behind, way_in_map
+from densify.geometry import poses
+from densify.pipeline.recording import Recording
+from densify.readers import open_sequence
+from densify.readers.street import Street
+from tests.recorded import FRAMES
+
+
+@pytest.fixture(scope="module")
+def street() -> Street:
+    return Street("street", 0, "hdl32", cameras=())
+
+
+@pytest.fixture(scope="module")
+def placed(street):
+    """(sweeps, poses) of a second's way, the sweeps in the frame of a map at the first one."""
+    frames = [FRAMES[0], FRAMES[0] + 10]
+    T = [poses.inverse(street.T_world_lidar(frames[0])) @ street.T_world_lidar(f) for f in frames]
+    sweeps = [street[f] for f in frames]
+    moved = [
+        replace(s, points=poses.transform(t, s.points)) for s, t in zip(sweeps, T, strict=True)
+    ]
+    return moved, np.stack(T)
+
+
+def test_few_returns_lie_behind_others_seen_from_the_scanner(street):
+    points = street[FRAMES[0]].points
+    assert share_behind(points, np.zeros(3)) < 0.5 * share_behind(points, np.array([4.0, 0, 0]))
+
+
+def test_the_way_of_the_scanner_in_a_map(street, placed):
+    sweeps, T = placed
+    way_m = np.linalg.norm(T[1, :3, 3])
+    assert way_m > 3 and abs(way_in_map(*sweeps) - way_m) < 1.5
+    assert way_in_map(street[FRAMES[0]], street[FRAMES[0] + 10]) == 0
+    assert is_still(np.stack([np.eye(4)] * 2)) and not is_still(T)
+
+
+def test_sweeps_at_their_poses_are_placed(street, placed):
+    sweeps, T = placed
+    T_far = np.stack([T_world_map() @ t for t in T])
+    moved = [replace(s, points=poses.transform(T_world_map(), s.points)) for s in sweeps]
+    assert are_placed(moved, T_far)
+    assert not are_placed([street[FRAMES[0]], street[FRAMES[0] + 10]], T_far)
+
+
+def T_world_map() -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = 30.0, -20.0, 0.5
+    return T
+
+
+def test_sweeps_in_the_frame_of_a_map_are_refused_with_the_remedy(placed, street, tmp_path):
+    T_map_world = poses.inverse(street.T_world_lidar(FRAMES[0]))
+    for frame in range(FRAMES[0], FRAMES[0] + 5):
+        T = T_map_world @ street.T_world_lidar(frame)
+        np.save(tmp_path / f"{frame}.npy", poses.transform(T, street[frame].points))
+    recording = Recording(open_sequence(tmp_path), resolve({}), window=2)
+    with pytest.raises(InputError, match=r"frame of a map.*begin \d\.\d m apart.*frame: poses"):
+        recording.window(FRAMES[0] + 2)
