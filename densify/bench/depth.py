@@ -53,10 +53,6 @@ def bench_depth(
             pixels with a depth in the measured and the filled map. ``seconds`` per key sweep are
             for projection. ``scores`` (num_pixels, coverage, outliers) are by ground truth, map
             (measured, filled) and pixels (all, moving).
-
-    Raises:
-        InputError: An argument cannot be used.
-        ComputationError: Registration fails.
     """
     choose_cameras(sequence, cameras)
     if method not in METHODS:

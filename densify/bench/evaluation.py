@@ -52,10 +52,6 @@ def evaluate(
             discontinuities, is focal length times baseline over depth.
         baseline_m: Stereo baseline in metres.
         progress: Function called with (stage, done, total).
-
-    Raises:
-        InputError: A file is no depth map or mask, the sizes of a pair differ, or one side stores
-            1000 x metres.
     """
     stereo = {"focal_px": focal_px, "baseline_m": baseline_m}
     by_part: dict[str, list[DepthErrors]] = defaultdict(list)

@@ -39,18 +39,12 @@ _LEAST_MOTION_M = 0.5
 
 @dataclass(frozen=True)
 class Window:
-    """Consecutive registered sweeps around a key sweep.
-
-    Attributes:
-        key: Frame number of the key sweep.
-        around: Sweeps from which the configured method estimates motion.
-        above: Frame number -> (N,) mask of points above the ground.
-    """
+    """Consecutive registered sweeps around a key sweep."""
 
     stretch: Stretch
-    key: int
-    around: Stretch
-    above: Mapping[int, Bool]
+    key: int  # frame number of the key sweep
+    around: Stretch  # sweeps from which the configured method estimates motion
+    above: Mapping[int, Bool]  # frame number -> (N,) mask of points above the ground
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -70,20 +64,14 @@ class SweepTruth(NamedTuple):
     """The ground truth of the N points of a sweep: scene flow in metres without ego-motion.
 
     Flow starts at the sweep's reference time and is in the lidar frame of that time.
-
-    Attributes:
-        step: (N,3) flow to the neighbouring sweep towards the key sweep.
-        to_key: (N,3) flow to the key sweep.
-        moving: (N,) bool, True for points that move at the reference time.
-        foreground: (N,) bool, True for points of objects, moving or not.
-        certain: (N,) bool, True for moving points that travel at least 0.5 m over the window and
-            belong to an object with 30 returns or more.
     """
 
-    step: Float
-    to_key: Float
-    moving: Bool
-    foreground: Bool
+    step: Float  # (N,3) flow to the neighbouring sweep towards the key sweep
+    to_key: Float  # (N,3) flow to the key sweep
+    moving: Bool  # (N,) bool, True for points that move at the reference time
+    foreground: Bool  # (N,) bool, True for points of objects, moving or not
+    # (N,) bool, True for moving points that travel at least 0.5 m over the window and belong to an
+    # object with 30 returns or more
     certain: Bool
 
     @staticmethod
@@ -105,16 +93,13 @@ class Scorer:
     """Scorer of methods on one window of sweeps.
 
     Most errors are over points above the ground, because no method moves the ground.
-
-    Attributes:
-        sources: Frame numbers of the sweeps whose flow to a neighbour is scored.
-        truths: Frame number -> exact ground truth, None for a real recording.
-        labels: Frame number -> labelled flow to the neighbour, {} without ground truth.
     """
 
     window: Window
-    sources: tuple[int, ...]
+    sources: tuple[int, ...]  # frame numbers of the sweeps whose flow to a neighbour is scored
+    # Frame number -> exact ground truth, None for a real recording
     truths: Mapping[int, SweepTruth] | None
+    # Frame number -> labelled flow to the neighbour, {} without ground truth
     labels: Mapping[int, LabelledFlow]
 
     @staticmethod
@@ -260,9 +245,6 @@ def bench_flow(
     Returns:
         ``data``, ``key``, ``frames``, ``num_pairs``, and ``methods``: name -> ``seconds_per_pair``
             and the scores ``step``, ``challenge``, ``window`` of `Scorer`.
-
-    Raises:
-        InputError: A method is unknown, the window has no neighbours, or a frame is missing.
     """
     unknown = [method for method in methods if method not in METHODS]
     if unknown or not methods:
@@ -293,12 +275,7 @@ def bench_flow(
 
 
 def open_window(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
-    """Return the registered window of a key sweep, with ``size`` sweeps on each side.
-
-    Raises:
-        InputError: The frame number does not exist.
-        ComputationError: Registration fails.
-    """
+    """Return the registered window of a key sweep, with ``size`` sweeps on each side."""
     recording = Recording(sequence, config, size, [key], looks_around=True)
     stretch = recording.window(key)
     heights = ground(stretch)

@@ -48,22 +48,14 @@ _R_FLU_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 @dataclass(frozen=True)
 class PaperPair:
-    """Two clouds in one frame, without ground, and the true flow from the first to the second.
-
-    Attributes:
-        source: (n,3) points of the first cloud in metres, z up.
-        target: (m,3) points of the second cloud in metres, z up.
-        flow: (n,3) true flow of the source points in metres.
-        moving: (n,) bool, True for moving points. None if unknown.
-        sweeps: Input of trained networks.
-    """
+    """Two clouds in one frame, without ground, and the true flow from the first to the second."""
 
     name: str
-    source: Float
-    target: Float
-    flow: Float
-    moving: Bool | None
-    sweeps: Sweeps
+    source: Float  # (n,3) points of the first cloud in metres, z up
+    target: Float  # (m,3) points of the second cloud in metres, z up
+    flow: Float  # (n,3) true flow of the source points in metres
+    moving: Bool | None  # (n,) bool, True for moving points. None if unknown.
+    sweeps: Sweeps  # input of trained networks
 
 
 NUM_POINTS = 2048
@@ -118,9 +110,6 @@ def bench_paper(
 
     Return ``num_pairs``, ``num_points`` (drawn from each cloud) and ``methods``: name -> mean
     scores.
-
-    Raises:
-        InputError: A method is unknown, there are no pairs, or a file is no model.
     """
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
@@ -199,10 +188,6 @@ def pair_of_recording(spec: str, key: int) -> PaperPair:
     """Return key sweep number ``key`` and the next sweep, without ground and ego-motion.
 
     The flow is the exact ground truth. For a real recording it is estimated by this package.
-
-    Raises:
-        InputError: The key sweep has no next sweep.
-        ComputationError: A sweep cannot be registered.
     """
     sequence = open_sequence(spec)
     teacher, settings = "engine", resolve(None)
@@ -219,11 +204,7 @@ def pair_of_recording(spec: str, key: int) -> PaperPair:
 
 
 def pairs_of_files(folder: Path, most: int) -> Iterator[PaperPair]:
-    """Yield the pairs in the first ``most`` files of a folder, by file name. 0 means all files.
-
-    Raises:
-        InputError: The folder has no files, or a file has another format.
-    """
+    """Yield the pairs in the first ``most`` files of a folder, by file name. 0 means all files."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         raise InputError(f"{folder}: no .npz files; expected the sets of FlowNet3D's authors")

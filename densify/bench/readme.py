@@ -24,19 +24,14 @@ from densify.readers import open_sequence
 
 
 class Scene(NamedTuple):
-    """A recording and the settings of a row.
-
-    Attributes:
-        keys: Frame numbers of the key sweeps.
-        window: Number of sweeps on each side of a key sweep.
-        scanner: Index of the scanner whose returns are the ground truth. None for exact ground
-            truth or the held-out key sweep.
-    """
+    """A recording and the settings of a row."""
 
     data: str
-    keys: tuple[int, ...]
+    keys: tuple[int, ...]  # frame numbers of the key sweeps
     camera: str = "image_02"
-    window: int = 5
+    window: int = 5  # number of sweeps on each side of a key sweep
+    # Index of the scanner whose returns are the ground truth. None for exact ground truth or the
+    # held-out key sweep.
     scanner: int | None = None
 
     def __str__(self) -> str:
@@ -98,10 +93,6 @@ def tables(
         names: Names in `TABLES`, empty for all.
         kitti: Folder of KITTI drive 2011_09_26_drive_0013_sync, None to skip its rows.
         pandaset: Folder of PandaSet sequence 002, None to skip its rows.
-
-    Raises:
-        InputError: A name is unknown.
-        ComputationError: Registration fails.
     """
     for name in names:
         if name not in TABLES:

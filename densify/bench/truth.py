@@ -29,20 +29,14 @@ _STEREO_BASELINE_M = 0.532725  # of the drives of 2011_09_26
 
 
 class TruthMap(NamedTuple):
-    """True depth of an image.
+    """True depth of an image."""
 
-    Attributes:
-        depth_m: (H,W) true depth in metres, 0 for no depth.
-        moving: (H,W) bool, True at pixels of moving objects.
-        by_disparity: True to count outliers by KITTI's rule (error above 3 px of disparity and 5
-            %). False to count errors above 0.3 m and 5 %.
-        baseline_m: Stereo baseline that turns depth into disparity.
-    """
-
-    depth_m: Float32
-    moving: Bool
+    depth_m: Float32  # (H,W) true depth in metres, 0 for no depth
+    moving: Bool  # (H,W) bool, True at pixels of moving objects
+    # True to count outliers by KITTI's rule (error above 3 px of disparity and 5 %). False to count
+    # errors above 0.3 m and 5 %.
     by_disparity: bool
-    baseline_m: float = KITTI_BASELINE_M
+    baseline_m: float = KITTI_BASELINE_M  # stereo baseline that turns depth into disparity
 
     def outliers(self, depth_m: Float32, known: Bool, focal_px: float) -> Bool:
         """Return (K,) True where the depth (H,W) is an outlier at the K pixels ``known`` (H,W)."""

@@ -69,29 +69,17 @@ def change(figure: str, before: Any, now: Any) -> dict[str, float]:
 
 
 class Verdict(NamedTuple):
-    """The change of one figure over the keys of a group.
+    """The change of one figure over the keys of a group."""
 
-    Attributes:
-        figure: Name of the figure, with its unit.
-        keys: Names of the keys.
-        before: Mean over the keys before the change.
-        now: Mean over the keys now.
-        change: Mean change; of outliers, at equal coverage.
-        error: Standard error of the mean change between keys; NaN with one key.
-        luck: Standard deviation of the mean change by luck.
-        worst: Name of the key with the worst change, and that change.
-        word: "better", "worse" or "no difference".
-    """
-
-    figure: str
-    keys: Sequence[str]
-    before: float
-    now: float
-    change: float
-    error: float
-    luck: float
-    worst: tuple[str, float]
-    word: str
+    figure: str  # name of the figure, with its unit
+    keys: Sequence[str]  # names of the keys
+    before: float  # mean over the keys before the change
+    now: float  # mean over the keys now
+    change: float  # mean change; of outliers, at equal coverage
+    error: float  # standard error of the mean change between keys; NaN with one key
+    luck: float  # standard deviation of the mean change by luck
+    worst: tuple[str, float]  # name of the key with the worst change, and that change
+    word: str  # "better", "worse" or "no difference"
 
 
 def verdicts(

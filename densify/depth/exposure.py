@@ -40,17 +40,11 @@ AT_ONCE = 1 << 16
 
 @dataclass(frozen=True)
 class Shot:
-    """The camera, image and time that a depth map shows.
+    """The camera, image and time that a depth map shows."""
 
-    Attributes:
-        camera: Camera whose view the map has.
-        number: Number of the image, None if no image belongs to the map.
-        stamp_ns: Time that the map shows: exposure of the image, or time of the key sweep.
-    """
-
-    camera: Camera
-    number: int | None
-    stamp_ns: int
+    camera: Camera  # camera whose view the map has
+    number: int | None  # number of the image, None if no image belongs to the map
+    stamp_ns: int  # time that the map shows: exposure of the image, or time of the key sweep
 
 
 def key_shots(
@@ -130,19 +124,12 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
 
 
 class InView(NamedTuple):
-    """The K points of a cloud that lie in an image.
+    """The K points of a cloud that lie in an image."""
 
-    Attributes:
-        exposure: Camera and time of the image.
-        rows: (K,) indices of the points in the cloud, ascending.
-        points_cam: (K,3) positions as in `Sight`.
-        uv: (K,2) pixel coordinates as in `Sight`.
-    """
-
-    exposure: Exposure
-    rows: Int
-    points_cam: Float
-    uv: Float
+    exposure: Exposure  # camera and time of the image
+    rows: Int  # (K,) indices of the points in the cloud, ascending
+    points_cam: Float  # (K,3) positions as in `Sight`
+    uv: Float  # (K,2) pixel coordinates as in `Sight`
 
     def joined(self, other: InView, num: int) -> InView:
         """Return the points of this cloud (``num`` points) with those of another one appended."""
@@ -155,39 +142,26 @@ class InView(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """N points projected to an image.
+    """N points projected to an image."""
 
-    Attributes:
-        points_cam: (N,3) positions in metres, camera frame, at the exposure.
-        uv: (N,2) column and row in px, NaN if a point has no projection.
-        inside: (N,) True for points on the image that have a depth.
-    """
-
-    points_cam: Float
-    uv: Float
-    inside: Bool
+    points_cam: Float  # (N,3) positions in metres, camera frame, at the exposure
+    uv: Float  # (N,2) column and row in px, NaN if a point has no projection
+    inside: Bool  # (N,) True for points on the image that have a depth
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """A camera at the time that a depth map shows.
-
-    Attributes:
-        T_cam_key: (4,4) from the key sweep's lidar frame to the camera at that time, with
-            ego-motion.
-        late_s: Seconds from the key sweep's reference time to that time.
-        twist: (6,) angular and linear velocity of the camera, rad/s and m/s in its own frame.
-        number: Number of the image, None if the map shows no image.
-        measure: Kind of depth, camera ``z`` or ``range``.
-        others: Exposures of the "previous" and "next" image, if the window covers them.
-    """
+    """A camera at the time that a depth map shows."""
 
     camera: Camera
+    # (4,4) from the key sweep's lidar frame to the camera at that time, with ego-motion
     T_cam_key: Float
-    late_s: float = 0.0
+    late_s: float = 0.0  # seconds from the key sweep's reference time to that time
+    # (6,) angular and linear velocity of the camera, rad/s and m/s in its own frame
     twist: Float = field(default_factory=lambda: np.zeros(6))
-    number: int | None = None
-    measure: str = "z"
+    number: int | None = None  # number of the image, None if the map shows no image
+    measure: str = "z"  # kind of depth, camera ``z`` or ``range``
+    # Exposures of the "previous" and "next" image, if the window covers them
     others: Mapping[str, Exposure] = field(default_factory=dict)
 
     @staticmethod

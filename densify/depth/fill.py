@@ -66,21 +66,14 @@ def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
 
 
 class _Known(NamedTuple):
-    """The K measured pixels of a map, row by row.
+    """The K measured pixels of a map, row by row."""
 
-    Attributes:
-        before: (H,W+1) int32 number of measured pixels above row r or left of column c in row r.
-        num: (H+1,W+1) int32 integral image of the measured pixels.
-        column: (K,) int32 column of each pixel.
-        inverse: (K,) float64 inverse depth of each pixel, 1/m.
-        confidence: (K,) float32 confidence of each pixel.
-    """
-
+    # (H,W+1) int32 number of measured pixels above row r or left of column c in row r
     before: NDArray[np.int32]
-    num: NDArray[np.int32]
-    column: NDArray[np.int32]
-    inverse: Float
-    confidence: Float32
+    num: NDArray[np.int32]  # (H+1,W+1) int32 integral image of the measured pixels
+    column: NDArray[np.int32]  # (K,) int32 column of each pixel
+    inverse: Float  # (K,) float64 inverse depth of each pixel, 1/m
+    confidence: Float32  # (K,) float32 confidence of each pixel
 
 
 class _Inside(NamedTuple):

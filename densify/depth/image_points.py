@@ -24,29 +24,18 @@ _SAME_AGE_NS = 10_000_000
 
 @dataclass(frozen=True)
 class PointsInImage:
-    """The K points of a cloud in an image.
+    """The K points of a cloud in an image."""
 
-    Attributes:
-        index: (K,) indices of the points in the cloud.
-        uv: (K,2) column and row in px.
-        depth: (K,) depth in m.
-        focal_px: (K,2) local scale, px per metre at a depth of 1 m.
-        slope: (K,2) slope of the tangent plane's inverse depth to the right and down, 1/m per px.
-        spacing_px: (K,2) spacing of neighbouring rays, across and down.
-        frame: (K,) frame number of the source sweep.
-        age_ns: (K,) time between the source sweep and the key sweep, see `_ages_ns`.
-        far: (K,) True for points of sweeps beyond the window.
-    """
-
-    index: Int
-    uv: Float
-    depth: Float32
-    focal_px: Float
+    index: Int  # (K,) indices of the points in the cloud
+    uv: Float  # (K,2) column and row in px
+    depth: Float32  # (K,) depth in m
+    focal_px: Float  # (K,2) local scale, px per metre at a depth of 1 m
+    # (K,2) slope of the tangent plane's inverse depth to the right and down, 1/m per px
     slope: Float
-    spacing_px: Float
-    frame: np.ndarray
-    age_ns: Int
-    far: Bool
+    spacing_px: Float  # (K,2) spacing of neighbouring rays, across and down
+    frame: np.ndarray  # (K,) frame number of the source sweep
+    age_ns: Int  # (K,) time between the source sweep and the key sweep, see `_ages_ns`
+    far: Bool  # (K,) True for points of sweeps beyond the window
 
     def select(self, keep: Bool) -> PointsInImage:
         """Return the points where ``keep`` (K,) is True."""

@@ -14,31 +14,20 @@ from densify.geometry.types import Bool, Float32
 
 @dataclass(frozen=True)
 class Layers:
-    """One depth map in the making, as images (H,W); depths in metres, 0 for pixels without depth.
+    """One depth map in the making: images (H,W) with depths in metres, 0 for no depth."""
 
-    Attributes:
-        depth_m: Depth of pixels that are accepted as measured.
-        rim_m: Depth of boundary pixels, measured so close to a depth discontinuity that they may
-            show the background. Accepted boundary pixels stay in this layer too.
-        filled_m: Depth of accepted and of interpolated pixels.
-        confidence: Confidence or rank of each pixel, 0 to 1.
-        point: Index, in the cloud, of the point that measured the pixel; -1 none.
-        tilt: (H,W,2) slope of the surface's inverse depth to the right and down, 1/m per px.
-        spacing_px: (H,W,2) spacing of neighbouring rays of one sweep, across and down, at all
-            pixels.
-        lab: (H,W,3) camera image in L*a*b*, None if there is no image.
-        solid: True on bodies of moving objects (`MovingBody`).
-    """
-
-    depth_m: Float32
+    depth_m: Float32  # depth of pixels that are accepted as measured
+    # Depth of boundary pixels, measured so close to a depth discontinuity that they may show the
+    # background. Accepted boundary pixels stay in this layer too.
     rim_m: Float32
-    filled_m: Float32
-    confidence: Float32
-    point: NDArray[np.int32]
-    tilt: Float32
+    filled_m: Float32  # depth of accepted and of interpolated pixels
+    confidence: Float32  # confidence or rank of each pixel, 0 to 1
+    point: NDArray[np.int32]  # index, in the cloud, of the point that measured the pixel; -1 none
+    tilt: Float32  # (H,W,2) slope of the surface's inverse depth to the right and down, 1/m per px
+    # (H,W,2) spacing of neighbouring rays of one sweep, across and down, at all pixels
     spacing_px: Float32
-    lab: Float32 | None = None
-    solid: Bool | None = None
+    lab: Float32 | None = None  # (H,W,3) camera image in L*a*b*, None if there is no image
+    solid: Bool | None = None  # true on bodies of moving objects (`MovingBody`)
 
     @property
     def gap_px(self) -> Float32:

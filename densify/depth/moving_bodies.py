@@ -47,21 +47,14 @@ _AGREES = 2.0  # tolerance, as a multiple of the tolerance between two static po
 
 
 class MovingBody(NamedTuple):
-    """The convex hull of a moving object, and the K rays of all sweeps that meet the hull.
+    """The convex hull of a moving object, and the K rays of all sweeps that meet the hull."""
 
-    Attributes:
-        corners: (V,3) corners of the hull in metres, key sweep's lidar frame and reference time.
-        velocity_m_s: (3,) velocity of the object without ego-motion, same frame.
-        entries: (K,3) positions where the rays enter the hull, same frame and time.
-        ends: (K,) True if the ray ends on the object, False if it passes through.
-        frame: (K,) frame number of the ray's sweep.
-    """
-
+    # (V,3) corners of the hull in metres, key sweep's lidar frame and reference time
     corners: Float
-    velocity_m_s: Float32
-    entries: Float
-    ends: Bool
-    frame: NDArray[np.integer]
+    velocity_m_s: Float32  # (3,) velocity of the object without ego-motion, same frame
+    entries: Float  # (K,3) positions where the rays enter the hull, same frame and time
+    ends: Bool  # (K,) True if the ray ends on the object, False if it passes through
+    frame: NDArray[np.integer]  # (K,) frame number of the ray's sweep
 
 
 def moving_bodies(

@@ -27,15 +27,10 @@ _NUM_STEPS = 6
 
 @dataclass(frozen=True)
 class Rays:
-    """The rays of the sweeps of a window, in the lidar frame of the key sweep.
+    """The rays of the sweeps of a window, in the lidar frame of the key sweep."""
 
-    Attributes:
-        stretch: Registered sweeps of the window.
-        key: Frame number of the key sweep.
-    """
-
-    stretch: Stretch
-    key: int
+    stretch: Stretch  # registered sweeps of the window
+    key: int  # frame number of the key sweep
 
     def starts(self, cloud: Cloud) -> Float:
         """Return the (M,3) origins of the rays of a cloud's M points, at their firing times."""

@@ -77,23 +77,17 @@ class SeenCloud(NamedTuple):
 
 @dataclass(frozen=True)
 class Views:
-    """The cameras and times of the depth maps of a key sweep; mappings are by name of the map.
+    """The cameras and times of the depth maps of a key sweep; mappings are by name of the map."""
 
-    Attributes:
-        key: Frame number of the key sweep.
-        origins: (S,3) of the scanners, key sweep's lidar frame, by frame number of the sweep.
-        rays: Rays of the window's sweeps.
-        lab: (H,W,3) L*a*b* images of the maps that use an image.
-        off: Names of the maps whose image does not lie where the depth discontinuities are.
-    """
-
-    key: int
+    key: int  # frame number of the key sweep
     exposures: Mapping[str, Exposure]
     sensors: Sensors
+    # (S,3) of the scanners, key sweep's lidar frame, by frame number of the sweep
     origins: Mapping[int, Float]
-    rays: Rays
+    rays: Rays  # rays of the window's sweeps
     settings: ProjectSettings
-    lab: Mapping[str, Float32]
+    lab: Mapping[str, Float32]  # (H,W,3) L*a*b* images of the maps that use an image
+    # Names of the maps whose image does not lie where the depth discontinuities are
     off: frozenset[str] = frozenset()
 
     @staticmethod
@@ -317,18 +311,13 @@ def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: f
 
 @dataclass(frozen=True)
 class HeldOut:
-    """The key sweep's returns as ground truth for maps made from its neighbouring sweeps alone.
-
-    Attributes:
-        key_alone: Depth maps of the key sweep by name, without boundary pixels.
-        moving: (H,W) True at moving returns of the key sweep, by name of the map.
-        gap_rad: Usual angle between neighbouring rings of the key sweep.
-    """
+    """The key sweep's returns as ground truth for maps made from its neighbouring sweeps alone."""
 
     views: Views
+    # Depth maps of the key sweep by name, without boundary pixels
     key_alone: Mapping[str, DepthMap]
-    moving: Mapping[str, Bool]
-    gap_rad: float
+    moving: Mapping[str, Bool]  # (H,W) True at moving returns of the key sweep, by name of the map
+    gap_rad: float  # usual angle between neighbouring rings of the key sweep
 
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
