@@ -235,6 +235,9 @@ def test_viewpoints_of_pcd_files_are_poses(tmp_path):
     write("1.pcd", default)
     with pytest.raises(InputError, match="no poses"):
         Folder(tmp_path).T_world_lidar(1)
+    write("1.pcd", "1 2 3 0 0 0 0")  # some programs write no rotation
+    with pytest.raises(InputError, match="no poses"):
+        Folder(tmp_path).T_world_lidar(1)
     write("1.pcd", f"{PLACE} {QW} {QX} {QY} {QZ}")
     sequence = Folder(tmp_path)
     np.testing.assert_allclose(sequence.T_world_lidar(0), np.eye(4), atol=1e-12)

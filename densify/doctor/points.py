@@ -9,7 +9,7 @@ import numpy as np
 
 from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
 from densify.doctor.sample import Sample, Spot
-from densify.free_space.sectors import LOST_DEG, blind_sector, lost_deg
+from densify.free_space.sectors import LOST_DEG, blind_sector, by_azimuth, lost_deg
 from densify.free_space.sensor import Sensors
 from densify.free_space.sweep_frame import MAP_FRAME_REMEDY, is_still, way_in_map
 from densify.geometry.types import Float
@@ -170,8 +170,9 @@ def _own_returns(spots: list[Spot]) -> tuple[float, int]:
 
 def check_directions(sample: Sample) -> list[Finding]:
     """Check that sweeps have returns in all directions, as far as the scanner sees."""
-    width_deg = [float(lost_deg(spot.sweeps).max()) for spot in sample.spots]
-    sectors = [blind_sector(spot.sweeps) for spot in sample.spots]
+    returns = [np.stack([by_azimuth(s) for s in spot.sweeps]) for spot in sample.spots]
+    width_deg = [float(lost_deg(of_spot).max()) for of_spot in returns]
+    sectors = [blind_sector(of_spot) for of_spot in returns]
     name, worst = "directions", max(width_deg)
     if worst >= LOST_DEG:
         frames = format_frames(s.frame for s in sample.spots[int(np.argmax(width_deg))].sweeps)

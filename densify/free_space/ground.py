@@ -120,10 +120,13 @@ def _median_of_low(clouds: Sequence[Float], cells: Sequence[Int], num_cells: int
     """Return the (num_cells,) median over clouds of their low points, inf in empty cells."""
     low = np.full((len(clouds), num_cells), np.nan, np.float32)
     for points, cell, low_m in zip(clouds, cells, low, strict=True):
-        order = np.lexsort((points[:, 2], cell))
-        occupied, first, count = np.unique(cell[order], return_index=True, return_counts=True)
+        z = points[:, 2]
+        below_1 = (z - z.min(initial=0)) / (z.max(initial=0) - z.min(initial=0) + 1)
+        order = np.argsort(cell + below_1)  # by cell, then by height
+        first = np.flatnonzero(np.diff(cell[order], prepend=-1))  # of each cell, lowest first
+        count = np.diff(first, append=len(order))
         stray = np.maximum(1, (_STRAY * count).astype(int))
-        low_m[occupied] = points[order[first + np.minimum(count - 1, stray)], 2]
+        low_m[cell[order[first]]] = z[order[first + np.minimum(count - 1, stray)]]
     known = ~np.isnan(low).all(axis=0)
     heights = np.full(num_cells, np.inf)
     heights[known] = np.nanmedian(low[:, known], axis=0)

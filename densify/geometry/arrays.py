@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -40,11 +41,15 @@ def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
         most_cells: Greatest number of cells of the grid.
     """
     everything = np.ones(len(points), bool)
-    if not len(points) or np.prod(np.ptp(points, axis=0) / cell + 1) <= most_cells:
+    if not len(points) or _num_cells(points, cell) <= most_cells:
         return everything
     distance = np.abs(points - np.median(points, axis=0)).max(axis=1)
     for share in _SHARES:
         near = distance <= np.quantile(distance, share)
-        if np.prod(np.ptp(points[near], axis=0) / cell + 1) <= most_cells:
+        if _num_cells(points[near], cell) <= most_cells:
             return near
     return everything
+
+
+def _num_cells(points: NDArray[Any], cell: float) -> float:
+    return math.prod(float(np.ptp(along)) / cell + 1 for along in points.T)

@@ -36,6 +36,7 @@ from densify.geometry.types import (
     Cloud,
     Float,
     FlowField,
+    Int,
     LidarSequence,
     Motion,
     ObjectTrack,
@@ -61,6 +62,7 @@ from densify.registration.trajectory import LeftOut, Registration, find_trajecto
 T = TypeVar("T")
 LEAD_IN_S = 0.5  # before a window or a block, in which odometry settles
 _TELL_SPEED = 2  # sweeps
+_SOME = 8  # every eighth point tells the share of points below the ground
 
 
 class Piece(NamedTuple):
@@ -183,6 +185,12 @@ class Recording:
         """Return a raw sweep (not deskewed), without returns of the own vehicle."""
         return self._sweeps.read(frame)
 
+    def returns(self, frames: Sequence[int]) -> Int:
+        """Return the (n,360) number of returns of raw sweeps in each degree of azimuth."""
+        for frame in [f for f in frames if f not in self._sweeps.returns]:
+            self.raw(frame)
+        return np.stack([self._sweeps.returns[frame] for frame in frames])
+
     def around(self, key: int) -> Stretch:
         """Return the registered sweeps, within and around a key's window, searched for motion."""
         piece = self._piece(key)
@@ -260,7 +268,7 @@ class Recording:
     def share_below(self, key: int) -> float:
         """Return the share of the points of a key's window that lie below the ground."""
         heights, sweeps = self._ground_of(key), self.window(key).sweeps
-        deep = [heights.below(s.sweep.points, s.T_world_lidar) for s in sweeps]
+        deep = [heights.below(s.sweep.points[::_SOME], s.T_world_lidar) for s in sweeps]
         return float(np.concatenate(deep).mean())
 
     def _ground_of(self, key: int) -> HeightMap:

@@ -14,7 +14,8 @@ from uuid import uuid4
 from densify.config import RegisterSettings
 from densify.config.cache import Cache, digest, kept
 from densify.config.errors import InputError
-from densify.geometry.types import Float, LidarSequence, Sweep
+from densify.free_space.sectors import by_azimuth
+from densify.geometry.types import Float, Int, LidarSequence, Sweep
 from densify.pipeline.costs import Watch
 from densify.readers.timeline import Timeline, check_key, check_window, read_sweep
 
@@ -45,6 +46,7 @@ class Sweeps:
         """
         self._sequence, self._timeline, self._settings = sequence, timeline, settings
         self._cache, self._run, self._watch = cache, run or uuid4().hex, watch
+        self.returns: dict[int, Int] = {}  # of sweeps read: frame -> `by_azimuth`
         self.read = lru_cache(maxsize=num_kept)(self._read)
         self.content = lru_cache(maxsize=None)(self._content)
 
@@ -65,7 +67,9 @@ class Sweeps:
         if frame in self._timeline.unknown:
             raise InputError(self._timeline.unknown[frame])
         with self._watch.stage("read"):
-            return read_sweep(self._sequence, frame, self._settings)
+            sweep = read_sweep(self._sequence, frame, self._settings)
+        self.returns[frame] = by_azimuth(sweep)
+        return sweep
 
     def _content(self, frame: int) -> str:
         """Return a digest of a sweep and its recorded pose, or the message of its error.

@@ -56,7 +56,7 @@ def add_warnings(
             if name not in cameras and not sequence.image_stamps_ns(name)
         ),
         *_of_sweeps(stretch, recording.settings),
-        *_of_sectors([recording.raw(frame) for frame in stretch.frames]),
+        *_of_sectors(stretch, recording),
         *_of_ground(recording, key),
         *_of_motion(recording, key),
         *_of_images(sequence, shots),
@@ -107,19 +107,20 @@ def _share_near(sweeps: Sequence[Sweep]) -> float:
     return num_near / max(num_near + sum(len(sweep) for sweep in sweeps), 1)
 
 
-def _of_sectors(sweeps: Sequence[Sweep]) -> Iterator[str]:
+def _of_sectors(stretch: Stretch, recording: Recording) -> Iterator[str]:
     """Yield warnings about directions in which raw sweeps lack returns."""
-    if _share_near(sweeps) > _MUCH_NEAR:
+    if _share_near([registered.sweep for registered in stretch.sweeps]) > _MUCH_NEAR:
         return  # they may lack those left out
-    width_deg = lost_deg(sweeps)
-    lacking = {s.frame: w for s, w in zip(sweeps, width_deg, strict=True) if w >= LOST_DEG}
+    returns = recording.returns(stretch.frames)
+    width_deg = zip(stretch.frames, lost_deg(returns), strict=True)
+    lacking = {frame: width for frame, width in width_deg if width >= LOST_DEG}
     if lacking:
         yield (
             f"sweeps {format_frames(lacking)} have no returns in up to {max(lacking.values()):.0f} "
             f"deg of azimuth where others have some, as after lost packets: static surfaces there "
             f"are of other sweeps, and motion is less certain"
         )
-    sector = blind_sector(sweeps)
+    sector = blind_sector(returns)
     if sector is not None:
         yield (
             f"no sweep has a return from {sector[0]} to {sector[1]} deg of azimuth "
@@ -158,9 +159,10 @@ def _of_motion(recording: Recording, key: int) -> Iterator[str]:
 
 def _of_recorded(recording: Recording, key: int) -> Iterator[str]:
     """Yield a warning if odometry does not confirm the recording's poses around the key."""
-    frames = recording.timeline.frames
-    row, num = recording.timeline.row[key], max(len(recording.window(key).frames) // 2, _LEAST_SIDE)
-    around = frames[max(row - num, 0) : row + num + 1]
+    timeline = recording.timeline
+    row, num = timeline.row[key], max(len(recording.window(key).frames) // 2, _LEAST_SIDE)
+    near = timeline.frames[max(row - num, 0) : row + num + 1]
+    (around,) = (frames for frames in timeline.runs(near) if key in frames)
     settings = replace(recording.settings.register, source="kiss-icp")
     try:
         sweeps = [recording.raw(frame) for frame in around]

@@ -81,8 +81,7 @@ class PoseTrack:
                 stamp, and the result is too.
             stamp_ns: Reference time of the sweep.
         """
-        at_stamp = poses.transform(poses.inverse(self.at(stamp_ns)), placed.points)
-        at_stamp[~placed.points.any(axis=1)] = 0.0
+        at_stamp = taken_back(placed.points, self.at(stamp_ns))
         if placed.offset_ns is not None:
             at_stamp = self.as_fired(at_stamp, stamp_ns, placed.offset_ns)
         return replace(placed, points=at_stamp)
@@ -107,6 +106,12 @@ class PoseTrack:
         if inverse:
             return turns.apply(points - shift_m, inverse=True)
         return turns.apply(points) + shift_m
+
+
+def taken_back(placed: Float, T_world_ego: Float) -> Float:
+    """Return points (N,3) of the world in the frame of a pose (4,4). Padding at 0 0 0 stays."""
+    points = poses.transform(poses.inverse(T_world_ego), placed)
+    return np.where(placed.any(axis=1, keepdims=True), points, placed)
 
 
 @dataclass(frozen=True)
@@ -168,21 +173,31 @@ class PoseFile:
 
     @staticmethod
     def of_viewpoints(paths: Sequence[Path]) -> PoseFile | None:
-        """Read the poses in VIEWPOINT of .pcd files; None if all are the default, or for others."""
+        """Read the poses in VIEWPOINT of .pcd files.
+
+        The result is None for other files, if the first and the last have the default, and if a
+        viewpoint is no pose, because some programs write zeros.
+        """
         if not all(path.suffix.lower() == ".pcd" for path in paths):
             return None
-        T = []
-        for path in paths:
-            with open_file(path) as file:
-                header = file.read(_PCD_HEADER).split(b"\nDATA")[0].decode("ascii", "replace")
-            lines = (line.split(maxsplit=1) for line in header.splitlines())
-            found = [line[1] for line in lines if len(line) == 2 and line[0] == "VIEWPOINT"]
-            where = f"{path}: VIEWPOINT"
-            values = checks.parse_numbers(found[0] if found else _NO_VIEWPOINT, where, 7)
-            T.append(checks.quaternion_pose(values[3:], values[:3], where))
-        if np.allclose(T, np.eye(4)):
+        try:
+            if np.allclose([_viewpoint(path) for path in (paths[0], paths[-1])], np.eye(4)):
+                return None
+            T = np.stack([_viewpoint(path) for path in paths])
+        except InputError:
             return None
-        return PoseFile(paths[0], "VIEWPOINT of each sweep", np.stack(T))
+        return PoseFile(paths[0], "VIEWPOINT of each sweep", T)
+
+
+def _viewpoint(path: Path) -> Float:
+    """Return the pose (4,4) in VIEWPOINT of a .pcd file, the identity without one."""
+    with open_file(path) as file:
+        header = file.read(_PCD_HEADER).split(b"\nDATA")[0].decode("ascii", "replace")
+    lines = (line.split(maxsplit=1) for line in header.splitlines())
+    found = [line[1] for line in lines if len(line) == 2 and line[0] == "VIEWPOINT"]
+    where = f"{path}: VIEWPOINT"
+    values = checks.parse_numbers(found[0] if found else _NO_VIEWPOINT, where, 7)
+    return checks.quaternion_pose(values[3:], values[:3], where)
 
 
 def _numbers(table: TextTable, columns: Sequence[int] | None = None) -> Float:

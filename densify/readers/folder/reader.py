@@ -42,7 +42,7 @@ from densify.readers.folder.series import (
 )
 from densify.readers.point_fields import Columns, PointLayout, PointTimes, sample_columns
 from densify.readers.point_files import read_table
-from densify.readers.recorded_poses import PoseFile, PoseTrack
+from densify.readers.recorded_poses import PoseFile, PoseTrack, taken_back
 from densify.readers.timeline import format_frames
 
 _ASSUMED_HZ = 10.0
@@ -267,8 +267,7 @@ class Folder(FileSequence):
         if self._config.sweeps.frame == "poses":
             if self._track is not None:
                 return self._track.taken_back(found, stamp_ns)
-            T_lidar_world = poses.inverse(self._pose(frame))
-            points = poses.transform(T_lidar_world, found.points)
+            points = taken_back(found.points, self._pose(frame))
             return replace(found, points=points, offset_ns=None)  # compensated to the pose
         if not self._config.sweeps.compensated or found.offset_ns is None:
             return found
