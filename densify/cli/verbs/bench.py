@@ -46,14 +46,10 @@ def add(commands: Any) -> None:
     _add_paper(benches)
     _add_doctor(benches)
     _add_gate(benches)
-    about = "make the tables of docs/results.md again, as Markdown on stdout; all take an hour"
+    about = "make the tables of docs/results.md again, as Markdown on stdout; all take half an hour"
     parser = add_verb(benches, "readme", _answer_readme, about)
-    names = "depth, flow, registration"
+    names = "flow, registration"
     parser.add_argument("tables", nargs="*", metavar="TABLE", help=f"{names} (default: all)")
-    option(
-        parser, "--kitti DIR", "folder of drive 2011_09_26_drive_0013_sync, for its rows", type=Path
-    )
-    option(parser, "--pandaset DIR", "folder of sequence 002, for its rows", type=Path)
 
 
 def _add_flow(benches: Any) -> None:
@@ -305,5 +301,5 @@ def _answer_readme(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.bench.readme import tables
 
     with progress_on_stderr() as progress:
-        for line in tables(options.tables, options.kitti, options.pandaset, progress):
+        for line in tables(options.tables, progress):
             yield Answer(line, {"lines": [line]})
