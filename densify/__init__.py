@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Dense depth maps from lidar recordings, with the moving objects kept sharp.
 
-Names are imported on first use, so ``import densify`` costs nothing and loads no torch::
+Names are imported on first use, so ``import densify`` loads no torch::
 
     import densify
 
@@ -9,10 +9,10 @@ Names are imported on first use, so ``import densify`` costs nothing and loads n
     result = densify.run(sequence, key=120, window=5)
     result.depth["image_02"].depth_m  # (H,W) float32 metres, 0 none
 
-Every function that reads what users give raises `InputError` for what is missing, damaged, unknown
-or out of range, and `OutputError`, a subclass, for a file that it cannot write. Stages raise
-`ComputationError` for results that are not reliable. A message is one line. It says what happened,
-where, what was expected and what to do. Docstrings do not repeat these errors.
+`InputError` means that something given is missing, damaged, unknown or out of range, and its
+subclass `OutputError` that a file cannot be written. `ComputationError` means that a stage's result
+is not reliable. A message is one line: what happened, where, what was expected, what to do.
+Docstrings do not repeat these errors.
 """
 
 from __future__ import annotations

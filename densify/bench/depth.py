@@ -43,16 +43,14 @@ def bench_depth(
     """Densify the key sweeps with each variant, and pool the scores over key sweeps and cameras.
 
     Args:
-        keys: Frame numbers of the key sweeps.
         variants: Name -> settings to compare.
         scanner: Index of the scanner whose returns are the ground truth, None for none. Other
             arguments as in `densify.pipeline.run.run`.
 
     Returns:
-        Plain numbers, under ``variants`` by name of the variant. ``density`` is the mean share of
-            pixels with a depth in the measured and the filled map. ``seconds`` per key sweep are
-            for projection. ``scores`` (num_pixels, coverage, outliers) are by ground truth, map
-            (measured, filled) and pixels (all, moving).
+        Under ``variants`` by name: ``density``, mean share of pixels with a depth in the measured
+            and the filled map; ``seconds`` of projection per key sweep; ``scores`` (num_pixels,
+            coverage, outliers) by ground truth, map (measured, filled) and pixels (all, moving).
     """
     choose_cameras(sequence, cameras)
     if method not in METHODS:
@@ -81,13 +79,10 @@ def bench_depth(
 
 
 class _Sums:
-    """Sums of pixel counts over key sweeps and cameras, by ground truth, map and kind of pixels.
-
-    The three counts are pixels with a true depth, those that have a depth in the map too, and
-    outliers among the latter.
-    """
+    """Sums of pixel counts over key sweeps and cameras, by ground truth, map and kind of pixels."""
 
     def __init__(self) -> None:
+        # Pixels with a true depth, those that have a depth in the map too, outliers among these
         self._counts: defaultdict[tuple[str, str, str], Any] = defaultdict(lambda: np.zeros(3, int))
         self._densities: dict[str, list[float]] = {product: [] for product in PRODUCTS}
         self._seconds = 0.0

@@ -30,12 +30,8 @@ def bench_doctor(
 ) -> dict[str, dict[str, Any]]:
     """Give recordings artificial errors of camera or poses, and count the doctor's verdicts.
 
-    Each error is applied in both directions to each camera or recording. The unchanged recordings
-    are counted too.
-
-    Returns:
-        Name of the error -> number of cases ``of``, and share of cases by verdict. The verdict is
-            from the check for this kind of error: fine, unknown, suspicious or wrong.
+    Each error is applied in both directions; unchanged recordings count too. The result maps each
+    error to its number of cases (``of``) and the share of each verdict in its check.
     """
     counts: dict[str, Counter[Verdict]] = {}
     for number, sequence in enumerate(sequences):

@@ -46,12 +46,8 @@ def evaluate(
         images       for each pair: predicted, truth, mask (paths or None), density, `DepthErrors`
         without_truth, without_prediction, without_mask   paths of files without a partner
 
-    Args:
-        pairs: The files of predicted and true depth, and of masks.
-        focal_px: Focal length in pixels. Disparity, which defines outliers and depth
-            discontinuities, is focal length times baseline over depth.
-        baseline_m: Stereo baseline in metres.
-        progress: Function called with (stage, done, total).
+    Disparity, which defines outliers and depth discontinuities, is focal length times baseline over
+    depth. ``progress`` is called with (stage, done, total).
     """
     stereo = {"focal_px": focal_px, "baseline_m": baseline_m}
     by_part: dict[str, list[DepthErrors]] = defaultdict(list)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Compare methods of scene flow on the same window of sweeps: ``densify bench flow``.
 
-Errors are pooled over the points above the ground in all sweeps of the window. A point has the flow
-to the neighbouring sweep towards the key sweep. Seconds per pair of sweeps cover ground estimation,
-this flow and the flow to the key sweep, without registration and compilation. Some scores need
-ground truth.
+Errors are those of the flow to the neighbouring sweep towards the key sweep, pooled over the points
+above the ground in all sweeps. Seconds per pair of sweeps cover ground estimation, this flow and
+the flow to the key sweep, without registration and compilation.
 """
 
 from __future__ import annotations
@@ -90,10 +89,7 @@ class SweepTruth(NamedTuple):
 
 @dataclass(frozen=True)
 class Scorer:
-    """Scorer of methods on one window of sweeps.
-
-    Most errors are over points above the ground, because no method moves the ground.
-    """
+    """Scorer of methods on a window, mostly by points above the ground, which no method moves."""
 
     window: Window
     sources: tuple[int, ...]  # frame numbers of the sweeps whose flow to a neighbour is scored
@@ -106,12 +102,9 @@ class Scorer:
     def of(
         sequence: LidarSequence, window: Window, sources: tuple[int, ...], place: Path | None = None
     ) -> Scorer:
-        """Return the scorer of a window.
+        """Return the scorer of a window that scores the sweeps ``sources`` (frame numbers).
 
-        Args:
-            sources: Frame numbers of the sweeps to score.
-            place: Folder of true flow, see `densify.readers.flow_files`. None for the exact ground
-                truth of the recording, if available.
+        ``place``: folder of true flow (`densify.readers.flow_files`); None for exact truth, if any.
         """
         truths, labels = None, {}
         if sequence.truth is not None:
@@ -125,10 +118,10 @@ class Scorer:
         return Scorer(window, sources, truths, labels)
 
     def challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
-        """Return the pooled scores of the Argoverse 2 challenges (`densify.scores.challenge`).
+        """Return the Argoverse 2 challenges' pooled scores, None without ground truth.
 
         ``steps`` is frame number -> flow to the neighbour towards the key sweep. The result has
-        ``three_way`` and ``bucketed`` errors and ``num_points``, and is None without ground truth.
+        ``three_way`` and ``bucketed`` errors and ``num_points``.
         """
         if not self.labels:
             return None
@@ -149,11 +142,10 @@ class Scorer:
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
         """Return the scores of the flow to the neighbouring sweep, pooled over the sources.
 
-        ``found`` is the recall: the share of ``certain`` moving points that are called moving.
-        ``falsely_moving`` is the share of static points, ground included, that are called moving.
-        End-point errors in metres are ``movers_m`` of moving points, ``found_movers_m`` of moving
-        points called moving. Without ground truth the only score is ``called_moving``, the share of
-        all points called moving.
+        ``found`` is the share of ``certain`` moving points that are called moving,
+        ``falsely_moving`` that of static points, ground included. End-point errors in metres are
+        ``movers_m`` of moving points and ``found_movers_m`` of those called moving. Without ground
+        truth, ``called_moving`` is the share of all points called moving.
         """
         truths = self.truths
         if truths is None:
@@ -179,9 +171,9 @@ class Scorer:
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
         """Return the scores of the flow to the key sweep: ghost rate and errors of moving points.
 
-        Errors need ground truth. They are end-point errors in metres of points above the ground, by
-        the number of sweeps to the key sweep. ``movers_m_by_hops`` has all moving points,
-        ``found_movers_m_by_hops`` the moving points called moving.
+        Given ground truth, end-point errors in metres of points above the ground, by number of
+        sweeps to the key: ``movers_m_by_hops`` of moving points, ``found_movers_m_by_hops`` of
+        those called moving.
         """
         stretch, key = self.window.stretch, self.window.key
         cloud = accumulate(stretch, [to_key[f] for f in stretch.frames], key, drop_lost=True)
@@ -208,7 +200,6 @@ class Scorer:
 
 
 def _plainly(values: Mapping[str, float]) -> dict[str, float | None]:
-    """Return the values with None instead of NaN, for JSON."""
     return {name: None if math.isnan(value) else value for name, value in values.items()}
 
 
@@ -236,7 +227,6 @@ def bench_flow(
     """Run and measure methods of scene flow. The result has plain numbers, None if unknown.
 
     Args:
-        key: Frame number of the key sweep.
         window: Number of sweeps on each side of the key sweep.
         methods: Names in `METHODS`. ``ours`` is the configured engine.
         truth: Folder of true flow (`densify.readers.flow_files`), which scores only the sweeps
@@ -289,10 +279,7 @@ def open_window(sequence: LidarSequence, key: int, size: int, config: Config) ->
 def _flows(
     method: str, window: Window, config: Config
 ) -> tuple[dict[int, FlowField], dict[int, FlowField], float]:
-    """Return flow to the neighbour towards the key sweep, flow to the key sweep, and seconds.
-
-    Both kinds of flow are by frame number.
-    """
+    """Return flow to the neighbour towards the key and flow to the key, by frame, and seconds."""
     changes, frames = METHODS[method], window.frames
     if changes is None:
         still = {f: FlowField.zero(len(window.stretch[f].sweep)) for f in frames}

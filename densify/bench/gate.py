@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Measure the main figures of many keys, for judging changes: ``densify bench gate``.
-
-The streets were never used to choose a rule or a number. `densify.bench.verdicts` compares two
-measurements.
-"""
+"""Measure the main figures of many keys, for judging changes: ``densify bench gate``."""
 
 from __future__ import annotations
 
@@ -55,7 +51,7 @@ _WINDOW = 5
 _NUM_DRAWS = 8  # of the pairs
 _MOVED_M, _TURNED_DEG = 0.002, 0.01  # luck of a pose
 _KEPT = 0.98  # share of the returns, for the luck of registration
-_ASIDE_PX = 10
+_ASIDE_PX = 10  # by which the truth of the stereo benchmark widens posts and signs
 _STEREO = "kitti_stereo/truth"
 _DRIVE = "2011_09_26/2011_09_26_drive_0013_sync"
 _CAR_M, _CAR_REACH_M = (-4.6, -2.2, 0.0), 2.5  # the nearest moving car of the Argoverse 2 pair
@@ -81,6 +77,7 @@ class GateKey(NamedTuple):
         return self.truth != "exact"
 
 
+# The streets were never used to choose a rule or a number.
 KEYS = (
     GateKey(f"kitti_stereo/{_DRIVE}", 10, "stereo"),
     *(GateKey(f"kitti/{_DRIVE}", key, "held out") for key in (104, 112, 120, 128)),
@@ -151,19 +148,17 @@ def measure(
     progress: Progress | None = None,
     cache: Cache | None = None,
 ) -> Stored:
-    """Return figures and their luck.
+    """Return figures and their luck, the standard deviation of each `change` over ``draws``.
 
     Figures are curves of outliers (`densify.bench.verdicts.Curve`) of the measured and the filled
     map; recall, errors and false positives of the scene flow; errors of poses. Flow between two
-    sweeps is estimated in eight draws with moved poses. Luck is the standard deviation of each
-    `change` over ``draws``, {} without draws.
+    sweeps is estimated in eight draws with moved poses.
 
     Args:
         folder: Folder of the real recordings; None leaves them out.
         kinds: Some of `KINDS`.
         names: Names of the keys; None for all.
-        draws: Number of times that the poses are moved by 2 mm and 0.01°, to measure luck.
-        progress: Callback (stage, done, total).
+        draws: Number of times that the poses are moved by 2 mm and 0.01°; luck is {} with 0.
         cache: Keeps registration and flow on disk, which pays if only depth changes.
     """
     chosen = _chosen((*KEYS, *PAIRS), folder, names)
@@ -185,15 +180,12 @@ def measure(
 
 
 class JudgedMap(NamedTuple):
-    """The depth map of a key, its ground truth, and which (H,W) pixels with both are outliers.
-
-    An outlier beside which the true depth agrees within 10 px along the row does not count for the
-    stereo truth, which widens posts.
-    """
+    """The depth map of a key, its ground truth, and which (H,W) pixels with both are outliers."""
 
     key: GateKey
     depth: DepthMap
     truth: TruthMap
+    # No outlier counts where stereo truth, which widens posts, agrees within 10 px along the row
     outlier: Bool
 
 
@@ -225,7 +217,6 @@ def _chosen(
 
 
 def _opened(key: GateKey, folder: Path | None) -> LidarSequence:
-    """Return the recording of a key."""
     return open_sequence(str(folder / key.data) if key.is_real and folder else key.data)
 
 
@@ -265,7 +256,6 @@ class _Still:
         return one
 
     def figures(self, kinds: Collection[str]) -> dict[str, Any]:
-        """Return the figures of some `KINDS`."""
         figures: dict[str, Any] = {}
         if "depth" in kinds:
             figures |= self._depth()
@@ -305,7 +295,6 @@ class _Still:
         }
 
     def made(self) -> tuple[DepthMap, TruthMap]:
-        """Return the depth map of the key, and its ground truth."""
         recording, key, camera = self._recording, self._key.key, self._key.camera
         sequence, settings = recording.sequence, recording.settings
         shots = key_shots(sequence, choose_cameras(sequence, [camera]), key, settings.project)

@@ -5,9 +5,8 @@ Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3D
 
 Methods get 2,048 points drawn from each cloud within 35 m, as in the paper. ``ours`` and trained
 networks get all points, and are scored at the drawn points. Scores are the paper's, averaged over
-pairs of clouds: mean end-point error, accuracy, mean angle to the true flow. Accuracy is the share
-of points with an error below 5 cm or 5 %, and below 10 cm or 10 %. The angle is over points with
-true flow.
+pairs of clouds: mean end-point error; share of points with an error below 5 cm or 5 %, and below 10
+cm or 10 %; mean angle to the true flow over points with true flow.
 
 Other data sets are folders of .npz files by FlowNet3D's authors (Liu et al., CVPR 2019).
 FlyingThings3D has ``points1``, ``points2``, ``flow`` and ``valid_mask1`` in camera axes, z forward.
@@ -108,8 +107,7 @@ def bench_paper(
 ) -> dict[str, Any]:
     """Measure methods of `METHODS` and files of trained networks on pairs of clouds.
 
-    Return ``num_pairs``, ``num_points`` (drawn from each cloud) and ``methods``: name -> mean
-    scores.
+    The result has ``num_pairs``, ``num_points`` (of a cloud) and ``methods``: name -> mean scores.
     """
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
@@ -185,10 +183,7 @@ def has_truth(spec: str) -> bool:
 
 
 def pair_of_recording(spec: str, key: int) -> PaperPair:
-    """Return key sweep number ``key`` and the next sweep, without ground and ego-motion.
-
-    The flow is the exact ground truth. For a real recording it is estimated by this package.
-    """
+    """Return sweep ``key`` and the next; for a real recording, this package estimates the flow."""
     sequence = open_sequence(spec)
     teacher, settings = "engine", resolve(None)
     if sequence.truth is not None:

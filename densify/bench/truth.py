@@ -126,13 +126,9 @@ def exact_truth(
 def stereo_truth(folder: Path, frame: int, camera: Camera) -> TruthMap:
     """Return the depth of KITTI's 2015 stereo benchmark, whose moving cars are whole models.
 
-    Args:
-        folder: Folder of ``frameN_disparity.png`` (uint16, 256 × disparity in px, 0 for none) and
-            ``frameN_objects.png`` (above 0 at moving cars).
-        frame: Frame number N of the image.
-        camera: The left colour camera of the drive.
-
-    Source: Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015.
+    ``folder`` has ``frameN_disparity.png`` (uint16, 256 × disparity in px, 0 for none) and
+    ``frameN_objects.png`` (above 0 at moving cars). ``camera`` is the left colour camera. Source:
+    Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015.
     """
     disparity_px = read_depth_png(folder / f"frame{frame}_disparity.png")
     depth_m = np.zeros_like(disparity_px)
@@ -143,10 +139,7 @@ def stereo_truth(folder: Path, frame: int, camera: Camera) -> TruthMap:
 
 
 def agrees_beside(truth: TruthMap, depth_m: Float32, reach_px: int, focal_px: float) -> Bool:
-    """Return (H,W) True where the true depth agrees within ``reach_px`` along the row.
-
-    The truth of the stereo benchmark widens posts and signs by up to 10 px.
-    """
+    """Return (H,W) True where the true depth agrees within ``reach_px`` along the row."""
     agrees = np.zeros(depth_m.shape, bool)
     for shift in range(-reach_px, reach_px + 1):
         beside = truth._replace(depth_m=np.roll(truth.depth_m, shift, axis=1))

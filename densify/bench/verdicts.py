@@ -2,8 +2,7 @@
 """Judge a change by figures of many keys, each known with its luck.
 
 Luck is the standard deviation σ of a figure when the poses of a window move by 2 mm and 0.01°. Two
-maps are compared key by key at equal coverage: the least confident pixels of either map are left
-out until both cover the same.
+maps are compared at equal coverage: the least confident pixels of either are left out.
 """
 
 from __future__ import annotations
@@ -29,12 +28,9 @@ Curve = Mapping[str, Any]
 
 
 def curve(num_true: int, confidence: Float | Float32, outliers: Bool) -> Curve:
-    """Return the outliers over the coverage.
+    """Return the outliers over the coverage, of ``num_true`` pixels with a true depth.
 
-    Args:
-        num_true: Number of pixels with a true depth.
-        confidence: (K,) confidence of the covered pixels with a true depth.
-        outliers: (K,) True at outliers. Pixels of equal confidence share their outliers evenly.
+    Both arrays (K,) are of the covered ones. Equal confidences share their outliers evenly.
     """
     _, level, size = np.unique(-confidence, return_inverse=True, return_counts=True)
     of_level = np.bincount(level, outliers, len(size))
@@ -87,10 +83,7 @@ def verdicts(
 ) -> Iterator[Verdict]:
     """Yield the verdict of each figure over all keys that both measurements have.
 
-    Args:
-        before: Name of the key -> name of the figure -> `Curve`, number, or numbers of draws.
-        now: The same.
-        luck: Name of the key -> name of the change (see `change`) -> standard deviation.
+    Both map key -> figure -> `Curve`, number or draws; ``luck`` maps key -> name of `change` -> σ.
     """
     rows: dict[str, dict[str, tuple[float, float, float, float]]] = defaultdict(dict)
     for key in [k for k in before if k in now]:
@@ -139,7 +132,6 @@ def beyond_luck(
 
 
 def _is_cost(name: str) -> bool:
-    """Return True if less of a figure is better."""
     return not name.endswith(("coverage", "recall %"))
 
 

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run the command line, a thin shell over the Python API.
-
-Results and paths go to stdout, progress and log to stderr. No other package prints. Verbs import
-numpy and heavier modules only when they run, so help answers at once.
-"""
+"""Run the command line, a thin shell over the Python API. No other package prints."""
 
 from __future__ import annotations
 
@@ -26,16 +22,12 @@ from densify.cli.verbs import parse
 from densify.config.errors import ComputationError, InputError, is_out_of_memory
 from densify.pipeline.heap import keep_freed_memory
 
+# FAILED: computation or bug (traceback in a file); BAD_INPUT: arguments, input, system errors
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code.
-
-    0: success. 1: a ComputationError, or an unforeseen error, whose traceback is written to a file.
-    2: an InputError, a system error, or (by argparse, which exits) a bad argument. 130:
-    interrupted.
-    """
+    """Run one command and return its exit code: DONE, FAILED, BAD_INPUT or INTERRUPTED."""
     with screen() as shown:
         try:
             _run(arguments, shown)

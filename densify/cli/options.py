@@ -32,10 +32,7 @@ def add_verb(
     about: str,
     epilog: str = "",
 ) -> argparse.ArgumentParser:
-    """Add a verb to the command line and return its parser.
-
-    ``verb`` is called with the options; it is None for a verb that has verbs of its own.
-    """
+    """Add a verb to the command line and return its parser; ``verb`` None has verbs of its own."""
     description = f"{about[0].upper()}{about[1:]}."
     parser: argparse.ArgumentParser = commands.add_parser(
         name, help=about, description=description, epilog=epilog or None

@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Summarise results, comparisons and exports, as text and (``*_facts``) as numbers for programs.
-
-The scores are in `Result.metrics`: ``density``, ``ghosts``, ``held_out`` by camera (scores of maps
-made without the key sweep against its returns) and ``depth`` by camera (scores against ground
-truth).
-"""
+"""Summarise results, comparisons and exports, as text and (``*_facts``) as numbers for programs."""
 
 from __future__ import annotations
 
@@ -81,7 +76,7 @@ def summary(result: Result) -> str:
 
 
 def _beside_icp(result: Result, *path: str) -> str:
-    """Return a share as text, followed by rigid accumulation's share in brackets; "" for none."""
+    """Return a share as text, with the share of rigid accumulation in brackets; "" for none."""
     share = look_up(result.metrics, *path)
     rigid = result.baselines.get("icp")
     by_icp = look_up(rigid.metrics, *path) if rigid is not None else None
@@ -109,12 +104,7 @@ def key_facts(result: Result) -> dict[str, Any]:
 
 
 def comparison(results: Mapping[str, Result]) -> str:
-    """Return a table with one column per method.
-
-    Rows: points, image density per camera, ghost rate, and coverage, MAE, RMSE and outliers of the
-    measured depth. These are given for all, moving and static pixels, against the held-out key
-    sweep and against ground truth.
-    """
+    """Return a table with one column per method: points, density, ghost rate, scores of depth."""
     cameras = list(next(iter(results.values())).depth)
     rows: list[tuple[str, tuple[str, ...], str]] = [("points", ("num_points",), ",d")]
     for camera in cameras:

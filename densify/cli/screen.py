@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Print answers on stdout, and log lines, errors and a progress bar on stderr.
-
-The progress bar is shown only on a terminal.
-"""
+"""Print answers on stdout, and log, errors and (on a terminal) a progress bar on stderr."""
 
 from __future__ import annotations
 
@@ -45,10 +42,7 @@ class Answer:
 
 
 def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> dict[Path, str]:
-    """Return the files to open first -> their content, at most one file of each kind.
-
-    ``kinds`` has patterns of the end of a path -> content, most important first.
-    """
+    """Return the files to open first -> their content, one for each path pattern of ``kinds``."""
     first: dict[Path, str] = {}
     for pattern, what in kinds.items():
         found = next((f for f in files if f.match(pattern) and f not in first), None)
@@ -115,10 +109,7 @@ _SCHEMA = 1
 
 
 class Screen(logging.Handler):
-    """The output of one command: text, or one JSON object at the end.
-
-    As a handler of the log it prints one line per record, above the progress bar.
-    """
+    """The output of one command: text, or one JSON object at the end; log lines above the bar."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -168,16 +159,13 @@ class Screen(logging.Handler):
 
 @contextmanager
 def screen() -> Iterator[Screen]:
-    """Send the package's log to a new screen within the ``with`` block.
-
-    ``densify.progress`` is shown only on a terminal, unless its level is set. Warnings of numpy and
-    other packages are shown as debug messages.
-    """
+    """Send the package's log to a new screen within the ``with`` block."""
     log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
     before, shown = (log.level, log.propagate, progress.level), Screen()
     log.addHandler(shown)
     log.setLevel(logging.INFO)
     log.propagate = False
+    # Progress is shown on a terminal only, warnings of other packages as debug messages.
     if not progress.level:
         progress.setLevel(logging.INFO if sys.stderr.isatty() else logging.WARNING)
     try:

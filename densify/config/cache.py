@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Cache results of pipeline steps on disk, addressed by a digest of all their inputs.
 
-An entry is an ``.npz`` file without pickles: the arrays, and everything else as JSON. A damaged
-entry is computed again. Only the user can write to the folder.
+An entry is an ``.npz`` file without pickles. A damaged entry is computed again. Only the user can
+write to the folder.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Define the errors that users can resolve, each with a one-line message.
-
-The message says what happened, where, what was expected, and what to do.
-"""
+"""Define the errors that users can resolve, each with a one-line message."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read bytes, text, JSON and YAML with size limits, and import optional packages.
-
-Every error of malformed content becomes one InputError.
-"""
+"""Read bytes, text, JSON and YAML with size limits, and import optional packages."""
 
 from __future__ import annotations
 
@@ -119,10 +116,7 @@ def read_yaml(path: Path) -> tuple[Any, dict[str, int]]:
 
 
 def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
-    """Return the content of YAML text, None if empty, and dotted key (``a.b``) -> its line.
-
-    Custom tags, duplicate keys and more than 30 aliases are refused.
-    """
+    """Return the content of YAML text, None if empty, and dotted key (``a.b``) -> its line."""
     import yaml
 
     try:

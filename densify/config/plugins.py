@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """List the built-in readers and engines, and find plug-ins of other packages by entry points.
 
-The tables name modules without importing them. The name of an entry point is the name of the
-plug-in, and its value is a module::
+The tables import no module. An entry point's name is the plug-in's, and its value a module::
 
     [project.entry-points."densify.readers"]
     npy = "densify_npy.reader"
@@ -27,28 +26,19 @@ if TYPE_CHECKING:
 class Plugin:
     """One reader or scene-flow engine.
 
-    A module of another package gives the other fields as attributes, ``holds`` as HOLDS and so on.
-
-    Attributes:
-        name: Name that users write.
-        module: Import path.
-        recognises: Reader: function that returns True if a path holds its recordings, judged by
-            file names.
-        holds: Reader: kind of recording, for messages.
-        boxes: Reader: path of the annotated boxes, for messages.
-        scenes: Reader: a path may hold several recordings, selected by ``#SCENE``.
-        argument: Engine: name of the argument after the colon; empty for no argument.
-        shared: Engine: motion of a long stretch serves every key in it
-            (`densify.flow.engines.SharedMotion`).
+    Another package's module may set the other fields: ``recognises``, ``HOLDS``, ``BOXES`` etc.
     """
 
-    name: str
-    module: str
+    name: str  # that users write
+    module: str  # import path
+    # Reader: returns True if a path holds its recordings, judged by file names
     recognises: Callable[[Path], bool] = lambda path: False
+    # Reader: kind of recording, for messages
     holds: str = "a recording of another package's reader"
-    boxes: str = ""
-    scenes: bool = False
-    argument: str = ""
+    boxes: str = ""  # reader: path of the annotated boxes, for messages
+    scenes: bool = False  # reader: a path may hold several recordings, selected by ``#SCENE``
+    argument: str = ""  # engine: name of the argument after the colon; empty for no argument
+    # Engine: motion of a long stretch serves every key in it (`densify.flow.engines.SharedMotion`)
     shared: bool = False
 
     @property
@@ -90,10 +80,7 @@ class Table:
         return rows[name] if name in rows else self._load(self._added()[name])
 
     def __iter__(self) -> Iterator[Plugin]:
-        """Yield all plug-ins, the most general built-in one last.
-
-        Modules of other packages are imported one by one.
-        """
+        """Yield all plug-ins, the most general built-in last; import other packages' one by one."""
         yield from self.built_in[:-1]
         yield from (self._load(point) for _, point in sorted(self._added().items()))
         yield self.built_in[-1]
@@ -107,7 +94,6 @@ class Table:
         return {point.name: point for point in points if point.name not in built_in}
 
     def _load(self, point: EntryPoint) -> Plugin:
-        """Import a plug-in of another package, and return its description."""
         what = f"{self.kind} {point.name} of the package {point.dist.name if point.dist else '?'}"
         try:
             module = point.load()

@@ -25,10 +25,6 @@ def resolve(
             YAML file of that form; or a str, the name of a preset or else of a file. Settings that
             are not given have their defaults.
         overrides: Texts ``section.key=value``, with values as in YAML; later overrides win.
-
-    Raises:
-        InputError: A name is unknown (the message suggests the right one), or a value has the wrong
-            type or is out of range. The message names the file or ``--set`` that gave it.
     """
     values = as_mapping(config if isinstance(config, Config) else Config())
     if isinstance(config, Mapping):
@@ -85,10 +81,7 @@ def apply_changes(
     where: str,
     sections: Mapping[str, type[Section]] = _SECTIONS,
 ) -> None:
-    """Overwrite settings ``{section: {key: value}}`` in place with checked changes of that form.
-
-    ``where``, the file or option that gave the changes, begins error messages.
-    """
+    """Overwrite settings ``{section: {key: value}}`` in place; errors begin with ``where``."""
     for name, keys in _mapping(changes, where, "sections"):
         if name not in values:
             hint = _expected(str(name), values, "section")

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Define every setting of the pipeline: a frozen dataclass per stage, collected in `Config`.
 
-To add a setting, add it to a section here, and to configs/default.yaml with a comment that explains
-it. To add a section, add its class and one line in `Config`.
+A new setting needs a comment in configs/default.yaml, a new section a line in `Config`.
 """
 
 from __future__ import annotations
@@ -95,11 +94,8 @@ class FlowSettings(Section):
         check_engine_spec(self.engine)
 
     def around(self, points_per_s: float) -> tuple[float, float]:
-        """Return how far around the window motion is searched, and the spacing of those sweeps, s.
-
-        Sparse sweeps (``points_per_s``) show little of a moving object: every one is searched
-        (spacing 0), farther around.
-        """
+        """Return how far around the window motion is searched, and those sweeps' spacing, s."""
+        # Sparse sweeps show little of a moving object: every one is searched (spacing 0), farther.
         few = points_per_s < _FEW_POINTS_PER_S
         needed_s, step_s = (_AROUND_FEW_S, 0.0) if few else (_AROUND_S, _AROUND_S)
         return needed_s if self.look_around_s is None else self.look_around_s, step_s

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Run calls in this process, in several processes of this machine, or on a Dask scheduler.
-
-The module imports no heavy package, because a worker imports it before its number of threads is
-set.
-"""
+"""Run calls in this process, in several processes of this machine, or on a Dask scheduler."""
 
 from __future__ import annotations
 
+# No heavy package here: a worker imports this module before its number of threads is set.
 import logging
 import multiprocessing
 import os
@@ -50,15 +47,14 @@ def call_all(
 ) -> Iterator[tuple[Item, Any]]:
     """Call ``call(item)`` for every item, and yield pairs (item, outcome) as calls finish.
 
-    An item whose process dies is tried a second time, alone. If the process dies again, the outcome
-    is a ComputationError. InputError and ComputationError of ``call`` are raised. Any other error
-    becomes the outcome of the item, as a ComputationError.
+    An item whose process dies is tried a second time, alone. A second death or an unexpected error
+    gives a ComputationError as outcome. InputError and ComputationError of ``call`` are raised.
 
     Args:
         call: A function of a module.
-        groups: Non-empty groups of hashable, picklable items. The first item of a group is finished
+        groups: Non-empty groups of hashable, picklable items. A group's first item is finished
             before the others begin, so they find shared results in the cache.
-        num_workers: Number of processes. 1 uses this process.
+        num_workers: Number of processes; 1 uses this process.
         log: File to which worker processes append their log.
         scheduler: Address of a Dask scheduler whose workers replace local processes.
     """
@@ -202,7 +198,6 @@ def _open_dask(scheduler: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
 
 
 def _begin(environment: dict[str, str]) -> None:
-    """Set up a worker process with its environment variables."""
     os.environ.update(environment)
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the command ends its workers itself

@@ -49,10 +49,7 @@ class Job:
 
 
 def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
-    """Densify and write one key sweep of a job, and return its record.
-
-    An error becomes a record with status ``failed``, except OutputError, which is raised.
-    """
+    """Densify and write one key and return its record, ``failed`` on any error but OutputError."""
     job, key = job_and_key
     start_s = time.perf_counter()
     try:

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read a training set of `densify dataset --layout kitti-depth` as a torch dataset.
-
-The images are read from the recordings.
-"""
+"""Read a training set of `densify dataset --layout kitti-depth` as a torch dataset."""
 
 from __future__ import annotations
 
@@ -32,7 +29,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
     Samples are ordered by drive, camera and frame number. A sample is a dict of float32 tensors and
     names. H and W are the size after cropping::
 
-        image           (3,H,W) RGB, 0 to 1
+        image           (3,H,W) RGB, 0 to 1, read from the recording
         sparse_depth_m  (1,H,W) camera z in metres from the key sweep alone, 0 for no depth
         dense_depth_m   (1,H,W) camera z in metres from all sweeps of the window, 0 for no depth
         confidence      (1,H,W) of the dense depth, 1 most certain; 0 at pixels without a depth
@@ -40,9 +37,8 @@ class DepthDataset(Dataset[dict[str, Any]]):
         frame           int, frame number in the recording; drive, camera: str
 
     A flipped sample shows a mirrored world: camera x becomes -x, and focal lengths stay positive.
-    If the camera has lens distortion, ``intrinsics`` ignore the distortion. Crops and flips are
-    drawn by torch's generator. `torch.manual_seed` repeats them, also in the workers of a
-    DataLoader.
+    ``intrinsics`` ignore lens distortion. `torch.manual_seed` repeats crops and flips, also in the
+    workers of a DataLoader.
     """
 
     def __init__(
@@ -61,17 +57,12 @@ class DepthDataset(Dataset[dict[str, Any]]):
             root: Folder of the training set, ``--out`` of `densify dataset`.
             cameras: Names of the cameras, None for all.
             filled: Use the filled map (measured and interpolated pixels) as dense depth.
-            crop: (height_px, width_px) of a cutout. It lies at the bottom of the image, where depth
-                is, and at a random column.
+            crop: (height_px, width_px) of a cutout at the bottom of the image, where depth is, and
+                at a random column.
             flip: Mirror each sample with probability 0.5.
-            data: Drive -> new path of its recording, for `densify.open_sequence`. Only recordings
-                that have moved since the set was made need an entry.
+            data: Drive -> new path of its recording, for `densify.open_sequence`, if it has moved
+                since the set was made.
             split: KITTI's split, ``train`` or ``val``, None for both.
-
-        Raises:
-            InputError: The folder holds no training set of this layout, or no finished key sweep.
-                Loading a sample raises it for a crop larger than an image, and for missing or
-                damaged files.
         """
         self._root, self._crop, self._flip = Path(root), crop, flip
         self._dense = "groundtruth_filled" if filled else "groundtruth"
@@ -99,7 +90,6 @@ class DepthDataset(Dataset[dict[str, Any]]):
         return len(self._samples)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """Return a sample, a dict as described in the class."""
         name, camera_name, frame = self._samples[index]
         drive = self._drives[name]
         camera, K = drive.cameras[camera_name], drive.cameras[camera_name].K.copy()

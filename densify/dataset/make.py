@@ -89,15 +89,16 @@ def make_dataset(
     verify: bool = False,
     report: Callable[[Summary], None] | None = None,
 ) -> Summary:
-    """Make a training set from the key sweeps of whole recordings.
+    """Make a training set from the key sweeps of whole recordings, and return the final progress.
 
-    A repeated call keeps finished key sweeps. Files do not depend on processes or interruptions.
+    A repeated call keeps finished key sweeps. Files do not depend on processes or interruptions. A
+    full disk or the loss of all workers raises ComputationError; finished key sweeps are kept.
 
     Args:
         data: Recordings, as `densify.open_sequence` takes them.
         out: Folder of the training set.
-        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``, None for all. A
-            slice without start or stop begins at the first frame or ends at the last one.
+        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``; no start or stop
+            means the first frame or the last. None for all.
         recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
         num_workers: Number of processes, as many as possible if None. More than one needs ``if
             __name__ == "__main__"`` in a script.
@@ -106,13 +107,6 @@ def make_dataset(
         shard: (i, n), part i of n, from 1. Machines that share ``out`` may make parts at once.
         verify: Compare finished files with their recorded hashes, and make damaged files again.
         report: Function called with the progress, before the first and after every key sweep.
-
-    Returns:
-        The final progress.
-
-    Raises:
-        InputError: An argument cannot be used, or another run works on the same part.
-        ComputationError: The disk is full or the workers are lost. Finished key sweeps are kept.
     """
     if isinstance(data, str) or not data:
         raise InputError(f"data: got {data!r}, expected a list of recordings, such as ['street']")
@@ -151,10 +145,7 @@ def status(out: Path) -> Summary:
 
 
 def damaged(out: Path) -> list[str]:
-    """Return the missing or changed files of finished key sweeps, as paths relative to ``out``.
-
-    A file is changed if its hash differs from the hash in the manifest.
-    """
+    """Return the finished key sweeps' missing or changed (by hash) files, relative to ``out``."""
     records = read_manifests(out).values()
     return [name for r in records if r.status != "failed" for name in damaged_files(r, out)]
 
@@ -189,7 +180,6 @@ def _blocks(drives: Sequence[Drive], shard: tuple[int, int] | None) -> list[Bloc
 
 
 def _finished(blocks: Sequence[Block], out: Path, verify: bool) -> dict[Key, KeyRecord]:
-    """Return the records of the blocks' finished key sweeps."""
     wanted = {(drive.name, key) for drive, keys in blocks for key in keys}
     before = read_manifests(out)
     done = finished(before.values(), out, verify)

@@ -12,8 +12,8 @@ The file is ``OUT/manifest.jsonl``, or ``OUT/manifest-2of4.jsonl`` for the secon
     seconds          computing time
     warnings         sentences about assumptions and suspicions
 
-Each line is on the disk before the next line begins. A killed process can damage only the last
-line, and its key sweep is made again. A later line of a key sweep replaces an earlier line.
+Each line is on the disk before the next begins. A killed process can damage only the last line,
+whose key sweep is made again. A later line of a key sweep replaces an earlier line.
 """
 
 from __future__ import annotations
@@ -92,9 +92,8 @@ class KeyRecord:
 def read_manifests(root: Path) -> dict[Key, KeyRecord]:
     """Return the records of all manifests in a folder, ordered by drive and frame number.
 
-    If a file has several lines for a key sweep, the last line counts. If several shards have a
-    record, "done" counts before "aside" and "failed". Damaged lines before the last line give a
-    warning.
+    In a file, the last line of a key sweep counts. Of several shards' records, done counts before
+    aside before failed. Damaged lines before the last line give a warning.
     """
     rank = _STATUSES.index
     records: dict[Key, KeyRecord] = {}
@@ -121,10 +120,7 @@ def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> lis
 
 
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
-    """Return the key sweeps that need no further work: done or aside, and all files exist.
-
-    With ``verify``, hashes of the files are compared too.
-    """
+    """Return the keys done or aside whose files exist (and match their hashes if ``verify``)."""
     return {
         r.name
         for r in records
@@ -134,10 +130,9 @@ def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> 
 
 
 class Manifest:
-    """The manifest file of a run or shard, open for writing. Use it as a context manager.
+    """The manifest file of a run or shard, open for writing by one process; a context manager.
 
-    A hidden lock file, which stays, lets only one process open the manifest. Opening and closing
-    sort the file: one line per key sweep, by drive and frame number.
+    Opening and closing sort the file: one line per key sweep, by drive and frame number.
     """
 
     def __init__(self, root: Path, shard: tuple[int, int] | None = None) -> None:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Judge the key sweeps of a training set beside their neighbours in the recording.
 
-A limit that holds for all recordings passes keys which are far worse than the others of their own
-recording, such as those at its ends, whose windows are cut.
+A limit for all recordings passes keys that are bad for their own, such as cut windows at its ends.
 """
 
 from __future__ import annotations
@@ -22,17 +21,7 @@ _SCORES = {"ghost": "ghosts", "outliers": "held-out outliers"}
 
 
 def worse_than_neighbours(records: Mapping[Key, KeyRecord]) -> dict[Key, str]:
-    """Return finished keys with far more ghosts or outliers than the keys around them.
-
-    A key is compared with the median of its neighbours, twice as many as a window has sweeps, so
-    that the keys whose windows an end cuts are the minority.
-
-    Args:
-        records: Records of a training set, by recording and frame number.
-
-    Returns:
-        Recording and frame number -> a sentence that says what is worse.
-    """
+    """Return finished keys with far more ghosts or outliers than others around -> what is worse."""
     drives: dict[str, list[KeyRecord]] = defaultdict(list)
     for record in records.values():
         if record.status != "failed":
@@ -42,6 +31,7 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord]) -> dict[Key, str]:
         drive.sort(key=lambda record: record.key)
         for score, said in _SCORES.items():
             shares = [_worst(record, score) for record in drive]
+            # Twice a window: the keys whose windows an end cuts are the minority of neighbours.
             for row in _outlying(shares, 2 * max(len(record.frames) for record in drive)):
                 if drive[row].status == "done":
                     found[drive[row].name].append(said)

@@ -56,8 +56,7 @@ class Gate(Section):
         max_ghost: Greatest share of accumulated points at positions that the key sweep saw through.
         min_density: Least share of the image's pixels with a measured depth, in every camera.
         max_outliers: Greatest share of outliers against the held-out key sweep, in every camera.
-        min_sweeps: Least number of sweeps in the window, which may be cut at ends and holes in
-            time.
+        min_sweeps: Least number of sweeps in the window, which ends and holes in time may cut.
         split: Split of the tree, ``train`` or ``val``; ``kitti`` takes KITTI's official split.
     """
 
@@ -90,8 +89,7 @@ class Recipe:
     Attributes:
         window: Number of sweeps on each side of a key sweep.
         method: ``flow``, ``icp`` or ``none``: scene flow, rigid accumulation or single sweep.
-        layout: ``kitti-depth`` for KITTI's depth tree, ``densify`` for the files of ``densify
-            run``.
+        layout: ``kitti-depth`` for KITTI's depth tree, ``densify`` for files as of ``densify run``.
         cameras: Names of the cameras, None for all.
         gate: Limits of the scores, and the split of the tree.
         config: Settings from `densify.config.resolve`. A limit of outliers turns scoring on.

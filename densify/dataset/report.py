@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write HTML pages: ``report.html`` of a run or training set, ``compare.html`` of a comparison.
-
-The page of a training set is a table of its key sweeps.
-"""
+"""Write HTML pages: ``report.html`` of a run or training set, ``compare.html`` of a comparison."""
 
 from __future__ import annotations
 
@@ -45,11 +42,7 @@ def write_comparison_page(folder: Path) -> Path:
 
 
 def write_report(place: Path, overwrite: bool = False) -> list[Path]:
-    """Write the HTML pages of a folder and return their paths.
-
-    The page is ``report.html`` for a run or a training set, and ``compare.html`` for a comparison.
-    ``place`` may also be the parent folder of a single key sweep.
-    """
+    """Write the HTML pages of a folder, or of the only key sweep in it, and return their paths."""
     pages = _pages(place)
     for path in pages:
         if path.exists() and not overwrite:
@@ -60,7 +53,6 @@ def write_report(place: Path, overwrite: bool = False) -> list[Path]:
 
 
 def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
-    """Return the path of each page -> function that returns its bytes."""
     if not place.is_dir():
         raise InputError(
             f"{place}: no such folder; expected what densify run, compare or dataset wrote"
@@ -128,7 +120,6 @@ def _row(record: KeyRecord, worse: Mapping[Key, str]) -> dict[str, Any]:
 
 
 def _rows(rows: Iterable[Iterable[Any]]) -> str:
-    """Return the rows of a table as HTML."""
     cells = ("".join(f"<td>{html.escape(_text(value))}</td>" for value in row) for row in rows)
     return "\n".join(f"<tr>{row}</tr>" for row in cells)
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Accumulate the points of all sweeps at the reference time of the key sweep.
-
-Also fit the track of each moving object over the window.
-"""
+"""Accumulate the sweeps' points at the key sweep's reference time, and fit tracks of objects."""
 
 from __future__ import annotations
 
@@ -31,15 +28,10 @@ _BEYOND_PERCENT = 0.2  # percent of the points outside the object's box, on each
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
     """Return the points of all sweeps as one cloud in the lidar frame of the key sweep.
 
-    Moving points are displaced by their scene flow. Static points keep their rigid positions, bit
-    for bit.
-
-    Args:
-        stretch: Registered sweeps of the window.
-        fields: Scene flow of each sweep to the reference time of the key sweep.
-        key: Frame number of the key sweep.
-        drop_lost: True leaves out moving points that cannot be followed to the key sweep, False
-            keeps their rigid positions.
+    Moving points are displaced by their scene flow, ``fields``, from each sweep to the key sweep's
+    reference time. Static points keep their rigid positions, bit for bit. Moving points that cannot
+    be followed to the key sweep are left out with ``drop_lost``, else they keep their rigid
+    positions.
     """
     kept = [np.flatnonzero(~(drop_lost & flow.lost)) for flow in fields]
     cloud, first = _empty_cloud(sum(map(len, kept))), 0
@@ -65,10 +57,7 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
 
 
 def confidence_of(since_key_ns: Int) -> Float32:
-    """Return 1 / (1 + t), t seconds between a sweep and the key sweep: a relative score of 0 to 1.
-
-    since_key_ns: (M,) times of the sweeps in ns.
-    """
+    """Return (M,) relative scores 1 / (1 + t) of 0 to 1, for sweeps t seconds from the key."""
     return (1 / (1 + np.abs(since_key_ns) * 1e-9)).astype(np.float32)
 
 
@@ -108,12 +97,8 @@ def object_tracks(
     the object's points to the key sweep. Sweeps with fewer than three of these points have no pose.
     Objects without such a sweep are left out. The x axis of an object points along its velocity, or
     along its path over the window if that is longer. For objects of 3 m and more these are taken at
-    the rear axle, where a vehicle that turns moves where it points.
-
-    Args:
-        stretch: Registered sweeps of the window.
-        fields: Scene flow of each sweep to the reference time of the key sweep.
-        key: Frame number of the key sweep.
+    the rear axle, where a vehicle that turns moves where it points. The arguments are as in
+    `accumulate`.
     """
     seen: dict[int, dict[int, _ObjectPoints]] = {}
     for registered, flow in zip(stretch.sweeps, fields, strict=True):

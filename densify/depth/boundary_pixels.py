@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Decide by the camera image which pixels close to a depth discontinuity are kept.
 
-The first pixel with a depth in each of 16 directions votes on the measured depth of a boundary
-pixel. The surface of the voter is extended to the boundary pixel. If it has the measured depth
-there, the vote is for that depth, else against it. The vote weighs less the more the image's
-colours change between both pixels, as in a bilateral grid or in geodesic matting. Two pixels
-without an image edge between them belong to the same surface.
+Known pixels around a boundary pixel vote on its measured depth (`vote`). A vote weighs less the
+more the image's colours change between both pixels, as in a bilateral grid or in geodesic matting.
+Two pixels without an image edge between them belong to the same surface.
 """
 
 from __future__ import annotations
@@ -42,11 +40,7 @@ _ROUNDED = 1 - 1e-6  # tolerance for rounding of a share
 
 
 def lab(image: NDArray[np.uint8]) -> Float32:
-    """Convert an (H,W,3) RGB image to (H,W,3) float32 CIE L*a*b* with L from 0 to 100.
-
-    The result is slightly blurred, and lightened if it is dark. In L*a*b* the distance of two
-    colours measures how different they look.
-    """
+    """Convert (H,W,3) RGB to CIE L*a*b*, L from 0 to 100; slightly blurred, lightened if dark."""
     blurred = cv2.GaussianBlur(image.astype(np.float32) / 255, (0, 0), _BLUR_PX)
     colours = cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB).astype(np.float32, copy=False)
     light = float(np.percentile(colours[..., 0], 99))
@@ -56,12 +50,8 @@ def lab(image: NDArray[np.uint8]) -> Float32:
 def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
     """Return the layers with the boundary pixels (``rim_m``) accepted that the image confirms.
 
-    A pixel is accepted if 97 % of the votes are for its depth. Its ``confidence`` becomes 0 to 0.2
-    by this share.
-
-    Args:
-        layers: Map with measured pixels (``depth_m``), boundary pixels (``rim_m``) and the image.
-        rims: ``image`` accepts pixels that the image confirms, ``keep`` all, ``strict`` none.
+    With ``rims=image`` a pixel is accepted if 97 % of the votes are for its depth. ``keep`` accepts
+    all pixels, ``strict`` none. The ``confidence`` of an accepted pixel is 0 to 0.2 by this share.
     """
     pixel = np.flatnonzero(layers.rim_m)
     share = np.full(len(pixel), np.float32(0.5))
@@ -89,14 +79,10 @@ def voted_for(
 ) -> Bool:
     """Return (P,) True where enough pixels around confirm the given depth of a pixel, see `vote`.
 
-    Args:
-        layers: Map with the image, the slopes and the ray spacing.
-        known_m: Maps (H,W) with the depth in metres of the pixels that vote, 0 for pixels without a
-            vote. Each map must confirm the depth. All maps have the same depths where they vote.
-        pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
-        depth_m: (P,) depths to confirm, in metres.
-        least_share: Least share of the votes, 0 to 1, that must be for the depth.
-        surely: True for the cautious share of `vote`.
+    At least ``least_share`` of their votes, 0 to 1, must be for the depth. ``known_m`` are maps
+    (H,W) with the depth in metres of the pixels that vote, 0 for other pixels. Each map must
+    confirm the depth. All maps have the same depths where they vote. The other arguments are as in
+    `vote`.
     """
     confirmed = np.ones(len(pixel), bool)
     steps = None
@@ -129,13 +115,11 @@ def vote(layers: Layers, voters: Voters, pixel: Int, depth_m: Float32, surely: b
     """Return the (P,) weighted share of the votes, 0 to 1, that confirm the depth of each pixel.
 
     The first known pixel in each of 16 directions votes for the depth if its own surface, extended
-    to the pixel, has that depth. Otherwise it votes against.
+    to the pixel, has that depth. Otherwise it votes against. Edges of the image weaken votes.
 
     Args:
-        layers: Map with the image, whose colour edges weaken votes, and the ray spacing.
-        voters: Known pixels with their surfaces.
         pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
-        depth_m: (P,) depths to confirm, in metres.
+        depth_m: (P,) depths to confirm.
         surely: True takes the least share of five positions of the image (unshifted, and shifted by
             0.6 ray spacings to each side), with a small constant vote. False takes the unshifted
             image; the share is 0 without voters.
@@ -166,11 +150,8 @@ def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 @inlined
 def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill in the 16 votes on the pixel in row v, column u; return the numbers for and against.
-
-    depth: depth to confirm, metres. gap: spacing of rays, px. steps: (16,) output, steps to the
-    voting pixel in each direction, 0 without a vote. agrees: (16,) output, True for a vote for.
-    """
+    """Fill in the 16 votes on the pixel in row v, column u; return the numbers for and against."""
+    # depth in metres, gap in px; steps: to the voter in each direction, 0 without a vote
     same = _SAME_M + _SAME_FRACTION * depth
     num_for, num_against = 0, 0
     for d in range(len(steps)):
@@ -189,17 +170,14 @@ def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-
 
 @inlined
 def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
-    """Return the weight exp(-c² / 2 s²) + ``_THROUGH`` of a vote by the colours of the image.
-
-    c is the largest colour distance from the start along k steps in direction d, s is ``_COLOURS``.
-    Outside its border the image continues with its border pixels.
-    """
+    """Return the weight exp(-c² / 2 s²) + ``_THROUGH`` of a vote by the colours of the image."""
     if lab.size == 0:
         return 1 + _THROUGH
     stride = max(np.int64(gap / _STRIDE), 1)
     height, width = lab.shape[:2]
     row, column = min(max(v, 0), height - 1), min(max(u, 0), width - 1)
     light, a, b = lab[row, column, 0], lab[row, column, 1], lab[row, column, 2]
+    # c²: greatest squared colour distance from the start along the path; s is _COLOURS
     change = np.float32(0)
     for step in range((k - 1) % stride + 1, k + 1, stride):
         du, dv = offset(d, step)
@@ -212,11 +190,7 @@ def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _vote(first, last, pixel, inverse, voters, lab, gap_px, surely, share):  # type: ignore[no-untyped-def]
-    """Fill ``share`` (P,) float32, the result of `vote`.
-
-    inverse: (P,) inverse of the depth to confirm, 1/m. lab: (H,W,3) image, empty without an image.
-    gap_px: (H,W) spacing of rays in pixels. The other arguments are as in `vote`.
-    """
+    """Fill ``share`` (P,), the result of `vote` on the inverse depths ``inverse`` (P,) in 1/m."""
     width, num = gap_px.shape[1], len(DIRECTIONS)
     steps, agrees = np.empty(num, np.int64), np.empty(num, np.bool_)
     doubt = _DOUBT if surely else 0.0

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Select the images that belong to a key sweep, and project points at the exposure of an image.
-
-A key sweep takes the image exposed nearest to it, or every image nearer to it than to any other
-sweep.
-"""
+"""Select the images that belong to a key sweep, and project points at the exposure of an image."""
 
 from __future__ import annotations
 
@@ -59,12 +55,6 @@ def key_shots(
     sweep, the earlier of two. With ``project.per=image`` there is a map CAMERA/NUMBER for each
     image nearer to the key sweep than to any other. Without an image within about half a period the
     default map shows the time of the sweep.
-
-    Args:
-        sequence: Recording with the times of sweeps and images.
-        cameras: Cameras that get depth maps.
-        key: Frame number of the key sweep.
-        settings: Section ``project``.
     """
     stamp_ns = sequence.stamp_ns(key)
     begin_ns, end_ns = _own_time_ns(sequence, key)
@@ -170,15 +160,8 @@ class Exposure:
     ) -> Exposure:
         """Return the camera of a depth map at the map's time, relative to the key sweep.
 
-        The camera pose is extrapolated from the key sweep with the vehicle's twist. If the
-        recording has a pose of the image, the recorded pose is used instead.
-
-        Args:
-            sequence: Recording with the times and poses of images.
-            stretch: Registered sweeps of the window.
-            key: Frame number of the key sweep.
-            shot: Camera, image and time that the map shows.
-            settings: All settings; ``output.optical_flow`` adds the ``others``.
+        The camera pose is the recorded pose of the image. Without one it is extrapolated from the
+        key sweep with the vehicle's twist. The setting ``output.optical_flow`` adds the ``others``.
         """
         others: dict[str, Exposure] = {}
         if settings.output.optical_flow and shot.number is not None:
@@ -201,15 +184,11 @@ class Exposure:
         return _exposure(sequence, stretch, key, key, shot, settings, others)
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
-        """Project N points to the image.
+        """Project points (N,3) to the image; metres, key sweep's lidar frame at its reference time.
 
-        Moving points advance by their velocity to the exposure. With a rolling shutter each row or
-        column of the image has its own exposure time. Points beside or behind a wide lens have no z
-        and are not inside.
-
-        Args:
-            points: (N,3) positions in metres, key sweep's lidar frame, at its reference time.
-            velocity_m_s: (N,3) velocities in the same frame, ego-motion removed.
+        Moving points advance by their velocity (N,3), ego-motion removed, to the exposure. With a
+        rolling shutter each row or column has its own exposure time. Points beside or behind a wide
+        lens have no z and are not inside.
         """
         late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)
@@ -252,10 +231,7 @@ def _exposure(
     settings: Config,
     others: Mapping[str, Exposure] | None = None,
 ) -> Exposure:
-    """Return the exposure of a shot, its pose extrapolated from sweep ``frame`` of the stretch.
-
-    The other arguments and the result are relative to the key sweep, as in `Exposure.of`.
-    """
+    """Return the exposure of a shot (as `Exposure.of`), extrapolated from sweep ``frame``."""
     camera, registered = shot.camera, stretch[frame]
     late_s = float(shot.stamp_ns - registered.sweep.stamp_ns) * 1e-9
     twist = registered.twist_before if late_s < 0 else registered.twist_after

@@ -55,11 +55,8 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
     Some sweeps, 5 m of travel apart, test the points of the others. Points ahead of a sweep are
     tested by the next testing sweep at least 3.5 m farther, points behind it by the previous one.
     By then even a vehicle that drives along has left most of its place. At the ends of the road the
-    last testing sweep is taken, if 2 m away or more, or the testing sweep on the other side.
-
-    Args:
-        sweeps: Deskewed sweeps in the order of the road.
-        travel_m: (S,) position of each sweep along the road, ascending.
+    last testing sweep is taken, if 2 m away or more, or the testing sweep on the other side. The
+    sweeps are deskewed, and ``travel_m`` (S,) is the ascending position of each along the road.
     """
     asked = [0] if sweeps else list[int]()
     for i, at_m in enumerate(travel_m.tolist()):
@@ -87,10 +84,7 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
 
 
 def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
-    """Return the indices of the sweeps that test sweep i: one before and one after it, or one.
-
-    asked: indices of all testing sweeps. travel_m: (S,) positions of the sweeps along the road.
-    """
+    """Return the indices, among ``asked``, of the sweeps before and after sweep i that test it."""
     apart_m = np.array([travel_m[j] - travel_m[i] for j in asked])
     sides = []
     for off_m in (-apart_m, apart_m):
@@ -103,13 +97,7 @@ def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
 
 
 def standing(sensors: Sensors, registered: RegisteredSweep, gone: Bool) -> StandingWorld:
-    """Return the static points of one sweep in the world frame, each with its surface patch.
-
-    Args:
-        sensors: Scanners, with the angles between their rays.
-        registered: Deskewed sweep.
-        gone: (N,) True for points to leave out, which another sweep saw through (`departed`).
-    """
+    """Return a sweep's points that are not ``gone`` (N,), world frame, with their patches."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     one = np.zeros(len(sweep), np.int32)
     every = np.ones(len(one), bool)
@@ -183,14 +171,8 @@ def far_cloud(
     """Return the points beyond the window that a camera observes, and their patches.
 
     Both are in the key sweep's lidar frame. One point per pixel and step of depth is kept.
-
-    Args:
-        found: Static points along the road.
-        T_key_found: (4,4) from the world frame of ``found`` to the key sweep's lidar frame.
-        stretch: Registered sweeps of the window.
-        key: Frame number of the key sweep.
-        standing_only: True leaves out points that the first or the last sweep of the window saw
-            through.
+    ``T_key_found`` (4,4) maps the world frame of ``found`` to that frame. ``standing_only`` leaves
+    out points that the first or the last sweep of the window saw through.
     """
     beyond = ~np.isin(found.frames, stretch.frames)
     rows = np.flatnonzero(beyond[found.source])
@@ -225,10 +207,7 @@ def far_cloud(
 
 
 def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) -> Int:
-    """Return those of the ``rows`` (K,) of points (N,3), world frame, that a camera needs.
-
-    A camera needs one point in every pixel and step of depth, from sweeps in mixed order.
-    """
+    """Return those of the ``rows`` (K,) of points (N,3), world frame, that a camera needs."""
     T_cam_world = exposure.T_cam_key @ T_key_world
     kept, cells = [rows[:0]], [np.zeros((0, 3), np.float32)]
     for first in range(0, len(rows), AT_ONCE):
@@ -238,6 +217,7 @@ def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) ->
         sight = exposure.see(there, np.zeros(there.shape, np.float32))
         inside = np.flatnonzero(sight.inside)
         depth_m = exposure.depth_m(sight.points_cam.take(inside, axis=0))
+        # A camera needs one point in every pixel and step of depth.
         place = np.column_stack([sight.uv.take(inside, axis=0), np.log(depth_m) / _SAME_DEPTH])
         kept.append(near[inside])
         cells.append(np.rint(place.astype(np.float32)))
@@ -248,10 +228,7 @@ def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) ->
 
 
 def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:
-    """Return (M,) True for points (M,3), key sweep's lidar frame, that a given sweep saw through.
-
-    key: frame number of the key sweep. witnesses: frame numbers of the given sweeps.
-    """
+    """Return (M,) True for points (M,3), key frame, that a sweep of ``witnesses`` saw through."""
     free = np.zeros(len(points), bool)
     for frame in witnesses:
         there = poses.transform(stretch.T_target_source(frame, key), points)

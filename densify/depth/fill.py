@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Interpolate between the measured pixels of a depth map.
-
-The two-sided fill fits a plane to the measured pixels of a window. The star fill closes holes that
-known pixels surround. Both are checked by the votes of measured pixels.
-"""
+"""Interpolate between the measured pixels of a depth map, where their votes confirm the result."""
 
 from __future__ import annotations
 
@@ -36,11 +32,8 @@ _STAR_SPREAD = 0.1  # greatest difference between the predictions, as a share of
 def fill(layers: Layers, reach: float) -> Layers:
     """Fill the pixels that have measured pixels on both sides, if the pixels around confirm them.
 
-    A filled depth stays if at least nine tenths of the votes (`voted_for`) are for it.
-
-    Args:
-        layers: Map with measured pixels; it is not changed.
-        reach: Half size of the largest window, in spacings of rays.
+    A filled depth stays if at least nine tenths of the votes (`voted_for`) are for it. ``reach`` is
+    the half size of the largest window in spacings of rays.
     """
     measured = np.where(layers.depth_m > 0, layers.confidence, np.float32(0))
     filled_m, confidence, tilt = fill_between(
@@ -51,14 +44,12 @@ def fill(layers: Layers, reach: float) -> Layers:
 
 
 def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
-    """Drop pixels filled since the map ``before_m`` (H,W) that too few votes confirm (`voted_for`).
-
-    Only measured pixels vote, because filled pixels would confirm themselves. Boundary pixels that
-    were not accepted may only vote against. This protects the pillar of a car, which has few
-    measured pixels. least_share: share of the votes, 0 to 1, that is enough.
-    """
+    """Drop pixels filled since ``before_m`` (H,W) with less than ``least_share`` of the votes."""
     filled = (layers.filled_m > 0) & (before_m == 0)
     pixel = np.flatnonzero(filled)
+    # Only measured pixels vote, because filled pixels would confirm themselves. Boundary pixels
+    # that were not accepted may only vote against. This protects the pillar of a car, which has few
+    # measured pixels.
     maps_m = np.maximum(layers.depth_m, layers.rim_m), layers.depth_m
     depth_m = layers.filled_m.flat[pixel]
     filled.flat[pixel] = ~voted_for(layers, maps_m, pixel, depth_m, least_share)
@@ -97,14 +88,7 @@ def fill_between(
 
     The pixel gets the depth of the plane. Weights fall to zero just outside the window. The window
     grows in thirds of the ray spacing, then to ``reach`` spacings. The smallest sufficient window
-    is taken.
-
-    Args:
-        depth_m: (H,W) measured depth in metres, 0 none.
-        confidence: (H,W) confidence of the measured pixels.
-        tilt: (H,W,2) slope of inverse depth to the right and down, 1/m per px.
-        spacing_px: (H,W,2) spacing of neighbouring rays, across and down.
-        reach: Greatest half size of the window, in spacings of rays.
+    is taken. The maps are those of `Layers`, of measured pixels only.
 
     Returns:
         Copies of depth_m, confidence and tilt with the filled pixels. Their confidence is the least
@@ -152,10 +136,7 @@ def _surrounded(num, top, bottom, left, right, row, column):  # type: ignore[no-
 
 @inlined
 def _gather(known, top, bottom, left, right, row, column, inside):  # type: ignore[no-untyped-def]
-    """Put the measured pixels of a window (rows ``top`` to ``bottom`` - 1) into ``inside``.
-
-    Return the number of these pixels, and their greatest and least inverse depth in 1/m.
-    """
+    """Put a window's pixels into ``inside``; return number, greatest and least inverse depth."""
     num, near, far = 0, 0.0, np.inf
     for first in range(top, bottom, _ROWS):
         last = min(first + _ROWS, bottom)
@@ -175,13 +156,11 @@ def _gather(known, top, bottom, left, right, row, column, inside):  # type: igno
 
 @inlined
 def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
-    """Fit a plane to ``num`` pixels of ``inside``, with weights that fall to 0 at the reach (px).
-
-    Return its inverse depth in the middle, both slopes, and the range of deviations from it.
-    """
+    """Fit a plane; return its inverse depth in the middle, both slopes, range of deviations."""
     n = u = v = uu = uv = vv = w = uw = vw = 0.0
     for i in range(num):
         there, du, dv = inside.inverse[i], inside.right[i], inside.down[i]
+        # It falls to 0 just beyond the reach (px).
         weight = (1 - abs(dv) / (reach_v + 1)) * (1 - abs(du) / (reach_u + 1))
         n += weight
         u += weight * du
@@ -203,11 +182,7 @@ def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, share):  # type: ignore[no-untyped-def]
-    """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`.
-
-    known: `_Known`. reaches: (n,) half sizes of the windows in spacings of rays, ascending. share:
-    (H,W) float32 output, size of the window used as a share of the largest.
-    """
+    """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`."""
     height, width = filled_m.shape
     most = (2 * _MOST_PX + 1) ** 2
     inside = _Inside(np.empty(most), np.empty(most), np.empty(most), np.empty(most, np.float32))
@@ -216,7 +191,7 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, s
         if filled_m[row, column] > 0:
             continue
         before_u, before_v = 0, 0
-        for step in range(len(reaches)):
+        for step in range(len(reaches)):  # half sizes in spacings of rays, ascending
             across_px = reaches[step] * spacing_px[row, column, 0]
             down_px = reaches[step] * spacing_px[row, column, 1]
             reach_u = min(max(int(np.rint(across_px)), 1), _MOST_PX)
@@ -242,18 +217,17 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, s
                     least = min(least, inside.confidence[i])
                 confidence[row, column] = least
                 tilt[row, column, 0], tilt[row, column, 1] = slope_u, slope_v
-                share[row, column] = (step + 1) / len(reaches)
+                share[row, column] = (step + 1) / len(reaches)  # size of the window, of the largest
                 break
 
 
 def fill_stars(layers: Layers) -> Layers:
     """Fill holes from the first known pixel, measured or filled, in each of 16 directions.
 
-    A hole is filled if at least eight directions have a known pixel within a spacing of rays, and
-    at most seven neighbouring directions have none. The surface of each known pixel is extended to
-    the hole. These predictions must agree to 10 % of inverse depth. Their mean, weighted by the
-    reciprocal of the steps, needs eight tenths of the votes. The confidence is half the least of
-    the known pixels.
+    At least eight directions must have a known pixel within a spacing of rays, and at most seven
+    neighbouring directions none. The surface of each known pixel is extended to the hole. These
+    predictions must agree to 10 % of inverse depth. Their mean, weighted by the reciprocal of the
+    steps, needs eight tenths of the votes. The confidence is half the least of the known pixels.
     """
     known = layers.filled_m > 0
     inverse = np.divide(1, layers.filled_m, out=np.zeros_like(layers.filled_m), where=known)
@@ -281,12 +255,7 @@ def _widest_gap(met):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  # type: ignore[no-untyped-def]
-    """Predict the depth of empty pixels from the first known pixels around them.
-
-    pixel: (P,) flat indices of the empty pixels, ascending. steps: (16,H,W) of `first_known`.
-    inverse: (H,W) inverse depth, 1/m. known: (H,W) confidence. found: (2,P) float32 output, depth
-    in m and least confidence, 0 where known pixels do not surround the hole or differ.
-    """
+    """Predict the depth of empty pixels from the first known pixels around them."""
     width = inverse.shape[1]
     met = np.empty(len(DIRECTIONS), np.bool_)
     for p in range(first, last):
@@ -310,4 +279,4 @@ def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  
             continue
         w = sum_w / weight
         if near - far <= _STAR_SPREAD * w:
-            found[0, p], found[1, p] = 1 / w, least
+            found[0, p], found[1, p] = 1 / w, least  # depth (m) and least confidence; 0 elsewhere

@@ -10,9 +10,9 @@ from densify.geometry.arrays import Bool, Float
 
 
 def half_spaces(corners: Float) -> Float:
-    """Return the (F,4) unit normal n and offset d of the sides of a convex hull.
+    """Return the (F,4) sides of the corners' (V,3) convex hull: unit normal n and offset d.
 
-    A point x is inside if n · x + d ≤ 0 for all sides. corners: (V,3).
+    A point x is inside if n · x + d ≤ 0 for all sides.
     """
     return np.unique(ConvexHull(corners).equations, axis=0)
 
@@ -20,12 +20,8 @@ def half_spaces(corners: Float) -> Float:
 def crossing(spaces: Float, start: Float, way: Float) -> tuple[Float, Float]:
     """Return the (K,) t at which lines start + t · way enter a convex body, and leave it.
 
-    A line that misses the body leaves before it enters.
-
-    Args:
-        spaces: (F,4) sides of the body, from `half_spaces`.
-        start: (K,3) start of each line, or (3,) of all.
-        way: (K,3) direction of each line.
+    A line that misses the body leaves before it enters. ``spaces`` is from `half_spaces`, ``way``
+    (K,3), ``start`` (K,3) or (3,) for all lines.
     """
     enter, leave = np.full(len(way), -np.inf), np.full(len(way), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -39,13 +35,7 @@ def crossing(spaces: Float, start: Float, way: Float) -> tuple[Float, Float]:
 
 
 def passes_near(corners: Float, start: Float, way: Float) -> Bool:
-    """Return (K,) True for lines that pass through a sphere around the corners of a body.
-
-    Args:
-        corners: (V,3) corners of the body.
-        start: (K,3) start of each line.
-        way: (K,3) direction of each line.
-    """
+    """Return (K,) True for lines, as in `crossing`, that meet a sphere around the corners (V,3)."""
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius_m = np.linalg.norm(corners - middle, axis=1).max()
     off = np.linalg.norm(np.cross(start - middle, way), axis=1)

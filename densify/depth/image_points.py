@@ -87,27 +87,23 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInIma
 def _pinhole(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> tuple[Float, Float, Float]:
-    """Return focal_px, slope and spacing_px of `PointsInImage` for z depth in a rectified image.
-
-    Patches count as facing the camera.
-    """
+    """Return focal_px, slope and spacing_px of `PointsInImage` for z depth in a rectified image."""
     focal_px = exposure.camera.K[[0, 1], [0, 1]]
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
     d = np.einsum("ij,ij->i", normal, points_cam)
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = normal[:, :2] / (d[:, None] * focal_px)
     everywhere = np.broadcast_to(focal_px, points_cam[:, :2].shape)
+    # Patches count as facing the camera.
     return everywhere, slope, spacing_m * focal_px / depth[:, None]
 
 
 def _any_lens(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> tuple[Float, Float, Float]:
-    """Return focal_px, slope and spacing_px of `PointsInImage` by the Jacobian J (2,3) at points p.
-
-    If a point moves on the plane n · p = d until the image moves by one pixel, p moves by δ = J⁺ -
-    p (n · J⁺) / d, the inverse depth by -δ_z / z², and the inverse range by -p · δ / r³.
-    """
+    """Return focal_px, slope and spacing_px of `PointsInImage` for any lens and measure."""
+    # If a point moves on the plane n · p = d until the image moves by one pixel, p moves by
+    # δ = J⁺ - p (n · J⁺) / d, the inverse depth by -δ_z / z², and the inverse range by -p · δ / r³.
     J = pixels_per_metre(exposure.camera, points_cam)
     focal_px = np.linalg.norm(J, axis=2) * depth[:, None]
     d = np.einsum("ij,ij->i", normal, points_cam)
@@ -130,16 +126,13 @@ def _any_lens(
 
 
 def _ages_ns(since_key_ns: Int, frame: np.ndarray, far: Bool) -> Int:
-    """Return the (K,) times between the points' sweeps and the key sweep.
-
-    Sweeps of the window whose times differ by less than 10 ms count as equally old. Otherwise clock
-    jitter would decide between the sweeps before and after the key sweep.
-    """
+    """Return the (K,) times between the points' sweeps and the key sweep."""
     ages_ns, near = np.abs(since_key_ns), np.flatnonzero(~far)
     first = int(frame[near].min(initial=np.iinfo(np.int32).max))
     of_sweep = np.zeros(max(0, int(frame[near].max(initial=-1)) + 1 - first), np.int64)
     of_sweep[frame[near] - first] = ages_ns[near]
     for younger, older in pairwise(np.argsort(of_sweep, kind="stable")):
+        # Else clock jitter would decide between the sweeps before and after the key sweep.
         if of_sweep[older] - of_sweep[younger] < _SAME_AGE_NS:
             of_sweep[older] = of_sweep[younger]
     ages_ns[near] = of_sweep[frame[near] - first]
@@ -168,15 +161,9 @@ def distance_behind(points: PointsInImage, camera: Camera) -> Float:
 def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
     """Raise ``canvas`` (H,W) float32 in place to the greatest inverse depth of the patches there.
 
-    A patch covers the pixel centres within ``half_px`` of its point. Its inverse depth is ``inverse
-    + slope · offset``, between half of ``inverse`` and all of it: no patch is nearer than its
-    point.
-
-    Args:
-        uv: (K,2) column and row of the points in px.
-        inverse: (K,) inverse depth of the points in 1/m.
-        slope: (K,2) slope of the inverse depth, 1/m per px.
-        half_px: (K,2) half width and height of the patches.
+    A patch covers the pixel centres within ``half_px`` (K,2) of its point uv (K,2). Its inverse
+    depth is ``inverse + slope · offset``, between half of ``inverse`` and all of it: no patch is
+    nearer than its point. ``inverse`` (K,) is in 1/m, ``slope`` (K,2) in 1/m per px.
     """
     height, width = canvas.shape
     for i in range(len(inverse)):
@@ -197,12 +184,8 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
 def sorted_by_pixel(points: PointsInImage, rank: Int, camera: Camera) -> tuple[Int, Int]:
     """Sort the points by pixel, the best point of each pixel first.
 
-    Args:
-        rank: (K,) rank of each point. The lowest comes first, then the nearest.
-
-    Returns:
-        ``start`` (H·W+1,) and ``order`` (K,): the points of pixel p are ``order[start[p]:start[p +
-            1]]``.
+    The lowest ``rank`` (K,) comes first, then the nearest point. Returns ``start`` (H·W+1,) and
+    ``order`` (K,): the points of pixel p are ``order[start[p]:start[p + 1]]``.
     """
     column, row = np.rint(points.uv).astype(np.int64).T
     start = np.empty(camera.height_px * camera.width_px + 1, np.int64)

@@ -35,10 +35,7 @@ class Layers:
         return np.sqrt(self.spacing_px[..., 0] * self.spacing_px[..., 1])
 
     def part(self, box: tuple[slice, slice]) -> Layers:
-        """Return a box of the layers as views: writing to the box changes these layers.
-
-        box: rows and columns of the image.
-        """
+        """Return a box of rows and columns as views: writing to the box changes these layers."""
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         images = {n: v[box] for n, v in values.items() if isinstance(v, np.ndarray)}
         return Layers(**values | images)

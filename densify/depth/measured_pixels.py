@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Compute the depth that the points in an image give its pixels.
 
-Among the points in a pixel that are not occluded, the point measured nearest in time to the key
-sweep wins. A plane is fitted to the surrounding points that agree with it, and the pixel gets the
-depth of the plane at its centre. The pixel is measured if, of all sweeps with points around it, the
-one nearest to the key is among those that agree. Close to a depth discontinuity it becomes a
-boundary pixel.
+Among the visible points in a pixel, the one measured nearest in time to the key sweep wins. A plane
+is fitted to the surrounding points that agree with it, and the pixel gets the depth of the plane at
+its centre. The pixel is measured if, of all sweeps with points around it, the one nearest to the
+key is among those that agree. Close to a depth discontinuity it becomes a boundary pixel.
 """
 
 from __future__ import annotations
@@ -68,9 +67,8 @@ def nearest_pixels(
 ) -> MeasuredPixels:
     """Return the nearest point of each pixel, without occlusion or support tests.
 
-    Args:
-        confidence: (K,) confidence of the points.
-        reason: (M,) `Reason` of each point of the cloud, changed in place to NOT_CHOSEN.
+    ``confidence`` (K,) is that of the points in the image. The ``reason`` (M,) in the cloud becomes
+    NOT_CHOSEN in place.
     """
     start, order = sorted_by_pixel(points, np.zeros(len(points.index), np.int64), camera)
     pixel = np.flatnonzero(np.diff(start))
@@ -85,13 +83,10 @@ def nearest_pixels(
 def visible_pixels(
     points: PointsInImage, camera: Camera, reason: NDArray[np.uint8]
 ) -> MeasuredPixels:
-    """Return the pixels that visible points measure.
+    """Return the pixels that visible points measure; set ``reason`` (M,) of points in the image.
 
     Points beyond the window come second. They measure pixels that the window leaves empty, away
     from depth discontinuities.
-
-    Args:
-        reason: (M,) `Reason` of each point of the cloud, changed in place for points in the image.
     """
     near = np.flatnonzero(~points.far)
     many = len(np.unique(points.frame[near]))
@@ -112,13 +107,7 @@ def visible_pixels(
 def _settled(
     points: PointsInImage, camera: Camera, many: int, taken: Bool | None = None
 ) -> tuple[MeasuredPixels, NDArray[np.uint8]]:
-    """Return the pixels that points measure, and the (K,) `Reason` of every point.
-
-    Args:
-        many: Number of agreeing sweeps that leaves no doubt.
-        taken: (H·W,) pixels to leave alone. If given, the rules for points beyond the window hold:
-            the sweep nearest to the key need not agree, but six sweeps must.
-    """
+    """Return the pixels that points measure, and the (K,) `Reason` of every point."""
     behind = distance_behind(points, camera)
     hidden = behind > 1
     reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
@@ -128,12 +117,13 @@ def _settled(
         supported = supported > 0
         inside = edge >= 1
     else:
+        # Beyond the window the sweep nearest to the key need not agree, but six sweeps must.
         supported, inside = num_sweeps >= _FAR_SWEEPS, edge >= _FAR_EDGE
         reason[winner[~inside]] = Reason.EDGE
     reason[winner[~supported]] = Reason.UNSUPPORTED
     doubts = np.stack(
         [
-            1 - np.minimum(num_sweeps / max(many, 1), 1),
+            1 - np.minimum(num_sweeps / max(many, 1), 1),  # ``many`` sweeps leave no doubt
             1 - np.minimum(num_points / _MANY_POINTS, 1),
             np.clip(3 - edge, 0, 2) / 2,
             np.minimum(residual_m / _ROUGH_M, 1),
@@ -162,14 +152,11 @@ class _Visible(NamedTuple):
 def _found(
     points: PointsInImage, hidden: Bool, camera: Camera, taken: Bool | None
 ) -> tuple[Int, Int, Float32]:
-    """Return the pixels (P,) with points, the best point of each (P,), and (6,P) of `_settle`.
-
-    Pixels with only occluded points are left out, and so are the pixels ``taken`` (H·W,).
-    """
+    """Return pixels (P,) with visible points, the best point of each, and (6,P) of `_settle`."""
     last = int(points.age_ns.max(initial=0)) + 1
     start, order = sorted_by_pixel(points, np.where(hidden, last, points.age_ns), camera)
     found = np.zeros((6, len(start) - 1), np.float32)
-    done = np.zeros(len(start) - 1, bool) if taken is None else taken
+    done = np.zeros(len(start) - 1, bool) if taken is None else taken  # left out
     inverse = points.inverse
     edge_px = FOOTPRINT * points.spacing_px[:, 0] + _SLACK_M * points.focal_px[:, 0] * inverse
     visible = _Visible(
@@ -216,15 +203,10 @@ def _count(seen):  # type: ignore[no-untyped-def]
 
 @inlined
 def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # type: ignore[no-untyped-def]
-    """Compare the points around pixel (v0, u0) with the tangent plane of point i.
-
-    The plane has inverse depth ``centre`` (1/m) in the pixel, and visible points within ``agree``
-    (1/m) of it agree. Points farther behind it within ``outer`` (px) show a discontinuity. The
-    moments m (9,) of the fit and the extent of the surface, reach (8,), are filled in. Return a bit
-    for each sweep that agrees, and True if none of the other sweeps with points there is nearer to
-    the key. Return also the number of points in the fit, their weighted sum of squares, and True if
-    a point is close behind.
-    """
+    """Compare the points around pixel (v0, u0) with the tangent plane of point i."""
+    # The plane has inverse depth centre (1/m) in the pixel, and visible points within agree (1/m)
+    # of it agree. Points farther behind it within outer (px) show a discontinuity. Filled in are
+    # moments m (9,) of the fit and the extent of the surface, reach (8,).
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
     su, sv, w0 = points.slope[i, 0], points.slope[i, 1], inverse[i]
@@ -262,18 +244,17 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
             m[8] += weight * dv * off
             squares += weight * off * off
             num += vouches
+    # A bit for each sweep that agrees; True if no other sweep there is nearer to the key; number of
+    # points in the fit, their weighted sum of squares; True if a point is close behind.
     return seen, agree_ns <= other_ns, num, squares, behind
 
 
 @Kernel
 def _settle(first, last, points, shape, taken, found):  # type: ignore[no-untyped-def]
-    """Find the depth of each pixel from the surrounding points that agree with its first point.
-
-    points: `_Visible`. taken: (P,) pixels to leave alone. found: (6,P) float32 output: depth (m),
-    number of sweeps that agree, 1 if no sweep nearer to the key disagrees, number of points in the
-    fit, their root mean square residual (m), and extent of the surface as a multiple of the radius
-    of discontinuities.
-    """
+    """Find the depth of each pixel from the surrounding points that agree with its first point."""
+    # found (6,P): depth (m), sweeps that agree, 1 if no sweep nearer to the key disagrees, points
+    # in the fit, their root mean square residual (m), extent of the surface in radii of
+    # discontinuities
     m, reach = np.empty(9), np.empty(8)
     for p in range(first, last):
         i = points.start[p]

@@ -3,10 +3,9 @@
 
 Dark paint and glass give few returns, and other sweeps measured the background there. Every moving
 object has a body: the convex hull of its points of the window, at the key sweep's time. The rays of
-all sweeps are moved along with it. It is closed where they end on it, and open where they pass.
-
-The front of a body is the nearest surface of the hull in each pixel, moved smoothly onto the
-object's own returns. Pixels well inside the closed part show it, the image decides the silhouette.
+all sweeps are moved along with it. It is closed where they end on it, and open where they pass. Its
+front is the nearest surface of the hull in each pixel, moved smoothly onto the object's own
+returns. Pixels well inside the closed part show it, the image decides the silhouette.
 """
 
 from __future__ import annotations
@@ -62,12 +61,7 @@ def moving_bodies(
 ) -> dict[int, MovingBody]:
     """Return the bodies of moving objects in view of a camera, by instance number.
 
-    Objects whose points span no volume have no body.
-
-    Args:
-        cloud: Points of the window at the key sweep's reference time.
-        rays: Origins of the rays that measured these points.
-        exposures: Cameras and times of the depth maps.
+    Objects whose points span no volume have no body. The ``rays`` measured the ``cloud``.
     """
     moving = np.flatnonzero(cloud.moving & (cloud.instance >= 0))
     instance = cloud.instance[moving]
@@ -114,10 +108,7 @@ def _corners(points: Float) -> Float:
 def _met(
     cloud: Cloud, instance: int, corners: Float, rays: ObjectRays
 ) -> tuple[Float, Bool, NDArray[np.integer]]:
-    """Return entries, ends and frame of the rays that meet a hull, as in `MovingBody`.
-
-    corners: (V,3) corners of the hull of object ``instance``. rays: rays of all sweeps toward it.
-    """
+    """Return entries, ends and frame of the rays that meet a hull (V,3), as in `MovingBody`."""
     rays = rays.select(passes_near(corners, rays.start, rays.way))
     enter, leave = crossing(half_spaces(corners), rays.start, rays.way)
     meets = (enter > 0) & (enter < np.minimum(leave, 1))
@@ -132,8 +123,7 @@ def close_bodies(
     """Return the layers with the surfaces of moving bodies; ``solid`` marks their pixels.
 
     Depths clearly in front of a body stay. Elsewhere inside the outline of its hull only depths of
-    moving objects stay. Pixels with a return of the body on its surface count as measured. cloud:
-    points at the key sweep's reference time. bodies: bodies by instance number.
+    moving objects stay. Pixels with a return of the body on its surface count as measured.
     """
     changed = ("depth_m", "filled_m", "confidence", "tilt", "point")
     layers = replace(layers, **{name: getattr(layers, name).copy() for name in changed})
@@ -171,14 +161,10 @@ def outlines(bodies: Iterable[MovingBody], exposure: Exposure) -> Bool:
 
 
 class _Front(NamedTuple):
-    """The nearest surface of a body's hull in each pixel of the image.
+    """The nearest surface of a body's hull in each pixel of the image."""
 
-    box: rows and columns of the image around the hull, h by w pixels. inverse: (h,w) inverse depth
-    of the surface in 1/m, 0 outside the outline of the hull.
-    """
-
-    box: tuple[slice, slice]
-    inverse: Float
+    box: tuple[slice, slice]  # rows and columns of the image around the hull, h by w pixels
+    inverse: Float  # (h,w) inverse depth of the surface in 1/m, 0 outside the outline of the hull
 
     @staticmethod
     def of(body: MovingBody, exposure: Exposure, margin_px: int) -> _Front | None:
@@ -241,10 +227,8 @@ class _Pixels(NamedTuple):
 def _close(
     layers: Layers, cloud: Cloud, exposure: Exposure, rows: Int, body: MovingBody, front: _Front
 ) -> Bool:
-    """Put the surface of one body into ``layers`` in place; return (h,w) True at its pixels.
-
-    layers: part of the map in the box of ``front``. rows: indices of its points in the cloud.
-    """
+    """Put a body into ``layers``, cut to the front's box; return (h,w) True at its pixels."""
+    # rows: of the body's points in the cloud
     surface = _surface(layers, rows, front)
     surface_m = (1 / surface).astype(np.float32)
     agree_m = _AGREES * (AGREE_M + AGREE_FRACTION * surface_m)
@@ -282,11 +266,7 @@ def _surface(layers: Layers, rows: Int, front: _Front) -> Float:
 def _shown(
     layers: Layers, cloud: Cloud, surface: Float, agree_m: Float32, share: Float
 ) -> tuple[Bool, Bool]:
-    """Return (h,w) the pixels that show a body, and (h,w) the pixels where its returns count.
-
-    Other depths in its outline are removed from ``layers``. surface: (h,w) its inverse depth, 1/m.
-    agree_m: (h,w) tolerance behind it. share: (h,w) rays that end on it, 0 outside its outline.
-    """
+    """Return (h,w) the pixels that show a body, and (h,w) the pixels where its returns count."""
     inside, now_m, surface_m = share > 0, layers.filled_m, (1 / surface).astype(np.float32)
     whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
     before = (now_m > 0) & (now_m < surface_m - HIDDEN_M - HIDDEN_FRACTION * surface_m)
@@ -296,6 +276,7 @@ def _shown(
     outline = inside & ~before & ~core & ~(moves & (layers.depth_m <= surface_m + agree_m))
     if not whole:
         outline &= share >= _LEAST_OF_WHOLE
+    # Other depths in the outline are removed.
     for values in (layers.depth_m, layers.filled_m, layers.confidence):
         values[outline] = 0
     layers.filled_m[core] = surface_m[core]
@@ -315,10 +296,7 @@ def _well_inside(closed: Bool, away_px: float) -> Bool:
 
 
 def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
-    """Return the (h,w) smooth offset o, in 1/m, of the pixels ``inside`` (h,w).
-
-    It minimises Σ known (o - offset)² + `_STIFF` Σ |∇o|² + `_HELD` Σ o².
-    """
+    """Return the (h,w) smooth offset (1/m) inside a body's outline, near the known offset."""
     number = np.cumsum(inside).reshape(inside.shape) - 1
     across, down = inside[:, :-1] & inside[:, 1:], inside[:-1] & inside[1:]
     one = np.concatenate([number[:, :-1][across], number[:-1][down]])
@@ -326,6 +304,7 @@ def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
     num = int(inside.sum())
     joins = sparse.coo_matrix((np.full(len(one), _STIFF), (one, other)), (num, num)).tocsr()
     joins = joins + joins.T
+    # The offset o minimises Σ known (o - offset)² + _STIFF Σ |∇o|² + _HELD Σ o².
     weight = known[inside].astype(np.float64)
     diagonal = np.asarray(joins.sum(axis=1)).ravel() + weight + _HELD
     found = np.zeros(inside.shape)

@@ -32,10 +32,7 @@ from the right. Each step goes to one of the eight neighbours."""
 
 
 def first_known(known: Bool) -> NDArray[np.uint8]:
-    """Return the (16,H,W) steps to the first known pixel in each of `DIRECTIONS`.
-
-    The number is 0 at a known pixel, and `NONE` if there is no known pixel in the direction.
-    """
+    """Return (16,H,W) steps to the first known pixel by `DIRECTIONS`: 0 at one, else `NONE`."""
     padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
     steps = padded[:, 2:-2, 2:-2]
     steps[:] = np.where(known, np.uint8(0), np.uint8(NONE))
@@ -45,10 +42,7 @@ def first_known(known: Bool) -> NDArray[np.uint8]:
 
 @Kernel
 def _march(steps):  # type: ignore[no-untyped-def]
-    """Fill in the steps to known pixels.
-
-    steps: (16,H+4,W+4), 0 at known pixels, with a border of two pixels that stays unchanged.
-    """
+    """Fill in steps (16,H+4,W+4), 0 at known pixels; the border of two pixels stays unchanged."""
     height, width = steps.shape[1:]
     for d in range(len(DIRECTIONS)):
         u1, v1, u2, v2 = DIRECTIONS[d].ravel()
@@ -81,11 +75,8 @@ def offset(d, k):  # type: ignore[no-untyped-def]
 def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
     """Return the inverse depth of a pixel if the surface of pixel (v, u) is extended to it.
 
-    du and dv: columns and rows from the pixel to (v, u).
-
-    Args:
-        inverse: (H,W) inverse depth in 1/m.
-        tilt: (H,W,2) slope of the inverse depth to the right and down, 1/m per px.
+    Pixel (v, u) is du columns and dv rows away. ``inverse`` (H,W) is in 1/m, ``tilt`` (H,W,2) is
+    its slope to the right and down in 1/m per px.
     """
     there = inverse[v, u]
     return limited(there - tilt[v, u, 0] * du - tilt[v, u, 1] * dv, there)
@@ -108,12 +99,9 @@ def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
 def plane(n, u, v, uu, uv, vv, w, uw, vw, ridge):  # type: ignore[no-untyped-def]
     """Return the inverse depth at the origin and both slopes of the least-squares plane.
 
-    The other arguments are sums over pixels: of the weight (n), and of the weight times products of
-    column offset u, row offset v and inverse depth w, as their names say.
-
-    Args:
-        ridge: Variance in px² added in both directions, so that pixels on one line do not tilt the
-            plane across the line.
+    ``ridge`` is a variance in px² added in both directions. With it, pixels on one line do not tilt
+    the plane across the line. The other arguments are sums over pixels: of the weight (n), and of
+    the weight times products of column offset u, row offset v and inverse depth w.
     """
     u, v, w = u / n, v / n, w / n
     uu, vv, uv = uu / n - u * u + ridge, vv / n - v * v + ridge, uv / n - u * v

@@ -36,11 +36,8 @@ def complete_boxes(
 ) -> tuple[ObjectTrack, ...]:
     """Return the tracks with completed boxes, and with the sides that were seen.
 
-    Args:
-        tracks: Tracks with the boxes around the objects' points.
-        cloud: Points of the window at the key sweep's reference time.
-        rays: Origins of the rays that measured these points.
-        ground: Height map of the ground, in the world of the rays' sweeps.
+    The boxes of ``tracks`` are around the objects' points. The ``rays`` measured the ``cloud``.
+    ``ground`` is in the world of their sweeps.
     """
     tracks = [_on_ground(track, rays, ground) for track in tracks]
     reach = {track.instance: _reach(track, rays.key) for track in tracks}
@@ -91,10 +88,7 @@ def corners_of(size_m: Float) -> Float:
 
 
 def _completed(track: ObjectTrack, start: Float, way: Float) -> ObjectTrack:
-    """Return a track with its completed box.
-
-    start and way: (K,3) rays toward the object, in the object's frame at the key.
-    """
+    """Return a track with its completed box, from rays (K,3) in the object's frame at the key."""
     seen, missing_m = list[str](), _missing_m(track.size_m)
     reach_m = track.size_m / 2 + missing_m + _BESIDE_M
     enter, leave = crossing(_box_spaces(-reach_m, reach_m), start, way)

@@ -15,15 +15,11 @@ from densify.geometry.types import Cloud
 
 
 class ObjectRays(NamedTuple):
-    """K rays, moved along with an object from their sweep to the key's time.
+    """K rays in the key sweep's lidar frame, moved along with an object to the key's time."""
 
-    rows: (K,) indices of their returns in the cloud. start and way: (K,3) origin of each ray, and
-    vector from there to the return, key sweep's lidar frame.
-    """
-
-    rows: Int
-    start: Float
-    way: Float
+    rows: Int  # (K,) indices of the returns in the cloud
+    start: Float  # (K,3) origin of each ray
+    way: Float  # (K,3) vector from there to the return
 
     def select(self, keep: Bool) -> ObjectRays:
         """Return the rays where ``keep`` (K,) is True."""
@@ -35,11 +31,8 @@ def rays_toward(
 ) -> dict[int, ObjectRays]:
     """Return the rays of all sweeps that may meet the hull of each object, by instance number.
 
-    Args:
-        cloud: Points of the window at the key sweep's reference time.
-        rays: Origins of the rays that measured these points.
-        own: Indices of each object's points in the cloud.
-        corners: (V,3) corners of each object's hull at the key's time.
+    ``own`` are the indices of each object's points in the cloud, ``corners`` (V,3) those of its
+    hull at the key's time.
     """
     found: dict[int, list[ObjectRays]] = {k: [] for k in own}
     for frame in rays.stretch.frames if own else ():
@@ -69,16 +62,12 @@ def rays_toward(
 
 
 class _Returns(NamedTuple):
-    """The N returns of one sweep in a cloud, key sweep's lidar frame.
+    """The N returns of one sweep in a cloud, key sweep's lidar frame."""
 
-    rows: (N,) their indices in the cloud. origin: (3,) lidar at the sweep's reference time. level:
-    (2,N) horizontal positions from there in metres. moved_m: greatest distance of a ray's start.
-    """
-
-    rows: Int
-    origin: Float
-    level: Float32
-    moved_m: float
+    rows: Int  # (N,) indices in the cloud
+    origin: Float  # (3,) lidar at the sweep's reference time
+    level: Float32  # (2,N) horizontal positions from there in metres
+    moved_m: float  # greatest distance of a ray's start from the lidar
 
     @staticmethod
     def of(cloud: Cloud, rays: Rays, frame: int) -> _Returns:

@@ -33,8 +33,6 @@ def patches(
     are on no single surface, the patch faces the scanner.
 
     Args:
-        cloud: M accumulated points.
-        sensors: Scanners, with the angles between their rays.
         origins: (S,3) origins of the scanners, key sweep's lidar frame, by frame number.
         wanted: (M,) True for points in view of a camera, None for all. Other points get zeros.
     """
@@ -60,7 +58,6 @@ def tangents(
     neighbouring rays, along the azimuth and along the elevation.
 
     Args:
-        points: (M,3) rigid positions in metres.
         lidar: (M,) number of the scanner of each point.
         sweep: (M,) index of each point's sweep in ``origins``.
         origins: (S,3) origins of the scanners for each sweep, in the frame of the points.
@@ -88,10 +85,7 @@ def tangents(
 
 @Kernel
 def _look(first, last, points, origins, place, seen):  # type: ignore[no-untyped-def]
-    """Fill ``seen`` (3,N) float32 with azimuth, elevation (rad) and range (m) of points (N,3).
-
-    Each point is seen from origin ``origins[place[i]]``, with origins (P,3) and place (N,).
-    """
+    """Fill ``seen`` (3,N) with azimuth, elevation (rad) and range (m) of points (N,3)."""
     for i in range(first, last):
         x = points[i, 0] - origins[place[i], 0]
         y = points[i, 1] - origins[place[i], 1]
@@ -134,10 +128,7 @@ def _before(seen, i, j):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _nearest_in_cells(seen, members, grid, cells):  # type: ignore[no-untyped-def]
-    """Fill ``cells`` (R,C) int32 with the index of the nearest member in each cell, -1 none.
-
-    members: (n,) indices of points. Between equally near points the direction decides.
-    """
+    """Fill ``cells`` (R,C) with the index of the nearest of the members in each cell, -1 none."""
     cells[:] = -1
     for i in members:
         row, column = _cell(seen[0, i], seen[1, i], grid)
@@ -160,12 +151,9 @@ def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
 
 @inlined
 def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
-    """Return the slope of inverse range per radian from its slopes on both sides (NaN: unknown).
-
-    If both sides are on the same surface it is their mean. Otherwise it is the lesser slope, or 0
-    if that is a step in depth. step: usual angle in rad.
-    """
+    """Return the slope of inverse range per radian from its slopes on both sides (NaN: unknown)."""
     metres = step * range_m * range_m  # of range per step, by a unit of slope
+    # On one surface the mean, else the lesser slope, or 0 if that is a step in depth; step in rad
     if abs(one - other) * metres <= _BEND_M + _BEND * abs(one + other) * metres:
         return 0.5 * (one + other)
     if not abs(one) <= abs(other):  # NaN too
@@ -175,11 +163,7 @@ def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
 
 @inlined
 def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-untyped-def]
-    """Return the change of inverse range per radian along one angle, NaN without a point.
-
-    axis: the angle, 0 azimuth or 1 elevation. The change by the other angle ``across``, whose slope
-    is ``slope_across``, is removed. there: index of the compared point, -1 none.
-    """
+    """Return the change of inverse range per radian along axis 0 (azimuth) or 1, NaN unknown."""
     if there < 0:
         return np.nan
     apart = seen[axis, there] - seen[axis, i]
@@ -187,19 +171,18 @@ def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-unty
         apart -= 2 * np.pi * np.rint(apart / (2 * np.pi))
     if abs(apart) < 1e-5:
         return np.nan
+    # The change by the other angle is removed.
     beside = seen[across, there] - seen[across, i]
     return (1 / seen[2, there] - 1 / seen[2, i] - slope_across * beside) / apart
 
 
 @inlined
 def _put(i, seen, table, level, rise, normal, spacing):  # type: ignore[no-untyped-def]
-    """Fill in normal and spacing of point i from its slopes of inverse range per radian.
-
-    level and rise: slopes along the azimuth and the elevation.
-    """
+    """Fill in normal and spacing of point i from its slopes of inverse range per radian."""
     azimuth, elevation, range_m = seen[0, i], seen[1, i], seen[2, i]
     across, along = _spacing(azimuth, elevation, table)
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+    # level: slope along the azimuth, rise: along the elevation
     aside = level / max(ce, 1e-3)
     normal[i, 0] = ce * ca / range_m - aside * sa - rise * se * ca
     normal[i, 1] = ce * sa / range_m + aside * ca - rise * se * sa
@@ -210,10 +193,7 @@ def _put(i, seen, table, level, rise, normal, spacing):  # type: ignore[no-untyp
 
 @Kernel
 def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
-    """Fill normal (N,3) and spacing (N,2) of points from neighbours on the ring, above and below.
-
-    members: (n,) indices of the points. seen: (3,N) of `_look`. cells: of `_nearest_in_cells`.
-    """
+    """Fill normal (N,3) and spacing (N,2) of members from neighbours on the ring, above, below."""
     right, left = np.array([-2, -1, -3]), np.array([2, 1, 3])
     same = np.array([0, 0, 0])
     up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
@@ -236,11 +216,7 @@ def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, s
 
 @Kernel
 def _tangents_anywhere(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
-    """Fill normal and spacing of points of a scanner without rings, as `_tangents_on_rings` does.
-
-    A plane is fitted by least squares to the points around, then to the points close to this plane.
-    If the plane does not fit half of them, the patch faces the scanner.
-    """
+    """Fill normal and spacing as `_tangents_on_rings`, for a scanner without rings."""
     num_rows, num_columns = cells.shape
     for k in range(first, last):
         i = members[k]
@@ -249,7 +225,7 @@ def _tangents_anywhere(first, last, members, seen, table, grid, cells, normal, s
         spacing_rad = _spacing(seen[0, i], seen[1, i], table)[1]
         reach = min(1 + int(_AROUND * spacing_rad / grid.bin_rad), _MOST_CELLS)
         level, rise = 0.0, 0.0
-        for turn in range(2):
+        for turn in range(2):  # a plane to the points around, then to those close to it
             uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0
             num, num_kept = 0, 0
             for r in range(max(row - reach, 0), min(row + reach, num_rows - 1) + 1):
@@ -270,6 +246,6 @@ def _tangents_anywhere(first, last, members, seen, table, grid, cells, normal, s
                     uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
             ridge = _RIDGE * (uu + vv) + 1e-12
             level, rise = slopes(uu + ridge, uv, vv + ridge, uw, vw)
-            if 2 * num_kept < num:
+            if 2 * num_kept < num:  # no plane: the patch faces the scanner
                 level, rise = 0.0, 0.0
         _put(i, seen, table, level * flatten, rise, normal, spacing)

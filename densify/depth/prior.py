@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Complete depth from a depth image of the user (the prior), such as one of a monocular network.
 
-A curve, fitted by robust least squares, converts the values of the prior to metres. The remaining
-error differs over the image. It is corrected by a membrane in the logarithm of depth, tied to the
-known pixels and torn at the prior's own depth discontinuities (random walks, Grady, "Random walks
-for image segmentation", PAMI 2006).
+A robust curve converts the values of the prior to metres. The remaining error differs over the
+image. It is corrected by a membrane in the logarithm of depth, tied to the known pixels and torn at
+the prior's own depth discontinuities (random walks, Grady, "Random walks for image segmentation",
+PAMI 2006).
 """
 
 from __future__ import annotations
@@ -43,11 +43,8 @@ def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
     at its far limit. Pixels on the blurred transition between two surfaces stay empty too. A prior
     that does not fit is not used. Confidences are a ranking. A pixel of the prior has at most 0.2,
     less where the prior is steep or deviates from known pixels nearby. All known pixels have more.
-
-    Args:
-        maps: Depth map, whose pixels keep their depth.
-        prior: Depth image of the same shape, with the same measure of depth.
-        kind: Kind of the prior's values, ``depth``, ``inverse`` or ``auto``.
+    The prior has the map's shape and measure of depth. The ``kind`` of its values is ``depth``,
+    ``inverse`` or ``auto``.
     """
     known = (prior.value > 0) & ~prior.sky
     above = MOST_CONFIDENCE + (1 - MOST_CONFIDENCE) * maps.confidence
@@ -80,12 +77,8 @@ def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
 def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
     """Return the curve from the values of a prior to depth with the least ``residual``.
 
-    A curve that turns near into far is rejected.
-
-    Args:
-        value: (N,) values of the prior, above 0.
-        depth_m: (N,) measured depths of the same pixels, above 0.
-        kind: Kind of the values, as in `complete`.
+    A curve that turns near into far is rejected. ``value`` and ``depth_m``, both (N,) and above 0,
+    are of the same pixels. ``kind`` is as in `complete`.
     """
     p, z = value.astype(np.float64), depth_m.astype(np.float64)
     fits = [_fitted(form, p, z) for form in _FORMS[kind]]
@@ -93,15 +86,14 @@ def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
 
 
 def _fitted(form: str, p: Float, z: Float) -> PriorFit:
-    """Fit one form of curve to values p (N,) and depths z (N,) by their medians in steps of depth.
-
-    Measured depth counts as exact, the prior's values do not. Medians tolerate a tenth of outliers.
-    """
+    """Fit one form of curve to values p (N,) and depths z (N,) by medians in steps of depth."""
     if len(z) < _MIN_FITTED:
         return PriorFit(form, 0.0, 0.0, np.inf, 1.0, False)
     step = np.floor(np.log(z / z.min()) / _USUAL).astype(np.int64)
     num = np.bincount(step)
     steps = np.flatnonzero(num)
+    # Measured depth counts as exact, the prior's values do not. Medians tolerate a tenth of
+    # outliers.
     middle_p = ndimage.median(p, step, steps)
     scale, shift = _line(form, middle_p, ndimage.median(z, step, steps))
     off = np.abs(_log_depth(p, PriorFit(form, scale, shift, np.inf, 1.0, False)) - np.log(z))
@@ -112,15 +104,12 @@ def _fitted(form: str, p: Float, z: Float) -> PriorFit:
 
 
 def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
-    """Return scale and shift of the curve of one form through values p and depths z.
-
-    The form is linear in both. Its weights make residuals close to residuals of the logarithm of
-    depth.
-    """
+    """Return scale and shift of the curve of one form, linear in both, through p and z."""
     unit, one = float(np.median(p)), np.ones(len(z))
     if form == "log":
         columns, target = [np.log(p / unit), one], np.log(z)
     else:
+        # The weights make residuals close to residuals of the logarithm of depth.
         weight = z if form == "inverse" else 1 / z
         columns, target = [p / unit * weight, weight], one
     A = np.stack(columns, axis=1)
@@ -151,15 +140,11 @@ def _at_far_limit(value: Float32, known: Bool, fit: PriorFit) -> Bool:
 
 
 class _Cells(NamedTuple):
-    """The image in square cells of ``size`` pixels, R rows and C columns.
-
-    guide: (R,C) logarithm of depth at the central pixel of each cell. of: (H,W) number of each
-    pixel's cell, row by row.
-    """
+    """The image in square cells of ``size`` pixels, R rows and C columns."""
 
     size: int
-    guide: Float
-    of: Int
+    guide: Float  # (R,C) logarithm of depth at the central pixel of each cell
+    of: Int  # (H,W) number of each pixel's cell, row by row
 
     @staticmethod
     def over(guide: Float32) -> _Cells:
@@ -174,30 +159,25 @@ class _Cells(NamedTuple):
         return _Cells(size, guide[np.ix_(rows, columns)].astype(np.float64), of)
 
     def membrane(self) -> sparse.csr_array:
-        """Return the (RC,RC) matrix of the squared differences between neighbouring cells.
-
-        A difference counts less the more the guides of both cells differ.
-        """
+        """Return the (RC,RC) matrix of the squared differences between neighbouring cells."""
         number = np.arange(self.guide.size).reshape(self.guide.shape)
         first = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
         second = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
         step = (self.guide.ravel()[first] - self.guide.ravel()[second]) / _USUAL
-        tied = _SMOOTHNESS * np.exp(-(step**2))
+        tied = _SMOOTHNESS * np.exp(-(step**2))  # less, the more the guides of both cells differ
         half = sparse.coo_array((tied, (first, second)), shape=(number.size, number.size))
         both = (half + half.T).tocsr()
         return sparse.diags_array(both.sum(axis=1)) - both
 
     def at_pixels(self, values: Float, guide: Float32) -> Float:
-        """Return (K,H,W) values (K,RC) of cells, interpolated between four cells.
-
-        Cells on another surface, by their guide, hardly count.
-        """
+        """Return (K,H,W) values (K,RC) of cells, interpolated between four cells."""
         grid = values.reshape(-1, *self.guide.shape)
         down, right = ((np.arange(length) - self.size // 2) / self.size for length in guide.shape)
         total, result = np.zeros(guide.shape), np.zeros((len(grid), *guide.shape))
         for row, row_weight in _both_ways(down, self.guide.shape[0]):
             for column, column_weight in _both_ways(right, self.guide.shape[1]):
                 place = np.ix_(row, column)
+                # Cells on another surface, by their guide, hardly count.
                 alike = np.exp(-(((guide - self.guide[place]) / _USUAL) ** 2)) + np.finfo(float).eps
                 weight = alike * np.outer(row_weight, column_weight)
                 total += weight
@@ -215,12 +195,8 @@ def _both_ways(place: Float, num: int) -> list[tuple[Int, Float]]:
 def _correction(
     filled_m: Float32, log_depth: Float, guide: Float32, steepness: Float32, usable: Bool
 ) -> tuple[Float, Float]:
-    """Return (H,W) the correction of the logarithm of depth, and (H,W) its remaining error.
-
-    The error is the mean error of known pixels nearby on the same surface. Far from known pixels
-    there is no correction, and the error is the mean over the image. filled_m: known depth, 0 none.
-    log_depth: logarithm of the prior's depth; guide: smoothed; steepness: its range around a pixel.
-    """
+    """Return (H,W) the correction of the logarithm of depth, and (H,W) its remaining error."""
+    # guide: the prior's log_depth smoothed, steepness: its range around a pixel
     cells = _Cells.over(guide)
     area, num = cells.size**2, cells.guide.size
     near = usable & (filled_m > 0) & (np.abs(guide - cells.guide.ravel()[cells.of]) < _USUAL)
@@ -246,6 +222,7 @@ def _correction(
     mean = float(np.average(np.abs(lacking), weights=flat)) if len(flat) else 0.0
     trust = flat * trusted(lacking - at_rest(flat, lacking, 0.0)[cell])
     correction = at_rest(trust, lacking, 0.0)
+    # The mean error of known pixels nearby on the same surface; far from them, of the image.
     spread = at_rest(trust, np.abs(lacking - correction[cell]), mean)
     at_pixels = cells.at_pixels(np.stack([correction, spread]), guide)
     return at_pixels[0], at_pixels[1]

@@ -44,12 +44,10 @@ def project(
 ) -> DepthMap:
     """Return the depth map of a cloud in the view of a camera.
 
+    Moving objects are shown at their position at the view's time. Without ``settings.visibility``
+    each pixel takes its nearest point.
+
     Args:
-        cloud: M accumulated points at the key sweep's reference time.
-        view: Points of the cloud in the image, with its camera and time. Moving objects are shown
-            at their position then.
-        settings: Section ``project``. Without ``visibility`` each pixel takes its nearest point.
-        patches: Surface patches of the cloud.
         filled: False leaves out the fill.
         lab: (H,W,3) image in L*a*b*. If None, no boundary pixel is accepted by it.
         rays: Rays of the window. If None, no pixel is rejected as seen through.
@@ -112,12 +110,7 @@ def _layers_of(
 
 
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
-    """Return the (H,W,2) spacing of rays across and down, the mean over blocks of pixels.
-
-    Blocks without points take the spacing of the nearest block. A block takes the downward spacing
-    of the block above or below if that is far larger, because the hole below the last of a
-    scanner's denser rings is as wide.
-    """
+    """Return the (H,W,2) spacing of rays across and down, the mean over blocks of pixels."""
     height, width = (-(-size // _BLOCK_PX) for size in shape)
     column, row = np.rint(points.uv).astype(np.int64).T // _BLOCK_PX
     block = row * width + column
@@ -129,6 +122,8 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     empty = (num == 0).reshape(height, width)
     nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     blocks = mean.reshape(height, width, 2)[tuple(nearest)]
+    # A block takes the downward spacing of the block above or below if that is far larger: the hole
+    # below the last of a scanner's denser rings is as wide.
     down_px = blocks[..., 1]
     widest_px = ndimage.maximum_filter1d(down_px, 3, axis=0)
     blocks[..., 1] = np.where(widest_px > _JUMP * down_px, widest_px, down_px)

@@ -69,14 +69,10 @@ def without_seen_through(
 ) -> Layers:
     """Return the layers without the pixels that rays passed through.
 
-    The ray of an occluded static point passed through where it crosses the surface of the map,
-    clearly before its end. The ray of any other point ended in its pixel. Both are blurred by a
-    third of the ray spacing. A pixel is rejected if more than a quarter of the rays passed through.
-    Moving bodies stay.
-
-    Args:
-        view: Points of the cloud in the image.
-        reason: (M,) `Reason` of each point of the cloud so far.
+    The ray of an occluded static point (by its ``reason``) passed through where it crosses the
+    surface of the map, clearly before its end. The ray of any other point ended in its pixel. Both
+    are blurred by a third of the ray spacing. A pixel is rejected if more than a quarter of the
+    rays passed through. Moving bodies stay.
     """
     counts = np.isin(cloud.frame, rays.stretch.frames)
     counts &= reason != Reason.OUTSIDE
@@ -115,12 +111,8 @@ def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Expo
     """Return the (P,2) px where rays cross the surface of a map clearly before they end.
 
     The search starts at the end of the ray. It goes to the point of the ray at the surface's depth
-    in the present pixel, and repeats this until the depth stays the same.
-
-    Args:
-        surface_m: (H,W) depth of the surface in metres, 0 none.
-        from_key: (K,3) origins of the rays, key sweep's lidar frame.
-        to_key: (K,3) ends of the rays, key sweep's lidar frame.
+    in the present pixel, and repeats this until the depth stays the same. The rays go ``from_key``
+    (K,3) ``to_key`` (K,3), key sweep's lidar frame. ``surface_m`` (H,W) is in metres, 0 none.
     """
     start = poses.transform(exposure.T_cam_key, from_key)
     end = poses.transform(exposure.T_cam_key, to_key)
@@ -145,10 +137,7 @@ def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Expo
 
 
 def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
-    """Return the (P,) share of the path from start to end at this depth, NaN if it is not reached.
-
-    start and end: (P,3) camera frame. depth_m: (P,) depth in ``measure``.
-    """
+    """Return the (P,) share of the path at this depth, camera frame, NaN if it is not reached."""
     way = end - start
     with np.errstate(divide="ignore", invalid="ignore"):
         if measure == "z":

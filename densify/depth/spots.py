@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Count as measured all pixels that a laser's spot covers, not only the pixel at its centre.
-
-With a long focal length several pixels fall into the spot of one beam. A return measures all of
-them.
-"""
+"""Count as measured all pixels that a laser's spot covers, as with a long focal length."""
 
 from __future__ import annotations
 
@@ -44,13 +40,9 @@ def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
 
 @Kernel
 def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, found, nearest):  # type: ignore[no-untyped-def]
-    """Find for each filled pixel the measured pixel, nearest in the image, whose spot covers it.
-
-    pixel and radius_px: (P,) index and spot radius of the measured pixels. uv: (P,2) px of their
-    returns. tilt: (H,W,2) slope of inverse depth, 1/m per px. filled_m: (H,W) depth of pixels that
-    may be covered, 0 elsewhere. found: (H,W) int64 output, index of the measured pixel. nearest:
-    (H,W) squared distance to its spot, inf at first.
-    """
+    """Find for each filled pixel the measured pixel, nearest in the image, whose spot covers it."""
+    # filled_m: 0 where no pixel may be covered; found (H,W): index of the measured pixel, nearest
+    # (H,W): squared distance to its spot, inf at first
     height, width = filled_m.shape
     for i in range(len(pixel)):
         v, u = pixel[i] // width, pixel[i] % width

@@ -55,16 +55,12 @@ _OFF = (
 
 
 class SeenCloud(NamedTuple):
-    """A cloud as the cameras see it.
-
-    patches: surface patches of the points. in_view: points in each image, by name of the map.
-    bodies: hulls of moving objects by instance number.
-    """
+    """A cloud as the cameras see it."""
 
     cloud: Cloud
     patches: Patches
-    in_view: Mapping[str, InView]
-    bodies: Mapping[int, MovingBody] = {}
+    in_view: Mapping[str, InView]  # points in each image, by name of the map
+    bodies: Mapping[int, MovingBody] = {}  # hulls of moving objects by instance number
 
     def joined(self, far: SeenCloud | None) -> SeenCloud:
         """Return the cloud with the points of sweeps beyond the window appended."""
@@ -143,13 +139,7 @@ class Views:
     def far(
         self, found: StandingWorld, T_key_found: Float, stretch: Stretch, standing_only: bool
     ) -> SeenCloud:
-        """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`.
-
-        Args:
-            found: Static points along the road.
-            T_key_found: (4,4) from the world of ``found`` to the key sweep's lidar frame.
-            standing_only: True leaves out points that a sweep of the window saw through.
-        """
+        """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`."""
         cloud, surface = far_cloud(
             found, T_key_found, stretch, self.key, self.exposures, standing_only
         )
@@ -160,9 +150,8 @@ class Views:
     ) -> dict[str, DepthMap]:
         """Return the depth map of each view by name.
 
-        Args:
-            visible: True leaves out occluded and unsupported points.
-            filled: True interpolates between measured pixels.
+        ``visible`` leaves out occluded and unsupported points. ``filled`` interpolates between
+        measured pixels.
         """
         settings = replace(self.settings, visibility=visible)
         maps = {}
@@ -180,11 +169,8 @@ class Views:
     ) -> Cloud:
         """Return the cloud with the colours of the (H,W,3) images that observe its points.
 
-        A point is observed unless it is clearly behind the depth of its pixel. Pixels without depth
-        give no colour.
-
-        Args:
-            depth: Maps made of the cloud, by name.
+        A point is observed unless it is clearly behind the depth of its pixel, in the maps
+        ``depth`` of the cloud. Pixels without depth give no colour.
         """
         rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
@@ -265,10 +251,6 @@ def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, other: Expos
 
     The flow includes ego-motion, and moving objects continue at their velocity. Pixels that only a
     laser spot covers take the flow of the nearest measured pixel. Other filled pixels have none.
-
-    Args:
-        cloud: Points at the key sweep's reference time.
-        depth: Map made of the cloud.
     """
     chosen = np.flatnonzero(depth.reason == Reason.KEPT)
     points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
@@ -288,11 +270,8 @@ def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, other: Expos
 def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: float) -> DepthMap:
     """Return the map with ``age_s``, seconds between its time and the source sweep of each pixel.
 
-    A filled pixel has the age of the nearest measured pixel in the image.
-
-    Args:
-        stamps_ns: Reference times of the sweeps by frame number.
-        late_s: Seconds from the key sweep's reference time to the time of the map.
+    A filled pixel has the age of the nearest measured pixel in the image. The map shows a time
+    ``late_s`` seconds after the key sweep. ``stamps_ns`` has the sweeps' times by frame number.
     """
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
     age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
@@ -321,11 +300,7 @@ class HeldOut:
 
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
-        """Return the ground truth of a key sweep.
-
-        Args:
-            cloud: Cloud with the key sweep's moving points and their velocities.
-        """
+        """Return the ground truth of a key sweep; ``cloud`` has its moving points' velocities."""
         settings = replace(views.settings, rims="strict", visibility=True)
         own = cloud.select(cloud.frame == views.key)
 

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Examine a recording before it is densified: find probable errors and their remedies.
 
-A check is a function of the `Sample` and one entry in `CHECKS`. It compares the recording as given
-with the recording corrected for each common mistake.
+A check in `CHECKS` compares the `Sample` as given with versions corrected for common mistakes.
 """
 
 from __future__ import annotations
@@ -99,9 +98,6 @@ class Diagnosis:
 
 
 def examine(sequence: LidarSequence, config: Config) -> Diagnosis:
-    """Run all checks on a recording.
-
-    At most 15 sweeps and about 40 images are read, whatever the length of the recording.
-    """
+    """Run all checks on a recording; at most 15 sweeps and about 40 images are read."""
     sample = Sample.of(sequence, config.register)
     return Diagnosis(sample, tuple(found for check in CHECKS for found in check(sample)))

@@ -77,10 +77,10 @@ def _check_images(sample: Sample, camera: Camera) -> Finding:
 def camera_views(
     sample: Sample, camera: Camera, silhouettes: dict[int, Silhouettes]
 ) -> tuple[list[View], str]:
-    """Return views (a sweep and its nearest image) from all registered spots of the sample.
+    """Return views (a sweep and its nearest image) from all registered spots, and an error message.
 
-    ``silhouettes`` has depth discontinuities by frame number; missing ones are added. The second
-    value is the error message if an image cannot be read, else "".
+    Missing ``silhouettes`` (by frame number) are added. The message is "" if no image is
+    unreadable.
     """
     exposed_ns = sample.sequence.image_stamps_ns(camera.name)
     numbers, stamps_ns = list(exposed_ns), np.array([*exposed_ns.values()], np.int64)

@@ -9,13 +9,10 @@ from enum import IntEnum
 
 
 class Verdict(IntEnum):
-    """The severity of a finding.
-
-    UNKNOWN: the recording allows no verdict, for instance because the vehicle is at rest.
-    """
+    """The severity of a finding."""
 
     FINE = 0
-    UNKNOWN = 1
+    UNKNOWN = 1  # the recording allows no verdict, such as one of a vehicle at rest
     SUSPICIOUS = 2
     WRONG = 3
 

@@ -80,10 +80,7 @@ def check_frame(sample: Sample) -> list[Finding]:
 
 
 def check_axes(sample: Sample) -> list[Finding]:
-    """Check that z points up.
-
-    Along the vertical axis one layer, the ground, holds most returns and few returns are below it.
-    """
+    """Check that z points up: one level layer, the ground, holds most returns, with few below."""
     level = {name: _ground_share(sample, up) for name, up in _UP.items()}
     best = max(level, key=lambda name: level[name])
     values = {f"share_{name}": share for name, share in level.items()}
@@ -123,10 +120,7 @@ def _ground_share(sample: Sample, up: Float) -> float:
 
 
 def check_own_vehicle(sample: Sample) -> list[Finding]:
-    """Check for returns of the vehicle that carries the scanner.
-
-    While the vehicle drives, these returns stay at the same position in the lidar frame.
-    """
+    """Check for returns of the own vehicle, which keep their lidar-frame position as it drives."""
     moving = [
         spot
         for spot in sample.registered

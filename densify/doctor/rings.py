@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Check the rings of a spinning scanner.
 
-They are cones about its spin axis only if each point is given relative to the scanner's position
-at its firing.
+They are cones about its spin axis only if each point is relative to the scanner at its firing.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from densify.registration.compensation import (
 
 _FAR_M = 60.0
 _LEAST_POINTS = 500
-_REACH_M = np.array([3.0, 0.8, 2.4])
-_GRID_M = (0.5, 0.4, 0.05)
+_REACH_M = np.array([3.0, 0.8, 2.4])  # searched ahead and behind, aside, above and below
+_GRID_M = (0.5, 0.4, 0.05)  # fine in height, which changes every ring
 _COARSE_FROM_M, _COARSE_POINTS, _COARSE_BINS, _NUM_STARTS = 18.0, 3000, 3, 8
 _FINER = ((0.1, 3), (0.05, 2), (0.02, 1))  # step in metres, bins
 # The rings of KITTI's HDL-64E, with two separate blocks of lasers, are sharpest from 0.2 m above.
@@ -139,11 +138,7 @@ def _text(place_m: Float) -> str:
 
 
 def found_origin(points: Float, start_m: Float) -> Float:
-    """Return (3,) the position from which the rings are sharpest, in the axes of the points.
-
-    The search covers 3 m ahead and behind a start position, 0.8 m aside, 2.4 m above and below.
-    Heights have fine steps, because the height changes every ring.
-    """
+    """Return (3,) the position near a start where the rings are sharpest, in axes of the points."""
     axes = [np.arange(-r, r + 1e-9, step) for r, step in zip(_REACH_M, _GRID_M, strict=True)]
     grid = start_m + np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     far = points[np.linalg.norm(points, axis=1) > _COARSE_FROM_M]

@@ -106,10 +106,7 @@ class Sample:
 
 
 def _chosen(timeline: Timeline) -> list[list[int]]:
-    """Return the frame numbers of each spot: separate groups of sweeps about 0.1 s apart.
-
-    A spot lies between two holes in time. If all of these stretches are short, spots are shorter.
-    """
+    """Return the frame numbers of each spot: sweeps about 0.1 s apart, without a hole in time."""
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
     unbroken = timeline.runs(timeline.frames)
     length = min(max(map(len, unbroken)), stride * (_NUM_SWEEPS - 1) + 1)

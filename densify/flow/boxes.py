@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Compute scene flow from tracked boxes: points in a box move with it, all others are static.
 
-The scene flow of Argoverse and nuScenes was made in this way (Pontes, Hays, Lucey, 3DV 2020,
-section 4.1; Jund et al., RA-L 2022).
+Sources: Pontes, Hays, Lucey, 3DV 2020, section 4.1 (Argoverse, nuScenes); Jund et al., RA-L 2022.
 """
 
 from __future__ import annotations
@@ -43,17 +42,14 @@ def flow_of_boxes(
     """Return the flow of the N points of one sweep to the next, and which flows are certain.
 
     Args:
-        here: Sweep of the N points.
         after: Next sweep in the same world. Only its pose and time are used.
-        boxes: Boxes of ``here``.
-        next_boxes: Boxes of ``after``; boxes of one object share the track name.
-        margins: Margins around each box; None for the defaults.
+        boxes, next_boxes: Boxes of the two sweeps. Boxes of one object share the track name.
 
     Returns:
         The flow with ego-motion removed, in the lidar frame of ``here``; ``instance`` is the index
-            of the point's box, -1 for no box. Then (N,) bool, True where the flow is certain. It is
-            False for points in two boxes, just outside a box, or at the bottom of a moving box. It
-            is False too in a box that the next sweep lacks, and in image areas without annotation.
+            of the point's box, -1 for no box. Then (N,) True where the flow is certain. It is False
+            for points in two boxes, just outside a box, at the bottom of a moving box, in a box
+            that the next sweep lacks, or in image areas without annotation.
     """
     margins = margins or BoxMargins()
     points = here.sweep.points
@@ -91,10 +87,7 @@ def flow_of_boxes(
 
 
 def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator[tuple[Int, Float]]:
-    """Yield, for each box, the indices of the points around it and its pose (4,4, lidar frame).
-
-    A box drawn for one scanner gets points of that scanner only.
-    """
+    """Yield, for each box, the indices of the points around it and its (4,4) pose, lidar frame."""
     points = here.sweep.points
     reach_m = np.linalg.norm(boxes.size_m / 2 + margins.grown_m + margins.unsure_m, axis=1)
     x, y = np.ascontiguousarray(points[:, 0]), np.ascontiguousarray(points[:, 1])
@@ -103,7 +96,7 @@ def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator
             (np.abs(x - T_here_box[0, 3]) <= reach_m[k])
             & (np.abs(y - T_here_box[1, 3]) <= reach_m[k])
         )
-        if boxes.lidar is not None and boxes.lidar[k] >= 0:
+        if boxes.lidar is not None and boxes.lidar[k] >= 0:  # drawn for one scanner
             rows = rows[here.sweep.lidar[rows] == boxes.lidar[k]]
         yield rows, T_here_box
 

@@ -28,16 +28,13 @@ class ChainedMotion:
     _found: dict[tuple[int, int], FlowField] = field(default_factory=dict, repr=False)
 
     def flow(self, frame: int, target: int) -> FlowField:
-        """Return the flow of every point of a sweep to another sweep's reference time.
+        """Return the flow of all points of sweep ``frame`` to the reference time of ``target``.
 
         The flow excludes ego-motion and is in the lidar frame of ``frame``. At each sweep on the
-        way, the onward flow is looked up at the moved point. Points of an object follow the
-        object's rigid motion there, plus the mean deviation of the nearest points. A point without
-        an object takes the mean flow of the nearest moving points. A point is lost if its object
-        has no points in the next sweep, or if no moving point is within 0.5 m.
-
-        Args:
-            frame, target: Frame numbers of the two sweeps.
+        way, points of an object take the object's rigid motion there, plus the mean deviation of
+        the nearest points. Points without an object take the mean flow of the nearest moving
+        points. A point is lost if its object has no points in the next sweep, or if no moving point
+        is within 0.5 m.
         """
         here, there = self.stretch.frames.index(frame), self.stretch.frames.index(target)
         return self._flow(here, there)
@@ -64,10 +61,7 @@ class ChainedMotion:
         return replace(step, velocity_m_s=velocity_m_s)
 
     def _follow(self, i: int, near: int, onward: FlowField) -> FlowField:
-        """Chain the flow from sweep index i to its neighbour ``near`` with the flow from there on.
-
-        ``near`` is i + 1 or i - 1. ``onward`` is the flow of the points of sweep ``near``.
-        """
+        """Chain the flow of sweep i to its neighbour ``near`` with the flow ``onward`` there."""
         step = self._flow(i, near)
         here, there = self.stretch.sweeps[i], self.stretch.sweeps[near]
         T_there_here = self.stretch.T_target_source(there.frame, here.frame)
@@ -100,11 +94,9 @@ class ChainedMotion:
 
 
 def _object_motion(source: Float, target: Float) -> Float:
-    """Return the (4,4) rigid motion that best moves (N,3) points to their target positions (N,3).
-
-    It is a pure translation for fewer than three points or points on a line.
-    """
+    """Return the (4,4) rigid motion that best moves points (N,3) to target positions (N,3)."""
     if np.linalg.matrix_rank(source - source.mean(axis=0), tol=_LINE_M) < 2:
+        # fewer than three points, or points on a line: a pure translation
         T = np.eye(4)
         T[:3, 3] = (target - source).mean(axis=0)
         return T

@@ -41,16 +41,12 @@ class Scene:
 
 
 class SharedMotion(Motion, Protocol):
-    """Motion of a long stretch that serves every key frame in it.
+    """Motion of a long stretch that serves every key frame in it."""
 
-    It is a dataclass. The disk cache stores it without the points of its sweeps.
-    """
+    # A dataclass, which the disk cache stores without the points of its sweeps
 
     def with_stretch(self, stretch: Stretch) -> SharedMotion:
-        """Return the same motion on another copy of its stretch, for example a copy without points.
-
-        Before the motion is written to disk, it gets an empty stretch.
-        """
+        """Return the same motion on a new copy of its stretch, an empty one for the disk cache."""
         ...
 
 
@@ -62,24 +58,17 @@ class EngineModule(Protocol):
     """
 
     def estimate_motion(self, scene: Scene, settings: Config, argument: str) -> Motion:
-        """Return the motion of all points of the scene's stretch.
+        """Return the motion of all points in the scene; the same input gives the same bytes.
 
-        The same input gives the same bytes. Work may be postponed until the motion's ``flow`` is
-        called. If the engine's row in the plugin table says ``shared``, the motion is a
-        `SharedMotion`.
-
-        Args:
-            argument: Part of ``flow.engine`` after the colon, "" without a colon.
+        ``argument`` is the part of ``flow.engine`` after the colon, "" without a colon. Work may be
+        postponed until the motion's ``flow`` is called. An engine whose row in the plugin table
+        says ``shared`` returns a `SharedMotion`.
         """
         ...
 
 
 def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
-    """Return the motion of all points of a scene, estimated by an engine.
-
-    Args:
-        spec: Engine as ``NAME[:ARGUMENT]``; None for the engine of ``flow.engine``.
-    """
+    """Return the motion of a scene by the engine ``NAME[:ARGUMENT]``; None for ``flow.engine``."""
     row, argument = engine(spec or settings.flow.engine)
     module = cast(EngineModule, row.work())
     return module.estimate_motion(scene, settings, argument)

@@ -26,10 +26,7 @@ _LOOSE = 10.0  # factor of the covariance: surface points must not stop a slide 
 def apply(state: Float, points: Float, centre: Float) -> Float:
     """Return the (N,3) points of an object, turned about its centre and displaced.
 
-    Args:
-        state: (4,) x, y, z (m) and yaw (rad), or (N,4) with a state for each point.
-        points: (N,3) metres.
-        centre: (3,) centre of the rotation, or (N,3).
+    The state is (4,) or, one for each point, (N,4); the centre is (3,) or (N,3).
     """
     return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
@@ -49,12 +46,10 @@ def _turned(arms: Float, yaw: float | Float) -> Float:
 
 
 def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
-    """Return (N,3,3) the inverse covariance (1/m²) of the surface around each point.
+    """Return (N,3,3) the inverse covariance (1/m²) of a surface of points (M,3) at N places.
 
-    Args:
-        points: (M,3) points of the surface, metres.
-        near: (N,k) rows in ``points`` of the neighbours that span the surface.
-        loose: Factor of the covariance; above 1 the surface constrains less.
+    ``near`` (N,k) are rows of the neighbours that span the surface. ``loose`` multiplies the
+    covariance; above 1 the surface constrains less.
     """
     away = points[near]
     away -= away.mean(axis=1, keepdims=True)
@@ -64,15 +59,10 @@ def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
 
 
 class Model:
-    """Accumulated surface of an object, to which new points are aligned.
-
-    Attributes:
-        points: (M,3) metres in the object's frame, about 1500 at most.
-        information: (M,3,3) inverse covariance (1/m²) of the surface around each point.
-    """
+    """Accumulated surface of an object, to which new points are aligned."""
 
     def __init__(self, points: Float) -> None:
-        self.points = np.zeros((0, 3))
+        self.points = np.zeros((0, 3))  # (M,3) object's frame, about 1500 at most
         self.add(points)
 
     def add(self, points: Float) -> None:
@@ -120,27 +110,17 @@ class Model:
 
 @Kernel
 def _add_matches(
-    arms: Float,
-    off: Float,
-    row: Int,
-    share: Float,
-    information: Float,
+    arms: Float,  # (N,3) from the centre to the points, object's frame
+    off: Float,  # (N,3) from the matched model points to the points
+    row: Int,  # (N,) matched model points, -1 for none
+    share: Float,  # (N,) distance to the match as a share of the greatest distance
+    information: Float,  # (M,3,3) of the model points
     yaw: float,
-    most: float,
+    most: float,  # greatest weight of a match
     H: Float,
     g: Float,
 ) -> None:
-    """Add the normal equations of x, y and yaw to H (3,3) and g (3,), in place.
-
-    Args:
-        arms: (N,3) from the centre to the points, metres, object's frame.
-        off: (N,3) from the matched model points to the points.
-        row: (N,) matched model points, -1 for none.
-        share: (N,) distance to the match as a share of the greatest distance.
-        information: (M,3,3) of the model points.
-        yaw: Of the object, rad.
-        most: Greatest weight of a match.
-    """
+    """Add the normal equations of x, y and yaw to H (3,3) and g (3,), in place."""
     J, JA = np.empty((2, 3, 3))  # J: derivative of the model's point by x, y and yaw
     J[:] = 0.0
     J[0, 0] = J[1, 1] = np.cos(yaw)

@@ -43,16 +43,13 @@ class HeightMap:
 
     @staticmethod
     def of(clouds: Sequence[Float]) -> HeightMap:
-        """Return the ground height under point clouds.
+        """Return the ground height under clouds of (N,3) points, z up, at least one point in all.
 
         The ground of a cell is the median, over the clouds, of a cloud's lowest point after its
-        second lowest and its lowest 2 %, because these may be mirror images from below the
-        road. A cell far below the median of its surroundings is repaired. A limit on the slope then
-        removes cars and walls, and narrow humps are removed. The points near the resulting lower
-        hull are averaged.
-
-        Args:
-            clouds: Clouds of (N,3) points in metres, z up, with at least one point in all.
+        second lowest and its lowest 2 %, because these may be mirror images from below the road. A
+        cell far below the median of its surroundings is repaired. A limit on the slope then removes
+        cars and walls, and narrow humps are removed. The points near the resulting lower hull are
+        averaged.
         """
         inside = bulk(np.concatenate([points[:, :2] for points in clouds]), CELL_M, _MOST_CELLS)
         ends = np.cumsum([len(points) for points in clouds])[:-1]
@@ -73,10 +70,7 @@ class HeightMap:
         return HeightMap(_averaged(hull, clouds, cells), low, CELL_M)
 
     def under(self, points: Float) -> Float:
-        """Return the (N,) ground height in metres at points (N,2) or (N,3).
-
-        Beyond the grid it is the height at the nearest edge.
-        """
+        """Return (N,) ground heights, m, at points (N,2) or (N,3); beyond the grid, at its edge."""
         x, y = ((points[:, :2] - self.low_m) / self.cell_m - 0.5).T
         ground_m: Float = ndimage.map_coordinates(self.heights_m, (x, y), order=1, mode="nearest")
         return ground_m
@@ -87,13 +81,9 @@ class HeightMap:
         return height_m
 
     def below(self, points: Float, T_world_lidar: Float) -> Bool:
-        """Return (N,) True for points clearly below the ground, such as mirror images.
+        """Return (N,) True for points (N,3, lidar frame) clearly below the ground: mirror images.
 
         Only points within 30 m of the lidar are judged, where the ground is measured densely.
-
-        Args:
-            points: (N,3) metres, lidar frame.
-            T_world_lidar: (4,4) pose of the lidar.
         """
         near = np.flatnonzero(np.hypot(points[:, 0], points[:, 1]) < _DENSE_M)
         deep = np.zeros(len(points), bool)
@@ -134,11 +124,8 @@ def _median_of_low(clouds: Sequence[Float], cells: Sequence[Int], num_cells: int
 
 
 def _averaged(hull: HeightMap, clouds: Sequence[Float], cells: Sequence[Int]) -> Float:
-    """Return the (X,Y) mean height of the points close to the hull around each cell.
-
-    The hull itself is lower where more points were measured, and an object driving there would seem
-    to climb. cells: (N,) number of the cell of each point of each cloud.
-    """
+    """Return the (X,Y) mean height of the points close to the hull around each cell."""
+    # The hull is lower where more points were measured: an object driving there would climb.
     total, number = np.zeros((2, hull.heights_m.size))
     for points, cell in zip(clouds, cells, strict=True):
         over_m = points[:, 2] - hull.under(points)
@@ -152,11 +139,9 @@ def _averaged(hull: HeightMap, clouds: Sequence[Float], cells: Sequence[Int]) ->
 
 
 def _without_humps(heights: Float) -> Float:
-    """Remove narrow humps, such as a vehicle that is always parked. Slopes and kerbs stay.
-
-    Morphological opening: Zhang et al., "A Progressive Morphological Filter for Removing Nonground
-    Measurements from Airborne LIDAR Data", TGRS 2003.
-    """
+    """Remove narrow humps, such as a vehicle that is always parked. Slopes and kerbs stay."""
+    # Morphological opening: Zhang et al., "A Progressive Morphological Filter for Removing
+    # Nonground Measurements from Airborne LIDAR Data", TGRS 2003.
     opened = ndimage.grey_opening(heights, (_WINDOW, _WINDOW))
     return np.where(heights - opened > ABOVE_GROUND_M, opened, heights)
 
@@ -174,10 +159,9 @@ def _slope_limited(heights: Float, rise: float) -> Float:
 def find_upright(sweeps: Sequence[Sweep]) -> Float:
     """Return the (3,3) rotation ``R_level_lidar`` from the lidar frame to level axes, z up.
 
-    The ground plane is found by RANSAC (Fischler, Bolles, "Random sample consensus", 1981). Most
-    points are on it, few below it, and the lidar is above it. The lidar is upside down if the
-    ground is found only after turning it over. Without a ground plane the result is the identity.
-    Slopes below 0.075 are not levelled.
+    RANSAC (Fischler, Bolles, 1981) finds the ground plane: most points are on it, few below it, and
+    the lidar is above it. The lidar is upside down if this holds only after turning it over.
+    Without a ground plane the result is the identity. Slopes below 0.075 are not levelled.
     """
     num = sum(map(len, sweeps)) // _NUM_POINTS + 1
     points = np.concatenate([s.points[::num] for s in sweeps])

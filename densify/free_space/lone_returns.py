@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Remove returns without other returns around them: snow, rain and dust.
 
-As in Charron et al., "De-noising of Lidar Point Clouds Corrupted by Snowfall", CRV 2018, the volume
-searched around a return grows with its range. Here it is a cell of direction and logarithm of
-range, and no neighbour search is needed.
+The volume searched around a return grows with its range (Charron et al., "De-noising of Lidar Point
+Clouds Corrupted by Snowfall", CRV 2018). It is a cell of direction and logarithm of range.
 """
 
 from __future__ import annotations
@@ -22,10 +21,7 @@ _MANY = 0.007  # returns alone in a cell; real sweeps in good weather had up to 
 
 
 def without_lone(sweep: Sweep) -> Sweep:
-    """Return the sweep without its lone returns if their number suggests snow, rain or dust.
-
-    The removed returns are counted in ``num_lone``.
-    """
+    """Remove lone returns, counting ``num_lone``, if their number suggests snow, rain or dust."""
     if len(sweep) < _LEAST:
         return sweep
     num = count_around(sweep)
@@ -37,11 +33,8 @@ def without_lone(sweep: Sweep) -> Sweep:
 
 
 def count_around(sweep: Sweep) -> Int:
-    """Return the (N,) number of returns around each return, itself included.
-
-    It is the larger count of two grids, half a cell apart, because a surface may lie on a cell
-    border.
-    """
+    """Return the (N,) number of returns around each return, itself included."""
+    # The larger count of two grids, half a cell apart: a surface may lie on a cell border.
     around = np.zeros(len(sweep), np.int64)
     for lidar in np.unique(sweep.lidar).tolist():
         mine = sweep.lidar == lidar

@@ -6,9 +6,9 @@ regular grid. Its rows are the scanner's rings, its columns the azimuth steps, b
 returns (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for free space).
 
 A scanner that does not fire in order of azimuth (solid state, rosettes) faces a cell at several
-times of a sweep. Each cell then keeps the middle of these times and their spread, which widens the
-margin. The density of such rays varies over the view. Therefore several images are made, each with
-cells twice as large, and each is used where enough of its cells are filled.
+times. The cell keeps their middle and their spread, which widens the margin. The density of such
+rays varies. Therefore several images are made, each with cells twice as large, and each is used
+where enough of its cells are filled.
 """
 
 from __future__ import annotations
@@ -79,12 +79,9 @@ class RangeImage:
     def of(registered: RegisteredSweep, num_together: int = 1, by_ring: bool = False) -> RangeImage:
         """Return the range images of a deskewed sweep.
 
-        Args:
-            num_together: Number of sweeps whose counts are added up. The columns are finer by this
-                factor.
-            by_ring: True also uses single rings: dense rings for far points, where an error of
-                registration is smaller than the spacing of rings, and isolated rings right at their
-                rays.
+        The columns are finer by ``num_together``, the number of sweeps whose counts are added up.
+        ``by_ring`` also uses single rings: dense rings for far points, where an error of
+        registration is smaller than their spacing, and isolated rings right at their rays.
         """
         scanners: list[ScannerImage] = []
         for lidar in np.unique(registered.sweep.lidar).tolist():
@@ -99,7 +96,7 @@ class RangeImage:
         min_filled: int = MIN_FILLED,
         velocity_m_s: Float | Float32 | None = None,
     ) -> Bool:
-        """Return (N,) True where the space at points is certainly free.
+        """Return (N,) True where the space at points (N,3) is certainly free.
 
         At least ``min_filled`` of the 3 x 3 cells around a point's direction must hold a return.
         Every return in them must be farther than the point by more than ``max(margin_m,
@@ -108,8 +105,7 @@ class RangeImage:
 
         Args:
             points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
-            velocity_m_s: (N,3) velocities in the lidar frame without ego-motion, None for static
-                points.
+            velocity_m_s: (N,3) lidar frame, without ego-motion; None for static points.
         """
         beyond = self.num_beyond(points, (margin_m, margin_fraction), min_filled, velocity_m_s)
         return np.asarray((beyond >= min_filled).any(axis=0))
@@ -123,14 +119,9 @@ class RangeImage:
     ) -> NDArray[np.int16]:
         """Return (S,N) for each of S images the filled cells around N points, if all are beyond.
 
-        The count is far below 0 if a return is not beyond the point (see `sees_through`), and 0 if
-        fewer than ``least`` cells are filled. The counts of several sweeps may be added.
-
-        Args:
-            points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
-            margins_m: Least distance of a return beyond a point: metres, and share of the range.
-            least: Least number of filled cells, of nine, for a count.
-            velocity_m_s: As in `sees_through`.
+        The count is far below 0 if a return is not beyond the point by ``margins_m`` (metres, share
+        of the range), and 0 if fewer than ``least`` of nine cells are filled. The counts of several
+        sweeps may be added. Points and velocities are as in `sees_through`.
         """
         points32 = np.ascontiguousarray(points, np.float32)
         velocity = np.zeros((0, 3), np.float32)
@@ -150,18 +141,14 @@ class RangeImage:
 
 
 class _Cells(NamedTuple):
-    """The cells of one image: edges of the rows (R+1,), and the range in which it is used.
-
-    lone: True if every other row is a single ring, and the rows between hold no ring. coarser: True
-    if used only where the previous image has too many empty cells.
-    """
+    """The cells of one image: edges of the rows (R+1,), and the range in which it is used."""
 
     row_edges_rad: Float32
     num_columns: int
     from_m: float = 0.0
     to_m: float = np.inf
-    lone: bool = False
-    coarser: bool = False
+    lone: bool = False  # every other row is a single ring, and the rows between hold no ring
+    coarser: bool = False  # used only where the previous image has too many empty cells
 
 
 def _images(
@@ -269,10 +256,7 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
 
 
 def _cells_of_rings(rings: Float, step: float, by_ring: bool) -> list[_Cells]:
-    """Return cells whose rows reach half way to the neighbouring rings.
-
-    The outermost rows reach as far outwards as inwards.
-    """
+    """Return cells whose rows reach half way to the neighbouring rings, and as far outwards."""
     middle = 0.5 * (rings[1:] + rings[:-1])
     outer: Float = 2 * rings[[0, -1]] - middle[[0, -1]]
     edges: Float = np.concatenate([outer[:1], middle, outer[1:]])
@@ -294,10 +278,8 @@ def _grid(edges: NDArray[np.floating], step: float) -> _Cells:
 
 
 def _no_closer(edges: Float, distance: float) -> Float:
-    """Drop edges until rows have at least this height. The first and the last edge stay.
-
-    Dense rings share a row, because a slight error of registration moves points to another ring.
-    """
+    """Drop edges until rows have at least this height. The first and the last edge stay."""
+    # Dense rings share a row, because a slight error of registration moves points to another ring.
     kept = [edges[0]]
     for edge in edges[1:]:
         if edge - kept[-1] >= distance:

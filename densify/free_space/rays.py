@@ -23,10 +23,8 @@ _A1, _A3, _A5, _A7, _A9 = (
 
 @inlined
 def _azimuth(x, y):  # type: ignore[no-untyped-def]
-    """Return the azimuth of (x, y) in radians, positive to the left.
-
-    The series is faster than the system's arctan2, and the same with every version of it.
-    """
+    """Return the azimuth of (x, y) in radians, positive to the left."""
+    # The series is faster than the system's arctan2, and the same with every version of it.
     ax, ay = abs(x), abs(y)
     steep = ay > ax
     ratio = ax / ay if steep else (ay / ax if ax > _ZERO else _ZERO)
@@ -51,10 +49,8 @@ def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
 
 @inlined
 def _rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
-    """Fill ``row`` with the interval of the ascending edges of each elevation, -1 outside.
-
-    This is a binary search of many elevations at once, with the steps as the outer loop.
-    """
+    """Fill ``row`` with the interval of the ascending edges of each elevation, -1 outside."""
+    # a binary search of many elevations at once, with the steps as the outer loop
     last, step = np.int32(len(edges) - 1), np.int32(1)
     row[:size] = 0
     while 2 * step < last:
@@ -71,10 +67,8 @@ def _rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
 
 @inlined
 def _at_time(x, y, z, time_s, twists):  # type: ignore[no-untyped-def]
-    """Move a point from the reference time to the lidar frame at ``time_s``: undo deskewing.
-
-    The rotation is taken to second order, because within a sweep it stays below 0.1 rad.
-    """
+    """Move a point from the reference time to the lidar frame at ``time_s``: undo deskewing."""
+    # The rotation is taken to second order, because within a sweep it stays below 0.1 rad.
     w = 0 if time_s < _ZERO else 1
     rx, ry, rz = twists[w, 0] * time_s, twists[w, 1] * time_s, twists[w, 2] * time_s
     px, py, pz = x - twists[w, 3] * time_s, y - twists[w, 4] * time_s, z - twists[w, 5] * time_s
@@ -140,10 +134,8 @@ def _speed(x, y, z, vx, vy, vz, twist):  # type: ignore[no-untyped-def]
 
 @inlined
 def _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column):  # type: ignore[no-untyped-def]
-    """Find the time at which the scanner faced each of ``size`` points, and move them to that time.
-
-    Two rounds from the position at the reference time converge.
-    """
+    """Move ``size`` points to the time at which the scanner faced them, which is found too."""
+    # Two rounds from the position at the reference time converge.
     num_columns, by_azimuth = image.nearest_m.shape[1], len(image.offset_s) == 1
     time_s[:size] = _ZERO
     for round in range(3):
@@ -174,15 +166,15 @@ def _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row,
 def see_beyond(begin, end, points, velocity, image, margins, least, beyond):  # type: ignore[no-untyped-def]
     """Add to ``beyond`` (N,) int16 the number of returns of one scanner beyond each point.
 
-    Counted are the filled cells among the 3 x 3 cells around a point. If any of their returns is
-    not beyond the point, `HIDES` is subtracted instead. All other arrays are float32.
+    Counted are the filled cells among the 3 x 3 cells around a point, if they are at least
+    ``least``. If any of their returns is not beyond the point, `HIDES` is subtracted instead. All
+    other arrays are float32.
 
     Args:
         points: (N,3) positions in metres, lidar frame at the reference time.
         velocity: (N,3) velocities in m/s, or (0,3) if all points are static.
         image: Range image, `densify.free_space.range_image.ScannerImage`.
         margins: (2,) least distance of a return beyond a point: metres and share of the range.
-        least: Least number of filled cells that is evidence.
     """
     moving, by_azimuth = len(velocity) > 0, len(image.offset_s) == 1
     settled_s = np.float32(image.settled_s)

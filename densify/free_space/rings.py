@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Measure the rays of a scanner, and how they sample directions: in rings, lines, or unordered.
 
-Every return is moved back to its firing time and to the scanner's frame at that time. Only in this
-frame do the returns of a spinning scanner form rings. Angles are in radians.
+Only in the scanner's frame at the firing time do the returns form rings. Angles are in radians.
 """
 
 from __future__ import annotations
@@ -106,7 +105,7 @@ class Layout:
 
 
 def measure(sweeps: Sequence[Aimed]) -> Layout:
-    """Return the layout of one scanner, measured in its rays of a few sweeps (``sweeps``).
+    """Return the layout of one scanner, measured in its rays of a few sweeps.
 
     Lasers that do not share an origin, as in KITTI's HDL-64E, mix their rings at close range. Their
     returns still follow at even steps along the azimuth: such a scanner samples in lines.
@@ -132,9 +131,9 @@ def measure(sweeps: Sequence[Aimed]) -> Layout:
 def find_rings(elevation: Float32) -> Float | None:
     """Return the (K,) ascending elevations of the rings, None if the returns are not on rings.
 
-    Merged scanners, processed clouds, and lasers that do not share an origin have no rings. The
-    rings are the peaks of a fine histogram, if these are separate and hold nearly all returns. Each
-    ring is then the mean elevation of the returns close to it. elevation: (N,).
+    Merged scanners, processed clouds, and lasers that do not share an origin have none. Rings are
+    separate peaks of a fine histogram of (N,) elevations that hold nearly all returns. Each ring is
+    the mean elevation of the returns close to it.
     """
     of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
     returns = np.bincount(of_return, minlength=int(np.pi / _RING_BIN_RAD) + 2).astype(float)
@@ -153,10 +152,7 @@ def find_rings(elevation: Float32) -> Float | None:
 
 
 def fires_by_azimuth(rays: Aimed) -> bool:
-    """Return True if all rays of the same azimuth are fired at nearly the same time.
-
-    The result is True if the rays have no times.
-    """
+    """Return True if rays of the same azimuth are fired at nearly one time, or have no times."""
     duration_s = float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
     if duration_s == 0.0:
         return True
@@ -178,10 +174,7 @@ def _some_sectors(rays: Aimed) -> Aimed:
 
 
 def _in_groups(group: NDArray[Any], angle: Float32) -> Float:
-    """Return the (N,) angles in ascending order, group by group, with large gaps between groups.
-
-    group: (N,) whole number of each angle's group.
-    """
+    """Return the angles in ascending order, group by group, with large gaps between groups."""
     return np.sort(group * _APART_RAD + angle.astype(np.float64))
 
 
@@ -199,16 +192,13 @@ def _step_along(azimuth: Float32, ring: NDArray[Any]) -> float:
 
 
 def _even_step(rays: Aimed) -> tuple[float, float]:
-    """Return the usual azimuth difference between consecutive returns of about equal elevation.
-
-    Also return the share of returns at this difference. It is more than half for a spinning
-    scanner, and a fifth for scattered returns.
-    """
+    """Return the usual azimuth step of returns of about equal elevation, and its share of them."""
     gap = _gaps(np.floor(rays.elevation / _BAND_RAD), rays.azimuth)
     gap = gap[gap > _LEAST_GAP_RAD]
     if not len(gap):
         return _DEFAULT_RAD[0], 0.0
     usual = float(np.median(gap))
+    # The share is more than half for a spinning scanner, and a fifth for scattered returns.
     return usual, float(np.mean(np.abs(gap - usual) < _EVEN * usual))
 
 
@@ -222,14 +212,12 @@ def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
 
 
 def _table_of_lines(sweeps: Sequence[Aimed], step_rad: float) -> RayTable:
-    """Return the table of median elevation differences within sectors of 1 degree, by elevation.
-
-    Differences within one line and across missing returns are left out.
-    """
+    """Return the table of median elevation differences within sectors of 1 degree, by elevation."""
     gaps, middles = [], []
     for rays in sweeps:
         ordered = _in_groups(np.floor(rays.azimuth / _COLUMN_RAD), rays.elevation)
         gap = np.diff(ordered)
+        # not across missing returns, and not within one line
         kept = (gap < _MAX_GAP_RAD) & (gap > max(step_rad / 2, _LEAST_GAP_RAD))
         gaps.append(gap[kept])
         middle = ordered[:-1][kept] + gap[kept] / 2
@@ -253,10 +241,8 @@ def _table(low: float, bin_rad: float, across: Float, along: Float) -> RayTable:
 
 
 def _table_of_density(sweeps: Sequence[Aimed]) -> RayTable:
-    """Return the table of the side of the square around a return that holds no other, by direction.
-
-    Returns are counted in the smallest window around each cell of a degree that holds enough.
-    """
+    """Return the table of the side of the square that a return has to itself, by direction."""
+    # Returns are counted in the smallest window around each cell of a degree that holds enough.
     low = float(min(r.elevation.min() for r in sweeps))
     rows = int((float(max(r.elevation.max() for r in sweeps)) - low) / _CELL_RAD) + 1
     columns = round(2 * np.pi / _CELL_RAD)

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Find the directions in which sweeps lack returns: lost packets and blind sectors.
 
-Around a vehicle there is ground or an obstacle in every direction. A degree of azimuth without a
-return was therefore not measured.
+Ground or obstacles surround a vehicle: a degree of azimuth without a return was not measured.
 """
 
 from __future__ import annotations
@@ -25,12 +24,9 @@ def by_azimuth(sweep: Sweep) -> Int:
 
 
 def lost_deg(returns: Int) -> Float:
-    """Return the (n,) width in degrees of azimuth that each sweep lacks and the others measured.
+    """Return the (n,) degrees of azimuth that each sweep lacks and half of the sweeps measured.
 
-    A degree counts as measured if half of the sweeps have returns in it, not just single ones.
-
-    Args:
-        returns: (n,360) numbers of `by_azimuth` of each sweep.
+    ``returns`` are the (n,360) numbers of `by_azimuth` of each sweep.
     """
     usual = np.median(returns, axis=0)
     measured = usual > _FEW * usual.mean()
@@ -42,8 +38,8 @@ def lost_deg(returns: Int) -> Float:
 def blind_sector(returns: Int) -> tuple[int, int] | None:
     """Return the first and last azimuth (deg, counterclockwise from x) that no sweep measured.
 
-    It is the widest gap of 3 to 90 degrees, and None without one. Wider gaps are the limits of the
-    scanner's field of view. returns: as for `lost_deg`.
+    It is the widest gap of 3 to 90 degrees, else None: wider gaps limit the scanner's field of
+    view.
     """
     empty = ~returns.any(axis=0)
     if empty.all() or not empty.any():

@@ -23,11 +23,7 @@ _MARGIN_M, _MARGIN_FRACTION = 0.4, 0.015  # the larger applies; tolerates regist
 
 
 def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
-    """Return the range image of each sweep, with single rings where that is safe.
-
-    Args:
-        num_together: Number of sweeps in a batch, see `densify.geometry.clock.num_in_batch`.
-    """
+    """Return the sweeps' range images, ``num_together`` in a batch, by rings where that is safe."""
     image = partial(RangeImage.of, num_together=num_together, by_ring=True)
     with ThreadPoolExecutor() as pool:
         return list(pool.map(image, sweeps))
@@ -47,11 +43,7 @@ class FreeSpace:
 
     @staticmethod
     def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
-        """Return the free space of a window of sweeps.
-
-        Args:
-            images: Range images of the sweeps, as from `range_images`; None makes them.
-        """
+        """Return the free space of a window of sweeps, from their `range_images` if given."""
         clock = Clock.of(stretch)
         if images is None:
             images = range_images(stretch.sweeps, num_in_batch(clock.period_ns * 1e-9))
@@ -86,7 +78,6 @@ class FreeSpace:
 
         Args:
             points: (N,3) positions in the world frame at the reference time of sweep j.
-            j: Index of the sweep.
             velocity_m_s: (N,3) velocities in the world frame, None for static points.
         """
         batch, num_beyond = self._batch_of[j], []

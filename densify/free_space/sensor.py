@@ -20,10 +20,7 @@ _HOLE_RAD = np.deg2rad(45.0)  # widest range of azimuth without returns that a b
 
 
 class RayGrid(NamedTuple):
-    """A grid of directions whose cells hold about one ray of a sweep each.
-
-    Columns go left from azimuth -pi, all round. Rows go up.
-    """
+    """Directions in cells of about one ray each; columns go left from azimuth -pi, rows up."""
 
     low_rad: float  # lowest elevation of the first bin
     bin_rad: float  # height of a bin of elevation
@@ -146,13 +143,10 @@ class Sensors:
 
 
 def _view(azimuth: Float32) -> tuple[float, float]:
-    """Return the right and the left end of the field of view, radians.
-
-    They bound the widest range of azimuth without returns, unless a building can cause that range.
-    """
+    """Return the right and the left end of the field of view, radians."""
     angles = np.unique(azimuth).astype(np.float64)
     gap = np.diff(angles, append=angles[0] + 2 * np.pi)
     widest = int(np.argmax(gap))
-    if gap[widest] < _HOLE_RAD:
+    if gap[widest] < _HOLE_RAD:  # a building can cause it
         return -np.pi, np.pi
     return float(angles[(widest + 1) % len(angles)]), float(angles[widest])

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find the place from which a sweep was measured: a ray ends once.
-
-Seen from the scanner, hardly any return lies behind another return in the same direction. Seen from
-elsewhere many do. The place where their share is least is the scanner's.
-"""
+"""Find the place from which a sweep was measured: from it, fewest returns lie behind others."""
 
 from __future__ import annotations
 
@@ -74,8 +70,8 @@ def is_still(T_world_lidar: Float) -> bool:
 def way_in_map(first: Sweep, last: Sweep) -> float:
     """Return the distance (m) between the places from which two raw sweeps were measured.
 
-    It is 0 for sweeps in their scanner's own frame, whose rays begin at one place. Sweeps between
-    which odometry finds no motion are in the frame of a map if their rays begin apart.
+    It is 0 for sweeps in their scanner's own frame. Sweeps between which odometry finds no motion
+    are in the frame of a map if their rays begin apart.
     """
     end = scanner_place(last.points[::2], last.origin_m(0))
     if np.linalg.norm(end - last.origin_m(0)) < _APART_M:
@@ -85,12 +81,12 @@ def way_in_map(first: Sweep, last: Sweep) -> float:
 
 
 def are_placed(sweeps: Sequence[Sweep], T_world_lidar: Float) -> bool:
-    """Return True if the rays of sweeps begin at their poses (n,4,4), in the world.
+    """Return True if the rays of sweeps begin at their poses (n,4,4): both are in the world.
 
-    The sweeps then are in the frame of their poses, which must not be applied again. The two sweeps
-    whose poses are farthest from the origin of the points tell, if they are more than 4 m away,
-    where no scanner is mounted. Fewer returns lie behind others seen from the pose than seen from
-    places around it at the same height, and fewer than seen from the origin.
+    The poses must then not be applied again. Fewer returns lie behind others seen from the pose
+    than seen from places around it at the same height, and than seen from the origin. Two sweeps
+    decide: those whose poses are farthest from the origin, if more than 4 m away, where no scanner
+    is mounted.
     """
     pairs = [
         (s.points, s.origin_m(0), T[:3, 3]) for s, T in zip(sweeps, T_world_lidar, strict=True)

@@ -29,16 +29,11 @@ def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
 
 
 def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
-    """Return (N,) True for the points around which a grid fits into memory.
+    """Return (N,) True for the points (N,D) around which a grid fits into memory.
 
-    These are all points if the box around them has at most ``most_cells`` cells. Otherwise up to
-    1 % of them, the farthest from their median, are left out, such as a few stray returns. If their
-    box is still too large, the points are spread out, and none is left out.
-
-    Args:
-        points: (N,D) positions.
-        cell: Side of a cell, in the unit of the points.
-        most_cells: Greatest number of cells of the grid.
+    These are all points if the box around them has at most ``most_cells`` cells of side ``cell``.
+    Otherwise up to 1 % of them, the farthest from their median, are left out, such as a few stray
+    returns. If their box is still too large, the points are spread out, and none is left out.
     """
     everything = np.ones(len(points), bool)
     if not len(points) or _num_cells(points, cell) <= most_cells:

@@ -38,20 +38,17 @@ _CONVERGED = np.sqrt(np.finfo(float).eps)  # from here one more step of Newton's
 
 
 def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
-    """Return the projection of points into the image of a camera.
+    """Return the projection of points (N,3), metres, camera frame, into the image of a camera.
 
     A distortion polynomial is valid only inside the image. Beyond the angle at which the distorted
     radius stops growing, it would fold points back into the image. Such points, and points more
     than the camera's ``max_angle_deg`` off its axis, are invisible.
 
-    Args:
-        points_cam: (N,3) metres, camera frame (x right, y down, z forward).
-
     Returns:
         uv: (N,2) image coordinates in pixels, integers at pixel centres. NaN for a point that is
             too near or outside the view of the lens.
-        visible: (N,) bool, True for a point in the view of the lens that falls on a pixel after
-            ``rint`` and is farther than 0.1 m: in z for a pinhole, in range for other lenses.
+        visible: (N,) True for a point in the view of the lens that falls on a pixel after ``rint``
+            and is farther than 0.1 m: in z for a pinhole, in range for other lenses.
     """
     lens = _lens(camera)
     uv, seen = np.full((len(points_cam), 2), np.nan), np.zeros(len(points_cam), bool)
@@ -70,10 +67,8 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
 def rays(camera: Camera, uv: Float) -> Float:
     """Return (N,3) unit vectors in the camera frame along the viewing rays of image coordinates.
 
-    This inverts `image_points` and raises the same errors.
-
-    Args:
-        uv: (N,2) pixels, integers at pixel centres. Outside the view of the lens the ray is NaN.
+    This inverts `image_points`: ``uv`` (N,2) are pixels, integers at pixel centres. The ray is NaN
+    outside the view of the lens.
     """
     lens = _lens(camera)
     on_plane = (np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T)[:, :2]

@@ -16,10 +16,7 @@ _BATCH_S = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """Reference times of W sweeps, at any rate and with missing sweeps.
-
-    Its methods take and return sweep indices, 0 to W - 1.
-    """
+    """Reference times of W sweeps, at any rate, with gaps; methods use sweep indices 0 to W - 1."""
 
     time_ns: Int  # (W,) int64, ascending
 
@@ -48,7 +45,7 @@ class Clock:
         return max(1, round(duration_s * 1e9 / self.period_ns))
 
     def batches(self) -> tuple[tuple[int, ...], ...]:
-        """Return batches: groups of consecutive sweep indices, each covering about 0.1 s.
+        """Return groups of consecutive sweep indices, each covering about 0.1 s.
 
         A faster scanner measures fewer points per sweep, and objects move less between its sweeps.
         A batch therefore has about as many points as one sweep at 10 Hz. At 10 Hz or slower each

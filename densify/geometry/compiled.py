@@ -6,7 +6,6 @@ interpreter while it runs, and threads can share its rows.
 
 Compiling takes a quarter of a first run. Rows are assigned number by number: an array or a tuple at
 once takes 1.6 s to compile. A literal argument of an inlined function compiles it once more.
-
 Numba's own parallel loops are not used. Their order of summation depends on the number of threads.
 Their pools abort the process after a fork or when two threads enter them at once. OpenMP waits in
 busy loops, which costs tenfold where cores are shared.
@@ -115,9 +114,9 @@ class Kernel:
     """A function compiled by numba at the first call with new types, and cached for later runs.
 
     The cache is beside the source file, else in the user's cache directory, or in the folder that
-    the environment variable NUMBA_CACHE_DIR names. The cache is loaded as code. It is therefore
-    ignored if users who cannot change the source could have written it, and also if it is damaged
-    or not writable. The function is then compiled in every run.
+    the environment variable NUMBA_CACHE_DIR names. It is loaded as code, and therefore ignored if
+    users who cannot change the source could have written it. Without a usable cache the function is
+    compiled in every run.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:

@@ -16,10 +16,8 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
 
     The points (N,3) are sorted into a grid whose cell diagonal equals the distance, hence all
     points of a cell are linked. Only neighbouring cells are compared, and the cost does not grow
-    with the square of the point density.
-
-    Returns the number of groups G, and (N,) int64 group labels 0 to G - 1, numbered by the first
-    point of each group.
+    with the square of the point density. Returns the number of groups G, and (N,) group labels 0 to
+    G - 1, numbered by the first point of each group.
     """
     if not len(points):
         return 0, np.zeros(0, np.int64)
@@ -44,7 +42,7 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
 def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
     """Return (N,) True for the points (N,3) closer than ``within_m`` to a dense seed.
 
-    ``seed`` is an (N,) mask. A seed is dense if at least ``least_share`` of the points within
+    A seed, of the mask ``seed`` (N,), is dense if at least ``least_share`` of the points within
     ``within_m`` of it are seeds.
     """
     close, seeds = np.zeros(len(points), bool), points[seed]

@@ -15,7 +15,7 @@ def tree_of(points: Float) -> cKDTree:
 
 
 def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Float, Int]:
-    """Return (N,) distances to the nearest points of the tree, and (N,) int64 rows of these points.
+    """Return (N,) distances to the nearest points of the tree, and (N,) rows of these points.
 
     They are inf and -1 for a query (N,d) without a point closer than ``within_m``.
     """
@@ -26,10 +26,7 @@ def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Fl
 
 
 def nearest_k(tree: cKDTree, queries: Float, k: int) -> tuple[Float, Int]:
-    """Return (N,k) ascending distances to the k nearest points, and (N,k) int64 rows in the tree.
-
-    ``k`` is reduced to the number of points if larger.
-    """
+    """Return (N,k) ascending distances to the k nearest points (or all), and their rows."""
     distance_m, row = tree.query(queries, np.arange(1, min(k, tree.n) + 1))
     return np.asarray(distance_m), np.asarray(row, np.int64)
 
@@ -40,13 +37,10 @@ def is_near(tree: cKDTree, queries: Float, within_m: float) -> Bool:
 
 
 def thinned(points: Float | Float32, order: Int, step: float, most: int) -> Int:
-    """Thin points by a grid, and return the rows of the points that are kept, ascending.
+    """Thin points (N,3) by a grid, and return the rows of the points that are kept, ascending.
 
-    Args:
-        points: (N,3); the box around them has at most 2^63 / N cells.
-        order: (K,) rows of the candidates, the preferred ones first. All other rows are dropped.
-        step: Side of a grid cell, in the unit of the points.
-        most: Number of candidates kept in each cell.
+    The rows ``order`` (K,) are the candidates, the preferred ones first. Each cell of side ``step``
+    keeps up to ``most`` of them. The box around the points has at most 2^63 / N cells.
     """
     cell = np.zeros(len(points), np.int64)
     for x in points.T:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Prepare clips for a network: a few neighbouring sweeps of a recording.
+"""Prepare clips for a network: a few registered, deskewed sweeps in a row, without the ground.
 
-The sweeps are registered and deskewed, without the ground. With labels, each sweep has its flow to
-the sweeps before and after it.
+With labels, each sweep has its flow to the sweeps before and after it.
 """
 
 from __future__ import annotations
@@ -98,8 +97,7 @@ def _new_street(spec: str, rng: np.random.Generator) -> Street:
 def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
     """Return the clip of up to 7 sweeps around a key frame.
 
-    The ``teacher`` gives the labels: "truth" the recording's ground truth, "engine" the scene flow
-    of the engine ``groups``. Other words give no labels.
+    Labels are the ground truth ("truth"), the flow of the engine ``groups`` ("engine"), else none.
     """
     stretch = Recording(sequence, settings, NUM_SWEEPS // 2, [key]).window(key)
     heights, frames = ground(stretch), stretch.frames

@@ -37,8 +37,7 @@ def label_sweeps(
 ) -> Iterator[tuple[int, Label | ComputationError | InputError]]:
     """Yield (frame number, label) of each sweep, or (frame number, error) if labelling fails.
 
-    Sweeps without a next sweep or without boxes are left out. ``config`` says where the poses come
-    from.
+    Sweeps without a next sweep or without boxes are left out. ``config`` chooses the poses.
     """
     boxes = getattr(sequence, "boxes", None)
     if boxes is None or all(boxes(frame) is None for frame in sequence.frames):
@@ -72,16 +71,14 @@ def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: in
 
 
 def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
-    """Write the label's flow file ``FRAME_NEXT.npz`` into a folder and return its path.
-
-    It holds the flow without and with (``total_flow``) ego-motion, and ``valid`` for certain flow.
-    """
+    """Write the label's flow file ``FRAME_NEXT.npz`` into a folder and return its path."""
     sweep, field = label.registered.sweep, label.field
     path = folder / f"{sweep.frame:06d}_{label.after.frame:06d}.npz"
     if path.exists() and not overwrite:
         raise InputError(f"{path}: there already, kept; give --overwrite to replace it")
     arrived = poses.transform(label.T_next_here, sweep.points + field.total)
     total = arrived - sweep.points
+    # total_flow includes ego-motion, valid marks certain flow
     data = flow_npz(field, row=sweep.row, total_flow=total, object=field.instance, valid=label.sure)
     write_file(path, data)
     return path

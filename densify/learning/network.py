@@ -2,13 +2,13 @@
 """Define a network for whole sweeps: points to a grid of pillars, a U-Net, back to points.
 
 It follows FastFlow3D (Jund et al., "Scalable Scene Flow from Point Clouds in the Real World", RA-L
-2022) and DeFlow (Zhang et al., ICRA 2024), and is small enough for a CPU. The points of each sweep
-are encoded separately and averaged over the cells of a grid of 0.4 m. The grids of all sweeps go
-through one U-Net, which can compare them. Each source point reads the result at its position and
-joins it with its own code. Two more layers compute the point's flow.
+2022) and DeFlow (Zhang et al., ICRA 2024), and is small enough for a CPU. Each sweep's points are
+encoded and averaged over the cells of a grid of 0.4 m. One U-Net compares the grids of all sweeps.
+Each source point joins the result at its position with its own code, and two more layers compute
+its flow.
 
-A model file is numpy's archive of arrays, read without running any code. ``header`` holds JSON
-(format, version, network, how it was trained), ``weights/NAME`` the network's arrays.
+A model file is a numpy archive, read without running any code. ``header`` holds JSON (format,
+version, network, how it was trained), ``weights/NAME`` the network's arrays.
 """
 
 from __future__ import annotations
@@ -82,8 +82,7 @@ class AboveGround(NamedTuple):
 def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> list[int | None]:
     """Return the indices of the sweeps that the network needs for the flow from source to target.
 
-    Source and target come first, then the sweeps before the source (after it if the target is
-    earlier). An index beyond the first or last sweep becomes None.
+    Sweeps before the source (after it if the target is earlier) follow. None is beyond the ends.
     """
     step = source - target
     wanted = [source, target, *(source + step * n for n in range(1, num_wanted - 1))]
@@ -243,10 +242,7 @@ class Model:
     made: Mapping[str, Any] = field(default_factory=dict)
 
     def flow(self, sweeps: Sweeps) -> Float:
-        """Return the (n,3) flow of the first sweep to the second in metres, as `Voxels.forward`.
-
-        The result has the same bytes on any number of cores.
-        """
+        """Return `Voxels.forward` as an array, with the same bytes on any number of cores."""
         with on_one_thread(), torch.inference_mode():
             found: Float = self.network(sweeps).double().numpy()
         return found

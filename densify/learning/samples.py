@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Draw pairs of sweeps to train on, in an order that follows from a seed alone.
 
-The pairs of several clips are mixed, in both directions of time, and drawn several times. Each time
-they are turned about the vertical, mirrored and scaled at random.
+The pairs of several clips are mixed, in both directions of time, and drawn several times, each time
+turned about the vertical, mirrored and scaled at random.
 
 The losses of the teachers (sources of supervision) are here too. ``objective`` is the published
 objective in m² per point (Pontes, Hays, Lucey, 3DV 2020, sections 3 and 4), with alpha = 4 (10
 without learning) and a graph of 50 neighbours. It needs no labels. ``engine`` and ``truth`` compare
-with a known flow. Nearly all points are static, and a plain mean teaches a network to predict no
+with a known flow. A plain mean over points, nearly all static, teaches a network to predict no
 motion. Therefore the loss, in metres, is a sum of means over static points, points slower than 1
 m/s, and faster points (DeFlow, Zhang et al., ICRA 2024, eq. 5).
 """
@@ -86,10 +86,7 @@ def sample_of(
     num_wanted: int,
     rng: np.random.Generator | None = None,
 ) -> Sample:
-    """Return the sample of two neighbouring sweeps of a clip, given by their indices.
-
-    ``rng`` turns, mirrors, scales and draws at random. None changes nothing and draws evenly.
-    """
+    """Return the sample of two neighbouring sweeps (indices), random where ``rng`` is given."""
     here, there = clip[source], clip[target]
     change = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
     scale = np.float32(np.linalg.norm(change[2]))

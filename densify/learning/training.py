@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Train a network on drawn samples with the loss of a teacher, by Adam.
 
-The same seed gives the same weights, byte for byte, on CPUs of one kind. Every sample follows from
-the seed and its number, and torch computes on one thread.
+The same seed gives the same bytes on CPUs of one kind: it fixes samples, and torch has one thread.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write files and folders that appear only when they are complete.
-
-The content is written into a hidden folder and then renamed. Missing parent folders are made. A
-failure to write raises OutputError with the path.
-"""
+"""Write files and folders that appear only when they are complete. Failures raise OutputError."""
 
 from __future__ import annotations
 
@@ -33,10 +29,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 @contextmanager
 def file_aside(path: Path) -> Iterator[Path]:
-    """Yield a temporary path. The file there is renamed to ``path`` when the block ends.
-
-    On an error within the block, the temporary file is removed and ``path`` stays as it was.
-    """
+    """Yield a temporary path that is renamed to ``path`` if the block ends without an error."""
     with _hidden_folder(path) as hidden:
         yield hidden / path.name
         os.replace(hidden / path.name, path)
@@ -46,8 +39,7 @@ def file_aside(path: Path) -> Iterator[Path]:
 def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
     """Yield a folder to write into, which becomes ``folder`` if the block ends without an error.
 
-    On any exception ``folder`` and its parent folders are as they were before. Existing entries
-    with names in ``owned`` are replaced or removed. All other entries of ``folder`` are kept.
+    On an error ``folder`` is as before. Of its entries, only ``owned`` are replaced or removed.
     """
     folder = Path(os.path.realpath(folder))
     missing = [place for place in folder.parents if not place.exists()]
@@ -77,10 +69,8 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
 
 
 def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
-    """Remove the hidden folders that killed processes left anywhere under ``root``.
-
-    Folders younger than ``age_s`` seconds are kept, because another process may be writing there.
-    """
+    """Remove the hidden folders that killed processes left anywhere under ``root``."""
+    # Another process may still write in folders younger than ``age_s`` seconds.
     for folder, names, _ in os.walk(root):  # skips entries that other processes remove meanwhile
         for name in names:
             hidden = Path(folder, name)
@@ -108,11 +98,7 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a value with types that JSON and YAML can write.
-
-    NumPy arrays and tuples become lists, NumPy scalars become Python numbers. NaN and infinity
-    become None.
-    """
+    """Return a value in types of JSON and YAML: arrays as lists, NaN and infinity as None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -39,33 +39,19 @@ _STANDARD_DIMENSIONS = {"intensity", "gps_time", "red", "green", "blue"}
 
 @dataclass(frozen=True)
 class StoredCloud:
-    """M points as stored in ``cloud.laz``, at the key sweep's reference time.
+    """M points as stored in ``cloud.laz``, at the key sweep's reference time."""
 
-    Attributes:
-        points: (M,3) positions in metres, in the lidar frame of the key sweep, rounded to 1 mm.
-        frame: (M,) int32 frame number of the source sweep.
-        moving: (M,) bool, True for points confirmed to move.
-        instance: (M,) int32 number of the moving object, -1 for points without an object.
-        confidence: (M,) float32 from 0 to 1.
-        displaced: (M,) float32 length of ``displacement`` in metres.
-        intensity: (M,) float32 from 0 to 1.
-        rgb: (M,3) uint8 colour, 0 where no camera observed the point.
-        far: (M,) bool, True for points of sweeps beyond the window.
-        displacement: (M,3) float32 metres from the rigidly accumulated position to ``points``.
-        gps_time: (M,) reference time of the source sweep in seconds, see `write_cloud`.
-    """
-
-    points: Float
-    frame: NDArray[np.int32]
-    moving: Bool
-    instance: NDArray[np.int32]
-    confidence: Float32
-    displaced: Float32
-    intensity: Float32
-    rgb: NDArray[np.uint8]
-    far: Bool
-    displacement: Float32
-    gps_time: Float
+    points: Float  # (M,3) metres, lidar frame of the key sweep, rounded to 1 mm
+    frame: NDArray[np.int32]  # (M,) frame number of the source sweep
+    moving: Bool  # (M,) True for points confirmed to move
+    instance: NDArray[np.int32]  # (M,) number of the moving object, -1 for none
+    confidence: Float32  # (M,) 0 to 1
+    displaced: Float32  # (M,) length of ``displacement`` in metres
+    intensity: Float32  # (M,) 0 to 1
+    rgb: NDArray[np.uint8]  # (M,3) colour, 0 where no camera observed the point
+    far: Bool  # (M,) True for points of sweeps beyond the window
+    displacement: Float32  # (M,3) metres from the rigidly accumulated position to ``points``
+    gps_time: Float  # (M,) reference time of the source sweep in seconds, see `write_cloud`
 
     @staticmethod
     def joined(parts: Sequence[StoredCloud]) -> StoredCloud:
@@ -88,14 +74,9 @@ class StoredCloud:
         return StoredCloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return a mapping from column name to values (M,).
-
-        The names are x y z displaced_x displaced_y displaced_z red green blue intensity confidence
-        displaced frame instance gps_time moving far. Booleans become uint8. Positions become
-        float32, which keeps 1 mm up to 8 km.
-        """
+        """Return column name -> (M,) values. Booleans become uint8, positions float32."""
         names = ("intensity", "confidence", "displaced", "frame", "instance", "gps_time")
-        return {
+        return {  # float32 keeps 1 mm up to 8 km
             **dict(zip("xyz", self.points.T.astype(np.float32), strict=True)),
             **dict(zip(_DISPLACED, self.displacement.T, strict=True)),
             **dict(zip(("red", "green", "blue"), self.rgb.T, strict=True)),
@@ -105,12 +86,11 @@ class StoredCloud:
 
 
 def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
-    """Write a cloud as LAZ with the extra dimensions of `_EXTRA_DIMENSIONS`.
+    """Write a cloud as LAZ with the extra dimensions of `_EXTRA_DIMENSIONS`, rounded to 1 mm.
 
-    ``gps_time`` is the reference time of the source sweep as LAS 1.4 defines it: seconds since
-    1980-01-06 minus 10^9, without leap seconds. Coordinates are rounded to 1 mm. Intensity and
-    colour are scaled to 16 bits. Equal clouds give equal bytes. The day of ``stamp_ns``, the key
-    sweep's reference time since 1970, is the date in the header.
+    ``gps_time`` is as in LAS 1.4: seconds since 1980-01-06 minus 10^9, without leap seconds. The
+    header has the day of ``stamp_ns``, the key sweep's reference time since 1970. Equal clouds give
+    equal bytes.
     """
     import laspy
 

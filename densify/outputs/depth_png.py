@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read and write depth, confidence, age, optical flow and pictures as PNG and JPEG.
-
-Depth has the format of KITTI's depth completion benchmark (Uhrig et al., "Sparsity Invariant CNNs",
-3DV 2017): PNG of 16 bits and one channel. A pixel stores ``256 * metres``, 0 for no depth.
-"""
+"""Read and write depth, confidence, age, optical flow and pictures as PNG and JPEG."""
 
 from __future__ import annotations
 
@@ -22,6 +18,7 @@ from densify.readers.decoded_files import read_image
 Picture = NDArray[np.uint8]
 """(H,W,3) uint8 RGB image."""
 
+# KITTI's depth completion benchmark: Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017
 _STEPS_PER_M = 256.0
 _STEPS_OF_CONFIDENCE = 254.0
 _STEPS_PER_S = 1000.0
@@ -46,19 +43,15 @@ def map_path(folder: Path, kind: str, name: str, suffix: str = ".png") -> Path:
 
 
 def write_depth_png(path: Path, depth_m: Float32) -> None:
-    """Write an (H,W) depth map in metres, 0 none. A pixel stores ``rint(256 * depth_m)``.
+    """Write an (H,W) depth map in metres as 16-bit PNG: ``rint(256 * depth_m)``, 0 for no depth.
 
-    Depths beyond 65535/256 = 256 m or below 2 mm (half a step) are stored as 0, no depth.
+    Depths beyond 65535/256 = 256 m or below 2 mm (half a step) become 0.
     """
     write_file(path, encode_png(_quantised(depth_m)))
 
 
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
-    """Write an (H,W) confidence map as PNG of 8 bits.
-
-    A pixel stores ``1 + rint(254 * confidence)``: 1 to 255 for confidence 0 to 1. It stores 0 where
-    `write_depth_png` stores no depth.
-    """
+    """Write an (H,W) map by `stored_confidence`, 0 where `write_depth_png` stores no depth."""
     levels = np.zeros(depth_m.shape, np.uint8)
     has_depth = _quantised(depth_m) > 0
     levels[has_depth] = stored_confidence(confidence[has_depth])
@@ -66,11 +59,7 @@ def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> N
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
-    """Write an (H,W) age map as PNG of 16 bits.
-
-    A pixel stores ``1 + rint(1000 * age_s)``, age in steps of 1 ms, and 65535 for 65.5 s or more.
-    It stores 0 where `write_depth_png` stores no depth.
-    """
+    """Write an (H,W) map by `stored_age`, 0 where `write_depth_png` stores no depth."""
     steps = np.zeros(depth_m.shape, np.uint16)
     has_depth = _quantised(depth_m) > 0
     steps[has_depth] = stored_age(age_s[has_depth])
@@ -90,11 +79,10 @@ def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
 
 
 def write_flow_png(path: Path, flow_px: Float32) -> None:
-    """Write optical flow in the format of KITTI's flow benchmark (Menze and Geiger, CVPR 2015).
+    """Write (H,W,2) optical flow, NaN where unknown, as KITTI does (Menze and Geiger, CVPR 2015).
 
     The PNG has 16 bits. Red stores ``rint(64 * u) + 2^15`` for the flow u to the right in pixels,
-    green the same for the flow down. Blue is 1 where the flow is known; elsewhere all are 0.
-    ``flow_px`` is (H,W,2), NaN where unknown. Flow beyond 512 px is written as unknown.
+    green the same for the flow down, blue 1. All are 0 for unknown flow and flow beyond 512 px.
     """
     levels = np.rint(_STEPS_PER_PX * flow_px.astype(np.float64)) + 2**15
     known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)

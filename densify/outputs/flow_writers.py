@@ -1,25 +1,22 @@
 # SPDX-License-Identifier: MIT
 """Write scene flow of one window, or of a whole recording in the formats of other programs.
 
-NAME is the name of the recording. "Ego-motion" is the motion of the vehicle::
+NAME is the name of the recording, a row one of the sweep file::
 
     npz            OUT/000119_000120.npz: flow files, see `densify.readers.flow_files`
-    av2            OUT/NAME/STAMP.feather, of the Argoverse 2 scene flow challenge of 2024: is_valid
-                   bool, flow_tx_m flow_ty_m flow_tz_m float16, flow to the next sweep without
-                   ego-motion in the sweep's lidar frame; a table row for each row of the sweep file
+    av2            OUT/NAME/STAMP.feather of the Argoverse 2 scene flow challenge of 2024 (which
+                   takes every fifth sweep, zipped as NAME/0000000005.feather): for each row
+                   is_valid bool, flow_tx_m flow_ty_m flow_tz_m float16, flow to the next sweep
+                   without the vehicle's motion, in the sweep's lidar frame
     opensceneflow  OUT/NAME.h5 (https://github.com/KTH-RPL/OpenSceneFlow), a group for each sweep,
                    its stamp in ns: lidar (N,4) deskewed to the stamp, pose (4,4), lidar_id,
-                   ground_mask (all False), row (N,) in the sweep file; where flow is known, flow
-                   (N,3) with ego-motion, flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
-    semantickitti  OUT/sequences/NAME/predictions/000120.label, as semantic-kitti-api scores them
+                   ground_mask (all False), row (N,); where flow is known, flow (N,3) with the
+                   vehicle's motion, flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
+    semantickitti  OUT/sequences/NAME/predictions/000120.label of semantic-kitti-api
                    (https://github.com/PRBonn/semantic-kitti-api, evaluate_mos.py): uint32 for each
-                   row of the sweep file; low 16 bits 251 moving or 9 static, high 16 bits the
-                   object's number, 0 none
+                   row; low 16 bits 251 moving or 9 static, high 16 bits object number, 0 none
     doc-depth      OUT/NAME, the exchange format of DOC-Depth (de Moreau et al., "DOC-Depth", IV
                    2025; https://github.com/SimondeMoreau/DOC-Depth, Preprocessing/FORMAT.md)
-
-The Argoverse challenge takes every fifth sweep, zipped as NAME/0000000000.feather,
-NAME/0000000005.feather….
 """
 
 from __future__ import annotations
@@ -68,11 +65,7 @@ def write_flow(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_flow_npz(folder: Path, flow: StretchFlow, recording: str) -> list[Path]:
-    """Write ``folder/000119_000120.npz`` for the flow from sweep 119 to 120, and all other steps.
-
-    The array ``recording`` in each file is the name of the recording. Return the paths of the
-    files.
-    """
+    """Write a file, such as ``folder/000119_000120.npz``, for each step, and return the paths."""
     paths = []
     for (frame, target), field in flow.steps.items():
         sweep = flow.stretch[frame].sweep
@@ -98,10 +91,9 @@ def _total_flow(flow: StretchFlow, frame: int, target: int) -> np.ndarray:
 
 
 def flow_npz(field: FlowField, **beside: Any) -> bytes:
-    """Return the bytes of a .npz file with a flow field of N points.
+    """Return the bytes of a .npz file with a flow field of N points and the arrays of ``beside``.
 
-    The arrays are ``residual_flow`` (N,3) float32 in metres without ego-motion, ``moving``,
-    ``instance`` (-1 none), ``lost``, ``to_reference`` float32 if known, and those of ``beside``.
+    ``residual_flow`` (N,3) is in metres, without ego-motion. Floats are float32.
     """
     arrays: dict[str, Any] = {"residual_flow": field.displacement}
     arrays |= {name: getattr(field, name) for name in ("moving", "instance", "lost")} | beside
@@ -150,11 +142,7 @@ def _add_sweep(file: Any, frame: int, flow: StretchFlow, T_world_lidar: Float) -
 def flow_writer(
     form: str, sequence: LidarSequence, out: Path, frames: Sequence[int], overwrite: bool
 ) -> Iterator[FlowWriter]:
-    """Yield a function that writes the flow of one sweep. Each file appears when it is complete.
-
-    ``form`` is a format of the module's docstring, ``frames`` are the sweeps to write. The file of
-    opensceneflow holds all of them.
-    """
+    """Yield a function that writes the flow of one sweep, ``form`` by the module's docstring."""
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)
     following = dict(zip(sequence.frames[:-1], sequence.frames[1:], strict=True))
     labels = out / "sequences" / name / "predictions"

@@ -23,11 +23,7 @@ def front_first(
     """Return the names of maps, that of the camera which looks ahead first, the others as given.
 
     Ahead is where the vehicle goes in the window. At rest it is the camera called front.
-
-    Args:
-        names: Names of the maps.
-        views: Camera and pose of each map; a map may be missing.
-        T_key_lidar: Frame number -> (4,4) lidar pose of a sweep of the window in the key frame.
+    ``T_key_lidar`` has (4,4) lidar poses in the key frame by frame number. ``views`` may lack maps.
     """
     frames = sorted(T_key_lidar)
     way_m = np.zeros(3)

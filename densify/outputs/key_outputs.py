@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Write the files of one densified sweep: depth maps, cloud, metrics.json, movers.json, scene/.
 
-"Key" is the frame number of that sweep. metrics.json has these fields. compare.json has the fields
-from ``frames`` on for each method, under ``methods``. A score is null where it is unknown::
+Fields of metrics.json, null where unknown. compare.json has those from ``frames`` on by method::
 
-    schema_version, key, method
+    schema_version, key (frame number of the sweep), method
     frames      frame numbers of the window
     num_points  number of points in the cloud; num_moving: number of moving points
     density     camera -> measured, filled: share of the pixels with a depth; with --prior also
@@ -20,21 +19,19 @@ from ``frames`` on for each method, under ``methods``. A score is null where it 
     expected_outliers  map -> measured, filled: the share of outliers that confidence predicts
     baselines   simpler method on the same registration -> the fields from ``frames`` on
 
-movers.json, by `ObjectTrack`: schema_version, key, objects. An object has instance (as in
-cloud.laz), size_m (length, width, height of the completed box), seen_size_m (of the box around its
-points), sides_seen and poses. Poses are at each sweep that observed the object and at the key
-sweep: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,) without ego-motion, in the
-key sweep's lidar frame.
+movers.json: objects, by `ObjectTrack`: instance (as in cloud.laz), size_m (length, width, height
+of the completed box), seen_size_m (of the box around its points), sides_seen, and poses at its
+sweeps and the key sweep: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,) without
+ego-motion, in the key sweep's lidar frame.
 
-scene/, for pages, viewers and other tools::
+scene/::
 
     image/CAMERA.jpg   the image that the map shows
     none/CAMERA.png, icp/…, truth/…   depth of the simpler methods, and true depth, as in ``depth``
     sweep/CAMERA.png   uint16, measured pixels: 1 + index of the source sweep in ``sweeps``; 0 none
     reason/CAMERA.png  uint8 `Reason` that the nearest point of a pixel was rejected
-    scene.json         schema_version, key; sweeps: frame, since_key_s, far, T_key_lidar (4,4);
-                       views: map -> camera, T_cam_key (4,4), late_s after the key sweep's
-                       reference time, image number
+    scene.json         sweeps: frame, since_key_s, far, T_key_lidar (4,4); views: map -> camera,
+                       T_cam_key (4,4), late_s after the key sweep, image number
 """
 
 from __future__ import annotations
@@ -83,8 +80,7 @@ class Context:
 def write_depth(result: Result, context: Context, folder: Path) -> None:
     """Write the maps ``depth``, ``depth_filled``, ``confidence`` and ``age`` of each camera.
 
-    Age is the time between the image's exposure and the sweep that measured the pixel. A filled
-    pixel has the age of the nearest measured pixel.
+    Age is the time from exposure to the sweep that measured the pixel or, if filled, the nearest.
     """
     for camera, depth in result.depth.items():
         if depth.age_s is None:
@@ -97,13 +93,11 @@ def write_depth(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_full(result: Result, context: Context, folder: Path) -> None:
-    """Write ``depth_full``, depth completed with the user's prior, and ``confidence_full``.
-
-    Confidence is at most 0.2 at pixels whose depth comes from the prior.
-    """
+    """Write ``depth_full``, depth completed with the user's prior, and ``confidence_full``."""
     for camera, full in result.full.items():
         write_depth_png(map_path(folder, "depth_full", camera), full.depth_m)
         path = map_path(folder, "confidence_full", camera)
+        # At most 0.2 at pixels whose depth comes from the prior
         write_confidence_png(path, full.confidence, full.depth_m)
 
 
@@ -120,12 +114,9 @@ def write_cloud_laz(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_movers(result: Result, context: Context, folder: Path) -> None:
-    """Write cloud and depth maps of each moving object, if ``output.movers`` separates objects.
-
-    Object number 7 is in ``movers/0007/``. Moving points without an object are in
-    ``movers/others/``.
-    """
+    """Write cloud and depth maps of each separated object to ``movers/0007/``."""
     for instance, mover in result.movers.items():
+        # others: moving points without an object
         place = folder / "movers" / (f"{instance:04d}" if instance >= 0 else "others")
         for name, maps in mover.depth.items():
             write_depth_png(map_path(place, "depth", name), maps.depth_m)
@@ -169,15 +160,11 @@ def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
 
 
 def record(result: Result, context: Context) -> dict[str, Any]:
-    """Return a mapping that says how a result was made.
-
-    The mapping has recording (its name), data, key, frames, cameras, warnings, configuration, cost
-    of each stage, and versions. A package of unknown version, as in system builds, has None.
-    """
+    """Return how a result was made: recording, key, configuration, cost of each stage, versions."""
     versions: dict[str, str | None] = {"densify": __version__, "python": platform.python_version()}
     versions["platform"] = platform.platform()
     for package in _PACKAGES:
-        versions[package] = None
+        versions[package] = None  # unknown, as in system builds
         with suppress(PackageNotFoundError):
             versions[package] = version(package)
     return {

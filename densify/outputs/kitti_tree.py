@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Write depth maps as a KITTI depth tree (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017).
 
-Loaders for KITTI depth completion read the tree unchanged::
-
-    val/2011_09_26_drive_0013_sync/proj_depth/velodyne_raw/image_02/0000000120.png
-                                              groundtruth/
-                                              groundtruth_filled/    only here
-                                              confidence/            only here
+Loaders of KITTI depth completion read ``SPLIT/DRIVE/proj_depth/KIND/CAMERA/0000000120.png``. KIND
+is velodyne_raw (single sweep) or groundtruth. groundtruth_filled and confidence are additions.
 """
 
 from __future__ import annotations
@@ -55,23 +51,14 @@ _FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 
 
 def split_of(drive: str) -> Split:
-    """Return the part of KITTI's depth benchmark that a recording belongs to: "val" or "train".
-
-    The name, such as ``2011_09_26_drive_0013_sync``, decides. It is "val" for the 13 validation
-    drives of the benchmark, else "train".
-    """
+    """Return "val" for the 13 validation drives of KITTI's depth benchmark, else "train"."""
     match = _KITTI_DRIVE.fullmatch(drive)
     return "val" if match and match[1] in _VALIDATION else "train"
 
 
 def drive_folder(name: str) -> str:
-    """Return a valid, unique folder name for a recording.
-
-    A valid name, such as KITTI's names, is kept. The simulated street with default options is
-    ``street``; ``street:highway?seed=0&sensor=hdl64`` becomes
-    ``street-highway_seed-0_sensor-hdl64``. Any other name is reduced to ASCII letters and digits. A
-    hash at its end keeps the name unique.
-    """
+    """Return a valid, unique folder name. A valid name, such as KITTI's names, is kept."""
+    # street:highway?seed=0&sensor=hdl64 -> street-highway_seed-0_sensor-hdl64
     if name == _DEFAULT_STREET:
         return "street"
     folder = name.translate(_PUNCTUATION)

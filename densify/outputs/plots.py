@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Draw pictures: figure.png, compare.png and curve.png.
-
-figure.png and compare.png show depth over the camera's image. They are drawn with OpenCV, because a
-run should not wait for matplotlib. curve.png shows outliers over density.
-"""
+"""Draw figure.png and compare.png (depth over the image), and curve.png (outliers over density)."""
 
 from __future__ import annotations
 
@@ -28,6 +24,7 @@ Curve = Sequence[Mapping[str, Any]]
 """Points of outliers over density, see `densify.scores.depth_metrics.precision_density`."""
 
 _DPI = 100
+# Figures over images are drawn with OpenCV: a run should not wait for matplotlib.
 # The colour scale is fixed, so that pictures of different key sweeps can be compared.
 _NEAR_M, _FAR_M = 3.0, 80.0
 _TICKS_M = (3, 5, 10, 20, 40, 80)
@@ -46,11 +43,7 @@ def write_key_figure(result: Result, context: Context, folder: Path) -> None:
 
 
 def write_figure(path: Path, results: Mapping[str, Result]) -> None:
-    """Write a figure with the measured depth of each method in the camera that looks ahead.
-
-    With a prior, the figure also shows the completed depth of the last method. Without a camera no
-    file is written.
-    """
+    """Write each method's measured depth, and completed depth, in the camera that looks ahead."""
     method, last = list(results.items())[-1]
     if not last.depth:
         return
@@ -83,11 +76,10 @@ def _error(result: Result, camera: str, product: str) -> str:
 
 
 def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
-    """Return a picture (h,w,3), as blue, green, red, of panels with depth over a camera's image.
+    """Return a BGR picture (h,w,3) of panels with depth over a camera's image in gray.
 
-    Each depth covers 3 x 3 pixels. Where they overlap, the nearest depth is drawn. Colours run from
-    red at 3 m to blue at 80 m on a logarithmic scale. ``image`` is (H,W,3) RGB, drawn in gray.
-    ``panels`` has title -> (H,W) depth in metres, 0 for no depth.
+    ``panels`` has title -> (H,W) metres, 0 for no depth. Each depth covers 3 x 3 pixels, nearest on
+    top, from red at 3 m to blue at 80 m on a logarithmic scale. ``image`` is (H,W,3) RGB.
     """
     kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
     gray = (_BRIGHTNESS * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8)
@@ -153,11 +145,7 @@ def write_curve(result: Result, context: Context, folder: Path) -> None:
 
 
 def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
-    """Draw the share of outliers over the density, one point for each confidence threshold.
-
-    Each camera has its own axes, two in a row. Thin lines show measured pixels, thick lines the
-    filled map. ``curves`` has camera -> method -> `precision_density`.
-    """
+    """Draw the share of outliers over the density. ``curves`` is camera -> method -> points."""
     from matplotlib.figure import Figure
 
     columns, rows = min(2, len(curves)), -(-len(curves) // 2)
@@ -165,7 +153,7 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
     for place, (camera, methods) in enumerate(curves.items(), 1):
         axes = figure.add_subplot(rows, columns, place)
         for number, (method, curve) in enumerate(methods.items()):
-            for kind, width in (("measured", 1.0), ("filled", 2.5)):
+            for kind, width in (("measured", 1.0), ("filled", 2.5)):  # thin and thick lines
                 known = [p for p in curve if p[f"outliers_{kind}"] is not None]
                 density = [100 * p[f"density_{kind}"] for p in known]
                 outliers = [100 * p[f"outliers_{kind}"] for p in known]

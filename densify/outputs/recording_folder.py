@@ -32,16 +32,10 @@ def default_folder(recording: str) -> Path:
 
 
 def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = ()) -> None:
-    """Raise InputError if a folder holds results of another recording.
+    """Raise InputError if a folder holds results of another recording, by `is_same`.
 
-    Two recordings differ if their names differ, or if both exist at different paths. Results
-    without the name of a recording are not compared.
-
-    Args:
-        out: Folder of the results, which need not exist.
-        recording: Name of the recording whose results are to be written.
-        data: Text of ``--data``.
-        keys: Frame numbers of the results to be written.
+    Results without the name of a recording are not compared. ``recording`` and ``data`` (text of
+    ``--data``) are of the results to be written, for the frame numbers ``keys``.
     """
     for stored_here in _stored_in(out, keys):
         if not any(is_same(recording, data, s.recording, s.data) for s in stored_here):
@@ -54,27 +48,23 @@ def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = 
 
 
 def is_same(recording: str, data: str, other: str, other_data: str) -> bool:
-    """Return True if two names and texts of ``--data`` are of one recording.
-
-    A recording that has been moved is the same recording. A file in it is the same one too.
-    """
+    """Return True if two names and texts of ``--data`` are of one recording, moved or not."""
     if drive_folder(recording) != drive_folder(other):
         return False
     path, other_path = (Spec.parse(text).path.resolve() for text in (data, other_data))
     if not (data and other_data and path.exists() and other_path.exists()):
         return True
+    # A file in the recording is the same recording.
     return path.is_relative_to(other_path) or other_path.is_relative_to(path)
 
 
 def _stored_in(out: Path, keys: Iterable[int]) -> Iterator[list[Stored]]:
-    """Yield the recordings of the results in a folder: a training set, keys, files of flow.
-
-    Of the keys, those to be written are read, and the first and the last one.
-    """
+    """Yield the recordings of the results in a folder: a training set, keys, files of flow."""
     drives = _mapping(out / "dataset.json").get("drives")
     if isinstance(drives, Mapping) and drives:
         yield [_stored(out / "dataset.json", name, drive) for name, drive in drives.items()]
     folders = sorted(path for path in out.glob("[0-9]*") if path.is_dir())
+    # The first key, the last one, and those to be written
     for folder in sorted({*folders[:1], *folders[-1:], *(out / f"{key:06d}" for key in keys)}):
         for path in (folder / "run.yaml", folder / "compare.json"):
             if name := (table := _mapping(path)).get("recording"):

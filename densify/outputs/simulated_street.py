@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Write frames of the simulated street as KITTI raw drive or plain folder, with ground truth.
 
-The files::
+The files, with timestamps of the KITTI drive for each frame of the whole street::
 
     OUT/2026_06_12/calib_cam_to_cam.txt calib_velo_to_cam.txt calib_imu_to_velo.txt
     OUT/2026_06_12/2026_06_12_drive_0001_sync/
         velodyne_points/{data/0000000120.bin, timestamps.txt, timestamps_start.txt, ..._end.txt}
         image_02/{data/0000000120.png, timestamps.txt}  image_03/...
-        oxts/{data/0000000120.txt, timestamps.txt}  truth/
+        oxts/{data/0000000120.txt, timestamps.txt}  truth/ (`densify.readers.truth_files`)
 
-    OUT/street/densify.yaml timestamps.txt (s since 1970) poses.txt (lidar poses, TUM format) truth/
+    OUT/street/densify.yaml timestamps.txt (s since 1970) poses.txt (lidar poses, TUM format)
+    OUT/street/truth/  numbered from 0
     OUT/street/sweeps/000000.bin, ...  float32 x y z intensity time lidar, s since the stamp
     OUT/street/images/CAMERA/1781258406000000000.png, ...  named by exposure times in ns
-
-A timestamps file of the KITTI drive has a line for each frame of the whole street. In the plain
-folder, ground truth is numbered from 0. ``truth/`` is described in `densify.readers.truth_files`.
 """
 
 from __future__ import annotations
@@ -65,10 +63,7 @@ def write_street(
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write frames of a simulated street and return the path to give to ``--data``.
-
-    ``format`` is one of `FORMATS`. On an error no file of the recording is left.
-    """
+    """Write frames of a street, all or none, and return the path to give to ``--data``."""
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
     excerpt, is_kitti = Excerpt.of(street, frames, cameras), format == "kitti"
@@ -286,10 +281,7 @@ def stamp_lines(stamps_ns: Int) -> str:
 
 
 def sweep_data(street: Street, frame: int, points: Float | Float32 | None = None) -> bytes:
-    """Return the bytes of a KITTI sweep file: float32 x y z intensity for each return.
-
-    ``points`` (N,3) replace the positions as fired.
-    """
+    """Return a KITTI sweep file: float32 x y z intensity; ``points`` (N,3) replace positions."""
     returns = street.returns(frame)
     columns = [returns.points if points is None else points, returns.intensity]
     return np.column_stack(columns).astype("<f4").tobytes()
@@ -301,11 +293,8 @@ def T_lidar_imu(tilt_deg: float) -> Float:
 
 
 def oxts_line(street: Street, frame: int, first: int) -> str:
-    """Return an oxts record of the true pose. Velocities, accelerations and turn rates are 0.
-
-    The frame ``first``, the first one written, lies at the fixed latitude: readers take the scale
-    of the Mercator projection from it.
-    """
+    """Return an oxts record of the true pose. Velocities, accelerations and turn rates are 0."""
+    # Readers take the Mercator scale from the latitude of frame ``first``, which is fixed.
     T_lidar = T_lidar_imu(street.simulator.tilt_deg)
     here, start = (
         street.simulator.T_world_lidar_at(street.stamp_ns(f)) @ T_lidar for f in (frame, first)

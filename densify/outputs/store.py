@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write the files of one key sweep to ``OUT/000120/...``, all of them or none.
-
-The files are results of ``run`` and tables of ``compare``.
-"""
+"""Write the files of ``run`` or ``compare`` of one key to ``OUT/000120/...``, all or none."""
 
 from __future__ import annotations
 
@@ -93,8 +90,7 @@ def write_result(
 ) -> list[Path]:
     """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
 
-    Other files in the folder are kept. ``config`` is the merged configuration as plain mappings,
-    ``data`` the recording as the user named it.
+    ``config`` is the merged configuration, ``data`` the recording as the user named it.
     """
     context = Context(config, data)
     check_recording(out, result.recording, data, [result.key])
@@ -112,10 +108,9 @@ def write_comparison(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write the results of several methods, by method, and return the paths of the files.
+    """Write compare.json and compare.png of several methods, and return the paths of the files.
 
-    The files are ``out/KEY/compare.json`` and ``compare.png``. The folder ``compare/`` has the
-    maps, cloud and scene of the last method. Other arguments as in `write_result`.
+    The folder ``compare/`` has the files of the last method. Other arguments as in `write_result`.
     """
     last = list(results.values())[-1]
     key, context = last.key, Context(config, data)

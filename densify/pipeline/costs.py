@@ -23,11 +23,7 @@ class Watch:
     """
 
     def __init__(self, progress: Progress | None = None) -> None:
-        """Begin to measure.
-
-        Args:
-            progress: Callback (stage, done, total), called by one thread at a time.
-        """
+        """Begin to measure; ``progress`` is called by one thread at a time."""
         self._progress = progress
         self._seconds: dict[str, float] = {}
         self._peak_mb: dict[str, float] = {}

@@ -83,12 +83,11 @@ class KeyScene(NamedTuple):
 def result_of_method(
     scene: KeyScene, moments: dict[str, Moment], name: str, filled: bool
 ) -> Result:
-    """Return the result of one method, without its baselines.
+    """Return the result of the method ``name``, without its baselines.
 
     Args:
-        moments: Points at the key's time, as each method accumulates them. Those of this method
-            are taken out to save memory.
-        name: Name of the method, of `METHODS`.
+        moments: Points at the key's time by method. Those of this method are taken out to save
+            memory.
         filled: Fill holes of the maps by interpolation.
     """
     method, output = METHODS[name], scene.settings.output
@@ -141,10 +140,7 @@ def result_of_method(
 
 
 def see(scene: KeyScene, name: str, cloud: Cloud) -> SeenCloud:
-    """Return the points of the method ``name`` as the cameras see them.
-
-    cloud: Points at the key's time, as the method accumulates them.
-    """
+    """Return the accumulated points of the method ``name`` as the cameras see them."""
     visible = METHODS[name].visible and scene.settings.project.visibility
     return _see_window(scene, cloud, visible).joined(_see_far(scene, METHODS[name]))
 
@@ -180,15 +176,13 @@ def _add_ages(
 
 
 def _without_times(scene: KeyScene, depth: dict[str, DepthMap]) -> dict[str, DepthMap]:
-    """Return the maps with a lower confidence if sweeps have no point times for deskewing.
-
-    Sweeps already compensated for motion need no point times and keep their confidence.
-    """
+    """Return the maps with a lower confidence if sweeps have no point times for deskewing."""
     sweeps, at = [s.sweep for s in scene.stretch.sweeps], scene.stretch[scene.key]
     untimed = np.mean([sweep.offset_ns is None for sweep in sweeps])
     if len(sweeps) < 2 or not untimed or not scene.settings.register.deskew:
         return depth
     period_s = float(np.median(np.diff([sweep.stamp_ns for sweep in sweeps]))) * 1e-9
+    # Sweeps already compensated for motion need no point times.
     if at.sweep.offset_ns is None and find_compensated(at.sweep, at.twist, period_s) is not None:
         return depth
     exposures = scene.views.exposures

@@ -29,15 +29,9 @@ def complete_with_prior(
 ) -> Result:
     """Return the result with completed maps (``full``) and their scores.
 
-    A prior that does not fit the measured depth is not used, and a warning is logged.
-
-    Args:
-        result: Result of one method; not changed.
-        files: The user's depth images.
-        shots: Map name -> camera, image number and time of the map.
-        truth: Map name -> ground-truth depth (H,W) in metres and mask (H,W) of moving pixels.
-            Maps without ground truth are missing.
-        kind: Setting ``prior.kind``.
+    A prior that does not fit the measured depth is not used, and a warning is logged. ``shots`` and
+    ``truth``, depth (H,W) in metres and mask (H,W) of moving pixels, are by map name. ``kind`` is
+    the setting ``prior.kind``.
     """
     full, metrics = {}, copy.deepcopy(dict(result.metrics))
     for name, prior in _read(files, shots, result.key).items():

@@ -66,17 +66,13 @@ _SOME = 8  # every eighth point tells the share of points below the ground
 
 
 class Piece(NamedTuple):
-    """Consecutive registered sweeps of one block that share a world.
+    """Consecutive registered sweeps of one block that share a world."""
 
-    number: index of the block. row: index of the piece in the block. poses: poses of the piece's
-    sweeps and of one sweep before them, in the levelled lidar frame of the first of ``frames``.
-    frames: frame numbers of the piece's sweeps.
-    """
-
-    number: int
-    row: int
+    number: int  # index of the block
+    row: int  # index of the piece in the block
+    # Poses of the piece's sweeps and of one before them, in the first's levelled lidar frame
     poses: Trajectory
-    frames: tuple[int, ...]
+    frames: tuple[int, ...]  # frame numbers of the piece's sweeps
 
 
 class Moment(NamedTuple):
@@ -113,9 +109,7 @@ class Recording:
         Args:
             window: Number of sweeps on each side of a key.
             keys: Frame numbers, around which sweeps are read; None for every frame.
-            cache: Cache of results on disk.
             run: Name of a run whose processes share results through the cache; None for no sharing.
-            watch: Measures the cost of each step.
             looks_around: True also searches motion ``flow.look_around_s`` beyond the windows.
         """
         self.sequence, self.settings = sequence, settings
@@ -202,16 +196,13 @@ class Recording:
         return len(self._searched(piece.number, piece.row)) == 2
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
-        """Return the scene flow of all points in a key's window.
-
-        engine: name of the scene-flow engine, None for ``flow.engine``. With two sweeps ``pairs``
-        replaces ``groups``.
-        """
+        """Return the flow of all points in a key's window; ``engine`` None is ``flow.engine``."""
         engine, window, piece = (
             engine or self.settings.flow.engine,
             self.window(key),
             self._piece(key),
         )
+        # Two sweeps are too few for ``groups``.
         if engine == "groups" and self.is_pair(key):
             engine = "pairs"
         if not engine_row(engine)[0].shared:
@@ -227,10 +218,7 @@ class Recording:
         return motion.with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
-        """Return the flow of a sweep to the next sweep, or else to the previous sweep.
-
-        The result is empty for a sweep without neighbours. Errors are as in `window_frames`.
-        """
+        """Return the flow of a sweep to the next, or else previous sweep; empty without either."""
         window = self.window(frame)
         beside = [f for f in window.frames if f > frame] or [f for f in window.frames if f < frame]
         motion = self.motion(frame) if beside else None
@@ -241,11 +229,10 @@ class Recording:
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
     ) -> Moment:
-        """Accumulate the sweeps of a key's window at the key's reference time.
+        """Accumulate the key sweep, or all sweeps of its window, at the key's reference time.
 
-        all_sweeps: use the whole window, else the key sweep alone. engine: name of the scene-flow
-        engine, "" for the configured engine, None for rigid accumulation. with_flow: also return
-        the flow of every sweep to the next sweep towards the key.
+        The scene flow is by ``engine``, "" for the configured engine, None for rigid accumulation.
+        ``with_flow`` also returns the flow of every sweep to the next sweep towards the key.
         """
         stretch, flow = self.window(key), None
         tracks: tuple[ObjectTrack, ...] = ()
@@ -276,11 +263,8 @@ class Recording:
         return self._ground(piece.number, piece.row)
 
     def standing(self, key: int) -> Beyond | None:
-        """Return the static surfaces along the road before and after the key's window.
-
-        The result is None if none are known, or not requested (``accumulate.far_m``).
-        """
-        if not self.settings.accumulate.far_m:
+        """Return the static surfaces along the road beyond the key's window, None without any."""
+        if not self.settings.accumulate.far_m:  # not requested
             return None
         piece = self._piece(key)
         found = self._far(piece.number, piece.row)

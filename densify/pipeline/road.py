@@ -68,10 +68,8 @@ class Road:
     def find_standing(self, near: Stretch, keys: Sequence[int], with_near: bool) -> StandingWorld:
         """Return the static surfaces along the road, in the world of ``near``.
 
-        Args:
-            near: Registered, deskewed sweeps of the window, including the keys.
-            keys: Frame numbers of the keys.
-            with_near: Include the points of ``near``.
+        ``near`` are deskewed sweeps of the window that include the keys. ``with_near`` includes
+        their points in the result.
         """
         sensors, views = Sensors.of(near.sweeps), self._views(near, keys)
         is_recorded, surfaces = self.settings.source == "dataset", dict[int, Surface]()
@@ -102,11 +100,7 @@ class Road:
         views: Sequence[_View],
         side: int,
     ) -> list[_Passed]:
-        """Return the sweeps before (side -1) or after (side 1) the window, nearest first.
-
-        near: registered sweeps of the window. surfaces: their surfaces by frame number. views:
-        cameras that must see a return to keep it.
-        """
+        """Return the sweeps before (side -1) or after (side 1) the window, nearest first."""
         last = near.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
         begin_m = 0.0 if side < 0 else _travel_m(near)[-1]
         found, last_m, travel_m = list[_Passed](), 0.0, 0.0
@@ -123,13 +117,10 @@ class Road:
         return found
 
     def _is_seen(self, near: Stretch, views: Sequence[_View], side: int) -> bool:
-        """Return True if a camera may see the road's end before (side -1) or after the window.
-
-        It is True for both sides of a window in which the vehicle stands.
-        """
+        """Return True if a camera may see the road's end before (side -1) or after the window."""
         first, last = (near.sweeps[row].T_world_lidar[:3, 3] for row in (0, -1))
         length_m = float(np.linalg.norm(last - first))
-        if length_m < _LEAST_STEP_M:
+        if length_m < _LEAST_STEP_M:  # the vehicle stands
             return True
         way = side * self.far_m * (last - first) / length_m
         end = ((last if side > 0 else first) + way)[None].astype(np.float32)
@@ -225,16 +216,7 @@ def _within(
 
 
 def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], frozenset[int]]:
-    """Correct the poses along the road until the surfaces of the sweeps agree (`relax_poses`).
-
-    Args:
-        passed: Sweeps in the order of the road, with approximate poses.
-        near: Registered sweeps of the window; their poses stay.
-
-    Returns:
-        The sweeps of ``passed`` with corrected poses and velocities, and the frame numbers of the
-            sweeps whose poses remain unreliable.
-    """
+    """Correct the poses by `relax_poses`; return also the frames of sweeps that stay unreliable."""
     frames = tuple(p.registered.frame for p in passed)
     found = relax_poses(
         [p.surface for p in passed if p.surface is not None],
@@ -245,7 +227,7 @@ def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], f
     stamp_ns = np.array([p.registered.sweep.stamp_ns for p in passed], np.int64)
     trajectory, moved = Trajectory(frames, stamp_ns, found.T_world_lidar), []
     for i, p in enumerate(passed):
-        if not p.known:
+        if not p.known:  # poses of the window stay
             T_world_lidar, sweep = found.T_world_lidar[i], p.registered.sweep
             p = p._replace(registered=RegisteredSweep(sweep, T_world_lidar, *twists(trajectory, i)))
         moved.append(p)
@@ -253,10 +235,7 @@ def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], f
 
 
 def _in_view(registered: RegisteredSweep, views: Sequence[_View]) -> RegisteredSweep:
-    """Return a sweep with only those returns that one of the cameras may see.
-
-    views: cameras and their poses in the world of the sweep.
-    """
+    """Return a sweep with only those returns that one of the views, in its world, may see."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     keep = np.zeros(len(sweep), bool)
     rows = np.flatnonzero(far.in_reach(sweep))

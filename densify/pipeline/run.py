@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run the pipeline.
+"""Run the pipeline: `run`, `run_keys`, `compare` and `flow_steps` check arguments, then call it.
 
 `densify` is all of it for one key::
 
@@ -9,8 +9,6 @@
     see, project, fill, score          densify.pipeline.key_result, method by method
     complete with a prior              densify.pipeline.prior
     warn                               densify.pipeline.warnings
-
-`run`, `run_keys`, `compare` and `flow_steps` check their arguments, then call it.
 """
 
 from __future__ import annotations
@@ -80,7 +78,7 @@ def run(
 
     Returns:
         The result. With ``output.score`` it also has the simpler methods as ``baselines``, and
-        scores of maps made without the key sweep.
+            scores of maps made without the key sweep.
     """
     made = run_keys(sequence, [key], window, method, cameras, config, progress, prior=prior)
     ((_, result),) = made
@@ -103,12 +101,8 @@ def run_keys(
     """Densify several keys, and yield (key, result or error) by ascending key.
 
     Keys whose windows overlap share registration, ground and motion. Objects are tracked over all
-    sweeps of these windows, which can improve a key slightly over `run`.
-
-    Args:
-        keys: Frame numbers, in any order.
-        window: Number of sweeps on each side of a key. The other arguments are as in `run`.
-        cache: Keeps shared results on disk.
+    sweeps of these windows, which can improve a key slightly over `run`. The ``cache`` keeps shared
+    results on disk. The other arguments are as in `run`.
     """
     methods, watch = methods_of_run(method, resolve(config)), Watch(progress)
     recording = _open(sequence, keys, window, methods, cameras, config, cache, watch)
@@ -133,12 +127,9 @@ def compare(
 ) -> dict[str, Result]:
     """Densify one key with several methods on the same registration, and score them.
 
+    The arguments are as in `run`, except for these.
+
     Args:
-        key: Frame number of the key sweep.
-        window: Number of sweeps on each side of the key.
-        cameras: Names of cameras; None for all.
-        config: Settings, see `densify.config.resolve`.
-        progress: Callback (stage, done, total).
         methods: Some of ``none``, ``icp``, ``icp-visible``, ``icp-far``, ``flow-plain``, ``paper``
             and ``flow``.
         cache: Keeps the results of steps on disk.
@@ -163,13 +154,7 @@ def flow_steps(
     """Yield (frame, scene flow to the next sweep, or error) for sweeps of a whole recording.
 
     If no next sweep exists, as at the end or before a hole in time, the flow is to the previous
-    sweep.
-
-    Args:
-        frames: Frame numbers, ascending.
-        config: Settings, see `densify.config.resolve`.
-        progress: Callback (stage, done, total).
-        cache: Keeps the results of steps on disk.
+    sweep. ``frames`` ascend. The other arguments are as in `run_keys`.
     """
     recording = _open(sequence, frames, 1, ["flow"], None, config, cache, None)
 
@@ -197,9 +182,7 @@ def densify(
 
     Args:
         recording: The recording, whose blocks include the key.
-        key: Frame number of the key sweep.
         methods: Names of `METHODS`.
-        cameras: Names of cameras; None for all.
         watch: Measures the cost of each stage, from zero. A stage shared by several keys counts for
             the first of them.
         with_images: Colour the cloud, and score depth if there is ground truth. The maps are the

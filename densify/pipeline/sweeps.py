@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read the raw sweeps of a recording on demand, and cut the recording into blocks.
-
-The keys of a block share registration and motion.
-"""
+"""Read the raw sweeps of a recording on demand, and cut it into blocks of neighbouring keys."""
 
 from __future__ import annotations
 
@@ -38,7 +35,6 @@ class Sweeps:
         """Prepare to read.
 
         Args:
-            timeline: Times of the sweeps.
             num_kept: Number of sweeps kept in memory.
             cache: Cache on disk, None for no cache.
             run: Name of a run whose processes share digests of sweeps; None for no sharing.
@@ -72,10 +68,7 @@ class Sweeps:
         return sweep
 
     def _content(self, frame: int) -> str:
-        """Return a digest of a sweep and its recorded pose, or the message of its error.
-
-        Processes of a run share the digest through the cache, so only one process reads the sweep.
-        """
+        """Return a digest of a sweep and its recorded pose, or the message of its error."""
 
         def find() -> str:
             try:
@@ -83,6 +76,7 @@ class Sweeps:
             except InputError as error:
                 return str(error)
 
+        # Processes of a run share the digest, so only one of them reads the sweep.
         inputs = [self._run, self._sequence.name, self._settings, frame]
         return kept(self._cache, "digests", lambda: inputs, find)
 
@@ -103,12 +97,8 @@ class Cut:
     def of(timeline: Timeline, window: int, keys: Collection[int], beyond_s: float = 0.0) -> Cut:
         """Cut blocks around the windows of some keys, ``beyond_s`` seconds longer on each side.
 
-        Keys with overlapping windows share a block, unless they are more than `BLOCK_S` apart.
-
-        Args:
-            timeline: Times of the sweeps.
-            window: Number of sweeps on each side of a key.
-            keys: Frame numbers, in any order.
+        Keys, in any order, share a block if their windows (``window`` sweeps on each side) overlap,
+        unless they are more than `BLOCK_S` apart.
         """
         check_window(window)
         groups: list[list[int]] = []

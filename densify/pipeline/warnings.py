@@ -37,14 +37,7 @@ def add_warnings(
     key: int,
     shots: Mapping[str, Shot],
 ) -> dict[str, Result]:
-    """Return the results of one key with the field ``warnings`` filled in, by name of the method.
-
-    Args:
-        results: Results by name of the method; not changed.
-        recording: Recording from which the results were computed.
-        key: Frame number of the key sweep.
-        shots: Camera, image number and time of each depth map, by name of the map.
-    """
+    """Return the ``results`` of one key, by method, with the field ``warnings`` filled in."""
     sequence, stretch = recording.sequence, recording.window(key)
     cameras = {shot.camera.name for shot in shots.values()}
     shared = [

@@ -22,42 +22,29 @@ class ReaderModule(Protocol):
     """Interface of a reader's module."""
 
     def open_recording(self, path: Path, scene: str | None) -> LidarSequence:
-        """Open the recording at a path; sweeps and images are read later, on demand.
-
-        Args:
-            path: File or folder of the recording.
-            scene: Scene name or reader's option after ``#`` in ``--data``; None without ``#``.
-        """
+        """Open a recording; ``scene`` is the text after ``#`` in ``--data``, None without it."""
         ...
 
 
 class Spec(NamedTuple):
-    """A recording as ``--data`` names it.
+    """A recording as ``--data`` names it."""
 
-    Attributes:
-        reader: Name of the reader in `READERS`; "street" for the built-in simulated recording;
-            None if the reader is recognised by the files.
-        place: Path as typed by the user; for the street, the whole text with its options.
-        scene: Scene name or reader's option after ``#``; None without ``#``.
-    """
-
+    # Name in `READERS`; "street" for the simulated recording; None to recognise the files
     reader: str | None
-    place: str
-    scene: str | None = None
+    place: str  # path as typed by the user; for the street, the whole text with its options
+    scene: str | None = None  # scene name or reader's option after ``#``
 
     @staticmethod
     def parse(text: str | Path) -> Spec:
-        """Parse ``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``.
-
-        A ``#`` belongs to the path if the path with ``#`` exists. Without ``READER:``, the ``#``
-        also belongs to the path if no file or folder is named by the text before ``#``.
-        """
+        """Parse ``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``."""
         text = str(text)
         if text == "street" or text.startswith(("street:", "street?")):
             return Spec("street", text)
         name, colon, place = text.partition(":")
         reader = name if colon and name in READERS.names() else None
         place = text if reader is None else place
+        # A # in the path of an existing file is part of the path. Without READER: it also is if no
+        # file is named by the text before it.
         path, mark, scene = place.rpartition("#")
         if not mark or _exists(place) or (reader is None and not _exists(path)):
             return Spec(reader, place)
@@ -84,13 +71,9 @@ def _exists(place: str) -> bool:
 def open_sequence(spec: str | Path = "street") -> LidarSequence:
     """Open a recording; sweeps and images are read later, on demand.
 
-    Args:
-        spec: Path, ``READER:PATH[#SCENE]``, or ``street[:PRESET][?seed=N&sensor=NAME]`` for the
-            built-in simulated street. Without ``READER:`` the reader is recognised by the files.
-
-    Raises:
-        InputError: The path does not exist, no reader recognises the files, the reader has no
-            scenes but ``#SCENE`` is given, or a camera's first image contradicts its calibration.
+    ``spec`` is a path, ``READER:PATH[#SCENE]``, or ``street[:PRESET][?seed=N&sensor=NAME]`` for the
+    built-in simulated street. Without ``READER:`` the reader is recognised by the files. The first
+    image of each camera must fit its calibration.
     """
     parsed = Spec.parse(spec)
     if parsed.reader == "street":

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read Argoverse 2 sensor and lidar logs as downloaded.
-
-Wilson et al., NeurIPS Datasets 2021::
+"""Read Argoverse 2 sensor and lidar logs as downloaded (Wilson et al., NeurIPS Datasets 2021).
 
     LOG/sensors/lidar/315966265259836000.feather             x y z intensity laser_number offset_ns
     LOG/sensors/cameras/ring_front_center/3159662652….jpg    optional
@@ -9,12 +7,11 @@ Wilson et al., NeurIPS Datasets 2021::
     LOG/calibration/egovehicle_SE3_sensor.feather, intrinsics.feather
     LOG/annotations.feather                                  optional: tracked boxes
 
-Points are in the vehicle's frame (x forward, y left, z up), float16. They are ego-motion
-compensated to the file's stamp, the *start* of the sweep. The reader undoes the compensation with
-the poses and the firing times (``offset_ns``). Two scanners turn half a revolution apart, the lower
-scanner upside down: lasers 0 to 31 are ``up_lidar``, 32 to 63 ``down_lidar`` (issue 77 of av2-api).
-Images are undistorted (k1 to k3 do not apply) and stamped at their exposure. Sweeps and images are
-numbered from 0 in the order of time.
+Points are in the vehicle's frame (x forward, y left, z up), float16, ego-motion compensated to the
+file's stamp, the *start* of the sweep. The reader undoes this with the poses and the firing times
+(``offset_ns``). Two scanners turn half a revolution apart: lasers 0 to 31 are ``up_lidar``, 32 to
+63 ``down_lidar``, upside down (issue 77 of av2-api). Images are undistorted (k1 to k3 do not apply)
+and stamped at their exposure. Sweeps and images are numbered from 0 in the order of time.
 """
 
 from __future__ import annotations
@@ -54,13 +51,9 @@ def open_recording(path: Path, scene: str | None) -> Argoverse2:
 
 
 class Argoverse2(FileSequence):
-    """An Argoverse 2 log as a `LidarSequence`.
-
-    The lidar frame is the vehicle's frame. The reference time of a sweep is its start.
-    """
+    """An Argoverse 2 log in the vehicle's frame; the reference time of a sweep is its start."""
 
     def __init__(self, log: Path) -> None:
-        """Read the poses and the calibration in the folder of a log."""
         sweeps = checks.numbered_files(log / "sensors" / "lidar", ".feather")
         if not sweeps:
             raise InputError(

@@ -27,13 +27,10 @@ _TYPES = {"s": ("string", "large_string"), "b": ("binary", "large_binary")}
 
 
 def read_feather(path: Path, columns: Mapping[str, str], what: str) -> dict[str, NDArray[Any]]:
-    """Return columns of a feather file by name, (N,) for a table of N rows.
+    """Return columns (N,) of a feather file by name; errors name ``what``, the kind of recording.
 
-    Args:
-        columns: Kind of values expected, by column name: "n" finite numbers, "m" numbers that may
-            be NaN, "i" integers, "s" strings, "b" bytes, "t" booleans, "l" lists of numbers. A
-            column "l" is returned as an object array of arrays or None.
-        what: Kind of recording, such as "Argoverse 2 recordings", for the error message.
+    ``columns`` has the kind of each: "n" finite numbers, "m" numbers or NaN, "i" integers, "s"
+    strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of arrays or None).
     """
     needed("pyarrow", "argoverse", what)
     feather = needed("pyarrow.feather", "argoverse", what)

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find and check what all readers share: numbered files, cameras, poses and boxes.
-
-Each check raises InputError with a message that begins with the file or folder.
-"""
+"""Find and check numbered files, cameras, poses and boxes; errors begin with the file or folder."""
 
 from __future__ import annotations
 
@@ -25,11 +22,7 @@ _ORTHONORMAL_TOLERANCE = 1e-3  # far above the rounding of text and float32 file
 
 
 def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
-    """Return the files of a folder named by a number, such as ``0000000120.bin``, ascending.
-
-    Of files whose names differ in the suffix alone, the one with the first of ``suffixes`` is
-    taken.
-    """
+    """Return a folder's files by number, such as ``0000000120.bin``; earlier suffixes win."""
     if not folder.is_dir():
         return {}
     files = [p for p in folder.iterdir() if p.stem.isdecimal() and p.suffix.lower() in suffixes]
@@ -45,10 +38,7 @@ def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
 
 
 def file_within(root: Path, name: str, where: Path | str) -> Path:
-    """Return the path of a file that a table names relative to a data set's folder.
-
-    Raise InputError, starting with ``where``, if the name leads out of the folder.
-    """
+    """Return the path of ``name`` relative to ``root``; raise InputError if it leads out of it."""
     path = root / name
     if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)):
         raise InputError(
@@ -99,17 +89,13 @@ def image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> Non
 
 def pinhole(
     name: str,
-    size_px: tuple[int, int],
-    fx_fy_cx_cy: Sequence[float],
-    T_cam_lidar: Float,
+    size_px: tuple[int, int],  # width, height
+    fx_fy_cx_cy: Sequence[float],  # pixels
+    T_cam_lidar: Float,  # (4,4)
     where: str,
     **lens: Any,
 ) -> Camera:
-    """Return a camera with zero skew.
-
-    ``size_px`` is (width, height), ``fx_fy_cx_cy`` in pixels, ``T_cam_lidar`` (4,4). ``lens`` has
-    further arguments of `Camera`, such as ``distortion``. Errors begin with ``where``.
-    """
+    """Return a camera with zero skew; ``lens`` has further arguments, such as ``distortion``."""
     fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
         raise InputError(
@@ -178,11 +164,9 @@ def rotation(R: Float, where: str) -> Float:
 
 
 def scanner_axes(T_lidar_scanner: Float) -> Float:
-    """Return the (S,3,3) rotations from the lidar frame to scanner axes, of (S,4,4) mounting poses.
-
-    The axes of an upside-down scanner are turned by 180 degrees about x, until z points up.
-    """
+    """Return (S,3,3) rotations from the lidar frame to scanner axes, of (S,4,4) mounting poses."""
     R = T_lidar_scanner[:, :3, :3]
+    # The axes of an upside-down scanner are turned by 180 degrees about x, until z is up.
     upright = np.where(R[:, 2:, 2:] < 0, R * [1.0, -1.0, -1.0], R)
     return np.ascontiguousarray(upright.transpose(0, 2, 1))
 
@@ -227,14 +211,7 @@ def boxes(
     where: str,
     lidar: Int | None = None,
 ) -> Boxes:
-    """Check and return the K boxes of a sweep; errors begin with ``where``.
-
-    Args:
-        track: (K,) name of each box's object, the same in all sweeps; "" if it is not tracked.
-        T_lidar_box: (K,4,4) poses of the boxes' centres in the lidar frame, x to the front.
-        size_m: (K,3) length, width and height.
-        lidar: (K,) index of the scanner whose points a box encloses, -1 for all; None for all.
-    """
+    """Check and return the K boxes of a sweep; `Boxes` describes the arguments."""
     bad = np.flatnonzero(~((size_m > 0) & (size_m < np.inf)).all(axis=1))
     if len(bad):
         raise InputError(

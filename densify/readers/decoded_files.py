@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Decode arrays, images and LAS files safely with NumPy, OpenCV and laspy.
-
-Each function checks the sizes stated in a file's header before it allocates memory. Every error of
-a library is raised as InputError.
-"""
+"""Decode arrays, images and LAS files; sizes in headers are checked before memory is allocated."""
 
 from __future__ import annotations
 

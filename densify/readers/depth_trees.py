@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Pair estimated and true depth maps, and masks, by the drive, camera and frame in their paths.
 
-The folder of estimated maps and the folder of true maps each have one of these layouts::
+Estimated and true maps each have one of these layouts (`densify dataset`: the 1st or 3rd)::
 
     <drive>/proj_depth/<product>/image_02/0000000005.png    KITTI's depth trees
     <drive>_sync_<product>_0000000005_image_02.png          KITTI's selected validation images
@@ -9,9 +9,8 @@ The folder of estimated maps and the folder of true maps each have one of these 
     000005/depth/image_02/000007.png                        its maps of single images, by number
     [image_02/]0000000005.png, scene_a.png                  plain folders; the name is the frame
 
-Folders that `densify export` wrote into PREDICTED are left out, because they hold copies.
-The sets of `densify dataset` have the first or the third layout. A drive is KITTI's dated name
-anywhere in a path, or the folder that holds proj_depth.
+A drive is KITTI's dated name anywhere in a path, or the folder that holds proj_depth. Copies that
+`densify export` wrote into PREDICTED are left out.
 """
 
 from __future__ import annotations
@@ -69,17 +68,13 @@ class _File:
 def pair_depth_files(
     predicted: Path, truth: Path, mask: Path | None = None, *, filled: bool = False
 ) -> DepthPairs:
-    """Pair estimated PNG depth maps with true depth maps and with masks.
+    """Pair estimated PNG depth maps with true depth maps and with masks of moving objects.
 
-    The frame in both paths must agree; the drive and the camera too if all paths name them. In a
-    folder with files of a known layout, other files are ignored. If ``truth`` has KITTI's
-    ``groundtruth`` maps, only these maps are used.
-
-    Args:
-        predicted: Path of an estimated map, or of a folder searched with its subfolders.
-        truth: Path of a true map, or of a folder. Two files are paired whatever their names.
-        mask: Folder of masks of moving objects, or one file beside two files; None for no masks.
-        filled: True pairs densify's filled maps, False its maps of measured pixels.
+    Each path is a file, or a folder that is searched with its subfolders. Two files are paired
+    whatever their names. In folders the frames must agree; the drive and the camera too if all
+    paths name them. Files of a known layout exclude others, and in ``truth`` KITTI's
+    ``groundtruth`` maps exclude other maps. ``filled`` pairs densify's filled maps instead of its
+    maps of measured pixels.
     """
     found = _product(_found(predicted, "PREDICTED"), predicted, filled)
     true = _found(truth, "TRUTH")

@@ -26,10 +26,7 @@ def in_lines(lines: Sequence[tuple[str, str]]) -> str:
 
 
 def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
-    """Summarise a recording as (name, text) pairs, among them frames, rate, cameras and poses.
-
-    The first and the last readable sweep are loaded, and no image. Rates are of median times.
-    """
+    """Summarise a recording as (name, text) pairs; load only its first and last readable sweep."""
     timeline = Timeline.of(sequence)
     unreadable = dict(timeline.unknown)
     first = _readable(sequence, timeline.frames, unreadable)

@@ -1,22 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Read scenes in the Dataset Governance Policy (DGP) format of TRI, such as DDAD.
-
-DDAD: Guizilini et al., CVPR 2020::
+"""Read TRI's Dataset Governance Policy (DGP) scenes: DDAD (Guizilini et al., CVPR 2020), others.
 
     ROOT/scene_02/scene_<hash>.json        samples, and the files, poses and stamps of their data
     ROOT/scene_02/calibration/<hash>.json  extrinsics (on the vehicle) and intrinsics, by name
     ROOT/scene_02/point_cloud/LIDAR/<stamp>.npz    ROOT/scene_02/rgb/CAMERA_01/<stamp>.jpg
 
-- ``--data`` names a scene's folder, or the data set and the scene after ``#``. Sweeps and the
-  images of each camera are numbered from 0 in the order of time; the number of a missing file
-  stays unused. Every sweep and image has a pose of its sensor.
-- Stamps are ISO dates. DDAD stores tenths of microseconds as microseconds: dates beyond 2200
-  are divided by ten.
-- Points have no times and are in the frame of the sweep's sensor. DDAD merges several solid-state
-  scanners into the vehicle's frame, with its origin on the ground. The origin of the rays is not
-  published. Scan lines are smoothest as seen from 1.55 m above the ground, so the mean position
-  of the cameras is used.
-- Images are of pinhole cameras without distortion.
+Sweeps and the images of each camera are numbered from 0 in the order of time; the number of a
+missing file stays unused. Each has an ISO date and a pose of its sensor. Points have no times and
+are in the sensor's frame. Images are of pinhole cameras without distortion.
 """
 
 from __future__ import annotations
@@ -37,7 +28,7 @@ from densify.readers import checks
 from densify.readers.decoded_files import read_arrays
 from densify.readers.file_sequence import FileSequence, Returns
 
-_BOGUS_YEAR = 2200
+_BOGUS_YEAR = 2200  # DDAD stores tenths of microseconds as microseconds
 
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
@@ -69,7 +60,6 @@ class Dgp(FileSequence):
     """A DGP scene as a `LidarSequence`, with poses of its images."""
 
     def __init__(self, path: Path) -> None:
-        """Read the description and the calibration in the folder of a scene."""
         file = find_scene(path)
         if file is None:
             raise InputError(f"{path}: no DGP scene; expected scene_<hash>.json in it")
@@ -90,6 +80,9 @@ class Dgp(FileSequence):
             cameras[name] = checks.pinhole(
                 name, size_px, lens, T_cam_lidar, f"{calibration}: {name}"
             )
+        # DDAD merges several solid-state scanners into the vehicle's frame, with its origin on the
+        # ground, and does not publish the origin of the rays. Scan lines are smoothest as seen from
+        # 1.55 m above the ground: the mean position of the cameras is used.
         self._origins_m = None
         if np.array_equal(T_ego_lidar, np.eye(4)) and cameras:
             places = [poses.inverse(camera.T_cam_lidar)[:3, 3] for camera in cameras.values()]

@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Provide the base class of readers of recorded files, which checks requests and contents.
-
-A reader derives from `FileSequence` and lists the sweeps, cameras and images in ``__init__``. It
-reads the returns of one sweep, one image or one pose at a time. The base class raises InputError
-for a frame, camera or image that does not exist, a sweep without valid returns, an image whose size
-differs from the calibration, and a pose that is not a rigid transform.
-"""
+"""Provide the base class of readers of recorded files, which checks requests and contents."""
 
 from __future__ import annotations
 
@@ -27,63 +21,40 @@ from densify.readers.decoded_files import stated_size_px
 
 @dataclass(frozen=True)
 class Returns:
-    """All N rows of a sweep's file, valid or not, not deskewed, measured by S scanners.
+    """All N rows of a sweep's file, valid or not, not deskewed, measured by S scanners."""
 
-    Attributes:
-        points: (N,3) metres, lidar frame at each point's own firing time; 0 0 0 if invalid.
-        intensity: (N,) intensities, 0 to 1; None if the file has none.
-        offset_ns: (N,) int64 firing times since the sweep's reference time; None if unknown.
-        lidar: (N,) index of the scanner that fired, 0 to S - 1; None for a single scanner.
-        scanner_origins: (S,3) metres, start of each scanner's rays in the lidar frame; None if
-            rays start at 0 0 0.
-        R_scanner_lidar: (S,3,3) rotations from the lidar frame to the axes of each scanner, which
-            spins about its z axis; None if the axes are equal.
-        num_untimed: Number of rows set to 0 0 0 because their time cannot belong to this sweep.
-    """
-
-    points: Float
-    intensity: Float32 | None = None
-    offset_ns: Int | None = None
+    points: Float  # (N,3) metres, lidar frame at each point's own firing time; 0 0 0 if invalid
+    intensity: Float32 | None = None  # (N,) 0 to 1; None if the file has none
+    offset_ns: Int | None = None  # (N,) int64 since the sweep's reference time; None if unknown
+    # (N,) index of the scanner that fired, 0 to S - 1; None for a single scanner
     lidar: NDArray[np.integer[Any]] | None = None
+    # (S,3) metres, start of each scanner's rays in the lidar frame; None if rays start at 0 0 0
     scanner_origins: Float | None = None
+    # (S,3,3) rotations from the lidar frame to the axes of each scanner, which spins about its z
+    # axis; None if the axes are equal
     R_scanner_lidar: Float | None = None
-    num_untimed: int = 0
+    num_untimed: int = 0  # rows set to 0 0 0 because their time cannot belong to this sweep
 
 
 class FileSequence(ABC):
-    """A `LidarSequence` that is read from files.
-
-    A derived reader sets ``_stamps_ns``, the reference times by frame, or overrides `stamp_ns`.
-
-    Attributes:
-        name: Name of the recording for people and outputs.
-        where: Path of the recording, for messages.
-        frames: Frame numbers of the existing sweeps, ascending.
-        cameras: Cameras by name.
-        truth: Ground truth of a simulated recording, None for other recordings.
-    """
+    """A `LidarSequence` of files; a reader sets ``_stamps_ns`` by frame or overrides `stamp_ns`."""
 
     _stamps_ns: Mapping[int, int] | Sequence[int] | Int
 
     def __init__(
         self,
-        name: str,
-        where: Path,
-        frames: Sequence[int],
-        cameras: Mapping[str, Camera] | None = None,
+        name: str,  # for people and outputs
+        where: Path,  # path of the recording, for messages
+        frames: Sequence[int],  # numbers of the existing sweeps, ascending
+        cameras: Mapping[str, Camera] | None = None,  # by name
+        # Exposure time of each existing image, by camera and image number
         exposed_ns: Mapping[str, Mapping[int, int]] | None = None,
-        truth: Truth | None = None,
-        files: Mapping[int, Path] | None = None,
+        truth: Truth | None = None,  # of a simulated recording
+        files: Mapping[int, Path] | None = None,  # by frame; None if sweeps share files
+        # PNG or JPEG files by camera and number; a reader without them overrides `_encoded_image`
         images: Mapping[str, Mapping[int, Path]] | None = None,
     ) -> None:
-        """Store the files and times that the reader found; the class describes the other arguments.
-
-        Args:
-            exposed_ns: Exposure time of each existing image, by camera and image number.
-            files: File of each sweep by frame, None if sweeps share files.
-            images: PNG or JPEG files by camera and image number. A reader without such files
-                overrides `_encoded_image`.
-        """
+        """Store the files and times that the reader found."""
         self.name = name
         self.where = where
         self.frames: Sequence[int] = frames
@@ -146,8 +117,8 @@ class FileSequence(ABC):
     def __getitem__(self, frame: int) -> Sweep:
         """Read a sweep and return its valid points, in file order, at their own firing times.
 
-        Rows at 0 0 0, which many formats use as padding, and rows with a position that is not
-        finite are dropped. Intensities that are not finite become 0.
+        Rows at 0 0 0 (padding) or with a position that is not finite are dropped. Intensities that
+        are not finite become 0.
         """
         path, returns = self._checked_returns(frame)
         x, y, z = returns.points.T  # by columns: reductions over rows of three are far slower

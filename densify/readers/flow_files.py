@@ -2,26 +2,22 @@
 """Read flow files: scene flow between two sweeps, from densify or from another method.
 
 ``000119_000120.npz`` holds the flow of N points of sweep 119 (source) to the reference time of
-sweep 120 (target). It has residual_flow or total_flow; the other arrays are optional::
+sweep 120 (target): residual_flow or total_flow, and optional arrays::
 
     residual_flow  (N,3) metres, ego-motion removed, in the source's lidar frame
-    total_flow     (N,3) metres with ego-motion: target minus source coordinates, each in the
-                   lidar frame of its sweep
+    total_flow     (N,3) metres, target minus source coordinates, each in its sweep's lidar frame
     row            (N,) row index of each point in the sweep's file; default 0 to N - 1
     moving         (N,) bool; default True for a residual flow of 0.05 m or more
-    object         (N,) number of the moving object, the same in every file; -1, the default, is
-                   no object
+    object         (N,) number of the moving object, the same in every file; default -1, no object
     valid          (N,) bool, the ground-truth flow of the point is known; used only for scoring
-    to_reference   (N,3) metres, the point's own motion from its firing time to the sweep's
-                   reference time; default 0
+    to_reference   (N,3) metres, the point's own motion from firing to reference time; default 0
 
-Ground-truth flow for scoring is read from flow files, or from the Argoverse 2 labels of
-BucketedSceneFlowEval::
+Ground truth for scoring is in flow files or in Argoverse 2 labels of BucketedSceneFlowEval::
 
     DIR/[LOG/]STAMP.feather  flow_tx_m flow_ty_m flow_tz_m, ego-motion removed, in the vehicle's
                              frame at the stamp; is_valid; classes_0, an index of `CATEGORIES` or
-                             -1 for background. The table has one row per row of the sweep's file.
-                             Files are named by stamps, or 0000000000, 0000000001, …
+                             -1 for background; a row for each row of the sweep's file. Names are
+                             stamps, or 0000000000, 0000000001, …
 """
 
 from __future__ import annotations
@@ -52,10 +48,7 @@ _KNOWN = (*_WIDE, "row", "moving", "object", "valid")
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Return the motion of all points from the flow files in the folder ``argument``.
-
-    This is the flow engine ``npz:FOLDER`` (`densify.flow.engines.EngineModule`).
-    """
+    """Return the motion of all points from a folder's flow files: the engine ``npz:FOLDER``."""
     check_argument(argument)
     step = partial(read_step, Path(argument), scene.stretch)
     return ChainedMotion(scene.stretch, step)
@@ -86,15 +79,12 @@ def read_step(folder: Path, stretch: Stretch, here: int, there: int) -> FlowFiel
 def sweep_columns(
     path: Path, row: NDArray[np.int64], points: NDArray[np.float64], T_here_there: NDArray[Any]
 ) -> dict[str, NDArray[Any]]:
-    """Read a flow file's arrays by name for the N points of a sweep, in the sweep's order.
+    """Read a flow file's arrays, as the module describes them, for N points in the sweep's order.
 
-    The module describes the arrays. Missing residual_flow, moving, object and valid are added. A
-    point that is missing in the file has flow 0 and object -1, and is not valid.
-
-    Args:
-        row: (N,) row index of each point in the sweep's file.
-        points: (N,3) points in the source's lidar frame (m).
-        T_here_there: (4,4) pose of the target's lidar frame in the source's lidar frame.
+    Missing residual_flow, moving, object and valid are added. A point that is missing in the file
+    has flow 0 and object -1, and is not valid. ``row`` (N,) is the row of each point in the sweep's
+    file. ``points`` is (N,3) metres in the source's lidar frame, in which ``T_here_there`` (4,4) is
+    the pose of the target's lidar frame.
     """
     arrays = load_flow_file(path)
     num_points = len(next(iter(arrays.values())))

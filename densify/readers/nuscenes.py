@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Read nuScenes (Caesar et al., CVPR 2020) without its devkit.
-
-Layout::
+"""Read nuScenes (Caesar et al., CVPR 2020) without its devkit; ``#scene-0061`` names a scene.
 
     ROOT/v1.0-trainval/{scene,sample,sample_data,ego_pose,calibrated_sensor,sensor}.json
     ROOT/v1.0-trainval/sample_annotation.json    optional: tracked boxes
     ROOT/{samples,sweeps}/LIDAR_TOP/*.pcd.bin    ROOT/samples/CAM_FRONT/*.jpg ...
 
-A scene is named by ``#scene-0061``. All its sweeps, and each camera's images, are numbered from 0
-in the order of time. The number of a missing file is skipped. Images are undistorted; their stamp
-is the exposure. The vehicle's path joins the poses of all records of a scene.
+A scene's sweeps, and each camera's images, are numbered from 0 in the order of time; the number of
+a missing file is skipped. Images are undistorted and stamped at the exposure. The vehicle's path
+joins the poses of all records of a scene.
 
 The scanner is one HDL-32E at 20 Hz. Points are in the scanner's frame (x right, y forward, z up),
-ego-motion compensated to the sweep's stamp, the time of the *last* packet. They have no times. A
-file lists the firings in the order of time, 32 rings each, 46.08 µs apart (HDL-32E manual, 9.3).
-Firing c of n is (c + 1 - n) · 46.08 µs after the stamp. With these times the compensation is
-undone. Missing returns then lie at the origin and are left out.
+ego-motion compensated to the sweep's stamp, the time of the *last* packet, and have no times. A
+file lists the firings in order, 32 rings each, 46.08 µs apart (HDL-32E manual, 9.3). Firing c of n
+is (c + 1 - n) · 46.08 µs after the stamp. With these times the compensation is undone; missing
+returns then lie at the origin and are left out.
 """
 
 from __future__ import annotations
@@ -113,12 +111,7 @@ class KeyBox(NamedTuple):
 
 @dataclass(frozen=True)
 class Annotations:
-    """The boxes of a scene's n key frames (2 Hz), from ``sample_annotation.json``.
-
-    Between key frames, boxes are interpolated at constant velocity and turn rate, as in the devkit.
-    An object in only one of two consecutive key frames is extrapolated from its nearest motion. Its
-    box then has no track name, because the real position is unknown.
-    """
+    """The boxes of a scene's n key frames (2 Hz); between them, boxes are interpolated."""
 
     where: str  # path of the table, for messages
     key_ns: Int  # (n,) ascending times of the key frames
@@ -168,6 +161,8 @@ class Annotations:
 
     def _box(self, instance: str, before: int, after: int, stamp_ns: int) -> KeyBox:
         """Inter- or extrapolate an object's box between key frames ``before`` and ``after``."""
+        # At constant velocity and turn rate, as in the devkit. An object in only one of the two is
+        # extrapolated from its nearest motion; it gets no track name, as its position is unknown.
         boxes = self.boxes
         for first, last in ((before, after), (after, after + 1), (before - 1, before)):
             inside = 0 <= first < last < len(boxes)
@@ -260,7 +255,6 @@ class NuScenes(FileSequence):
     """A nuScenes scene as a `LidarSequence`; the lidar frame is the scanner's own frame."""
 
     def __init__(self, tables: Path, token: str, name: str) -> None:
-        """Read the sensors and the vehicle's path; sweeps and images are read on demand."""
         self._tables, self._token, root = tables, token, tables.parent
         with described_in(tables / "sample_data.json", _EXPECTED):
             records, self._ego = _read_path(tables, token, name)

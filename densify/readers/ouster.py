@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Read packets of an Ouster scanner, by the maker's ouster-sdk (extra ``ouster``).
+"""Read packets (.pcap) of an Ouster scanner by the maker's ouster-sdk (extra ``ouster``).
 
-A recording is a ``.pcap`` capture and the ``.json`` metadata of the sensor. The metadata file is
-named after ``#``, or its name begins the name of the capture, or no other ``.json`` is beside it.
-
-A sweep is a frame of the sensor, numbered from 0, read on demand. Its stamp is the time at which
-the computer captured its first packet. The sensor's clock gives the firing times of the columns
-relative to the first column. Points are as measured, without compensation, in the sensor's frame (x
-forward, y left, z up, origin on the base). Rays start on the spinning axis. Point rows follow the
-range image, row by row. For a ray with two returns, the first is read. There are no cameras and no
-poses.
+The ``.json`` metadata of the sensor is named after ``#``, or found by `find_metadata`. A sweep is a
+frame of the sensor, numbered from 0; its stamp is when the computer captured its first packet. The
+sensor's clock gives the firing times of columns since the first. Points are as measured, in the
+sensor's frame (x forward, y left, z up, origin on the base); rays start on the spinning axis. Rows
+follow the range image, row by row. Of two returns of a ray the first is read. There are no cameras
+and no poses.
 """
 
 from __future__ import annotations
@@ -55,7 +52,6 @@ class Ouster(FileSequence):
     """An Ouster capture as a `LidarSequence`, stamped at the first packet of each sweep."""
 
     def __init__(self, path: Path, metadata: Path) -> None:
-        """Open a capture with its metadata."""
         core = needed("ouster.sdk.core", "ouster", "Ouster captures")
         pcap = needed("ouster.sdk.pcap", "ouster", "Ouster captures")
         read_json(metadata)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Read PandaSet (Xiao et al., ITSC 2021): the folder of one sequence, as downloaded.
 
-Its files::
-
     002/lidar/{00.pkl.gz, ..., poses.json, timestamps.json}
     002/camera/front_camera/{00.jpg, ..., poses.json, timestamps.json, intrinsics.json}
     002/annotations/cuboids/{00.pkl.gz, ...}    optional: tracked boxes
@@ -11,10 +9,8 @@ Its files::
   Pandar64) turns once in a sweep. The second (``d`` 1, PandarGT, forward) is not synchronised.
 - Points are in the world, each transformed by the vehicle's pose at its firing time. The vehicle's
   poses are at 10 Hz, x right, y forward, z up. The clocks of poses and points agree to 20 ms.
-- The positions of the scanners are not published. The assumed position of the Pandar64 makes its
-  rings sharpest, and of the PandarGT the swings of its mirror smoothest. The same vehicle drove all
-  sequences. The lidar frame is the Pandar64's: x forward, y left, z along its axis.
-- Boxes are in the world. An object that both scanners observe has two boxes, one for each scanner
+- The lidar frame is the Pandar64's: x forward, y left, z along its axis.
+- Boxes are in the world. An object that both scanners observe has a box for each of them
   (``cuboids.sensor_id``). ``dimensions`` are width, length, height. ``yaw`` is measured from the
   world's y axis to the front of the box (as in the devkit; not tried on real boxes).
 - Cameras are pinholes without distortion, as large as their images. Each image has a pose and a
@@ -37,6 +33,8 @@ from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.pickled_frame import read_columns
 from densify.readers.recorded_poses import PoseTrack
 
+# The positions of the scanners are not published. These make the rings of the Pandar64 sharpest and
+# the swings of the PandarGT's mirror smoothest. The same vehicle drove all sequences.
 _AXIS = np.array([-0.0157, 0.00045, 1.0])  # spinning axis of the Pandar64, forward left up
 _POSITION_M = np.array([0.777, 0.002, 1.8593])
 PANDAR_GT_M = np.array([0.580, 0.027, -0.294])
@@ -68,13 +66,9 @@ def open_recording(path: Path, scene: str | None) -> PandaSet:
 
 
 class PandaSet(FileSequence):
-    """A PandaSet sequence as a `LidarSequence` with a recorded pose for each image.
-
-    The stamp of a sweep is the end of the Pandar64's turn.
-    """
+    """A PandaSet sequence with a recorded pose for each image, stamped at the end of each turn."""
 
     def __init__(self, path: Path) -> None:
-        """Read poses, stamps and intrinsics of a sequence; sweeps and images are read on demand."""
         lidar = path / "lidar"
         found = {file.name.removesuffix(".pkl.gz"): file for file in sorted(lidar.glob("*.pkl.gz"))}
         sweeps = {int(name): file for name, file in found.items() if name.isdecimal()}

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Read columns of a pickled pandas data frame without pandas and without running the pickle.
 
-A pickle is a program that may import and call any function. Here every imported name is replaced
-by a class that only stores the call's arguments. Names that a pickled data frame does not need are
-refused. The columns are then taken from the stored arguments.
+A pickle may import and call any function. Here imported names become classes that only store their
+arguments, from which the columns are taken; names that a data frame does not need are refused.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Find the meaning of a point cloud's fields by their names, and of times also by their values.
 
-Velodyne's ``time`` is in seconds since the stamp. Ouster's ``t`` and Livox's ``offset_time`` are in
-nanoseconds, Hesai's and RoboSense's ``timestamp`` in seconds since 1970. The unit is found from the
-span of a sweep's times: units differ by a factor of 1000, and a sweep takes about one period.
-Points with a time outside their sweep are left out and counted.
+Velodyne's ``time`` is in seconds since the stamp, Ouster's ``t`` and Livox's ``offset_time`` in
+nanoseconds, Hesai's and RoboSense's ``timestamp`` in seconds since 1970. The span of a sweep's
+times tells the unit: units differ by a factor of 1000, and a sweep takes about one period.
 """
 
 from __future__ import annotations
@@ -60,10 +59,8 @@ class Fields:
 
 
 def find_fields(names: Collection[str]) -> Fields:
-    """Find the field of each quantity by name, in any case; the order of `_NAMES` decides.
-
-    CloudCompare puts ``scalar_`` before the names of fields.
-    """
+    """Find the field of each quantity by name, in any case; the order of `_NAMES` decides."""
+    # CloudCompare puts scalar_ before the names of fields.
     lower = {name.lower().removeprefix("scalar_"): name for name in reversed(list(names))}
     found = {
         part: next((lower[name] for name in known.split() if name in lower), "")
@@ -190,15 +187,11 @@ def find_times(
     absolute: bool | None = None,
     reference: str = "",
 ) -> tuple[PointTimes | None, str]:
-    """Find the unit, epoch, middle and span of point times from several sweeps of a recording.
+    """Find the unit, epoch, middle and span of the (N,) point times of several sweeps.
 
-    The unit is the most frequent unit. The middle and the span are medians over the sweeps.
-    Known values of ``unit``, ``absolute`` and ``reference`` are kept, "" or None is found.
-
-    Args:
-        sweeps: Values (N,) of the field for each sweep; N differs between sweeps.
-        period_ns: Time between consecutive sweeps.
-        stamps_ns: Stamps of the given sweeps, None without stamps.
+    Known values of ``unit``, ``absolute`` and ``reference`` are kept, "" or None is found. The unit
+    is the most frequent one; the middle and the span are medians. ``period_ns`` is the time between
+    consecutive sweeps; ``stamps_ns`` has the stamps of the given sweeps, None without stamps.
 
     Returns:
         The meaning of the times and its description; or None and the reason of the failure.
@@ -288,17 +281,11 @@ class PointLayout:
         where: Path | str,
         period_ns: int,
         stamps_ns: Sequence[int] | None,
-        named: Mapping[str, str] | None = None,
-        intensity_scale: float = 0.0,
-        **times: Any,
+        named: Mapping[str, str] | None = None,  # known names of fields, as in `Fields`
+        intensity_scale: float = 0.0,  # known divisor of intensities, 0 to find it
+        **times: Any,  # known unit, absolute or reference of `find_times`
     ) -> PointLayout:
-        """Find the layout from the columns of several sweeps; ``where`` begins error messages.
-
-        Args:
-            named: Names of fields that the user gave, by the attributes of `Fields`.
-            intensity_scale: Known divisor of intensities, 0 to find the divisor.
-            times: Known ``unit``, ``absolute`` or ``reference`` of `find_times`.
-        """
+        """Find the layout from the columns of several sweeps; ``where`` begins error messages."""
         fields = Fields(**(vars(find_fields(sweeps[0])) | dict(named or {})))
         missing = [axis for axis in "xyz" if not getattr(fields, axis)]
         if missing:

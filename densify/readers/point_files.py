@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read the columns of point files (.bin, .npy, .npz, .csv, .txt, .pcd, .ply, .las, .laz).
-
-No content of a file is run as code.
-"""
+"""Read the columns of point files; no content of a file is run as code."""
 
 from __future__ import annotations
 
@@ -57,23 +54,18 @@ class PointTable:
 
 
 def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
-    """Read the points of a file, all rows in file order.
+    """Read all rows of a point file, in file order.
 
-    ========================= ==================================================================
-    .bin                      float32 columns; without names, those of KITTI, nuScenes or Waymo if
-                              size and values fit one of them
-    .npy, .npz                an (N,3 or more) array, in an .npz called ``points``; or organised,
-                              (H,W,3 or more); or structured;
-                              or an .npz of x, y, z and others, (N,) each
-    .csv, .txt                numbers, NaN where blank; a first line of words names the columns
-    .pcd                      ascii, binary, binary_compressed
-    .ply                      properties of its vertices (extra ``ply``)
-    .las, .laz                dimensions
-    ========================= ==================================================================
+    ``names`` are those of the columns if the file has none, by default those of `unnamed`.
 
-    Args:
-        path: Point file.
-        names: Names of the columns if the file has none. By default they are those of `unnamed`.
+    .bin        float32 columns; without ``names``, those of KITTI, nuScenes or Waymo if size and
+                values fit one of them
+    .npy, .npz  an (N,3 or more) array, in an .npz called ``points``; or organised (H,W,3 or more);
+                or structured; or an .npz of x, y, z and others, (N,) each
+    .csv, .txt  numbers, NaN where blank; a first line of words names the columns
+    .pcd        ascii, binary, binary_compressed
+    .ply        properties of its vertices (extra ``ply``)
+    .las, .laz  dimensions
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Read depth priors: depth images that the user provides, such as from a monocular network.
 
-A folder of them::
-
     DIR/[CAMERA/[data/]]FRAME.npy, .exr or .png    CAMERA may be omitted for a single camera
     DIR/sky/[CAMERA/]FRAME.png    optional masks, nonzero for sky
 
-A single file is accepted too. FRAME is the number of the image: 120, 000120, 0000000120,
-0000000120_depth or _disp. Arrays are (H,W) of any number type; axes of length 1 are dropped. EXR
-files have one channel, or a channel called Z, Y or depth. PNG files are 16 bit gray. A pixel that
-is not finite or not above 0 has no value.
+A single file is accepted too. FRAME is the number of the image: 120, 0000000120, 0000000120_depth
+or _disp. Arrays are (H,W) of any number type; axes of length 1 are dropped. EXR files have one
+channel, or one called Z, Y or depth. PNG files are 16 bit gray. A pixel that is not finite or not
+above 0 has no value.
 """
 
 from __future__ import annotations

@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read recorded poses from text files, and interpolate the pose of a vehicle at any time.
-
-Pose files hold 3x4 matrices (KITTI), 4x4 matrices, TUM lines, or tables with a quaternion.
-
-Many data sets store each sweep ego-motion compensated, as if measured at one time. Compensation
-smears moving objects, hides the points' times, and bends rings. `PoseTrack.as_fired` undoes it.
-"""
+"""Read recorded poses from text files, and interpolate the pose of a vehicle at any time."""
 
 from __future__ import annotations
 
@@ -64,11 +58,9 @@ class PoseTrack:
     def as_fired(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
         """Undo ego-motion compensation: return points in the vehicle frame at their firing times.
 
-        Args:
-            points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``. Points at 0 0 0
-                (padding) stay unchanged.
-            stamp_ns: Reference time of the sweep.
-            offset_ns: (N,) firing times since ``stamp_ns``.
+        Many data sets store a sweep as if measured at one time, which smears moving objects and
+        bends rings. ``points`` is (N,3) metres, compensated to the vehicle frame at ``stamp_ns``;
+        padding at 0 0 0 stays. ``offset_ns`` is (N,) firing times since ``stamp_ns``.
         """
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
@@ -76,10 +68,7 @@ class PoseTrack:
     def taken_back(self, placed: Returns, stamp_ns: int) -> Returns:
         """Undo that points were moved to the world with the poses of this path.
 
-        Args:
-            placed: Points of one sweep in the world. Without times they are compensated to the
-                stamp, and the result is too.
-            stamp_ns: Reference time of the sweep.
+        Points of a sweep without times are compensated to its ``stamp_ns``, and the result is too.
         """
         at_stamp = taken_back(placed.points, self.at(stamp_ns))
         if placed.offset_ns is not None:
@@ -173,18 +162,15 @@ class PoseFile:
 
     @staticmethod
     def of_viewpoints(paths: Sequence[Path]) -> PoseFile | None:
-        """Read the poses in VIEWPOINT of .pcd files.
-
-        The result is None for other files, if the first and the last have the default, and if a
-        viewpoint is no pose, because some programs write zeros.
-        """
+        """Read the poses in VIEWPOINT of .pcd files; None for other files and without poses."""
         if not all(path.suffix.lower() == ".pcd" for path in paths):
             return None
         try:
+            # The default in the first and the last file is no pose.
             if np.allclose([_viewpoint(path) for path in (paths[0], paths[-1])], np.eye(4)):
                 return None
             T = np.stack([_viewpoint(path) for path in paths])
-        except InputError:
+        except InputError:  # some programs write zeros
             return None
         return PoseFile(paths[0], "VIEWPOINT of each sweep", T)
 

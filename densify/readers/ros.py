@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Read ROS 1 bags and ROS 2 bags (.db3, .mcap) by the rosbags package, without ROS (extra ``ros``).
 
-``ros:PATH[#points=/topic,/topic&images=/topic,/topic&poses=/topic]``. If several topics fit, name
-the topic. ``images=none`` reads no images, ``poses=none`` no poses.
+``ros:PATH[#points=/topic,/topic&images=/topic,/topic&poses=/topic]``; name topics if several fit,
+``images=none`` and ``poses=none`` read none.
 
 points: PointCloud2 of any layout, or Livox's CustomMsg, in the frame of the header, each point as
-    fired from the origin of this frame. Several lidars form one sweep in the frame of the first
-    named lidar: each message of the first is joined with the messages of the other lidars that are
-    nearest in time. /tf_static gives the lidars' positions, the origins of the rays.
-stamps: The time in the header (if 0, the time of recording) is the reference time. Point times
-    count from the stamp, or are absolute (`densify.readers.point_fields`). Sweeps and images are
-    numbered from 0 in the order of their stamps.
+    fired from the origin of this frame. Several lidars form one sweep in the frame of the first:
+    its messages are joined with the others nearest in time. /tf_static gives the lidars' positions.
+stamps: The header's time (if 0, the time of recording) is the reference time. Point times count
+    from the stamp, or are absolute. Sweeps and images are numbered from 0 in the order of stamps.
 images: Image or CompressedImage with the CameraInfo of the same namespace. Raw images use K and D,
     ``image_rect`` uses P and R. The camera frame of the header is joined to the lidar frame by
     /tf_static, or by a /tf that never moves. A stereo P with a sideways shift is assumed to agree.

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read messages of ROS 1 and ROS 2 bags by the rosbags package, without ROS.
-
-A bag is scanned once to index the header stamps of all messages of the used topics. Messages are
-then decoded one at a time.
-"""
+"""Read messages of ROS bags without ROS; one scan indexes header stamps, decoding is on demand."""
 
 from __future__ import annotations
 
@@ -65,17 +61,11 @@ class Topic(NamedTuple):
 
 
 class Bag:
-    """A ROS 1 or ROS 2 bag, opened for reading.
-
-    Attributes:
-        path: A .bag, .db3 or .mcap file, the folder of a ROS 2 bag, or a folder of .bag files
-            that are parts of one recording.
-        topics: Topics that have messages, by name.
-        num_unstamped: Number of indexed messages whose header has no stamp, by topic.
-    """
+    """A ROS 1 or ROS 2 bag, opened for reading."""
 
     def __init__(self, path: Path) -> None:
-        """Open a bag; raise InputError if the path is no bag or the bag is damaged."""
+        # A .bag, .db3 or .mcap file, the folder of a ROS 2 bag, or a folder of .bag files that are
+        # parts of one recording
         self.path = path
         self._files = _bag_files(path)
         self._is_ros2 = not (self._files[0].suffix == ".bag" and self._files[0].is_file())
@@ -85,7 +75,7 @@ class Bag:
                 open_file(part).close()  # raises a clear error for an unreadable file
         package = needed(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
         self._lock = RLock()
-        self.num_unstamped = Counter[str]()
+        self.num_unstamped = Counter[str]()  # indexed messages without a header stamp, by topic
         try:
             self._readers = [package.Reader(file) for file in self._files]
             for reader in self._readers:
@@ -164,10 +154,8 @@ class Bag:
 
 
 def message_types(is_ros2: bool) -> Any:
-    """Return the rosbags type store with the standard, /tf and Livox message types.
-
-    Definitions in a bag are not used, because rosbags turns definitions into executable code.
-    """
+    """Return the rosbags type store with the standard, /tf and Livox message types."""
+    # Definitions in a bag are not used, because rosbags turns definitions into executable code.
     typesys = needed("rosbags.typesys", "ros", "ROS bags")
     stores = typesys.Stores
     types = typesys.get_typestore(stores.ROS2_JAZZY if is_ros2 else stores.ROS1_NOETIC)

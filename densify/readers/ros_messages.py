@@ -52,10 +52,7 @@ _FIXED_M = 1e-6  # frames that move less, in metres or radians, are fixed
 
 
 def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
-    """Return the fields of a PointCloud2 or Livox CustomMsg by name, an array (N,) each as stored.
-
-    Fields with several numbers for a point are left out.
-    """
+    """Return the one-number fields of a PointCloud2 or Livox CustomMsg by name, (N,) as stored."""
     if not hasattr(message, "point_step"):
         rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
         table = np.array(rows, list(_LIVOX.items()))
@@ -235,10 +232,8 @@ class Transforms:
         return found.get(target)
 
     def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
-        """Return a frame's moving parent and its path in it, T_parent_frame; None if it is fixed.
-
-        The nearest moving parent is usually ``odom``, not ``map``, which jumps at loop closures.
-        """
+        """Return a frame's moving parent and path T_parent_frame in it; None if it is fixed."""
+        # The nearest moving parent is usually odom, not map, which jumps at loop closures.
         T_body_frame, body, passed = np.eye(4), frame, {frame}
         while body in self.fixed and body not in self.moving:
             parent, T = self.fixed[body]
@@ -253,14 +248,11 @@ class Transforms:
 
 
 def recorded_track(bag: Bag, topic: str, transforms: Transforms, lidar: str) -> PoseTrack:
-    """Read the path T_world_lidar from a topic of odometry or poses; ``lidar`` names the frame.
-
-    Odometry gives the pose of its child frame, which fixed transforms join to the lidar. Poses
-    without a child frame are assumed to be poses of the lidar itself.
-    """
+    """Read the path T_world_lidar of frame ``lidar`` from a topic of odometry or poses."""
     found, where = dict[int, Float](), f"{bag.path}: {topic}"
     for message in bag.messages(topic):
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+        # Poses without a child frame are assumed to be poses of the lidar itself.
         child = plain(getattr(message, "child_frame_id", "")) or lidar
         T_child_lidar = transforms.between(child, lidar)
         if T_child_lidar is None:

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read times in the names of files and in text files.
-
-The unit of times since 1970 is found from their size, for the years 2000 to 2099. Other times are
-in seconds unless a unit is given.
-"""
+"""Read times in file names and text files; the unit of times since 1970 is found by their size."""
 
 from __future__ import annotations
 
@@ -38,11 +34,9 @@ class Named(NamedTuple):
 
 
 def named(path: Path, unit: str = "") -> Named:
-    """Find the frame number or the time in the name of a file.
-
-    ``0000000120`` and ``cloud_12`` are numbers. ``1317042651.468569638``, ``1317042651_468569638``
-    and ``1317042651468`` are times since 1970. With a ``unit`` the last number is a time.
-    """
+    """Find the number or the time in a file's name; with a ``unit`` the last number is a time."""
+    # 0000000120 and cloud_12 are numbers. 1317042651.468569638, 1317042651_468569638 and
+    # 1317042651468 are times since 1970.
     words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
     if unit:
         try:
@@ -73,11 +67,8 @@ def in_ns(text: str, unit: str) -> int:
 
 
 def date_ns(text: str) -> int:
-    """Convert an ISO date and time in UTC to nanoseconds since 1970 without loss of digits.
-
-    Raise ValueError for other texts, and for years beyond 64 bits, which numpy would wrap.
-    """
-    day = np.datetime64(text, "D")
+    """Convert an ISO date in UTC to ns since 1970 without loss; raise ValueError for others."""
+    day = np.datetime64(text, "D")  # numpy wraps years beyond 64 bits
     if not np.datetime64("1970-01-01") <= day < np.datetime64("2262-01-01"):
         raise ValueError(f"got {text!r}, expected a year from 1970 to 2261")
     return int(np.datetime64(text, "ns").astype(np.int64))  # never through a float
@@ -95,10 +86,7 @@ def _epoch_unit(text: str) -> str:
 
 
 def check_digits(stamps_ns: Collection[int], text: str, where: Path) -> None:
-    """Raise InputError if times in file order are equal because they were rounded.
-
-    ``text`` is the first time as the file has it.
-    """
+    """Raise InputError if times in file order are equal by rounding; ``text`` is the first one."""
     steps_ns = np.diff(np.array([*stamps_ns], np.int64))
     num_equal = int((steps_ns == 0).sum())
     least = min(2, len(steps_ns))  # one of several may be a hiccup of the recorder
@@ -185,11 +173,7 @@ class StampFile(NamedTuple):
 
     @staticmethod
     def read(path: Path, unit: str = "") -> StampFile:
-        """Read the times of a file with a time on each line, among other columns or alone.
-
-        Times are numbers of a ``unit`` (as in `TextTable.times_ns`), or dates such as 2011-09-26
-        13:10:51.158069617.
-        """
+        """Read a time from each line, alone or among columns: a number of ``unit``, or a date."""
         table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
         at_time, at_name = table.column(TIME_COLUMNS), table.column(_FILE_COLUMNS)
         words = table.rows[0]

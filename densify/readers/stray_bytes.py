@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mend JPEG files that hold all pixels but break a rule of the format (ITU-T T.81, annex B).
-
-Some USB cameras send a few bytes too many before a restart marker. Others leave out the marker at
-the end. libjpeg decodes all pixels of these files, and warns of them as of damaged files.
-"""
+"""Mend JPEG files that hold all pixels but break a rule of the format (ITU-T T.81, annex B)."""
 
 from __future__ import annotations
 
@@ -14,6 +10,8 @@ from numpy.typing import NDArray
 
 _MARKER = re.compile(rb"\xff[\xd0-\xd7\xd9]")  # restart, or end of the image
 _SCAN, _END = b"\xff\xda", b"\xff\xd9"
+# Some USB cameras send a few bytes too many before a restart marker. Others leave out the marker at
+# the end. libjpeg decodes all pixels of these files, and warns of them as of damaged files.
 _STRAY, _CUT_OFF, _NO_END = "extraneous bytes", "premature end of data", "Premature end of JPEG"
 _MOST_STRAY_BYTES = 16
 """Data that are decoded wrongly often leave more bytes, up to all of a restart interval."""
@@ -52,10 +50,7 @@ def _decoded(data: bytes) -> tuple[NDArray[np.uint8] | None, str]:
 
 
 def _without_stray(data: bytes) -> tuple[bytes, int]:
-    """Return the data without stray bytes, and the number of markers that had some before them.
-
-    Raise ValueError for data that are damaged.
-    """
+    """Return mended data, and the number of markers after stray bytes; ValueError if damaged."""
     num_markers, end = 0, data.rfind(_SCAN)
     for _ in range(_MOST_MARKERS):
         found = _MARKER.search(data, end)
@@ -79,10 +74,8 @@ def _without_stray(data: bytes) -> tuple[bytes, int]:
 
 
 def _ends_in_ones(data: bytes, end: int) -> bool:
-    """Return True if the bits that fill up the last byte before a marker are ones, as they must be.
-
-    In an interval that is decoded wrongly these bits may be anything.
-    """
+    """Return True if the bits that fill up the last byte before a marker are ones, as must be."""
+    # In an interval that is decoded wrongly these bits may be anything.
     last = data[end - 1]
     if data[end - 2 : end] == b"\xff\x00" or last == 0xFF:
         return True

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Provide the built-in simulated street as a recording. Frames are rendered on demand and cached.
 
-``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``. The recording lasts 16
-seconds (frames 0 to 159 at 10 Hz). The cache is in the cache directory of the user, or in the
-folder named by the environment variable DENSIFY_CACHE_DIR. The cache can be deleted at any time,
-because rendering is reproducible byte for byte.
+``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``, 16 seconds long. The
+cache (DENSIFY_CACHE_DIR, or the user's cache directory) may be deleted: rendering is reproducible
+byte for byte.
 """
 
 from __future__ import annotations
@@ -42,24 +41,15 @@ class Street:
 
     def __init__(
         self,
+        # street, highway, static (only the ego vehicle moves) or crossing (the ego vehicle stands)
         preset: str = "street",
-        seed: int = 0,
-        sensor: str = "hdl64",
-        hz: int = 10,
-        tilt_deg: float = 0.0,
-        cameras: tuple[str, ...] = USUAL,
+        seed: int = 0,  # of the random scene
+        sensor: str = "hdl64",  # a lidar in `densify.street.sensors.SENSORS`
+        hz: int = 10,  # sweeps per second: 5, 10 or 20
+        tilt_deg: float = 0.0,  # pitch of the lidar's mount, nose down; cameras are not tilted
+        cameras: tuple[str, ...] = USUAL,  # in `densify.street.cameras.CAMERAS`
     ) -> None:
-        """Set up the street; sweeps and images are rendered on demand.
-
-        Args:
-            preset: Kind of scene: street, highway, static (only the ego vehicle moves) or crossing
-                (the ego vehicle does not move).
-            seed: Seed of the random scene.
-            sensor: Name of a lidar in `densify.street.sensors.SENSORS`.
-            hz: Sweeps per second: 5, 10 or 20.
-            tilt_deg: Pitch of the lidar's mount in degrees, nose down; cameras are not tilted.
-            cameras: Names of cameras in `densify.street.cameras.CAMERAS`.
-        """
+        """Set up the street; sweeps and images are rendered on demand."""
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)
         if not (0 <= seed < 10**18 and hz in (5, 10, 20) and abs(tilt_deg) <= 45):

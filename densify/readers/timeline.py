@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Order the sweeps of a recording by time, find neighbouring sweeps, and read sweeps and cameras.
-
-Neighbours are found by stamps: a drive without every second file is a recording of half the rate.
-"""
+"""Order sweeps by time, find neighbouring sweeps by their stamps, and read sweeps and cameras."""
 
 from __future__ import annotations
 
@@ -215,10 +212,7 @@ def _out_of_order(stamps_ns: Int) -> list[int]:
 
 
 def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) -> Sweep:
-    """Read a sweep with only the returns kept by `in_range`.
-
-    Without ``settings.deskew`` the sweep has no firing times (``offset_ns`` is None).
-    """
+    """Read a sweep's returns kept by `in_range`, without times if not ``settings.deskew``."""
     sweep = in_range(sequence[frame], settings)
     return sweep if settings.deskew else replace(sweep, offset_ns=None)
 
@@ -238,10 +232,7 @@ def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
-    """Return the cameras with the given names, in this order.
-
-    If ``names`` is None, return all cameras with images, or all cameras if there are no images.
-    """
+    """Return the named cameras in order; for None those with images, or all if none has images."""
     if isinstance(names, str) or not isinstance(names, Iterable | None):
         one = [*sequence.cameras][:1]
         raise InputError(f"cameras: got {names!r}, expected a list of names, such as {one}")

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Read and write exact ground truth of a simulated recording: body motion and each point's body.
 
-A body is a rigid part of the scene; body 0 is the static world. Layout of a ``truth/`` folder, with
-the frame numbers of the recording::
+A body is a rigid part of the scene; body 0 is the static world. A ``truth/`` folder has::
 
     bodies.npz             T_world_lidar (F,4,4): scanner poses at the reference times of F frames
                            T_world_body (F,B,4,4): poses of B bodies at the reference times
@@ -63,7 +62,6 @@ class FileTruth:
     """Ground truth (`Truth`) read from a ``truth`` folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Read ``bodies.npz`` of a truth folder; raise InputError if it is missing or damaged."""
         self._folder = folder
         self.bodies = Bodies(*_load(folder / "bodies.npz", *_BODIES))
 

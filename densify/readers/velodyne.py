@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Read packets of a Velodyne scanner, a ``.pcap`` file, by velodyne-decoder.
+"""Read packets of a Velodyne scanner, a ``.pcap`` file, by velodyne-decoder (extra ``velodyne``).
 
-It needs the extra ``velodyne``. The packets do not identify the model reliably. Therefore name the
-model, as in ``velodyne:FILE.pcap#HDL-32E``.
-
-A sweep is a turn that begins and ends straight behind the scanner, to the accuracy of a packet.
-Sweeps are numbered from 0 and decoded on demand. Incomplete turns at the ends of the file are left
-out. The stamp of a sweep is the time at which the computer captured its last packet. ``offset_ns``
+Packets do not identify the model reliably; name it, as in ``velodyne:FILE.pcap#HDL-32E``. A sweep
+is a turn that begins and ends straight behind the scanner, to the accuracy of a packet, stamped
+when the computer captured its last packet. Incomplete turns at the ends are left out. ``offset_ns``
 is computed from the packets' clock and the firing order of the model. Points are as measured, in
 the scanner's frame: x forward (azimuth 0), y left, z up. There are no cameras and no poses.
-A packet that was captured twice is read once.
 """
 
 from __future__ import annotations
@@ -68,7 +64,6 @@ class Velodyne(FileSequence):
     """A Velodyne capture as a `LidarSequence`, stamped at the last packet of each sweep."""
 
     def __init__(self, path: Path, model: str) -> None:
-        """Find the packets and turns of a capture; sweeps are decoded on demand."""
         self._library = needed("velodyne_decoder", "velodyne", "Velodyne captures")
         self._model = getattr(self._library.Model, MODELS[model])
         packets, self._num_twice = _once(_find_packets(path))

@@ -1,20 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Read the Waymo Open Dataset, perception, version 2, without TensorFlow.
-
-Sun et al., CVPR 2020::
+"""Read the Waymo Open Dataset, perception, version 2 (Sun et al., CVPR 2020), without TensorFlow.
 
     ROOT/{lidar,lidar_calibration,vehicle_pose}/CONTEXT.parquet
     ROOT/{camera_image,camera_calibration,lidar_box}/CONTEXT.parquet    optional
 
 ROOT is ``training``, ``validation`` or ``testing``. A segment is named by ``#CONTEXT``. Frames are
-numbered from 0 in the order of time. An image has the number of its frame.
-
-Lidars 0 to 4 are TOP, FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. A return is a pixel of a range image; its
-column gives the azimuth, its row the inclination (range_image_utils.py of the data set). The first
-returns of a lidar are followed by its second returns. Points are in the vehicle's frame (x forward,
-y left, z up) *when fired*, without compensation. The columns of TOP are spread evenly over the
-frame's period from ``frame_timestamp_micros``. The other lidars' returns are assumed to be measured
-at the sweep's stamp. Intensity has no upper bound and is mapped by tanh.
+numbered from 0 in the order of time. An image has the number of its frame. Lidars 0 to 4 are TOP,
+FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. A return is a pixel of a range image: column is azimuth, row is
+inclination (range_image_utils.py of the data set). First returns precede second returns. Points are
+in the vehicle's frame (x forward, y left, z up) *when fired*, without compensation. The columns of
+TOP are spread evenly over the frame's period from ``frame_timestamp_micros``. The other lidars'
+returns are assumed to be at the sweep's stamp. Intensity has no upper bound and is mapped by tanh.
 
 ``vehicle_pose`` is the pose at the middle of the spin and equals the pose of the FRONT image (issue
 464 of waymo-open-dataset). The sweep's stamp is the ``pose_timestamp`` of this image, or without
@@ -131,10 +127,7 @@ def read_lasers(parts: Components) -> dict[int, Laser]:
 
 
 def read_boxes(parts: Components) -> dict[int, Boxes]:
-    """Return the boxes of all annotated frames, by ``frame_timestamp_micros``.
-
-    Boxes are in the vehicle's frame at the frame's ``vehicle_pose``.
-    """
+    """Return boxes by ``frame_timestamp_micros``, in the vehicle's frame at ``vehicle_pose``."""
     numbers = (*BOX_CENTRE, *BOX_SIZE, BOX_HEADING)
     rows = parts.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
     centre_m, size_m = (
@@ -216,13 +209,9 @@ def open_recording(path: Path, scene: str | None) -> Waymo:
 
 
 class Waymo(FileSequence):
-    """A Waymo segment as a `LidarSequence`; the lidar frame is the vehicle's frame.
-
-    The stamp of a sweep is the time of the recorded pose, about the middle of the spin.
-    """
+    """A Waymo segment in the vehicle's frame, stamped at the recorded pose, about mid-spin."""
 
     def __init__(self, root: Path, context: str) -> None:
-        """Read stamps and calibrations; sweeps, images and poses are read on demand."""
         parts = self._parts = Components(root, context)
         self._starts_us = np.unique(parts.read("lidar", {STAMP: "i"})[STAMP])
         if not len(self._starts_us):

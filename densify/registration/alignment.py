@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Align surfaces with small_gicp: generalized ICP, and point to plane.
 
-Segal et al., "Generalized-ICP", RSS 2009; Koide, "small_gicp: Efficient and parallel algorithms for
-point cloud registration", JOSS 2024.
+Segal et al., "Generalized-ICP", RSS 2009; Koide, "small_gicp", JOSS 2024.
 """
 
 from __future__ import annotations
@@ -42,13 +41,7 @@ class Surface(NamedTuple):
     def of(
         points: Float, voxel_m: float = _VOXEL_M, num_neighbors: int = _NUM_NEIGHBORS
     ) -> Surface:
-        """Return the surface of a point cloud, in the frame of the points.
-
-        Args:
-            points: (N,3) positions in metres.
-            voxel_m: Side of a voxel in metres; one point per voxel stays.
-            num_neighbors: Number of neighbours that determine the normal of a point.
-        """
+        """Return the surface of points (N,3), one per voxel, with normals, in their frame."""
         return Surface(*small_gicp.preprocess_points(points, voxel_m, num_neighbors, 1))
 
     @staticmethod
@@ -93,9 +86,9 @@ def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> A
     """Align a source with a target, by generalized ICP or point to plane.
 
     Args:
-        target: A `Surface` in its own frame, or a map (`make_map`) of surfaces.
+        target: A `Surface`, or a map (`make_map`) of surfaces.
         source: A `Surface`, or points without covariances (`thin`), in its own frame.
-        T_target_source: (4,4) initial pose of the source in the target's frame.
+        T_target_source: (4,4) initial pose of the source.
         match_m: Greatest distance in metres between corresponding points.
     """
     is_surface = isinstance(source, Surface)

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Detect sweeps that are compensated for motion already.
 
-The rings of a spinning scanner are cones about its spin axis. They appear as cones only if each
-point is given relative to the scanner's position at its firing.
+Rings are cones about the spin axis only as seen from the scanner's position at each firing.
 """
 
 from __future__ import annotations
@@ -49,14 +48,10 @@ class Rings(NamedTuple):
 def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
     """Return how sharply points are concentrated in rings, as seen from an origin; 1 if not at all.
 
-    Elevation angles are counted in cells. For each window of elevation, it is the chance that two
-    returns share a cell, relative to an even spread. The median over the windows keeps flat ground,
-    which all falls into one window, from dominating.
-
-    Args:
-        points: (N,3) metres, in axes with z along the spin axis.
-        origin_m: (3,) assumed position of the scanner, same axes.
-        bins: Width of a cell as a multiple of 0.02 degrees.
+    It is the chance that two returns of a window of elevation share a cell of ``bins`` times 0.02
+    degrees, relative to an even spread. The median over the windows keeps flat ground, which all
+    falls into one window, from dominating. Points (N,3) and ``origin_m`` (3,), the assumed position
+    of the scanner, are in axes with z along the spin axis.
     """
     x, y, z = (points - origin_m).T
     elevation = np.arctan2(z, np.hypot(x, y))
@@ -76,14 +71,12 @@ def rings_by_motion(
 ) -> Rings:
     """Return the sharpness of a sweep's rings, as stored and with the motion undone or compensated.
 
-    Each sharpness is the greatest over the given scanner positions.
-
     Args:
         points: (N,3) metres, lidar frame, as stored.
         offset_s: (N,) firing times since the stamp.
         twist: (6,) velocity of the lidar (rad/s, m/s), lidar frame.
         R: (3,3) rotation from the lidar axes to the scanner's axes.
-        origins_m: Candidate positions (3,) of the scanner, in its axes.
+        origins_m: Positions (3,) of the scanner to try, in its axes; the sharpest counts.
     """
 
     def sharpest(moved: Float) -> float:
@@ -111,25 +104,19 @@ def sample_rows(sweep: Sweep, far_m: float) -> Int:
 
 
 def turning_s(points: Float, period_s: float) -> Float:
-    """Return (N,) firing times since the stamp, estimated from azimuth.
+    """Return (N,) firing times since the stamp, from the azimuth of points (N,3), lidar frame.
 
-    The scanner is assumed to turn clockwise and to face forward at the stamp.
-
-    Args:
-        points: (N,3) lidar frame.
-        period_s: Time of one revolution.
+    The scanner is assumed to turn clockwise in ``period_s`` and to face forward at the stamp.
     """
     turn: Float = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     return turn * period_s
 
 
 def find_compensated(sweep: Sweep, twist: Float, period_s: float) -> Rings | None:
-    """Return the rings of a sweep that is compensated for motion already, else None.
+    """Return the rings of a raw sweep that is compensated for motion already, else None.
 
-    Args:
-        sweep: Sweep as stored in the recording.
-        twist: (6,) velocity of the lidar (rad/s, m/s), lidar frame.
-        period_s: Time of one revolution, used for sweeps without point times.
+    ``twist`` (6,) is the lidar's velocity (rad/s, m/s), lidar frame. ``period_s`` is the time of
+    one revolution, used for sweeps without point times.
     """
     if np.linalg.norm(twist[3:]) < LEAST_SPEED_M_S:
         return None

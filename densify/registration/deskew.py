@@ -13,13 +13,10 @@ from densify.geometry.types import Float, RegisteredSweep, Stretch, Sweep, Traje
 
 
 def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
-    """Return the sweeps at their poses, with the lidar's motion within each sweep removed.
+    """Return raw sweeps at their poses, with the lidar's motion within each sweep removed.
 
     Points before the reference time move with the velocity from the previous sweep, points after it
     with the velocity to the next sweep. A sweep without point times keeps its points.
-
-    Args:
-        sweeps: Raw sweeps whose frames are in the trajectory.
     """
     registered = []
     for sweep in sweeps:
@@ -31,13 +28,9 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
 def deskew_sweep(
     sweep: Sweep, T_world_lidar: Float, twist_before: Float, twist_after: Float
 ) -> RegisteredSweep:
-    """Return the deskewed sweep with its pose.
+    """Return a deskewed copy of the sweep with its (4,4) pose at the reference time.
 
-    Args:
-        sweep: Raw sweep; not changed.
-        T_world_lidar: (4,4) pose at the reference time.
-        twist_before: (6,) velocity of the lidar (rad/s, m/s, lidar frame) before that time.
-        twist_after: (6,) velocity of the lidar after that time.
+    The twists (6,) are the lidar's velocities (rad/s, m/s, lidar frame) before and after that time.
     """
     points: Float = sweep.points
     if sweep.offset_ns is not None:

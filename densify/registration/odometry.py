@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Estimate the velocity at dense sweeps by KISS-ICP on a sample, from a searched initial speed.
-
-Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023.
-"""
+"""Estimate the velocity at dense sweeps by KISS-ICP (Vizzo et al., RA-L 2023) on a sample."""
 
 from __future__ import annotations
 
@@ -34,14 +31,10 @@ _ABOVE_GROUND_M = 0.4
 def find_odometry(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
     """Return the (S,6) approximate velocity (rad/s, m/s) before each of S raw sweeps, by KISS-ICP.
 
-    A sample of the points above the ground is registered, because rings on flat ground move with
-    the vehicle: with them, a highway of 64 rings looks as if the vehicle were at rest. Each sweep
-    is predicted at constant velocity, starting from `search_twist`, because KISS-ICP assumes a
-    start at rest. Sweeps of a fast scanner are registered about 0.1 s apart, for the same reason.
-
-    Args:
-        sweeps: Sweeps ascending in time, at least two. The first velocity is that before the
-            second sweep.
+    A sample of the points above the ground is registered: with rings on flat ground, a highway of
+    64 rings looks as if the vehicle were at rest. Prediction starts from `search_twist`, and sweeps
+    of a fast scanner are registered about 0.1 s apart, because KISS-ICP assumes a start at rest. S
+    is at least 2. The first velocity is that before the second sweep.
     """
     from kiss_icp.config import KISSConfig
     from kiss_icp.kiss_icp import KissICP
@@ -71,15 +64,11 @@ def find_odometry(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
 def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
     """Return the (6,) initial velocity (rad/s, m/s), without rotation, by a grid search.
 
-    The velocity is the one that best aligns the points above the ground in the first three sweeps.
-    Distances below the spacing of neighbouring rays count as 0, because a guard rail looks the same
-    from a vehicle at rest and from a vehicle that moves along the rail. The grid moves the second
-    sweep by steps of 1 m, then by 0.5 m around the best position. Steps are smaller for sweeps less
-    than 0.1 s apart.
-
-    Args:
-        stamp_ns: (S,) ascending.
-        points: (N,3) metres of each of the S sweeps, in its lidar frame.
+    It best aligns the points above the ground in the first three sweeps. Distances below the
+    spacing of neighbouring rays count as 0, because a guard rail looks the same from a vehicle at
+    rest and from a vehicle that moves along the rail. The grid moves the second sweep by steps of 1
+    m, then by 0.5 m around the best position, or less for sweeps less than 0.1 s apart. Each
+    sweep's points (N,3) are in its lidar frame.
     """
     step_s = np.diff(stamp_ns[:3]) * 1e-9
     step_m = _STEP_M * min(1.0, step_s[0] / _STEP_S)
@@ -119,11 +108,7 @@ def _grid(center: Float, reach_m: float, step_m: float) -> Float:
 
 
 def above_ground(points: Float) -> Float:
-    """Return the points more than 0.4 m above the lowest point of their 1 m grid cell.
-
-    Rings on flat ground move with the vehicle and would hide its motion. If no point is above, all
-    points are returned.
-    """
+    """Return the points over 0.4 m above the lowest in their 1 m grid cell; all if none is."""
     if not len(points):
         return points
     x, y, z = points.T

@@ -2,9 +2,8 @@
 """Estimate poses of the sweeps along the road, before and after a window.
 
 A chain registers one sweep after another on a map of Gaussian voxels. A pose graph then aligns
-submaps with several submaps before them: Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE
-Intelligent Transportation Systems Magazine 2010. Cauchy weights keep an outlier among the submap
-alignments from bending the road.
+submaps with several submaps before them (Grisetti et al., "A Tutorial on Graph-Based SLAM", ITS
+Magazine 2010). Cauchy weights keep an outlier among these alignments from bending the road.
 """
 
 from __future__ import annotations
@@ -51,19 +50,14 @@ def follow_road(
 
     Each sweep is aligned with a map of the sweeps before it, starting at constant velocity. The
     chain ends at a sweep that cannot be read, is too sparse, does not fit the map, or would need an
-    implausible vehicle motion.
+    implausible vehicle motion. Surfaces are deskewed, in the lidar frame of their sweep.
 
     Args:
-        known: Registered sweeps of the window, the sweep next to ``frames`` last.
-        surfaces: Surface of each known sweep, in its lidar frame.
+        known, surfaces: Sweeps of the window, the one next to ``frames`` last, and their surfaces.
         frames: Frame numbers along the road, ascending or descending in time, nearest first.
         stamp_ns: (n,) reference times of ``frames``.
         read: Returns the raw sweep of a frame.
-        reach_m: Distance along the road to cover.
-        step_m: Approximate distance between sweeps. Sweeps in between are not read.
-
-    Yields:
-        The raw sweep with its pose, and its surface, deskewed, in its lidar frame.
+        reach_m, step_m: Distances along the road: to cover, and between the sweeps that are read.
     """
     chain, T_world_lidar, last_ns = make_map(), known[-1].T_world_lidar, known[-1].sweep.stamp_ns
     for s, surface in zip(known, surfaces, strict=True):
@@ -121,7 +115,6 @@ def relax_poses(
     road without landmarks cannot be detected.
 
     Args:
-        surfaces: Surface of each sweep, in its lidar frame.
         T_world_lidar: (n,4,4) approximate poses.
         known: (n,) True for poses that stay fixed; at least one, and consecutive.
         num_sweeps: Number of sweeps in a submap. Relative poses within a submap stay fixed.
@@ -159,11 +152,8 @@ def relax_poses(
 
 
 def _submaps(known: Bool, num_sweeps: int) -> tuple[Int, Int]:
-    """Return (n,) the submap of each sweep, ascending, and (m,) the middle sweep of each submap.
-
-    A submap has either known sweeps or others. Incomplete submaps are the farthest from the known
-    sweeps.
-    """
+    """Return (n,) the ascending submap of each sweep, and (m,) the middle sweep of each submap."""
+    # A submap has either known sweeps or others; incomplete ones are the farthest from the known.
     begin, end = np.flatnonzero(known)[[0, -1]] + (0, 1)
     row = np.arange(len(known))
     before, after = begin - 1 - row[:begin], row[end:] - end
@@ -183,13 +173,7 @@ class _Graph:
     """A pose graph: m submaps as nodes, and p alignments between two submaps as edges."""
 
     def __init__(self, ends: Int, fixed: Bool, pairs: Sequence[Alignment]) -> None:
-        """Build the graph.
-
-        Args:
-            ends: (p,2) indices of the target and the source submap of each alignment.
-            fixed: (m,) True for submaps whose pose stays.
-            pairs: The p alignments.
-        """
+        """Build the graph of p alignments between target and source submaps ``ends`` (p,2)."""
         self._ends, self._fixed = ends, fixed
         T_target_source = np.array([a.T_target_source for a in pairs]).reshape(-1, 4, 4)
         self._T_source_target = np.linalg.inv(T_target_source)
@@ -206,10 +190,7 @@ class _Graph:
         return T
 
     def holds(self, T: Float) -> Bool:
-        """Return (m,) True for submaps that reliable alignments connect to fixed submaps.
-
-        T: (m,4,4) relaxed poses of the submaps.
-        """
+        """Return (m,) True for submaps that reliable alignments connect to fixed ones."""
         target, source = self._ends.T
         wrong = self.off_m(self._apart(T)) > _MOST_LEFT_M
         across = np.zeros((2, len(self._fixed)))
@@ -234,10 +215,7 @@ class _Graph:
         return poses.log(self._T_source_target @ self._between(T))
 
     def off_m(self, apart: Float) -> Float:
-        """Return the (p,) root mean square distance, in metres, of two surfaces of an alignment.
-
-        apart: (p,6) motion (rad, m) of the source away from its aligned pose.
-        """
+        """Return the (p,) RMS distance (m) of two surfaces, the source moved by (p,6) rad, m."""
         square = np.einsum("pi,pij,pj->p", apart, self._information, apart)
         return np.sqrt(np.maximum(square, 0))
 

@@ -2,10 +2,9 @@
 """Register sweeps point to plane on the surfaces of the last second.
 
 Point-to-point registration (`densify.registration.odometry`) matches a sweep with the scan pattern
-of earlier sweeps, which moves with the vehicle. A rosette pattern that turns 7 degrees a sweep
-turns the poses with it. The sweeps of one second together give surface normals that do not depend
-on the pattern (Chen, Medioni, "Object modelling by registration of multiple range images", IVC
-1992).
+of earlier sweeps. A rosette pattern that turns 7 degrees a sweep turns the poses with it. The
+surface normals of one second do not depend on the pattern (Chen, Medioni, "Object modelling by
+registration of multiple range images", IVC 1992).
 """
 
 from __future__ import annotations
@@ -41,13 +40,10 @@ def register_on_surfaces(
 ) -> tuple[Float, list[Float]]:
     """Register raw sweeps, each with the sweeps of the second before it.
 
-    The first sweeps are registered with the sweeps after them. Without odometry each sweep starts
-    at constant velocity, and the first second is registered twice. The first time starts from
-    `search_twist`, which is some metres per second off, the second time from the velocity found.
-
-    Args:
-        sweeps: Raw sweeps, ascending in time.
-        twists: (S,6) approximate velocity (rad/s, m/s) before each sweep, by odometry.
+    The first sweeps are registered with the sweeps after them. ``twists`` (S,6) are velocities
+    (rad/s, m/s) before each sweep, by odometry. Without them each sweep starts at constant
+    velocity, and the first second is registered twice: from `search_twist`, which is some metres
+    per second off, then from the velocity found.
 
     Returns:
         The (S,4,4) poses in the frame of the first sweep, and (N,3) deskewed points of each sweep
@@ -71,12 +67,7 @@ class _SweepRow:
     def __init__(
         self, sweeps: Sequence[Sweep], num_neighbors: int, match_m: Sequence[float]
     ) -> None:
-        """Prepare the sweeps.
-
-        Args:
-            num_neighbors: Number of neighbouring points that give a normal.
-            match_m: Greatest distance in metres between corresponding points, for each round.
-        """
+        """Prepare the sweeps; ``match_m``: greatest distance of a match, for each round."""
         self._sweeps = [subsample(sweep, _NUM_POINTS) for sweep in sweeps]
         self.stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
         self._num_neighbors, self._match_m = num_neighbors, match_m
@@ -84,10 +75,7 @@ class _SweepRow:
         self._points: list[Float] = []  # of the sweeps aligned so far, in the world
 
     def register(self, twist: Float, twists: Float | None = None) -> tuple[Float, list[Float]]:
-        """Return the poses and points of the sweeps, see `register_on_surfaces`.
-
-        twist: (6,) initial velocity (rad/s, m/s).
-        """
+        """Return poses and points of `register_on_surfaces`, from an initial velocity (6,)."""
         num, stamp_ns = len(self._sweeps), self.stamp_ns
         num_start, step_s = min(_NUM_START, num // 2), np.diff(stamp_ns) * 1e-9
         self._points = [deskew_points(self._sweeps[0], twist)]
@@ -109,12 +97,8 @@ class _SweepRow:
         return np.stack([np.eye(4), *(T_first_world @ T for T in self._T[1:])]), points
 
     def _place(self, i: int, step: int, T_guess: Float, twist: Float, others: range) -> Float:
-        """Align sweep i with others, and return the velocity from sweep ``step`` - 1 to ``step``.
-
-        T_guess: predicted pose. twist: predicted (6,) velocity. others: indices of the other
-        sweeps, nearest first; if empty the sweep keeps its prediction.
-        """
-        self._T[i] = T_guess
+        """Align sweep i with ``others``, nearest first; return the velocity before ``step``."""
+        self._T[i] = T_guess  # without others the sweep keeps its prediction
         if others:
             chosen = others[:: max(1, round(len(others) / _NUM_IN_REACH))]
             around = np.concatenate([self._points[j] for j in chosen])

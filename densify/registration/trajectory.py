@@ -61,17 +61,10 @@ class Registration:
 def find_trajectory(
     sweeps: Sequence[Sweep], settings: RegisterSettings, recorded: Trajectory | None = None
 ) -> Trajectory:
-    """Return the poses of raw sweeps.
+    """Return the poses of raw sweeps: the recorded ones after a check, or registered ones.
 
     Each sweep is aligned with the surfaces of earlier sweeps. KISS-ICP predicts the motion of dense
-    sweeps.
-
-    Args:
-        sweeps: Raw sweeps, ascending in time.
-        recorded: Poses of the recording, to be checked and used; None to register the sweeps.
-
-    Raises:
-        SweepError: The poses are implausible. The message names the frame.
+    sweeps. Implausible poses raise SweepError, whose message names the frame.
     """
     frames = tuple(s.frame for s in sweeps)
     stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
@@ -134,12 +127,9 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
 
 
 def find_jump(twist: Float, before: Float | None, step_s: float) -> str:
-    """Return why a vehicle cannot move at this velocity for ``step_s``; "" if it can.
+    """Return why a vehicle cannot move at ``twist`` (6,) (rad/s, m/s) for ``step_s``; "" if it can.
 
-    Args:
-        twist: (6,) velocity (rad/s, m/s).
-        before: (6,) velocity of the previous step; None if unknown.
-        step_s: Duration of the step in seconds.
+    ``before`` (6,) is the velocity of the previous step, None if unknown.
     """
     slack_m_s = _POSE_NOISE_M / step_s
     speed_m_s, turn_deg_s = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))
@@ -159,15 +149,11 @@ def find_jump(twist: Float, before: Float | None, step_s: float) -> str:
 def check_overlap(
     points: Sequence[Float], trajectory: Trajectory, settings: RegisterSettings
 ) -> None:
-    """Raise UnplacedSweepError if a sweep overlaps too little with the sweeps just before it.
+    """Raise UnplacedSweepError if a sweep overlaps too little with the third of a second before it.
 
-    These are the sweeps of the last third of a second. Odometry can continue at constant velocity
-    over sweeps of another place. One earlier sweep is not enough for a scan pattern that does not
-    repeat. Near the start, the following third of a second is tested too. Very sparse sweeps pass.
-
-    Args:
-        points: (N,3) points of each sweep in the world.
-        trajectory: Frame numbers and times of these sweeps.
+    Odometry can continue at constant velocity over sweeps of another place. One earlier sweep is
+    not enough for a scan pattern that does not repeat. Near the start, the following third of a
+    second is tested too. Very sparse sweeps pass. ``points`` are (N,3) of each sweep, world.
     """
     frames, stamp_ns = trajectory.frames, trajectory.stamp_ns
     above = [above_ground(p) for p in points]

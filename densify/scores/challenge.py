@@ -10,8 +10,7 @@ vehicle and without the ground:
   package bucketed-scene-flow-eval): the points of each class are sorted by the length of their true
   flow into ``linspace(0, 2.0, 51)`` metres a sweep and one bucket beyond. The first bucket is
   static, scored by its mean error in metres. In every other bucket the mean error is divided by the
-  mean length of the true flow. These quotients are averaged over the buckets with points, and then
-  over the classes.
+  mean true length. The quotients are averaged over the buckets with points, then over the classes.
 """
 
 from __future__ import annotations
@@ -72,11 +71,8 @@ class ChallengeScorer:
     def add(self, points: Float, estimated: Float, true: Float, classes: NDArray[Any]) -> None:
         """Add the flow of one pair of sweeps, without unlabelled points and the ground.
 
-        Args:
-            points: (N,3) positions in metres, vehicle frame.
-            estimated: (N,3) estimated flow to the next sweep in metres, ego-motion removed.
-            true: (N,3) true flow to the next sweep in metres, ego-motion removed.
-            classes: (N,) indices in `CLASSES`, or `IGNORED`.
+        ``points`` (N,3) are in metres, vehicle frame. Both flows (N,3) are to the next sweep in
+        metres, ego-motion removed. ``classes`` (N,) are indices in `CLASSES`, or `IGNORED`.
         """
         counted = np.abs(points[:, :2]).max(axis=1, initial=0) < self._within_m
         counted &= classes < len(CLASSES)

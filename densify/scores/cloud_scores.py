@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Score an accumulated cloud by its ghosts, without ground truth.
-
-Every ``*_scores`` dictionary holds plain numbers ready for JSON. An undefined number is None.
-"""
+"""Score an accumulated cloud by its ghosts, without ground truth; undefined numbers are None."""
 
 from __future__ import annotations
 
@@ -20,10 +17,9 @@ _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
 def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
     """Return (M,) True for ghosts, and (M,) True for points that the key sweep cannot judge.
 
-    A ghost is a point of another sweep of the window at a position that the key sweep saw through.
-    All returns of the key sweep in its direction and the eight directions around are farther, by
-    more than max(0.5 m, 2 % of its range). At least six of the nine directions must have a return.
-    Dark paint and glass give no return and hide ghosts.
+    A ghost is a point of another sweep at a position that the key sweep saw through. All returns of
+    the key sweep in its direction and the eight around, at least six, are farther by more than
+    max(0.5 m, 2 % of its range). Dark paint and glass give no return and hide ghosts.
     """
     ghost, unjudged = np.zeros((2, len(cloud)), bool)
     other = np.flatnonzero(_others(cloud, key))
@@ -44,10 +40,9 @@ def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
 def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
     """Return the shares of `ghosts` among the ``num_points`` points of the window's other sweeps.
 
-    The shares are for ``all``, ``moving`` and ``static`` points, by distance from the key sweep in
-    frames (``by_distance["3"]``), and by time from it, rounded to 10 ms (``by_seconds["0.30"]``).
-    ``unjudged`` is the share of all, moving and static points without returns of the key sweep to
-    compare.
+    They are for ``all``, ``moving`` and ``static`` points, by distance from the key sweep in frames
+    (``by_distance["3"]``) and by time from it, rounded to 10 ms (``by_seconds["0.30"]``).
+    ``unjudged`` has the shares without returns of the key sweep to compare.
     """
     other = np.flatnonzero(_others(cloud, key))
     ghost, unjudged = (found[other] for found in ghosts(cloud, key_image, key))

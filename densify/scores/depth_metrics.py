@@ -2,8 +2,8 @@
 """Compare depth with ground truth, as lists of pixels or whole maps.
 
 The definitions are from KITTI's depth development kit (``evaluate_depth.cpp``; Uhrig et al.,
-"Sparsity Invariant CNNs", 3DV 2017). The kit fills the holes of a prediction before it scores. Here
-a missing pixel lowers the coverage and is no error.
+"Sparsity Invariant CNNs", 3DV 2017). The kit fills holes before it scores; here a missing pixel
+lowers the coverage and is no error.
 """
 
 from __future__ import annotations
@@ -29,37 +29,23 @@ _LEAST_CONFIDENCES = tuple(round(0.05 * step, 2) for step in range(20))
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Errors of depth z against the true depth t. An error over no pixels is None.
+    """Errors of depth z against the true depth t. An error over no pixels is None."""
 
-    Attributes:
-        num_pixels: Number of pixels with a true depth.
-        num_compared: Number of pixels with both depths, over which the errors are taken.
-        coverage: Share of the true pixels with a depth, num_compared / num_pixels.
-        mae_m: Mean of |z - t|.
-        rmse_m: Root mean square of z - t.
-        imae_per_km: Mean of |1/z - 1/t|.
-        irmse_per_km: Root mean square of 1/z - 1/t.
-        abs_rel: Mean of |z - t| / t.
-        sq_rel: Mean of (z - t)² / t².
-        delta_1: Share of pixels with max(z/t, t/z) < 1.25 (Eigen et al., NIPS 2014).
-        delta_2: Share of pixels with that ratio below 1.25².
-        delta_3: Share of pixels with that ratio below 1.25³.
-        outliers: Share of outliers by the rule of KITTI's 2015 stereo benchmark (Menze and Geiger,
-            "Object Scene Flow for Autonomous Vehicles", CVPR 2015).
-    """
-
-    num_pixels: int
-    num_compared: int
-    coverage: float | None
-    mae_m: float | None
-    rmse_m: float | None
-    imae_per_km: float | None
-    irmse_per_km: float | None
-    abs_rel: float | None
-    sq_rel: float | None
+    num_pixels: int  # pixels with a true depth
+    num_compared: int  # pixels with both depths, over which the errors are taken
+    coverage: float | None  # num_compared / num_pixels
+    mae_m: float | None  # mean of |z - t|
+    rmse_m: float | None  # root mean square of z - t
+    imae_per_km: float | None  # mean of |1/z - 1/t|
+    irmse_per_km: float | None  # root mean square of 1/z - 1/t
+    abs_rel: float | None  # mean of |z - t| / t
+    sq_rel: float | None  # mean of (z - t)² / t²
+    # Shares of pixels with max(z/t, t/z) < 1.25, 1.25² and 1.25³ (Eigen et al., NIPS 2014)
     delta_1: float | None
     delta_2: float | None
     delta_3: float | None
+    # Share of outliers by the rule of KITTI's 2015 stereo benchmark (Menze and Geiger, "Object
+    # Scene Flow for Autonomous Vehicles", CVPR 2015)
     outliers: float | None
 
 
@@ -73,15 +59,9 @@ def depth_errors(
 ) -> DepthErrors:
     """Return the errors of depths over the pixels with ground truth.
 
-    A depth z is an outlier if its disparity focal_px · baseline_m / z is off by more than 3 px
-    *and* by more than 5 % of the true disparity.
-
-    Args:
-        predicted_m: Camera z in metres, 0 none; (H,W) map or (N,) list of pixels.
-        truth_m: True camera z in metres, 0 none, same shape.
-        mask: True at the pixels that count, same shape; None for all.
-        focal_px: Focal length fx of the camera.
-        baseline_m: Stereo baseline that turns depth into disparity.
+    Depths are camera z in metres, 0 none. All arrays are (H,W) maps or (N,) lists of pixels,
+    ``mask`` True at the pixels that count. A depth z is an outlier if its disparity focal_px (fx) ·
+    baseline_m / z is off by more than 3 px *and* by more than 5 % of the true disparity.
     """
     known = truth_m > 0 if mask is None else (truth_m > 0) & mask
     compared = known & (predicted_m > 0)
@@ -112,9 +92,8 @@ def precision_density(
 ) -> list[dict[str, float | None]]:
     """Return density and share of outliers for each least confidence 0, 0.05, … 0.95.
 
-    The values are given for ``measured`` and ``filled`` depth. ``density_*`` is the share of all
-    pixels that keep a depth. ``outliers_*`` is the share of outliers among kept pixels with true
-    depth (H,W), in metres, 0 none.
+    For ``measured`` and ``filled`` depth, ``density_*`` is the share of pixels that keep a depth,
+    ``outliers_*`` that of outliers among those with a true depth (H,W), metres, 0 none.
     """
     curve = []
     for least in _LEAST_CONFIDENCES:
@@ -140,8 +119,7 @@ def errors_by_part(
     """Return `depth_errors` of parts of the pixels (H,W), by name of the part.
 
     The parts are ``all`` pixels, ranges of true depth (``0-10 m`` … ``over 80 m``), `depth_edges`
-    (``edge``) and other pixels (``not edge``). With a mask of ``moving`` pixels given, there are
-    also parts ``moving`` and ``static``. Other arguments as in `depth_errors`.
+    (``edge``), other pixels (``not edge``) and, given a mask, ``moving`` and ``static`` pixels.
     """
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]

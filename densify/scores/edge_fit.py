@@ -3,9 +3,9 @@
 
 Levinson and Thrun, "Automatic Online Calibration of Cameras and Lasers", RSS 2013, with two
 additions. Vertical silhouettes are compared with horizontal image gradients, and level silhouettes
-with vertical gradients, so pitch is observable as well as yaw. The error of the best fit is that of
-an M-estimator (Huber, "The behavior of maximum likelihood estimates under nonstandard conditions",
-1967): the curvature of the score, and the spread of its slope over the images.
+with vertical gradients, so pitch is observable as well as yaw. The error of the best fit is an
+M-estimator's (Huber, "The behavior of maximum likelihood estimates under nonstandard conditions",
+1967), from the score's curvature and the spread of its slope over the images.
 """
 
 from __future__ import annotations
@@ -36,53 +36,34 @@ _CLEARLY = 2.0  # standard errors
 
 
 class Silhouettes(NamedTuple):
-    """E depth discontinuities of a sweep.
+    """E depth discontinuities of a sweep."""
 
-    Attributes:
-        places: (E,3) metres, lidar frame: at the range of the near surface, in the direction
-            halfway between the near and the far return.
-        is_level: (E,) bool, True if the far surface is above or below, False if beside.
-    """
-
+    # (E,3) metres, lidar frame: at the range of the near surface, in the direction halfway between
+    # the near and the far return
     places: Float
-    is_level: Bool
+    is_level: Bool  # (E,) True if the far surface is above or below, False if beside
 
 
 class View(NamedTuple):
-    """An image and the depth discontinuities of a sweep near it in time.
-
-    Attributes:
-        silhouettes: Depth discontinuities.
-        strength: (2,H,W) image gradient (horizontal, then vertical) minus its mean.
-        scale: Size of the resized image divided by the size of the original.
-        twist: (6,) velocity of the lidar (rad/s, m/s), lidar frame.
-        exposed_s: Stamp of the image minus the reference time of the sweep.
-    """
+    """An image and the depth discontinuities of a sweep near it in time."""
 
     silhouettes: Silhouettes
-    strength: Float32
-    scale: float
-    twist: Float
-    exposed_s: float
+    strength: Float32  # (2,H,W) image gradient (horizontal, then vertical) minus its mean
+    scale: float  # size of the resized image divided by the size of the original
+    twist: Float  # (6,) velocity of the lidar (rad/s, m/s), lidar frame
+    exposed_s: float  # stamp of the image minus the reference time of the sweep
 
 
 class Fit(NamedTuple):
-    """The best-fitting offset of a camera's rotation and clock.
+    """The best-fitting offset of a camera's rotation and clock."""
 
-    Attributes:
-        offset: (4,) degrees about the camera's x (pitch), y (yaw) and z (roll), and seconds from
-            the stamps of the images to their exposure.
-        error: (4,) standard error of the offset, infinite if the views do not determine it.
-        score: Sum of image gradients at the depth discontinuities with this offset.
-        rival: Best score with an offset more than 1 degree or 0.1 s away.
-        usual: Median score of all offsets on the grid.
-    """
-
+    # (4,) degrees about the camera's x (pitch), y (yaw) and z (roll), and seconds from the stamps
+    # of the images to their exposure
     offset: Float
-    error: Float
-    score: float
-    rival: float
-    usual: float
+    error: Float  # (4,) standard error of the offset, infinite if the views do not determine it
+    score: float  # sum of image gradients at the depth discontinuities with this offset
+    rival: float  # best score with an offset more than 1 degree or 0.1 s away
+    usual: float  # median score of all offsets on the grid
 
     @property
     def clearness(self) -> float:
@@ -103,13 +84,10 @@ def silhouettes_of(sweep: Sweep) -> Silhouettes:
 
 
 def depth_edges(points: Float) -> Silhouettes:
-    """Return the depth discontinuities of one scanner's points.
+    """Return the depth discontinuities of one scanner's points (N,3), metres, in its own frame.
 
     A return is at an edge if its inverse range lies above the line through both neighbours. On a
     plane inverse range is linear at any slant, so neither a distant road nor a fence gives edges.
-
-    Args:
-        points: (N,3) metres, in the scanner's own frame and axes.
     """
     x, y, z = points.T
     range_m = np.linalg.norm(points, axis=1)
@@ -168,16 +146,11 @@ def score(camera: Camera, views: Sequence[View]) -> tuple[float, int]:
 
 
 def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -> bool:
-    """Return True if an image clearly does not lie where the depth discontinuities are.
+    """Return True if an (H,W,3) RGB image clearly does not lie where the depth discontinuities are.
 
-    The score of the given pose, the best within 0.3 degrees, is compared with all turns up to 2.7
-    degrees. The image is off if another turn is better by two standard errors, which are those of
-    the sum over the discontinuities of the difference between both.
-
-    Args:
-        camera: Camera with its pose at the exposure.
-        silhouettes: Depth discontinuities of the sweep nearest in time.
-        image: (H,W,3) RGB image.
+    ``camera`` has its pose at the exposure, ``silhouettes`` are of the sweep nearest in time. The
+    image is off if a turn of up to 2.7 degrees scores better than the best within 0.3 degrees, by
+    two standard errors of the sum of their differences at the discontinuities.
     """
     view = View(silhouettes, *image_edges(image, camera.focal_px), np.zeros(6), 0.0)
     lines, turns = _Lines.of(camera, view, np.zeros(4)), _turns(np.zeros(1), np.zeros(1))
@@ -188,11 +161,7 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
 
 
 def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
-    """Return the best fit of a camera to two or more views.
-
-    Args:
-        with_clock: Fit the delay of the images too, else it is 0.
-    """
+    """Return the best fit of a camera to two or more views, with delay 0 unless ``with_clock``."""
     free = np.array([True, True, True, with_clock])
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
     grid = _grid(free)
@@ -214,10 +183,7 @@ def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
 
 
 def _grid(free: Bool) -> Float:
-    """Return (M,4) offsets, as in `Fit`: all pitches and yaws with each roll, then with each delay.
-
-    ``free`` (4,) is True for the parameters that are fitted.
-    """
+    """Return (M,4) offsets: pitches and yaws with each roll, then with each delay, if ``free``."""
     roll, delay = _steps(2), _steps(3)
     parts = [_turns(roll, np.zeros(1))] if free[2] else []
     return np.concatenate([*parts, *([_turns(np.zeros(1), delay)] if free[3] else [])])
@@ -234,26 +200,16 @@ def _turns(roll: Float, delay: Float) -> Float:
 
 
 class _Lines(NamedTuple):
-    """The E depth discontinuities of a view, projected into the resized image.
+    """The E depth discontinuities of a view, projected into the resized image."""
 
-    Attributes:
-        uv: (E,2) pixels.
-        slope: (E,2,4) change of ``uv`` per degree and per second of the offset.
-        is_level: (E,) as in `Silhouettes`.
-        strength: (2,H+2,W+2) image gradient, padded with 0.
-    """
-
-    uv: Float
-    slope: Float
+    uv: Float  # (E,2) pixels
+    slope: Float  # (E,2,4) change of ``uv`` per degree and per second of the offset
     is_level: Bool
-    strength: Float32
+    strength: Float32  # (2,H+2,W+2) image gradient, padded with 0
 
     @staticmethod
     def of(camera: Camera, view: View, offset: Float) -> _Lines:
-        """Project the depth discontinuities of a view into its image.
-
-        ``offset`` (4,) changes the camera's rotation and clock, as in `Fit`.
-        """
+        """Project the depth discontinuities of a view, after an offset (4,) as in `Fit`."""
 
         def project(more: Float) -> tuple[Float, Bool]:
             seen_s = view.exposed_s + offset[3] + more[3]
@@ -281,12 +237,7 @@ class _Lines(NamedTuple):
         return self.strengths(offsets, thin).sum(axis=1, dtype=np.float64)
 
     def strengths(self, offsets: Float, thin: int = 1) -> Float32:
-        """Return (M,E) image gradients at the discontinuities, for M offsets.
-
-        Args:
-            offsets: (M,4) as in `Fit`.
-            thin: Only every ``thin``-th discontinuity is used.
-        """
+        """Return (M,E) image gradients at every ``thin``-th discontinuity, for offsets (M,4)."""
         height, width = self.strength.shape[1:]
         uv, slope = self.uv[::thin], self.slope[::thin]
         moved = np.rint(uv + np.einsum("ma,eda->med", offsets, slope)).astype(np.int32) + 1
@@ -300,10 +251,7 @@ def _sum(lines: Sequence[_Lines], offset: Float) -> float:
 
 
 def _is_beside(offsets: Float, other: Float) -> Any:
-    """Return (M,) True for offsets (M,4) clearly apart from another offset (4,).
-
-    They differ by more than 1 degree of pitch or yaw, or by 0.1 s.
-    """
+    """Return (M,) True for offsets (M,4) over 1 degree of pitch or yaw, or 0.1 s, from another."""
     return (np.abs(offsets - other)[..., [0, 1, 3]] > (1.0, 1.0, 0.1)).any(axis=-1)
 
 

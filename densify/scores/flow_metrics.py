@@ -2,6 +2,7 @@
 """Compute metrics of scene flow, each with its definition, unit and source.
 
 Flow is (N,3) metres from one time to another, ego-motion removed. A mean over no points is NaN.
+Sources: Liu, Qi, Guibas, "FlowNet3D", CVPR 2019 (errors); Pontes et al., 3DV 2020 (angles).
 """
 
 from __future__ import annotations
@@ -20,10 +21,7 @@ def end_point_errors(estimated: Float, true: Float) -> Float:
 
 
 def end_point_error(estimated: Float, true: Float, mask: Bool | None = None) -> float:
-    """Return the mean end-point error (EPE) in metres, over ``mask`` (N,) if given.
-
-    Liu, Qi, Guibas, "FlowNet3D", CVPR 2019.
-    """
+    """Return the mean end-point error in metres, over ``mask`` (N,) if given."""
     error_m = end_point_errors(estimated, true)
     return mean_of(error_m if mask is None else error_m[mask])
 
@@ -32,7 +30,6 @@ def accuracy(estimated: Float, true: Float, limit: float) -> float:
     """Return the share (0 to 1) of the points with a small end-point error.
 
     The error is below ``limit`` metres *or* below ``limit`` times the length of the true flow.
-    `STRICT` and `RELAXED` are the limits of FlowNet3D (CVPR 2019) and Pontes et al. (3DV 2020).
     """
     error_m = end_point_errors(estimated, true)
     return mean_of((error_m < limit) | (error_m < limit * np.linalg.norm(true, axis=1)))
@@ -41,8 +38,7 @@ def accuracy(estimated: Float, true: Float, limit: float) -> float:
 def angle_error_rad(estimated: Float, true: Float) -> float:
     """Return the mean angle in radians between the estimated and the true flow.
 
-    It is taken over the points whose true flow is not 0 (Pontes et al., 3DV 2020). An estimate of 0
-    counts as a right angle.
+    Points whose true flow is 0 do not count. An estimate of 0 counts as a right angle.
     """
     length_m = np.linalg.norm(true, axis=1)
     flow, truth, length_m = (values[length_m > 0] for values in (estimated, true, length_m))

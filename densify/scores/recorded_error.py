@@ -38,10 +38,7 @@ class RecordedError(NamedTuple):
 def main_error(
     recorded: Sequence[Float], odometry: Sequence[Float], duration_s: float
 ) -> tuple[str, str]:
-    """Return the main error of the recorded motions, scale or drift, and its correction, as texts.
-
-    ``recorded`` and ``odometry`` are as in `RecordedError.of`, each over ``duration_s``.
-    """
+    """Return the main error of motions over ``duration_s``, scale or drift, and its correction."""
     recorded_m, odometry_m = (
         np.array([T[:3, 3] for T in motions]) for motions in (recorded, odometry)
     )

@@ -86,10 +86,7 @@ def T_level_lidar(tilt_deg: float) -> Float:
 
 
 def cameras_beside(tilt_deg: float, names: tuple[str, ...] = USUAL) -> dict[str, Camera]:
-    """Return the cameras, with poses relative to the lidar frame of a tilted mount.
-
-    Tilting the lidar does not move the cameras on the vehicle.
-    """
+    """Return the cameras, which do not tilt, with poses relative to the tilted lidar."""
     T = T_level_lidar(tilt_deg)
     return {n: replace(CAMERAS[n], T_cam_lidar=CAMERAS[n].T_cam_lidar @ T) for n in names}
 
@@ -110,10 +107,9 @@ class Picture:
 
 
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
-    """Render the picture of a camera, each row exposed at its own time.
+    """Render the picture of a camera, each row at its own time, the middle one at ``time_s``.
 
-    The camera's pose is relative to the lidar frame of a level mount. ``time_s`` is the exposure of
-    the middle row, in seconds since frame 0.
+    ``camera``'s pose is relative to a level lidar, ``time_s`` in seconds since frame 0.
     """
     h, w = camera.height_px, camera.width_px
     v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)

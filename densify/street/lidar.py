@@ -1,14 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Simulate one sweep: the returns of each ray, and the rays that pass surfaces or are lost.
-
-Many rays give no return from car windows and dark doors. The shares are taken from 207 moving cars
-of KITTI's stereo benchmark (Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR
-2015) in sweeps of an HDL-64E. They depend on the angle of incidence, the brightness of the car and
-the part. The source's upper part is the window band with pillars and roof, while the tables here
-are of paint and glass alone. They are fitted to give simulated cars the shares of the source
-(``tests/test_street_returns.py``). Fewer rays pass through doors than in the source, where such
-rays are errors of calibration.
-"""
+"""Simulate one sweep: the returns of each ray, and the rays that pass surfaces or are lost."""
 
 from __future__ import annotations
 
@@ -33,7 +24,10 @@ _IS_LEAKY = np.isin(np.arange(len(Material)), (*_PARTS, Material.LEAF))
 _BRIGHTNESS = (0.2, 0.55)  # between dark, middle and bright paint
 _INCIDENCE_DEG = (10.0, 30.0, 50.0, 67.5, 82.5)
 # Percent of rays that are lost, and that pass: for each part, five incidences of dark, middle and
-# bright cars.
+# bright cars. From 207 moving cars of KITTI's stereo benchmark (Menze and Geiger, "Object Scene
+# Flow for Autonomous Vehicles", CVPR 2015) in sweeps of an HDL-64E, fitted to give simulated cars
+# the same shares (tests/test_street_returns.py): the upper part there is the window band with
+# pillars and roof, here glass alone. Fewer rays pass doors here: there, errors of calibration do.
 _LOST = 0.01 * np.array(
     [
         [(8, 18, 22, 35, 35), (5, 6, 13, 18, 8), (2, 8, 10, 0, 0)],
@@ -103,10 +97,7 @@ def _of_vehicle(material: Int) -> Bool:
 
 
 def patches(place: Float, owner: Int) -> Float:
-    """Return (N,) numbers, uniform in 0 to 1, that vary smoothly over a surface.
-
-    Different owners (object indices) have independent numbers.
-    """
+    """Return (N,) uniform numbers, 0 to 1, smooth over the surface of each ``owner`` (object)."""
     cell = np.floor(place / _PATCH_M)
     share = place / _PATCH_M - cell
     share = share * share * (3 - 2 * share)
@@ -144,23 +135,14 @@ _MELT_PROBABILITY = 0.2
 
 @dataclass(frozen=True)
 class Returns:
-    """The N returns of a sweep in the order of time.
+    """The N returns of a sweep in the order of time."""
 
-    Attributes:
-        points: (N,3) float32 metres, in the lidar frame at each point's own firing time.
-        intensity: (N,) float32 of 0 to 1.
-        offset_ns: (N,) int64 firing time minus the reference time.
-        lidar: (N,) uint8 index of the scanner.
-        body: (N,) int32 index of the body hit.
-        instance: (N,) int32 number of the object hit, -1 for none.
-    """
-
-    points: Float32
-    intensity: Float32
-    offset_ns: NDArray[np.int64]
-    lidar: NDArray[np.uint8]
-    body: NDArray[np.int32]
-    instance: NDArray[np.int32]
+    points: Float32  # (N,3) metres, in the lidar frame at each point's own firing time
+    intensity: Float32  # (N,) 0 to 1
+    offset_ns: NDArray[np.int64]  # (N,) firing time minus the reference time
+    lidar: NDArray[np.uint8]  # (N,) index of the scanner
+    body: NDArray[np.int32]  # (N,) index of the body hit
+    instance: NDArray[np.int32]  # (N,) number of the object hit, -1 for none
 
 
 def T_ego_lidar(tilt_deg: float = 0.0) -> Float:

@@ -53,10 +53,7 @@ class Mesh:
 
     @staticmethod
     def quads(corners: Float, material: Material, tint: Tint | Float = WHITE) -> Mesh:
-        """Return a mesh of (K,4,3) quads, with corners in order around each quad.
-
-        Texture coordinates run along the first side and away from it.
-        """
+        """Return a mesh of (K,4,3) quads in order around. Texture x runs along their first side."""
         k = len(corners)
         side, away = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
         along = side / np.maximum(lengths(side), 1e-9)

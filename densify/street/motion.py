@@ -85,10 +85,7 @@ class Still:
 
 @dataclass(frozen=True)
 class Driving:
-    """The trajectory of a vehicle that follows a curve on the ground with both axles.
-
-    The origin is midway between the axles, x forward, z up.
-    """
+    """A vehicle with both axles on a curve. Its origin is midway between them, x forward, z up."""
 
     curve: Curve  # path of both axles
     speed: Speed  # speed along the path
@@ -178,10 +175,7 @@ class Limb:
 
 
 class Rectangles(NamedTuple):
-    """Footprints of bodies: rectangles in the horizontal x-y plane of the world.
-
-    The arrays may have any leading shape, written "...".
-    """
+    """Footprints in the x-y plane of the world. The arrays may have any leading shape, "..."."""
 
     centre: Float  # (...,2) x, y of the centre, metres, world
     forward: Float  # (...,2) unit vector along the length, world

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Build the scenes.
-
-``street`` and ``static``: a street in town with a bend, a side road and traffic. ``crossing``: the
-ego vehicle stands at a crossroads. ``highway``: the ego vehicle drives 25 m/s, others 30 m/s.
-"""
+"""Build the scenes: town street (with traffic or static), crossroads and highway."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Define the simulated sensors: their scanners, and every pulse of a sweep.
 
-A scan pattern has ``num_pulses(period_s)``, the number of pulses in a sweep, and
-``directions(slots)``, (N,3) unit vectors in the axes of the scanner.
+A scan pattern has ``num_pulses(period_s)`` and ``directions(slots)`` in the scanner's axes.
 """
 
 from __future__ import annotations
@@ -27,13 +26,10 @@ class Slots(NamedTuple):
 
 @dataclass(frozen=True)
 class Spinning:
-    """A scan pattern that spins once a sweep, clockwise as viewed from above.
+    """A pattern that spins once a sweep, clockwise from above, forward at the reference time."""
 
-    It faces forward at the reference time. Beams fire one after another, never two at once, so
-    every pulse has an azimuth of its own.
-    """
-
-    elevation_deg: tuple[float, ...]  # elevations of the beams in firing order
+    # Beams in firing order, never two at once: every pulse has an azimuth of its own
+    elevation_deg: tuple[float, ...]
     # Firings per second of each beam. A revolution at 20 Hz has half the columns of a revolution at
     # 10 Hz.
     columns_per_s: int
@@ -57,18 +53,14 @@ class _Steady:
     pulses_per_s: int
 
     def num_pulses(self, period_s: float) -> int:
-        """Return the number of pulses in a sweep."""
         return int(self.pulses_per_s * period_s + 1e-6)
 
 
 @dataclass(frozen=True)
 class Raster(_Steady):
-    """A scan pattern that covers a rectangle, line by line, once a sweep.
+    """A scan pattern that covers a rectangle, line by line, by a fast and a slow mirror."""
 
-    A fast mirror swings from side to side, a slow mirror goes from top to bottom. No two pulses of
-    a sweep have the same elevation.
-    """
-
+    # No two pulses of a sweep have the same elevation.
     width_deg: float  # width of the field of view, with its centre straight ahead
     height_deg: float  # height of the field of view
     lines_per_s: int  # swings of the fast mirror per second, counting each direction
@@ -83,11 +75,7 @@ class Raster(_Steady):
 
 @dataclass(frozen=True)
 class Rosette(_Steady):
-    """A scan pattern of two prisms of equal power that turn at different rates.
-
-    It draws a rose around the forward axis. The rose continues from sweep to sweep and does not
-    repeat, as in Livox's scanners.
-    """
+    """A scan pattern of two equal prisms: a rose that never repeats, as in Livox's scanners."""
 
     width_deg: float  # diameter of the round field of view
     # Rotation rates of the two prisms. Petals are drawn at the difference of the rates and turn at

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make the frames of a scene: sweeps, pictures and the exact motion of every body.
-
-Internal times are in seconds since frame 0, external times in absolute nanoseconds.
-"""
+"""Make the frames of a scene: sweeps, pictures and the exact motion of every body."""
 
 from __future__ import annotations
 
@@ -141,10 +138,7 @@ class Simulator:
         return self.bodies_at([self.stamp_ns(frame) for frame in range(self.num_frames)])
 
     def bodies_at(self, stamps_ns: Sequence[int], which: Sequence[int] | None = None) -> Bodies:
-        """Return the poses of bodies at these times.
-
-        ``which`` has indices of bodies, all bodies of an object together; None for all bodies.
-        """
+        """Return the poses of bodies (``which``, whole objects; None for all) at these times."""
         times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
         if which is not None:
@@ -174,7 +168,7 @@ class Simulator:
 
 
 def seconds(time_ns: int) -> float:
-    """Return nanoseconds since frame 0 as seconds."""
+    """Return an absolute time in ns as seconds since frame 0, the unit inside this package."""
     return (time_ns - EPOCH_NS) * 1e-9
 
 

@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Build the ground: a smooth hilly surface, the roads on it, and a mesh with kerbs.
-
-The height is a function of position. The carriageway is the union of the road strips with rounded
-corners, given as a signed distance. The triangles of the ground are cut along its zero line, where
-the upright kerb is.
-"""
+"""Build the ground: a smooth hilly surface, the roads on it, and a mesh with kerbs."""
 
 from __future__ import annotations
 
@@ -25,10 +20,7 @@ Spans = Sequence[tuple[float, float]]
 
 
 class Curve:
-    """A smooth planar curve through points, with an arc length from 0 to ``length_m``.
-
-    It continues straight beyond its ends.
-    """
+    """A smooth planar curve, from arc length 0 to ``length_m`` and straight beyond its ends."""
 
     def __init__(self, xy: Float) -> None:
         """Build the curve through (N,2) points in metres, neighbours about half a metre apart."""
@@ -66,17 +58,14 @@ class Curve:
     def bending(
         length_m: float, curvature: Callable[[Float], Float], origin_m: float = 0.0
     ) -> Curve:
-        """Return a curve of this length and curvature (1/m, positive to the left, by arc length).
-
-        At arc length ``origin_m`` it passes the origin with heading +x.
-        """
+        """Return a curve by curvature (1/m, left positive), through the origin along +x."""
         step = 0.05
         station = np.arange(0.0, length_m + step, step)
         heading = np.concatenate([[0.0], np.cumsum(curvature(station[:-1] + step / 2) * step)])
         middle = (heading[1:] + heading[:-1]) / 2
         steps = step * np.stack([np.cos(middle), np.sin(middle)], axis=1)
         xy = np.concatenate([[[0.0, 0.0]], np.cumsum(steps, axis=0)])
-        start = round(origin_m / step)
+        start = round(origin_m / step)  # at this arc length it passes the origin
         c, s = np.cos(heading[start]), np.sin(heading[start])
         xy = (xy - xy[start]) @ np.array([[c, -s], [s, c]])
         return Curve(xy[:: round(_STEP_M / step)])
@@ -232,10 +221,7 @@ class Ground:
         return self.terrain.height(xy) + self.kerb_m * (self.distance(xy) > 0)
 
     def mesh(self, margin_m: float, cell_m: float, far_m: float = 200.0) -> Mesh:
-        """Return fine triangles up to ``margin_m`` from the roads and coarse ones up to ``far_m``.
-
-        Coarse triangles are sunk where fine ones cover them.
-        """
+        """Return triangles fine up to ``margin_m`` from roads, coarse up to ``far_m``."""
         centre = np.concatenate([r.curve(r.curve.knots_m) for r in self.roads])
         low, high = centre.min(axis=0) - margin_m - 4, centre.max(axis=0) + margin_m + 4
         corners, quads = _grid(low, high, cell_m)
@@ -250,6 +236,7 @@ class Ground:
         """Return triangles cut at the edge of the carriageway, and the upright kerb."""
         pieces: list[tuple[Float, int]] = []  # (K,3,2) corners, side
         edges: list[Float] = []  # (K,2,2), the road on the left
+        # Triangles are cut along the zero line of the signed distance to the kerb.
         negative = distance[triangles] < 0
         count = negative.sum(axis=1)
         pieces += [(xy[triangles[count == 3]], 0), (xy[triangles[count == 0]], 1)]
@@ -296,6 +283,7 @@ class Ground:
     def _far(self, low: Float, high: Float, far_m: float, margin_m: float) -> Mesh:
         corners, quads = _grid(low - far_m, high + far_m, _COARSE_M)
         covered = self.distance(corners) < margin_m - 1.5 * _COARSE_M
+        # Coarse triangles are sunk where fine ones cover them.
         z = self.terrain.height(corners) + np.where(covered, -1.0, self.kerb_m - 0.05)
         return Mesh.quads(np.column_stack([corners, z])[quads], Material.GRASS)
 

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Put the traffic of every scene on its lanes.
-
-Actors meet around the ego vehicle after 12 seconds, and never collide. An actor that would collide
-is drawn at random again. Time 0 is frame 0 at every sweep rate.
-"""
+"""Put the traffic of every scene on its lanes, without collisions. Time 0 is frame 0."""
 
 from __future__ import annotations
 
@@ -79,10 +75,7 @@ class Traffic:
     def drive(
         self, make: Maker, lane: Lane, station_m: float, speed: Speed | float, slack_m: float = 2.0
     ) -> None:
-        """Put a vehicle on a lane, beside a station (arc length) of the road at the meeting time.
-
-        A speed in m/s is varied at random, and the station by up to ``slack_m``.
-        """
+        """Put a vehicle beside a station of the road at the meeting time, varied by ``slack_m``."""
 
         def recipe(rng: np.random.Generator) -> Actor:
             at = lane.at(station_m + rng.uniform(-slack_m, slack_m))

@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cast rays among moving rigid bodies, each ray at its own time.
-
-Rays are transformed to the frame of each body by the body's pose at the ray's time. A body that
-moves during a sweep is therefore distorted as in reality. This module is the only one that imports
-Embree.
-"""
+"""Cast rays among moving rigid bodies, each at its own time. Only this module imports Embree."""
 
 from __future__ import annotations
 
@@ -79,15 +74,7 @@ Optics = Callable[[Meeting], Int]
 
 
 class Triangles:
-    """The triangles of all bodies in a row, without triangles of no area.
-
-    ``body[k]``, ``material[k]``, ``instance[k]``, ``corner[k]``, ``normal[k]``, ``uv[k]``,
-    ``tint[k]`` and ``mean_tint[k]`` belong to triangle k.
-
-    Attributes:
-        first: Index of the first triangle of each body.
-        scenes: Embree scene of each body, in single precision.
-    """
+    """The triangles of all bodies in a row, except those of no area. Arrays are by triangle."""
 
     def __init__(self, bodies: Sequence[Body]) -> None:
         meshes = [b.mesh.of_instance(b.instance) if b.instance >= 0 else b.mesh for b in bodies]
@@ -99,6 +86,7 @@ class Triangles:
         keep = np.flatnonzero(length[:, 0] > 1e-7)
         counts = [len(m.triangles) for m in meshes]
         self.body = np.repeat(np.arange(len(meshes), dtype=np.int32), counts)[keep]
+        # Index of the first triangle of each body
         self.first: Int = np.searchsorted(self.body, np.arange(len(meshes) + 1))
         self.material = mesh.material[keep].astype(np.int64)
         self.tint: Float = mesh.tint.take(keep, axis=0)
@@ -108,6 +96,7 @@ class Triangles:
         self.corner: Float = corners[:, 0].take(keep, axis=0)
         self.normal: Float = normal.take(keep, axis=0) / length.take(keep, axis=0)
         each = np.split(single.take(keep, axis=0), self.first[1:-1])
+        # Embree scene of each body, in single precision
         self.scenes = [_raycasting_scene(corners) for corners in each]
 
     def first_hit(
@@ -115,8 +104,7 @@ class Triangles:
     ) -> tuple[Int, Int, Float]:
         """Return the rays that hit their body, the first triangle that each hits, and u, v there.
 
-        ``parts`` has the index of a body and the end of its rays, by ascending ends. ``origin`` and
-        ``direction`` (N,3) are in the frame of the ray's body.
+        ``parts`` has body and end of its rays, ascending. Rays (N,3) are in the frames of bodies.
         """
         start, ray = origin.astype(np.float32), direction.astype(np.float32)
         met, triangle, barycentric, begin = [], [], [], 0
@@ -136,11 +124,7 @@ class Triangles:
 
 
 class World:
-    """All bodies. Body 0 is static.
-
-    Attributes:
-        seed: Seed of the random properties of surfaces.
-    """
+    """All bodies. Body 0 is static. ``seed`` determines the random properties of surfaces."""
 
     def __init__(self, bodies: Sequence[Body], seed: int = 0) -> None:
         self.bodies, self.seed = tuple(bodies), seed
@@ -148,17 +132,13 @@ class World:
 
     @cached_property
     def triangles(self) -> Triangles:
-        """The triangles of all bodies, built at first use.
-
-        Poses do not need the triangles, whose construction takes a third of the time of a scene.
-        """
-        return Triangles(self.bodies)
+        """The triangles of all bodies, built at first use."""
+        return Triangles(self.bodies)  # a third of the time of a scene, and poses need none
 
     def cast(self, rays: Rays, optics: Optics, num_together: int = 1, spread: float = 0.0) -> Hits:
         """Return the first surface at which each ray ends, by the decisions of ``optics``.
 
-        ``num_together`` consecutive rays have the same origin and time, and directions within
-        ``spread`` rad of the first ray's.
+        ``num_together`` consecutive rays share origin and time, within ``spread`` rad of the first.
         """
         every = np.arange(len(rays.time_s))
         best = self._cast_bodies([(0, len(every))], rays.origin, rays.direction, every, optics)

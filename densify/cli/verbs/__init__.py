@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Collect the verbs, and parse the command line.
 
-A verb's module has a function ``add``, which adds its options, and a function ``answer``. The
-latter opens recordings, calls the Python API, writes files, and yields answers. Verbs import heavy
-packages only when they run, so help answers at once.
+A verb's module has ``add``, which adds its options, and ``answer``, which yields answers. It
+imports heavy packages only when it runs, and help answers at once.
 """
 
 from __future__ import annotations
@@ -86,7 +85,7 @@ class _Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"got {value!r}; {hint}{expected}")
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        """Print the message. Errors of writing are not hidden."""
+        """Print the message, and let errors of writing through."""
         if message:
             print(message, end="", file=file or sys.stderr)
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answer ``densify flow``: scene flow of two point files or of a recording.
-
-``densify labels`` makes scene flow from tracked boxes.
-"""
+"""Answer ``densify flow`` and ``densify labels``: scene flow by estimation or tracked boxes."""
 
 from __future__ import annotations
 

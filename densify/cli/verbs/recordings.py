@@ -93,7 +93,6 @@ def _describe(diagnosis: Diagnosis) -> str:
 
 
 def _facts(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the findings with their values."""
     findings = [{**asdict(f), "verdict": str(f.verdict)} for f in diagnosis.findings]
     worst = str(diagnosis.worst)
     return {"recording": diagnosis.sample.sequence.name, "worst": worst, "findings": findings}

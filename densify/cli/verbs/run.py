@@ -67,7 +67,6 @@ def add_compare(commands: Any) -> None:
 
 
 def _add_key_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that ``run`` and ``compare`` share."""
     parser.epilog = f"Every setting, with its default and its effect: {presets()['default']}"
     add_recording(parser)
     add_common(parser, "window", "camera")
@@ -132,7 +131,6 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _front_first(paths: Sequence[Path], result: Result) -> list[Path]:
-    """Return the paths, those of the map that looks ahead first."""
     from densify.outputs.front_view import front_first
 
     names = front_first([*result.depth], result.views, result.T_key_lidar)
@@ -141,7 +139,6 @@ def _front_first(paths: Sequence[Path], result: Result) -> list[Path]:
 
 
 def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
-    """Return the frames of ``--key`` and ``--keys``, ascending."""
     from densify.readers.timeline import format_frames
 
     wanted = {*options.key}

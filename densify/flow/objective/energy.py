@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Compute the scene flow objective as differentiable torch code.
+"""Compute the objective of Pontes, Hays, Lucey (3DV 2020) as differentiable torch code.
 
-Source: Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020.
 Without learning alpha is 10 on a graph of 50 neighbours. As a training loss it is 4.
 """
 
@@ -43,11 +42,9 @@ def energy(
     gradient is exact wherever no two neighbours tie. The energy is a sum over points, not a mean.
 
     Args:
-        flow: (n,3) metres, F.
-        source: (n,3) metres, points p.
+        flow, source: (n,3) metres, F and the points p.
         target: (m,3) metres, points q, in the frame of the source.
         laplacian: (n,n) L of `densify.flow.objective.graph.laplacian`.
-        alpha: Weight of the smoothness term; a smaller weight leaves each point freer.
     """
     if flow.shape != source.shape:
         raise InputError(

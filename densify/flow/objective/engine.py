@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Solve the published objective between two clouds.
+"""Solve the objective of Pontes, Hays, Lucey (3DV 2020) between two clouds.
 
-Source: Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020. The
-engine ``paper`` solves it between neighbouring sweeps, above the ground.
+The engine ``paper`` solves it between neighbouring sweeps, above the ground.
 """
 
 from __future__ import annotations
@@ -60,8 +59,7 @@ def flow_between(
 ) -> FlowField:
     """Return the flow of a source cloud (N,3) to a target (M,3), by the published objective.
 
-    With ``static_prior`` only groups that certainly move have flow. The arguments are as in
-    `densify.estimate_flow`; ``settings`` is its section ``objective``.
+    With ``static_prior`` only groups that certainly move have flow. See `densify.estimate_flow`.
     """
     objective = SolverSettings(
         solver=settings.solver,
@@ -76,11 +74,7 @@ def flow_between(
 
 
 def _only_proven(clouds: tuple[Float, Float], flow: Float) -> FlowField:
-    """Keep the flow (N,3) of groups of source points that certainly move. Other points get flow 0.
-
-    A group is judged by its common translation. The free flow of each point cannot decide, because
-    it always comes closer to the target.
-    """
+    """Keep the flow (N,3) of groups of points that certainly move; other points get flow 0."""
     field = FlowField.zero(len(flow))
     source, target = (PairCloud(c, np.full(len(c), float(i))) for i, c in enumerate(clouds))
     moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > _LEAST_MOTION_M)
@@ -89,6 +83,7 @@ def _only_proven(clouds: tuple[Float, Float], flow: Float) -> FlowField:
     for k in range(num_groups):
         rows = moved[group == k]
         state, centre = np.append(np.median(flow[rows], axis=0), 0.0), source.points[rows].mean(0)
+        # by its common translation: the free flow always comes closer to the target
         if judge(k, rows, RigidMotion(state, centre), source, target).moves():
             field.displacement[rows] = flow[rows]
             field.moving[rows] = True

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Build the graph of a point cloud and its Laplacian, the smoothness term of the objective.
 
-Source: Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020,
-section 3.
+Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020, section 3.
 """
 
 from __future__ import annotations
@@ -36,15 +35,11 @@ def checked_cloud(values: ArrayLike, name: str) -> Float:
 
 
 def knn_graph(points: Float, num_neighbors: int) -> csr_array:
-    """Return the weights W of the undirected k-nearest-neighbour graph.
+    """Return the weights W of the undirected k-nearest-neighbour graph of points (n,3), metres.
 
     W is (n,n) symmetric float64, with ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is
-    among the k nearest of the other, 1 on the diagonal, 0 elsewhere.
-
-    Args:
-        points: (n,3) metres.
-        num_neighbors: Number k of neighbours without the point itself, at most n - 1. A larger k
-            couples the flow of points farther apart.
+    among the k nearest of the other, 1 on the diagonal, 0 elsewhere. k excludes the point itself
+    and is at most n - 1. A larger k couples the flow of points farther apart.
     """
     if num_neighbors < 1:
         raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
@@ -64,14 +59,11 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
 
 
 def laplacian(weights: csr_array) -> csr_array:
-    """Return the graph Laplacian ``L = D^-1/2 (D - W) D^-1/2``.
+    """Return the (n,n) graph Laplacian ``L = D^-1/2 (D - W) D^-1/2`` of the W of `knn_graph`.
 
-    L is (n,n), symmetric, positive semi-definite, float64. The degree D holds the row sums of W
-    with the self-weight ``W_ii = 1``, as in the paper. The null space of L is ``D^1/2 · 1``: a
-    constant flow costs energy where the density changes.
-
-    Args:
-        weights: (n,n) W of `knn_graph`.
+    L is symmetric, positive semi-definite, float64. The degree D holds the row sums of W with
+    ``W_ii = 1``, as in the paper. The null space of L is ``D^1/2 · 1``: a constant flow costs
+    energy where the density changes.
     """
     degree = weights.sum(axis=1)
     scale = diags_array(1.0 / np.sqrt(degree))

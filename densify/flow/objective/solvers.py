@@ -35,19 +35,12 @@ _MAX_PRODUCTS, _RESIDUAL_DROP = (
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """The settings of a solver. The defaults are the paper's except for the solver.
+    """The settings of a solver. The defaults are the paper's except for the solver."""
 
-    Attributes:
-        solver: Name of the solver, "pcg" or "adam".
-        alpha: Weight of smoothness, at least 0. A larger weight moves neighbours more alike.
-        num_neighbors: Number k of neighbours in the graph. A larger k is stiffer and slower.
-        adam_num_steps: Number of steps of Adam. 200 usually reach the lowest energy.
-    """
-
-    solver: str = "pcg"
-    alpha: float = 10.0
-    num_neighbors: int = 50
-    adam_num_steps: int = 1500
+    solver: str = "pcg"  # or "adam"
+    alpha: float = 10.0  # weight of smoothness, at least 0; larger: neighbours move more alike
+    num_neighbors: int = 50  # k of the graph; a larger k is stiffer and slower
+    adam_num_steps: int = 1500  # 200 usually reach the lowest energy
 
     def __post_init__(self) -> None:
         if self.solver not in SOLVERS:
@@ -80,12 +73,10 @@ def solve(
 ) -> Solution:
     """Return the smooth flow that moves ``source`` onto ``target``, a minimum of the objective.
 
-    The same input gives the same bytes on the same CPU. All is computed in float64.
+    All is computed in float64. The same input gives the same bytes on the same CPU.
 
     Args:
-        source: (n,3) metres.
-        target: (m,3) metres, in the same frame.
-        settings: Settings of the solver; None for the defaults.
+        source, target: (n,3) and (m,3) metres, in one frame.
         initial: (n,3) flow to start from, None for 0. With it, pcg uses the final alpha at once.
     """
     settings = settings or SolverSettings()
@@ -129,30 +120,22 @@ def _adam(
 
 
 class _Value:
-    """The energy of a flow, with the matches that give its gradient.
-
-    Attributes:
-        data: Term E_d of `densify.flow.objective.energy.energy`, m².
-        smoothness: Term tr(FᵀLF), m².
-        total: Energy at the requested alpha.
-        bent: (n,3) product L F.
-        pull: (n,3) sum of the vectors from each moved point to its matches: minus half the gradient
-            of E_d.
-        num_matches: (n,) number of matches of each point, both ways.
-    """
+    """The energy of a flow, with the matches that give its gradient."""
 
     def __init__(self, problem: _Problem, flow: Float) -> None:
         moved = problem.source + flow
         forward_m, to_target = problem.target_tree.query(moved)
         backward_m, to_source = cKDTree(moved).query(problem.target)
         self.flow = flow
-        self.data = float(np.sum(forward_m**2) + np.sum(backward_m**2))
-        self.bent = problem.laplacian @ flow
-        self.smoothness = float((flow * self.bent).sum())
+        self.data = float(np.sum(forward_m**2) + np.sum(backward_m**2))  # E_d, m²
+        self.bent = problem.laplacian @ flow  # (n,3) L F
+        self.smoothness = float((flow * self.bent).sum())  # tr(FᵀLF), m²
         self.total = self.data + problem.alpha * self.smoothness
         back = problem.target - moved[to_source]
         pulls = [np.bincount(to_source, back[:, axis], len(moved)) for axis in range(3)]
+        # (n,3) from each moved point to its matches: minus half the gradient of E_d
         self.pull = problem.target[to_target] - moved + np.stack(pulls, axis=1)
+        # (n,) of each point, both ways
         self.num_matches = 1.0 + np.bincount(to_source, minlength=len(moved))
 
     def at(self, alpha: float) -> float:
@@ -171,18 +154,15 @@ class _Problem:
 
 
 def _pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
-    """Return the solution by majorisation and minimisation, over levels of descending alpha.
-
-    With fixed matches the energy becomes a quadratic upper bound that is tight at the current flow.
-    A step that lowers the quadratic lowers the energy. At large alphas whole surfaces slide. If
-    alpha started small, the points would stick to their first neighbours.
-    """
+    """Return the solution by majorisation and minimisation, over levels of descending alpha."""
+    # At large alphas whole surfaces slide; from a small one points stick to their first neighbours.
     value = _Value(problem, start)
     energies = [value.total]
     for number, alpha in enumerate(levels):
         is_last = number == len(levels) - 1
         for _ in range(_MAX_LAST_ALTERNATIONS if is_last else _MAX_ALTERNATIONS):
             before = value.at(alpha)
+            # With fixed matches, a quadratic bounds the energy above, tight at the current flow.
             value = _Value(problem, value.flow + _step(problem, value, alpha))
             energies.append(value.total)
             if before - value.at(alpha) <= _LEVEL_TOLERANCE * value.at(alpha):
@@ -191,11 +171,8 @@ def _pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
 
 
 def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
-    """Return the (n,3) step X of the flow that roughly minimises the quadratic bound.
-
-    Conjugate gradients with a Jacobi preconditioner solve, with the Laplacian L,
-    ``(diag(num_matches) + alpha L) X = -gradient / 2``.
-    """
+    """Return the (n,3) step X of the flow that roughly minimises the quadratic bound."""
+    # (diag(num_matches) + alpha L) X = -gradient / 2, with a Jacobi preconditioner
     shape = problem.source.shape
     diagonal = value.num_matches[:, None]
     inverse = 1.0 / (diagonal + alpha * problem.diagonal[:, None])

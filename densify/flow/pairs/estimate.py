@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Estimate scene flow between any two clouds in one frame.
-
-Either rigid groups that certainly move have flow, or all points have the flow of the published
-objective.
-"""
+"""Estimate scene flow between any two clouds, of moving groups or by the published objective."""
 
 from __future__ import annotations
 
@@ -53,19 +49,16 @@ def estimate_flow(
     objective. With ``flow.engine=paper`` the moving groups take it.
 
     Args:
-        source: (N,3) metres, z up, with or without the ground.
-        target: (M,3) metres, in the same frame.
+        source, target: (N,3) and (M,3) metres, z up, with or without the ground.
         config: Settings; the sections ``flow`` and ``objective`` are used.
         initial: (N,3) flow to start from. It is needed only for objects faster than the search
             covers: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
-        source_offset_ns: (N,) time of each point. Give the times of both clouds, or no times. Both
+        source_offset_ns, target_offset_ns: (N,) and (M,) times of the points, both or none. Both
             clouds use one clock, or each counts from its own sweep's reference time; in the second
             case the target is taken for the next revolution. Without times, the flow is too slow or
             too fast for an object that the scanner meets earlier or later in the second sweep.
-        target_offset_ns: (M,) time of each point.
-        source_lidar: (N,) number of the scanner that measured each point. Give both clouds' numbers
-            or none. Without times, points are compared within a scanner only.
-        target_lidar: (M,) number of the scanner that measured each point.
+        source_lidar, target_lidar: (N,) and (M,) numbers of the points' scanners, both or none.
+            Without times, points are compared within a scanner only.
 
     Returns:
         Flow from the middle of the source's times to the target's middle, in the common frame. With
@@ -141,10 +134,7 @@ def _attach_below(points: Float, field: FlowField, low: Int) -> None:
 def _columns(
     source: ArrayLike | None, target: ArrayLike | None, clouds: tuple[Float, Float], name: str
 ) -> tuple[Int, Int] | None:
-    """Return (N,) and (M,) values of two clouds' points as int64, None if not given.
-
-    Raises InputError if only one cloud has values, or their shape or type is wrong.
-    """
+    """Return two clouds' values as int64 (N,) and (M,), None if none; InputError if wrong."""
     if source is None and target is None:
         return None
     columns = []
@@ -164,15 +154,7 @@ def _columns(
 
 
 def _shares(times_ns: tuple[Int, Int] | None) -> tuple[list[Float], float] | None:
-    """Return the firing times of two clouds as shares of the time between the clouds.
-
-    Args:
-        times_ns: (N,) and (M,) firing times.
-
-    Returns:
-        (N,) and (M,) times after the middle of the source's times, in units of the time from there
-            to the middle of the target's times, and this time in s. None if unknown or equal.
-    """
+    """Return firing times as shares of the time between the clouds, and this time (s)."""
     if times_ns is None:
         return None
     low, high = (np.array([int(of(times)) for times in times_ns]) for of in (np.min, np.max))
@@ -182,6 +164,7 @@ def _shares(times_ns: tuple[Int, Int] | None) -> tuple[list[Float], float] | Non
         gap = span  # each from its own reference time: the next revolution
     if gap == 0:
         return None
+    # 0 at the middle of the source's times, 1 at the middle of the target's
     shares = [
         i + (times - m) / gap for i, (times, m) in enumerate(zip(times_ns, middle, strict=True))
     ]
@@ -192,10 +175,7 @@ def _shares(times_ns: tuple[Int, Int] | None) -> tuple[list[Float], float] | Non
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Chain the flow of neighbouring sweeps: the engine ``pairs``, for recordings of two sweeps.
-
-    As `densify.flow.engines.EngineModule`; takes no argument.
-    """
+    """Chain the flow of neighbouring sweeps: the engine ``pairs``, for recordings of two sweeps."""
     of_groups = replace(settings, flow=replace(settings.flow, engine="groups"))
 
     def step(here: int, there: int) -> FlowField:

@@ -2,9 +2,8 @@
 """Propose rigid motions of a group of points between two clouds, and judge them.
 
 A group starts at the displacements at which most of its points come close to the other cloud (Hough
-1962). From there the tracker's aligner aligns it with the other cloud. A motion is judged by the
-ratio of two likelihoods of both clouds: the group moves, or it is static. If the firing times are
-known, every point is compared at its own time.
+1962), and is aligned from there. A motion is judged by the likelihood ratio of both clouds: the
+group moves, or it is static. Points with firing times are compared at their own times.
 """
 
 from __future__ import annotations
@@ -75,10 +74,8 @@ class Proposal:
 
     @property
     def gain(self) -> float:
-        """The log-likelihood ratio of both clouds, without target points that fit static better.
-
-        They would pull the motion: an object shows other parts after it has moved.
-        """
+        """The log-likelihood ratio of both clouds, without target points that fit static better."""
+        # They would pull the motion: an object shows other parts after it has moved.
         return self.source_gain + float(np.maximum(self.target_gain, 0.0).sum())
 
     def goes_with(self, other: Proposal) -> bool:
@@ -90,8 +87,7 @@ class Proposal:
     def moves(self, free: Bool | None = None) -> bool:
         """Return True if the group certainly moves.
 
-        Args:
-            free: (K,) True for target points that no other motion explains. None for all.
+        free: (K,) True for target points that no other motion explains. None for all.
         """
         counted = (
             self.target_gain if free is None else self.target_gain[free | (self.target_gain < 0)]
@@ -104,15 +100,10 @@ class Proposal:
 def judge(
     group: int, members: Int, motion: RigidMotion, source: PairCloud, target: PairCloud
 ) -> Proposal:
-    """Return the evidence that a group moves by a motion, against a static group.
+    """Return the evidence that the source points ``members`` move together, against static ones.
 
     Source points are compared with the target. Target points are compared with the source, in which
     only the group moves: points that stay at its old position count against the motion.
-
-    Args:
-        group: Index of the group.
-        members: Indices of its source points.
-        motion: Motion of the group.
     """
     static = replace(motion, state=np.zeros(4))
     members = source.evenly(members)
@@ -132,14 +123,10 @@ def judge(
 def compare(
     source: PairCloud, members: Int, target: PairCloud, motion: RigidMotion
 ) -> tuple[Float, Int]:
-    """Compare source points that make a motion with the surfaces of the target.
+    """Compare source points ``members`` (N,), which make a motion, with the target's surfaces.
 
-    Args:
-        members: (N,) indices of the source points.
-
-    Returns:
-        The (N,) costs, and the indices of the target points that come close to the source points
-            when they are moved back.
+    Return the (N,) costs, and the indices of the target points that come close to the source points
+    when they are moved back.
     """
     at_start = motion.at_start(source, members)
     ends = [motion.place(at_start, of(target.share)) for of in (np.min, np.max)]
@@ -162,12 +149,7 @@ class Search:
     initial: Float | None
 
     def proposals(self, group: int, members: Int) -> list[Proposal]:
-        """Return the motions by which a group may move, with their evidence.
-
-        Args:
-            group: Index of the group.
-            members: Indices of its points in the source.
-        """
+        """Return the motions by which the points ``members`` may move, with their evidence."""
         points = self.source.points[members]
         centre = points.mean(axis=0)
         reach_m = _MAX_SPEED_M_S * min(self.apart_s or _USUAL_S, _LONGEST_S)
@@ -198,8 +180,7 @@ class Search:
     def refine(self, proposal: Proposal, members: Int) -> Proposal:
         """Return the proposal with the most likely motion nearby, by a pattern search.
 
-        Source: Hooke, Jeeves, "Direct Search", Journal of the ACM 1961. The alignment holds rings
-        on rings, the likelihood does not.
+        Hooke, Jeeves, JACM 1961. The alignment holds rings on rings, the likelihood does not.
         """
         slope = _slope_of(self.ground, proposal.motion.centre)
         x, y = proposal.motion.state[:2] / np.linalg.norm(proposal.motion.state[:2])

@@ -25,15 +25,12 @@ def find_movers(
     apart_s: float | None = None,
     initial: Float | None = None,
 ) -> tuple[list[RigidMotion], Int]:
-    """Return the motions of the groups of points that move from the source to the target.
+    """Return the motions of the moving groups, and (N,) the index of each source point's, or -1.
 
     Args:
         height_m: (N,) height of the source points above the ground.
         apart_s: Time between the clouds, None if unknown. The search covers up to 38 m/s.
         initial: (N,3) flow. A group also starts at the median flow of its members.
-
-    Returns:
-        The motions, and (N,) the index of each source point's motion, -1 for static points.
     """
     clouds = source, target
     with ThreadPoolExecutor(2) as pool:
@@ -68,11 +65,9 @@ def _choose(proposals: list[Proposal], num_targets: int) -> list[Proposal]:
 
 
 def _gain_with_neighbours(proposals: list[Proposal]) -> Float:
-    """Return (P,) the gain of each proposal and of the groups beside it that may go with it.
-
-    A car that two scanners see at two positions could also go half as fast, from the second
-    position to the first one, but its other appearance could not.
-    """
+    """Return the (P,) gain of each proposal and the groups beside it that may go with it."""
+    # A car that two scanners see at two positions could also go half as fast, from the second
+    # position to the first one, but its other appearance could not.
     centres = np.array([p.motion.centre for p in proposals]).reshape(-1, 3)
     total = np.zeros(len(proposals))
     for i, proposal in enumerate(proposals):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Compare points with the surfaces that another cloud measured.
 
-The rings of a scanner hit other parts of an object after it has moved, hence the distance to the
-nearest point says little. The neighbours of a position are thinned until they span several rings,
-and a normal distribution is fitted to them (Biber, Straßer, "The Normal Distributions Transform",
-IROS 2003). A point may lie anywhere along that surface, but not off it.
+The rings of a scanner hit other parts of an object after it has moved. Therefore a point may lie
+anywhere along a surface, but not off it. The neighbours of a position are thinned until they span
+several rings, and a normal distribution is fitted to them (Biber, Straßer, "The Normal
+Distributions Transform", IROS 2003).
 """
 
 from __future__ import annotations
@@ -66,10 +66,7 @@ class Surface:
         self._points, self._tree = points, tree_of(points)
 
     def cost(self, points: Float) -> Float:
-        """Return (N,) negative log-likelihoods of points (N,3), 0 to 3.
-
-        It is half the squared Mahalanobis distance to the normal distribution of the neighbours.
-        """
+        """Return (N,) costs of points (N,3), 0 to 3: half their squared Mahalanobis distances."""
         cost, num = np.full(len(points), MISSING), min(_NUM_NEIGHBORS, self._tree.n)
         if num < _MIN_NEIGHBORS:
             return cost

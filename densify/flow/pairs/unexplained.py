@@ -20,8 +20,7 @@ _MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # greatest heights of a group's lowest and h
 def find_unexplained(cloud: PairCloud, other: PairCloud) -> Bool:
     """Return (N,) True for points of ``cloud`` without a counterpart in ``other``.
 
-    A point has a counterpart if a point of the other cloud is within 0.1 m, or if it is on one of
-    its surfaces.
+    A counterpart is a point of the other cloud within 0.1 m, or one of its surfaces.
     """
     rest = np.flatnonzero(~is_near(tree_of(other.points), cloud.points, _EXPLAINED_M))
     surface = Surface(other.points[other.evenly(np.arange(len(other.points)))])
@@ -50,10 +49,7 @@ def group_around(points: Float, unexplained: Bool) -> Int:
 def road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
     """Return the rows of each group that may be a road user, not a crown or a wall.
 
-    Args:
-        group: (N,) label of each point's group, -1 for none.
-        unexplained: (N,) True for points without counterpart.
-        height_m: (N,) height above the ground.
+    All arrays are (N,). ``group`` is -1 for none, ``height_m`` is above the ground.
     """
     rows = np.flatnonzero(group >= 0)
     rows = rows[np.argsort(group[rows], kind="stable")]

@@ -53,11 +53,9 @@ class Strips:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The C points above the ground of one sweep, and which of them may move.
+    """The C points above the ground of one sweep, and which may move: see `Obstacles`."""
 
-    The attributes are as in `Obstacles`. They do not depend on the world's origin.
-    """
-
+    # None of them depends on the world's origin.
     row: Int
     seed: Bool
     cluster: Int
@@ -77,12 +75,7 @@ class Obstacles:
 
     @staticmethod
     def of(stretch: Stretch, i: int, found: Candidates) -> Obstacles:
-        """Return the obstacles of the sweep with index i: its points above the ground, world frame.
-
-        Args:
-            i: Index of the sweep in the stretch.
-            found: Candidates of this sweep, from `find_candidates`.
-        """
+        """Return the obstacles of sweep i of the stretch, world frame, from its candidates."""
         registered = stretch.sweeps[i]
         return Obstacles(
             row=found.row,
@@ -106,10 +99,7 @@ class Obstacles:
 
 @dataclass(frozen=True)
 class Batch:
-    """A few consecutive sweeps within 0.1 s, searched together, and their obstacles.
-
-    At 10 Hz a batch is one sweep, see `Clock.batches`.
-    """
+    """Consecutive sweeps within 0.1 s, searched together; one at 10 Hz, see `Clock.batches`."""
 
     sweeps: tuple[int, ...]  # indices of the sweeps in the stretch
     # Middle between the first and the last reference time, since the stretch's first sweep
@@ -120,13 +110,7 @@ class Batch:
 
     @staticmethod
     def of(sweeps: Sequence[int], obstacles: Sequence[Obstacles], clock: Clock) -> Batch:
-        """Build a batch from the sweeps with the indices ``sweeps``.
-
-        Args:
-            sweeps: Indices of consecutive sweeps.
-            obstacles: Obstacles of every sweep of the stretch.
-            clock: Reference times of every sweep of the stretch.
-        """
+        """Build a batch from sweep indices, with the obstacles and clock of the whole stretch."""
         parts = [obstacles[j] for j in sweeps]
         first_ns, last_ns = clock.time_ns[[sweeps[0], sweeps[-1]]].tolist()
         begins = np.cumsum([0] + [len(part.points) for part in parts[:-1]]).tolist()
@@ -136,20 +120,14 @@ class Batch:
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
         """Concatenate the arrays of this batch's sweeps, in the order of ``obstacles``.
 
-        Args:
-            columns: For every sweep of the stretch, an array with a value for each obstacle.
+        columns: For every sweep of the stretch, an array with a value for each obstacle.
         """
         return np.concatenate([columns[j] for j in self.sweeps])
 
     def split(self, rows: Int) -> dict[int, Int]:
-        """Convert indices of obstacles in the batch to indices within each sweep's own obstacles.
+        """Convert ascending rows (K,) of the batch's obstacles to rows of each sweep's `Obstacles`.
 
-        Args:
-            rows: (K,) ascending indices into ``obstacles`` of the batch.
-
-        Returns:
-            Sweep index -> ascending indices into the `Obstacles` of that sweep. Sweeps without a
-                point are left out.
+        Return sweep index -> ascending rows, without sweeps that have none.
         """
         parts = np.split(rows, np.searchsorted(rows, self.begins[1:]))
         own = zip(self.sweeps, parts, self.begins, strict=True)
@@ -188,13 +166,8 @@ def find_candidates(
     """Return the points above the ground of each sweep, and which of them may move.
 
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
-    because usually only a part of a moving object's points is seen through.
-
-    Args:
-        among: Indices of the sweeps to work on; None for all.
-
-    Returns:
-        For each sweep worked on, its points above the ground.
+    because usually only a part of a moving object's points is seen through. ``among`` are the
+    indices of the sweeps to work on, None for all.
     """
 
     def of_sweep(i: int) -> Candidates:
@@ -218,9 +191,8 @@ def find_candidates(
 def closer_rings(points: Float, gap_m: Float) -> Float:
     """Return the (N,3) points with heights compressed where rings are too far apart to be linked.
 
-    Args:
-        points: (N,3) metres relative to the scanner, z up, so that level surfaces stay level.
-        gap_m: (N,) distance between neighbouring rings at each point.
+    ``points`` are relative to the scanner, z up, so that level surfaces stay level. ``gap_m`` (N,)
+    is the distance between neighbouring rings at each point.
     """
     squeezed = points.copy()
     squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
@@ -228,12 +200,7 @@ def closer_rings(points: Float, gap_m: Float) -> Float:
 
 
 def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
-    """Return (N,) firing times in seconds since the first sweep's reference time.
-
-    Args:
-        i: Index of the sweep that measured the points.
-        rows: (N,) indices of the points in that sweep.
-    """
+    """Return (N,) firing times of ``rows`` of sweep i, seconds since the first reference time."""
     sweep = stretch.sweeps[i].sweep
     offset_ns = np.zeros(len(rows), np.int64) if sweep.offset_ns is None else sweep.offset_ns[rows]
     begin_ns = stretch.sweeps[0].sweep.stamp_ns
@@ -241,16 +208,10 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Link the seeds and the points within 0.4 m of seeds into clusters.
+    """Link seeds and points (N,3) within 0.4 m of seeds into clusters.
 
-    Seeds with few other seeds around them, as in a hedge, do not count.
-
-    Args:
-        points: (N,3) metres.
-        seed: (N,) True for seeds.
-
-    Returns:
-        The number of clusters, and (N,) labels, -1 for points in no cluster.
+    Seeds with few other seeds around them, as in a hedge, do not count. Return the number of
+    clusters, and (N,) labels, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
     near = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, _MIN_SEED_SHARE))

@@ -79,9 +79,9 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
     """Return the accumulated shape of a track; shapes of walkers exclude their surroundings.
 
     Objects faster than 2 m/s keep all points. Otherwise three kinds of points are dropped. Echoes
-    merged with the echoes of a wall occur only in even or only in odd sweeps. Points of a bush are
-    static or lie among static points. Points of a wall are hardly ever seen through. The same holds
-    for sides of slow cars: this cut applies only if the rest is shorter than 1.5 m.
+    merged with a wall's occur only in even or only in odd sweeps. Points of a bush are static or
+    lie among static points. Points of a wall are hardly ever seen through, like sides of slow cars:
+    this cut applies only if the rest is shorter than 1.5 m.
     """
     sweeps = sorted(track.claimed)
     parts = {j: track.points_in(obstacles, [j]) for j in sweeps}
@@ -108,16 +108,8 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
 def _is_static(
     track: Track, obstacles: Sequence[Obstacles], parts: dict[int, Float], of: Int, reach_m: float
 ) -> Bool:
-    """Return (N,) True for points that other sweeps confirm as static.
-
-    More of the other sweeps have a return at the measured position of such a point than at its
-    position moved along with the object.
-
-    Args:
-        parts: Points of the object by sweep index, in the object's frame, N in all.
-        of: (N,) position of the point's sweep in ``parts``.
-        reach_m: Greatest distance from a position to a return that occupies it.
-    """
+    """Return (N,) True for points that more other sweeps confirm as static than as moved."""
+    # parts: N points by sweep index, object's frame; of: (N,) position of their sweep in ``parts``
     in_object = np.concatenate(list(parts.values()))
     places = np.concatenate([obstacles[j].points[track.claimed[j]] for j in parts])
     low, high = places.min(0) - reach_m, places.max(0) + reach_m
@@ -139,15 +131,10 @@ def assign_points(
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
 ) -> list[Instance]:
-    """Decide which moving object each point of a batch of sweeps belongs to.
+    """Return, for each sweep of a batch, (N,) the index of each point's object, -1 for none.
 
-    Args:
-        batch: Indices of consecutive sweeps within 0.1 s.
-        objects: Confirmed moving objects.
-        obstacles: Points above the ground of each sweep of the stretch.
-
-    Returns:
-        For each sweep of the batch (N,) int32, the index of each point's object, -1 for none.
+    ``batch`` are the indices of its sweeps, ``objects`` the confirmed ones, ``obstacles`` those of
+    each sweep of the stretch.
     """
     parts = [SweepPoints.of(stretch, i, ground, obstacles[i], space.sensors) for i in batch]
     attached = []
@@ -197,12 +184,9 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
 def leave_out_isolated(
     instance: Instance, seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock
 ) -> None:
-    """Detach isolated points that are low or belong to a slow object (``instance`` = -1).
+    """Set ``instance`` (N,) to -1 at isolated points that are low or belong to a slow object.
 
     They are echoes merged with the echoes of a wall, or the road behind an edge.
-
-    Args:
-        instance: (N,) index of each point's object, -1 for none; changed in place.
     """
     low = seen.height_m < _AS_LOW_AS_ROAD_M
     for k in np.unique(instance[instance >= 0]):
@@ -223,14 +207,11 @@ def lengthen(
     objects: Sequence[MovingObject],
     space: FreeSpace,
 ) -> None:
-    """Extend vehicles along their heading, as wide and as high as they are.
+    """Extend vehicles along their heading, as wide and as high as they are, in ``instance`` (N,).
 
     The middle of a long side that slides along itself is never seen through, and lacks candidates.
-    The extension ends at a hole, or where another sweep sees through the moved points.
-
-    Args:
-        instance: (N,) index of each point's object, -1 for none; changed in place.
-        i: First sweep of the batch.
+    The extension ends at a hole, or where another sweep sees through the moved points. i is the
+    first sweep of the batch.
     """
     batch_s = np.ptp(seen.time_s) if len(seen.time_s) else 0.0
     for k, (track, shape) in enumerate(objects):
@@ -260,10 +241,7 @@ def lengthen(
 def columns_apart_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
     """Return the distance along a side between neighbouring columns of rays that hit it.
 
-    Args:
-        place: (3,) position on the side, world.
-        ahead: (2,) unit vector along the side, world.
-        T_lidar_world: (4,4) pose of the world in the lidar frame.
+    ``place`` (3,) is on the side, ``ahead`` (2,) a unit vector along it, both in the world.
     """
     in_lidar = poses.transform(T_lidar_world, place[None])[0, :2]
     x, y = T_lidar_world[:2, :2] @ ahead
@@ -284,14 +262,8 @@ def _is_linked(along: Float, own: Float, hole_m: float) -> Bool:
 def _is_free_of_violations(
     track: Track, seen: SweepPoints, rows: Int, along: Float, i: int, space: FreeSpace
 ) -> Bool:
-    """Return (N,) True for extension points up to the first violations, ahead and behind.
-
-    The extension ends where another sweep sees through more than 5 % of the moved points so far.
-
-    Args:
-        rows: (N,) rows in ``seen`` of the extension.
-        along: (N,) metres ahead of the object's middle, negative behind.
-    """
+    """Return (N,) True for extension points up to the first violations, ahead and behind."""
+    # along: (N,) metres ahead of the object's middle, negative behind
     step = np.floor(np.abs(along) / LINK_M).astype(np.int64)
     num_steps = int(step.max(initial=0)) + 1
     step += num_steps * (along < 0)  # steps ahead, then steps behind

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Track one cluster of candidates as a rigid object from batch to batch, both ways in time.
 
-The candidates of each batch are aligned with all points of the object so far, starting from the
-pose that constant speed and turn rate predict. A batch holds consecutive sweeps within 0.1 s.
+Candidates are aligned with the object so far, from the pose of constant speed and turn rate.
 """
 
 from __future__ import annotations
@@ -38,17 +37,10 @@ _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
-    """Return the clusters that may start a track, the best first.
+    """Return the clusters that may start a track, the best first: batch index, rows of obstacles.
 
     Large clusters make good models. Far from the ends of the recording, sweeps on both sides show
     how the object moves.
-
-    Args:
-        batches: Obstacles of each batch (consecutive sweeps within 0.1 s).
-        clock: Times of the batches.
-
-    Returns:
-        For each cluster, the batch index and the indices of its points in the batch's obstacles.
     """
     starts = []
 
@@ -70,12 +62,8 @@ def velocities_beside(
 ) -> Iterator[Float]:
     """Yield the velocity (3,), m/s, of each object within 1 m of a cluster, as of a tow car.
 
-    The measurements alone hardly show how fast a long side slides along itself.
-
-    Args:
-        batch: Batch of the cluster.
-        members: Indices of the cluster's points in the batch's obstacles.
-        objects: Moving objects found so far.
+    The measurements alone hardly show how fast a long side slides along itself. ``members`` are the
+    cluster's rows of the batch's obstacles.
     """
     points = batch.obstacles.points[members]
     tree, middle = tree_of(points), points.mean(0, keepdims=True)
@@ -97,10 +85,7 @@ class Follower:
     def follow(self, members: Int, start: int, velocity: Float) -> Track:
         """Track a cluster forwards, then backwards; the model is made of all points found so far.
 
-        Args:
-            members: Indices of the cluster's points in the obstacles of batch ``start``.
-            start: Index of the batch.
-            velocity: (3,) initial velocity, m/s, world.
+        ``members`` are rows of the obstacles of batch ``start``; ``velocity`` (3,) is m/s, world.
         """
         here, rate = self.batches[start].obstacles, np.append(velocity, 0.0)
         seen_s = float(here.time_s[members].mean())
@@ -125,16 +110,7 @@ class Follower:
     def _find(
         self, model: Model, track: Track, rate: Float, n: int
     ) -> tuple[Float, float, Int, Float] | None:
-        """Align the candidates of one batch with the points of the object so far.
-
-        Args:
-            rate: (4,) rate of the state x, y, z, yaw at the start, per second.
-            n: Index of the batch.
-
-        Returns:
-            The state (4,), its time (s), the K rows that fit, and (K,3) the positions of these
-                points at that time, world. None if too few points fit.
-        """
+        """Align the candidates of batch n with the object so far; None if too few points fit."""
         batch, recent = self.batches[n], self.clock.num_in(_RECENT_S)
         c, centre = batch.obstacles, track.centre
         about, about_rate, _ = _predict(track, rate, recent, track.seen_at(batch.time_ns))
@@ -159,7 +135,7 @@ class Follower:
         fit = model.covers(undo(state, target, centre), FIT_M)
         if fit.sum() < enough:
             return None
-        return state, seen_s, rows[fit], target[fit]
+        return state, seen_s, rows[fit], target[fit]  # the (K,3) points at seen_s, world
 
 
 def _at_once(c: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
@@ -168,19 +144,9 @@ def _at_once(c: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
 
 
 def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float, Float, Float]:
-    """Predict the state by constant speed and turn rate from the observations nearest in time.
-
-    The velocity turns with the object (Schubert, Richter, Wanielik, "Comparison and Evaluation of
-    Advanced Motion Models for Vehicle Tracking", FUSION 2008).
-
-    Args:
-        rate: (4,) rate of the state at the start, per second.
-        num: Number of observations to use.
-        time_s: Time to predict.
-
-    Returns:
-        The state (4,), its rate (4,), and the standard deviation (3,) of x, y (m) and yaw (rad).
-    """
+    """Predict state (4,), rate (4,), and (3,) x, y, yaw std at constant speed and turn rate."""
+    # The velocity turns with the object (Schubert, Richter, Wanielik, "Comparison and Evaluation of
+    # Advanced Motion Models for Vehicle Tracking", FUSION 2008).
     nearest_first = sorted(
         track.observations.items(), key=lambda s: (abs(s[1].seen_s - time_s), s[0])
     )

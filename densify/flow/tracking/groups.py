@@ -42,13 +42,10 @@ class GroupMotion:
         return replace(self, stretch=stretch)
 
     def flow(self, frame: int, target: int) -> FlowField:
-        """Return the flow of every point of a sweep to another sweep's reference time.
+        """Return the flow of all points of sweep ``frame`` to the reference time of ``target``.
 
         The flow excludes ego-motion and is in the lidar frame of ``frame``. Points of an object are
         lost if the target is more than 0.2 s before its first or after its last observation.
-
-        Args:
-            frame, target: Frame numbers of the two sweeps.
         """
         here, there = self.stretch.frames.index(frame), self.stretch.frames.index(target)
         registered, instance = self.stretch.sweeps[here], self.instance[here]
@@ -83,16 +80,10 @@ class Bending:
     softened: Softened  # points of the object in each of these sweeps, and how the points bend
 
     def carry(self, here: int, there: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
-        """Return the (N,3) points of a sweep at two times, both in the object's own frame.
+        """Return the (N,3) points of sweep ``here`` at two reference times, object's frame.
 
-        Args:
-            here: Index of the sweep with the N points.
-            there: Index of the sweep to whose time the points are carried.
-            seen_s: (N,) firing times of the points.
-
-        Returns:
-            The points at the reference time of sweep ``here``, and at the reference time of sweep
-                ``there`` or of the nearest sweep that observed the object.
+        The times are those of sweep ``here``, and of sweep ``there`` or the nearest sweep that
+        observed the object. ``seen_s`` (N,) are the firing times.
         """
         n, m = (self.sweeps.index(i) for i in (here, clock.nearest(there, self.sweeps)))
         points = self.softened.parts[n].points
@@ -102,10 +93,9 @@ class Bending:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """Find all moving objects in the stretch, as `densify.flow.engines.EngineModule`.
+    """Find all moving objects in the stretch, at any sweep rate: the engine ``groups``.
 
-    The engine takes no argument and works at any sweep rate. Below 10 Hz, objects that turn, bend
-    or are occluded between two sweeps are tracked worse or lost.
+    Below 10 Hz, objects that turn, bend or are occluded between sweeps are tracked worse or lost.
     """
     return motion_of(scene, scene.candidates)
 
@@ -115,12 +105,10 @@ def motion_of(
     candidates: Sequence[Candidates],
     velocities_m_s: Sequence[Float] | None = None,
 ) -> GroupMotion:
-    """Find the moving objects among given candidates.
+    """Find the moving objects among the points of each sweep that may move (``candidates``).
 
-    Args:
-        candidates: Candidates of each sweep: the points that may move.
-        velocities_m_s: For each sweep (C,3) velocities of its C points above the ground, world
-            frame. None estimates them by a vote of neighbouring sweeps.
+    ``velocities_m_s`` are, for each sweep, (C,3) of its C points above the ground, world frame.
+    None estimates them by a vote of neighbouring sweeps.
     """
     stretch, space = scene.stretch, scene.space
     obstacles = [Obstacles.of(stretch, i, found) for i, found in enumerate(candidates)]

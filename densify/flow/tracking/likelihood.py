@@ -2,12 +2,9 @@
 """Decide by a log-likelihood ratio whether a track moves or is static.
 
 A static object that looks different from sweep to sweep, such as a fence or a tree's crown, can
-seem to move. Each term is the logarithm of a measured quantity. The weights w and the prior cost of
-a track, ``price``, were fitted to tracks of simulated streets with known ground truth::
-
-    log odds = w · terms - price
-
-``examples/fit_tracks.py`` makes the table, ``likelihood.json`` beside this file.
+seem to move. The log odds are ``w · terms - price``. Each term is the logarithm of a measured
+quantity. The weights w and the prior cost of a track, ``price``, were fitted to tracks of simulated
+streets: ``examples/fit_tracks.py`` makes the table, ``likelihood.json`` beside this file.
 """
 
 from __future__ import annotations
@@ -59,8 +56,7 @@ class Violations(NamedTuple):
 class Evidence(NamedTuple):
     """Evidence that tells a moving track from a static one.
 
-    Lengths are divided by the neighbour distance: the distance up to which points count as
-    neighbours at the track (`near_m`).
+    Lengths are divided by the distance up to which points count as neighbours there (`near_m`).
     """
 
     violations: Violations  # seen-through counts of the track's points, as static and as moved
@@ -85,11 +81,7 @@ class Evidence(NamedTuple):
         }
 
     def log_odds(self, table: Mapping[str, float]) -> float:
-        """Return the log odds that the track moves.
-
-        Args:
-            table: Weight of each term by name, and the constant ``price`` that is subtracted.
-        """
+        """Return the log odds that the track moves; ``table``: weights of terms, and ``price``."""
         return sum(table[name] * value for name, value in self.terms().items()) - table["price"]
 
 
@@ -116,14 +108,10 @@ def judge(
     objects: Sequence[MovingObject],
     judged: Judge | None = None,
 ) -> Verdict:
-    """Return the log odds that a smoothed track moves.
+    """Return the log odds that a smoothed track moves, minus infinity below 3 observations.
 
-    A track with fewer than 3 observations counts as static: its log odds are minus infinity.
-
-    Args:
-        track: Track to judge, with the path of `Track.smooth`.
-        objects: Objects confirmed so far, whose returns do not count against the track.
-        judged: Function called with the track and its evidence.
+    Returns of the ``objects`` confirmed so far do not count against the track. ``judged`` is called
+    with the track and its evidence.
     """
     if len(track.observations) < _NUM_STATES:
         return Verdict(-np.inf, -np.inf)
@@ -149,10 +137,7 @@ def judge(
 
 
 def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Violations:
-    """Count how often other sweeps see through a sample of the track's points.
-
-    Each point is tested at its measured position, and at the position to which the track moves it.
-    """
+    """Count how often other sweeps see through sampled track points, as static and as moved."""
     tested = {}
     for batch in space.batches:
         num = _NUM_ASKED // len(batch)
@@ -179,14 +164,9 @@ def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSp
 
 
 def _slenderness(track: Track, obstacles: Sequence[Obstacles], within_m: float) -> float:
-    """Return the extent of the points along their motion divided by their height, at least 1.
-
-    A long, low guard rail shows no motion along itself, and sweeps see through it between two
-    rings.
-
-    Args:
-        within_m: Accuracy of the height, m.
-    """
+    """Return the extent of the points along their motion divided by their height, at least 1."""
+    # A long, low guard rail shows no motion along itself, and is seen through between two rings.
+    # within_m: accuracy of the height
     points = track.points_in(obstacles, track.claimed)
     way = (track.path(track.path.end_s) - track.path(track.path.begin_s))[:2]
     along_m = float(np.ptp(points[:, :2] @ way)) / max(float(np.hypot(*way)), 1e-9)
@@ -200,18 +180,11 @@ def find_places_left(
     objects: Sequence[MovingObject],
     within_m: float,
 ) -> tuple[Places, Places]:
-    """Count what other sweeps observed at the track's positions while the object was elsewhere.
+    """Count what sweeps before an object's arrival, and after it left, observed at its positions.
 
     Vacated positions are free if the object moved. A static wire fence can imitate this: it is seen
-    through from some directions only. Its vacated positions then hold returns of the fence. Returns
-    of other confirmed objects do not count.
-
-    Args:
-        objects: Other confirmed objects.
-        within_m: Greatest distance from a position to a return that takes it, m.
-
-    Returns:
-        Counts of sweeps before the object arrives at a position, and of sweeps after it left.
+    through from some directions only. Its vacated positions then hold returns of the fence, up to
+    ``within_m`` away. Returns of ``objects``, the other confirmed ones, do not count.
     """
     sweeps = list(track.claimed)
     parts = [
@@ -242,10 +215,7 @@ def find_places_left(
 def _returns_near(
     places: Float, reach_m: float, c: Obstacles, objects: Sequence[MovingObject]
 ) -> Float:
-    """Return the (N,3) points of a sweep within ``reach_m`` of ``places`` (M,3), world.
-
-    Points on the given moving objects are left out.
-    """
+    """Return the (N,3) points within ``reach_m`` of places (M,3), world, on no given object."""
     rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
     rows = rows[is_near(tree_of(places), c.points[rows], reach_m)]
     for track, shape in objects:

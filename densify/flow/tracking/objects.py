@@ -35,8 +35,7 @@ _SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
 def near_m(gap_m: Float | float) -> Any:
     """Return the neighbour distance: how far apart (m) two returns of one place may lie.
 
-    Args:
-        gap_m: Distance between neighbouring rings there; an array gives an array.
+    ``gap_m`` is the distance between neighbouring rings there; an array gives an array.
     """
     return np.maximum(_NEAR_M, _NEAR_GAPS * gap_m)
 
@@ -70,14 +69,7 @@ class Track:
     path: Path = field(init=False)
 
     def add(self, n: int, batch: Batch, state: Float, seen_s: float, rows: Int) -> None:
-        """Add the observation of the object in one batch.
-
-        Args:
-            n: Index of the batch.
-            state: (4,) displacement x, y, z (m) and yaw (rad).
-            seen_s: Mean firing time of the object's points.
-            rows: Ascending indices of the object's points in the batch's obstacles.
-        """
+        """Add the observation in batch n: state (4,), mean firing time, ascending obstacle rows."""
         mine = batch.split(rows)
         self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(mine))
         self.claimed |= mine
@@ -111,10 +103,7 @@ class Track:
         return velocity_m_s
 
     def seen_through(self, points: Float, j: int, space: FreeSpace) -> Bool:
-        """Return (N,) True for (N,3) points, object's frame, seen through by the sweep of index j.
-
-        The points are first moved with the object to the time of that sweep.
-        """
+        """Return (N,) True where sweep j sees through points (N,3, object's frame) moved to it."""
         at_s = space.clock.time_s[j]
         carried = self.place(points, at_s)
         return space.seen_through(carried, j, self.velocity_m_s(carried, at_s))
@@ -146,21 +135,16 @@ class Track:
         return float(np.ptp([seen.seen_s for seen in self.observations.values()]))
 
     def rise_m(self, ground: HeightMap, state: Float) -> float:
-        """Return how much higher (m) the ground is below the object at a state (4,) than at first.
-
-        It is the median over the object's position and 1 m to both sides, because the road below an
-        object may never be observed.
-        """
+        """Return how much higher (m) the ground is below a state (4,) than at first."""
+        # The median with 1 m to both sides: the road below an object may never be observed.
         way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
         start = self.centre[:2] + np.outer([-_BESIDE_M, 0.0, _BESIDE_M], [-way[1], way[0]])
         before_m, there_m = ground.under(np.concatenate([start, start + state[:2]])).reshape(2, -1)
         return float(np.sort(there_m - before_m)[len(start) // 2])
 
     def seen_at(self, time_ns: int) -> float:
-        """Estimate when (s) the sweep with a reference time ``time_ns`` measures the object.
-
-        Both count from the first sweep. The delay is taken from the observation nearest in time.
-        """
+        """Estimate when (s) the sweep with reference time ``time_ns`` measures the object."""
+        # Both count from the first sweep. The delay is that of the observation nearest in time.
         nearest = min(
             self.observations.items(), key=lambda item: (abs(item[1].time_ns - time_ns), item[0])
         )[1]
@@ -198,19 +182,14 @@ class Shape:
         return inside
 
     def near(self, points: Float, within_m: float) -> Bool:
-        """Return (N,) True for (N,3) points that touch the object, object's frame.
-
-        They lie within ``within_m`` of one of its points, or inside its outline seen from above.
-        """
+        """Return (N,) True for points (N,3, object's frame) near the object or in its outline."""
         return is_near(self.tree, points, within_m) | self.within_outline(points)
 
     @cached_property
     def side_rad(self) -> float:
-        """The direction of one side seen from above, in [0, pi / 2), object's frame.
-
-        The other sides are taken as parallel or perpendicular. The direction makes the histograms
-        of the points along both axes most peaked (greatest sum of squares).
-        """
+        """The direction of one side seen from above, in [0, pi / 2), object's frame."""
+        # Other sides are taken as parallel or perpendicular: histograms of the points along both
+        # axes are most peaked (greatest sum of squares).
         points = self.points[:: len(self.points) // _SOME_POINTS + 1, :2]
         points = points - points.mean(axis=0)
         reach_m = float(np.linalg.norm(points, axis=1).max())

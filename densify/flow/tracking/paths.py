@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Smooth paths through the states of an object.
+"""Smooth paths through the states of an object, by penalised B-splines.
 
-Penalised B-splines: Eilers, Marx, "Flexible Smoothing with B-splines and Penalties", Statistical
-Science 1996. The third difference is penalised: the stiffest path has constant acceleration, and
-softer paths can start and stop.
+Eilers, Marx, "Flexible Smoothing with B-splines and Penalties", Statistical Science 1996. The third
+difference is penalised: the stiffest path has constant acceleration, and softer paths can start and
+stop.
 """
 
 from __future__ import annotations
@@ -30,14 +30,10 @@ _CUBIC = np.array([[-1, 3, -3, 1], [3, -6, 3, 0], [-3, 0, 3, 0], [1, 4, 1, 0]]) 
 
 @dataclass(frozen=True)
 class Path:
-    """A smooth motion: a cubic spline over time with d coordinates.
-
-    The first coordinates are x and y in metres; a `Track` uses d = 4, its state x, y, z (m), yaw
-    (rad).
-    """
+    """A smooth motion: a cubic spline over time with d coordinates, first x and y in metres."""
 
     knots_s: Float  # (n + 4,) knots of the n B-splines, s
-    coefficients: Float  # (n,d) coefficients of the B-splines
+    coefficients: Float  # (n,d) of the B-splines; a `Track` has d = 4: x, y, z (m), yaw (rad)
     begin_s: float  # first time of the fit. The path continues at constant velocity before it.
     end_s: float  # last time of the fit. The path continues at constant velocity after it.
     # Root mean square distance of the states in x and y from the path, corrected for the degrees of
@@ -46,15 +42,10 @@ class Path:
 
     @staticmethod
     def fit(times_s: Float, states: Float, weights: Float) -> Path:
-        """Fit a path as stiff as the states allow.
+        """Fit a path to states (m,d) at ascending times (m,), as stiff as the states allow.
 
         A softer path is taken only if its leave-one-out error, in closed form, is at least 20 %
-        lower.
-
-        Args:
-            times_s: (m,) ascending times.
-            states: (m,d) states at these times.
-            weights: (m,) weight of each state, of any scale.
+        lower. ``weights`` (m,) may have any scale.
         """
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
         num_spans = max(1, round((end_s - begin_s) / _KNOT_S))

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Join the tracks of one object: pieces that touch and move alike are one object.
-
-A side that slides along itself, a mirror, or a roof between two rings may be tracked by itself.
-"""
+"""Join tracks that touch and move alike: a mirror, a roof, or a side may be tracked by itself."""
 
 from __future__ import annotations
 
@@ -61,12 +58,7 @@ def join_pieces(
     """Find the object that each of the K tracks belongs to, and the motion of its points.
 
     An object has the number of its piece with most points. Tracks without points are on their own.
-
-    Args:
-        stretch: The sweeps of the tracks.
-        tracks: Confirmed tracks.
-        instance: For each sweep (N,) int32, the index in ``tracks`` for each point, -1 for static.
-        space: Free space that the sweeps observed.
+    ``instance`` is, for each sweep, (N,) int32, each point's index in ``tracks``, -1 for static.
     """
     pieces = _pieces(stretch, tracks, instance, space)
     number, carrier = np.arange(len(tracks)), np.arange(len(tracks))
@@ -90,17 +82,14 @@ def join_pieces(
 
 
 def _moves_by_itself(piece: _Piece, track: Track, space: FreeSpace) -> bool:
-    """Return True if the motion of a piece is known as well as that of its object's ``track``.
-
-    A shorter path is known less well, and a side that slides along itself is wrong. The halves of a
-    turning truck move by themselves.
-    """
+    """Return True if the motion of a piece is known as well as that of its object's ``track``."""
     if len(piece.track.observations) < _AS_LONG * len(track.observations):
-        return False
+        return False  # a shorter path is known less well
     middle = sorted(piece.points)[len(piece.points) // 2]
     at_s = space.clock.time_s[middle]
     there = piece.track.place(piece.within(piece.track, [middle]), at_s)
     off_m_s = piece.track.velocity_m_s(there, at_s) - track.velocity_m_s(there, at_s)
+    # The motion of a side that slides along itself is wrong, that of half a turning truck is not.
     return bool(np.linalg.norm(off_m_s[:, :2], axis=1).max() <= _SAME_M_S)
 
 
@@ -121,12 +110,10 @@ def _pieces(
 
 
 def _is_part(piece: _Piece, whole: MovingObject, times: set[int], space: FreeSpace) -> bool:
-    """Return True if a piece belongs to an object that is seen in the sweeps ``times``.
-
-    It touches the object in most common sweeps, and moves alike or lies in the object's box; or it
-    moves alike in the object's lane, at most 0.5 m from the box, or 1.5 m if nothing was seen
-    through between.
-    """
+    """Return True if a piece belongs to an object that is seen in the sweeps ``times``."""
+    # It touches the object in most common sweeps, and moves alike or lies in the object's box; or
+    # it moves alike in the object's lane, at most 0.5 m from the box, or 1.5 m if nothing was seen
+    # through between.
     common = sorted(times & piece.points.keys())
     if not common:
         return False
@@ -181,10 +168,7 @@ def _is_away(piece: _Piece, whole: MovingObject, i: int) -> bool:
 def _is_seen_between(
     points: Float, whole: MovingObject, sweeps: Sequence[int], space: FreeSpace
 ) -> bool:
-    """Return True if a sweep saw through the middle between an object and a piece.
-
-    points: (N,3) points of the piece, object's frame. sweeps: indices of the sweeps.
-    """
+    """Return True if a sweep saw through the middle between an object and a piece's points."""
     away_m, beside = nearest(whole.shape.tree, points)
     closest = points[away_m.argmin()], whole.shape.points[beside[away_m.argmin()]]
     between = np.mean(closest, axis=0, keepdims=True)

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Estimate non-rigid motion: how a tracked object bends relative to its rigid motion.
 
-The smoothness term is the graph Laplacian of Pontes, Hays, Lucey, "Scene Flow from Point Clouds
-with or without Learning" (3DV 2020, section 3). Infinite stiffness gives a rigid object. Their data
-term, nearest points, pulls points onto the scan lines of the other sweep. Here blurred surfaces are
-compared: a point moves by the mean of the target around it minus the mean of its own sweep around
-it. The first mean is a soft correspondence (Granger, Pennec, "Multi-scale EM-ICP", ECCV 2002). The
-second removes the effect of the blur itself at edges and in holes.
+The smoothness term is the graph Laplacian of Pontes, Hays, Lucey (3DV 2020, section 3). Their data
+term, nearest points, pulls points onto the scan lines of the other sweep. Here a point moves by the
+mean of the target around it, a soft correspondence (Granger, Pennec, "Multi-scale EM-ICP", ECCV
+2002), minus the mean of its own sweep around it. The second mean removes the effect of the blur
+itself at edges and in holes.
 """
 
 from __future__ import annotations
@@ -63,10 +62,8 @@ class Softened:
     held_out_m: dict[float, float]
 
     def velocity_m_s(self, i: int) -> Float:
-        """Return (n,3) velocities of part i's points relative to the rigid motion, object's frame.
-
-        They are the mean of the velocities to the next and from the previous part.
-        """
+        """Return (n,3) velocities of part i's points beyond the rigid motion, object's frame."""
+        # The mean of the velocities to the next and from the previous part
         velocities = [np.zeros_like(self.parts[i].points)]
         for j, moved in ((i + 1, self.to_next[i]), (i - 1, self.to_previous[i])):
             if 0 <= j < len(self.parts):
@@ -74,10 +71,8 @@ class Softened:
         return np.asarray(np.mean(velocities[1:] or velocities, axis=0))
 
     def carry(self, i: int, j: int) -> Float:
-        """Return the (n,3) points of part i at the time of part j, object's frame.
-
-        At each part in between, a point continues like nearby points that came the same way.
-        """
+        """Return the (n,3) points of part i at the time of part j, object's frame."""
+        # At each part in between, a point continues like nearby points that came the same way.
         at, step = self.parts[i].points, 1 if j > i else -1
         if i == j or np.isinf(self.alpha):
             return at
@@ -94,11 +89,10 @@ class Softened:
 def soften(parts: Sequence[Part]) -> Softened:
     """Estimate the bending of one object from its parts, by ascending time.
 
-    The stiffness is lowered while held-out parts confirm it: every second part is left out, and
-    predicted from the bending between its neighbours. The softest stiffness is taken that predicts
-    clearly better than the rigid object, in most parts. Otherwise the object stays rigid. Objects
-    longer than 3 m always stay rigid. Objects with fewer than 5 parts, less than 0.35 s, or a
-    median of fewer than 20 points per part stay rigid too.
+    Every second part is left out, and predicted from the bending between its neighbours. The
+    softest stiffness is taken that predicts clearly better than the rigid object, in most parts.
+    Otherwise the object stays rigid. Objects longer than 3 m, with fewer than 5 parts, less than
+    0.35 s, or a median of fewer than 20 points per part always stay rigid.
     """
     parts = tuple(parts)
     still = tuple(np.zeros_like(part.points) for part in parts)
@@ -131,12 +125,8 @@ def _may_bend(parts: tuple[Part, ...]) -> bool:
 
 
 def _held_out(parts: tuple[Part, ...]) -> Float:
-    """Return the mean squared distance (m²) of each held-out part from its prediction.
-
-    The array is (held-out parts, 1 + stiffness levels). Element ``[i, k]`` is about part i + 1 at
-    level k - 1; k = 0 is the rigid object. A part is predicted from its two neighbours alone.
-    """
-    errors = np.zeros((len(parts) - 2, 1 + len(_ALPHAS)))
+    """Return the mean squared distance (m²) of each held-out part from its prediction."""
+    errors = np.zeros((len(parts) - 2, 1 + len(_ALPHAS)))  # part i + 1, level k - 1; 0 is rigid
     for first in (0, 1):
         kept, left_out = parts[first::2], parts[first + 1 :: 2]
         bending = _Bending(kept)
@@ -157,28 +147,13 @@ def _squared_distance(a: Float, b: Float) -> float:
 
 
 class _Bending:
-    """Solver of the flow from each part (points of the object in one sweep) to its neighbours.
-
-    A hop leads from one part to the next or the previous part. A node is one point per voxel of
-    0.07 m. The nodes of all hops lie side by side in one cloud, and share one system of equations.
-    `refine` holds the targets t fixed and minimises, over the flow F::
-
-        Σ w |f - t|² + Σ a |f|² + steady + alpha tr(Fᵀ L F)
-
-    f: (3,) row of F: displacement of a node beyond the rigid motion, metres.
-    F: (nodes, 3) flow of all nodes, and L: (nodes, nodes) Laplacian of their graph (`_laplacian`).
-    t: (3,) current f, plus the mean of the other part's nodes around the moved node, minus the mean
-        of the part's own moved nodes around it.
-    w: Weight that fades from 1 to 0 with the distance to the target.
-    a: Weight of the rigid position, until the node has clearly left it (Geman, McClure 1987).
-    steady: Penalty on different velocities before and after (`_steadiness`).
-    alpha: Stiffness, the weight of smoothness.
-    """
+    """Solver of the flow from each part (points of the object in one sweep) to its neighbours."""
 
     def __init__(self, parts: tuple[Part, ...]) -> None:
         self._parts = parts
         self._nodes = [p.points[_one_per_voxel(p.points)] for p in parts]
         n = len(parts)
+        # A hop leads to the next or the previous part. Their nodes lie side by side in one cloud.
         self._hops = [(i, i + 1) for i in range(n - 1)] + [(i, i - 1) for i in range(1, n)]
         everything = np.concatenate(self._nodes)
         self._apart_m = float(np.ptp(everything, axis=0).max()) + 10.0
@@ -187,15 +162,13 @@ class _Bending:
         self._laplacian = _laplacian(self._source)
         self._around = nearest_k(tree_of(self._source), self._source, _NUM_BLURRED)[1]
         self._steady = self._steadiness()
-        self._flow = np.zeros_like(self._source)
+        self._flow = np.zeros_like(self._source)  # (nodes, 3) beyond the rigid motion
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
 
     def refine(self, level: int) -> None:
-        """Find all targets again and solve for the flow, in place.
-
-        Args:
-            level: Index of the stiffness in `_ALPHAS`, 0 for the stiffest.
-        """
+        """Find all targets again and solve for the flow, in place; level 0 is the stiffest."""
+        # Minimise, for fixed targets t: Σ w |f - t|² + Σ a |f|² + steady + alpha tr(Fᵀ L F).
+        # The anchor a holds a node until it clearly left the rigid position (Geman, McClure 1987).
         moved = self._source + self._flow
         near = nearest_k(tree_of(self._target), moved, _NUM_BLURRED)[1]
         there, distance_m = _blurred(self._target, near, moved, _BLURS_M[level])
@@ -247,12 +220,8 @@ class _Bending:
         return np.concatenate([c + [k * self._apart_m, 0.0, 0.0] for k, c in enumerate(clouds)])
 
     def _steadiness(self) -> csr_array:
-        """Return the (nodes, nodes) matrix of ``|f_next / dt_next + f_previous / dt_previous|²``.
-
-        f_next and f_previous are a node's displacements to the next and the previous part, dt the
-        times between the parts. The sum is 0 at constant velocity. The matrix is scaled to a weight
-        of 1 for equal times.
-        """
+        """Return the (nodes, nodes) matrix of ``|f_next / dt_next + f_before / dt_before|²``."""
+        # f are displacements to the next and the previous part. The sum is 0 at constant velocity.
         number = {hop: k for k, hop in enumerate(self._hops)}
         times_s = [p.time_s for p in self._parts]
         opposite = np.arange(len(self._source))
@@ -264,7 +233,7 @@ class _Bending:
             rows = slice(self._start[k], self._start[k + 1])
             opposite[rows] = np.arange(self._start[other], self._start[other + 1])
             u, v = 1 / abs(times_s[b] - times_s[a]), 1 / abs(times_s[2 * a - b] - times_s[a])
-            scale = 2 * _STEADY / (u * u + v * v)
+            scale = 2 * _STEADY / (u * u + v * v)  # a weight of 1 for equal times
             own[rows], crossed[rows] = scale * u * u, scale * u * v
         row = np.arange(len(opposite))
         coupling = coo_array((crossed, (row, opposite)), shape=(len(row), len(row)))
@@ -272,11 +241,8 @@ class _Bending:
 
 
 def _laplacian(points: Float) -> csr_array:
-    """Return the (n,n) Laplacian ``(D - W) / mean(D)`` of the neighbour graph of (n,3) points.
-
-    ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is among the 6 nearest of the other,
-    within 0.5 m. The diagonal of W is 1. D holds the row sums of W.
-    """
+    """Return the (n,n) Laplacian ``(D - W) / mean(D)`` of the neighbour graph of points (n,3)."""
+    # W[i, j] = exp(-|p_i - p_j|² / 1 m²) where either is among the 6 nearest of the other
     n = len(points)
     distance_m, near = nearest_k(tree_of(points), points, _NUM_NEIGHBORS + 1)
     row, rank = np.nonzero(distance_m <= _LINK_M)
@@ -310,11 +276,7 @@ def _one_per_voxel(points: Float) -> Int:
 
 
 def _blurred(points: Float, near: Int, at: Float, blur_m: float) -> tuple[Float, Float]:
-    """Return (N,3) Gaussian-weighted means around positions ``at``, and distances to the nearest.
-
-    The mean of position i is over ``points[near[i]]``, with the standard deviation ``blur_m``. The
-    (N,) distances are to the nearest of these points.
-    """
+    """Return (N,3) Gaussian means of ``points[near[i]]`` around ``at[i]``, nearest distances."""
     around = points[near]
     away = around - at[:, None]
     squared = np.einsum("nki,nki->nk", away, away)
@@ -325,12 +287,7 @@ def _blurred(points: Float, near: Int, at: Float, blur_m: float) -> tuple[Float,
 
 
 def _look_up(at: Float, came: Float, points: Float, known_came: Float, values: Float) -> Float:
-    """Interpolate the values (M,3) of known points with similar position and last displacement.
-
-    Args:
-        at, came: (N,3) positions, and the displacements by which they were reached.
-        points, known_came: (M,3) positions and displacements of the known points.
-    """
+    """Interpolate values (M,3) of known points with similar position and last displacement."""
     known, asked = np.hstack([points, known_came]), np.hstack([at, came])
     near = nearest_k(tree_of(known), asked, _NUM_LOOKED_UP)[1]
     distance_m = np.linalg.norm(known[near] - asked[:, None], axis=2)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Search for moving objects: clusters of candidates are tracked, and kept if confirmed.
 
-A track is the accumulated points of a cluster and one rigid pose for each batch (sweeps within 0.1
-s). It starts from the velocity that most batches agree on, is followed both ways, and is smoothed
-in time. It is confirmed only if the smooth motion explains the measurements.
+A track starts from the velocity that most batches (sweeps within 0.1 s) agree on, is followed both
+ways, and is smoothed in time. It is confirmed only if the smooth motion explains the measurements.
 """
 
 from __future__ import annotations
@@ -51,20 +50,15 @@ def find_tracks(
 ) -> list[Track]:
     """Return the confirmed tracks of all moving objects in the stretch (consecutive sweeps).
 
-    Args:
-        obstacles: Points above the ground of each sweep.
-        velocities_m_s: For each sweep (C,3) velocities of its obstacles, world frame, at which
-            clusters start. None lets the neighbouring sweeps vote.
-        judged: Function called with each track that was tried, and its evidence.
+    ``velocities_m_s`` are, for each sweep, (C,3) of its obstacles, world frame, at which clusters
+    start. None lets the neighbouring sweeps vote. ``judged`` is called with each track that was
+    tried, and its evidence.
     """
     return _Search(obstacles, space, ground, velocities_m_s, judged).tracks()
 
 
 class _Search:
-    """State of the search: batches of sweeps, points still free, and objects found so far.
-
-    A point is free until a track claims it.
-    """
+    """State of the search: batches, points free until a track claims them, and objects found."""
 
     def __init__(
         self,
@@ -120,10 +114,7 @@ class _Search:
         return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
 
     def _velocity_of(self, members: Int, n: int) -> Float:
-        """Return the likely velocity (3,), m/s, world frame, of a cluster.
-
-        ``members`` are the indices of the cluster's points in the obstacles of batch index n.
-        """
+        """Return the likely velocity (3,), m/s, world, of ``members`` of batch n's obstacles."""
         c = self.batches[n].obstacles
         if self._velocities_m_s is None:
             group = Group.of(c.points[members], c.time_s[members])
@@ -133,19 +124,14 @@ class _Search:
         return velocity
 
     def _track_of(self, members: Int, n: int) -> tuple[Track, Verdict]:
-        """Return the most likely track of a cluster, and the log odds that it moves.
-
-        ``members`` are the indices of the cluster's points in the obstacles of batch index n.
-        It starts at the velocity that most sweeps agree on, and at the velocities of adjacent
-        objects such as a towing vehicle. If free-space violations remain, it is followed again from
-        its first and last batch. More of the object may be in view there than one side that slides
-        along itself.
-        """
+        """Return the most likely track of ``members`` of batch n's obstacles, and its verdict."""
         best = self._follow(members, n, self._velocity_of(members, n))
+        # adjacent objects, such as a towing vehicle
         for velocity in velocities_beside(self.batches[n], members, self._objects):
             if best[1].is_clearly_below(best[1].at_most):
                 best = _better(best, self._follow(members, n, velocity))
         track, verdict = best
+        # At its ends more may be in view than one side that slides along itself.
         if verdict.moves and verdict.is_clearly_below(verdict.at_most):
             for k in sorted({min(track.observations), max(track.observations)} - {n}):
                 rows = track.rows_in(self.batches[k])
@@ -162,10 +148,8 @@ class _Search:
         return track, judge(track, self._obstacles, self._space, self._objects, self._judged)
 
     def _gather(self, track: Track) -> None:
-        """Claim, in place, free candidates in or near the object that its motion explains.
-
-        Otherwise these points would start a track of their own.
-        """
+        """Claim free candidates in or near the object that its motion explains, in place."""
+        # Otherwise these points would start a track of their own.
         shape = self._shape_of(track)
         for j, own in track.claimed.items():
             c = self._obstacles[j]
@@ -176,11 +160,9 @@ class _Search:
             track.claimed[j] = np.concatenate([own, self._without_violations(track, j, rows)])
 
     def _claim_in_line(self, track: Track) -> None:
-        """Claim, in place, free clusters of single rings or columns ahead of and behind the object.
-
-        On a roof, or on a side that recedes from the scanner, such clusters lie too far apart to be
-        linked. Tracked alone, such a cluster would stay where the rays are.
-        """
+        """Claim free clusters of single rings or columns ahead of and behind the object."""
+        # On a roof, or on a side that recedes from the scanner, they are too far apart to link.
+        # Tracked alone, such a cluster would stay where the rays are.
         space, shape = self._space, self._shape_of(track)
         at_s = next(iter(track.observations.values())).seen_s
         lane = MovingObject(track, shape).lane(at_s)
@@ -206,18 +188,12 @@ class _Search:
             track.claimed[j] = np.concatenate([track.claimed[j], rows[together]])
 
     def _unclaimed(self, j: int, rows: Int, own: Int) -> Int:
-        """Return those ``rows`` of sweep j that are free candidates, without ``own``.
-
-        Both are indices into the obstacles of sweep j; ``own`` belong to the track already.
-        """
+        """Return those ``rows`` of sweep j's obstacles that are free candidates and not ``own``."""
         rows = rows[self._free[j][rows] & (self._obstacles[j].cluster[rows] >= 0)]
         return np.setdiff1d(rows, own, assume_unique=True)
 
     def _without_violations(self, track: Track, j: int, rows: Int) -> Int:
-        """Return those ``rows`` of sweep j that, moved with the track, are never seen through.
-
-        The test covers all sweeps within 0.3 s; ``rows`` are indices into the obstacles of sweep j.
-        """
+        """Return those ``rows`` of sweep j that, moved with the track, are never seen through."""
         c = self._obstacles[j]
         for i in self._space.others(j):
             if self._space.clock.near(i, j, _NEAR_S) and len(rows):
@@ -232,10 +208,7 @@ def _better(known: tuple[Track, Verdict], found: tuple[Track, Verdict]) -> tuple
 
 
 def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -> Bool:
-    """Return (N,) True for points whose cluster is hit by a single ring or column of rays.
-
-    ``rows`` (N,) are indices into the obstacles ``c`` of one sweep.
-    """
+    """Return (N,) True for ``rows`` of ``c`` whose cluster is hit by a single ring or column."""
     if not len(rows):
         return np.zeros(0, bool)
     clusters, of_row = np.unique(c.cluster[rows], return_inverse=True)
@@ -257,11 +230,9 @@ def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -
 
 
 def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> None:
-    """Align every observation again, in place, and keep the result if the motion becomes smoother.
-
-    An object that is followed batch by batch drifts when its other side comes into view. Therefore
-    even batches are aligned with the points of the odd batches, and the other way round.
-    """
+    """Align every observation again, in place; keep the result if the motion is smoother."""
+    # Followed batch by batch, an object drifts when its other side comes into view. Therefore even
+    # batches are aligned with the points of the odd batches, and the other way round.
     sweeps: tuple[list[int], list[int]] = [], []
     for n, seen in sorted(track.observations.items()):
         sweeps[n % 2].extend(seen.sweeps)

@@ -54,14 +54,10 @@ class DistanceField:
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_to(self, found: Bytes, group: Group, velocities: Float) -> None:
-        """Raise ``found``, in place, to the nearness of the moved group to this sweep's candidates.
+        """Raise ``found`` (V,N) to the nearness of the moved group to this sweep's candidates.
 
-        Each point moves at each velocity, to the time at which this sweep would measure the group.
-
-        Args:
-            found: (V,N) nearness of each of N points at each of V velocities, 0 to 255.
-            group: Group of the N points.
-            velocities: (V,3) m/s, world.
+        Each of N points moves at each of the (V,3) velocities (m/s, world) to the time at which
+        this sweep would measure the group. Nearness is 0 to 255.
         """
         if self.tree is None:
             return
@@ -107,16 +103,11 @@ class Group:
 def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
     """Return the horizontal velocity (3,) of a cluster, m/s, that the neighbouring sweeps support.
 
-    At this velocity the moved points come nearest to candidates of other batches (see `Batch`).
-    First the batches about 0.1 and 0.2 s before and after are compared, in coarse steps of
-    velocity. A flat side shows its speed only at its ends, which move by less than a voxel in this
-    short time. Therefore batches up to 0.5 s away are compared too, in fine steps.
-
-    Args:
-        group: Points of a cluster in batch n.
-        n: Index of the batch.
-        fields: For each batch, the distance fields of its sweeps.
-        clock: Times of the batches.
+    At this velocity the group of batch n comes nearest to candidates of other batches. First the
+    batches about 0.1 and 0.2 s before and after are compared, in coarse steps of velocity. A flat
+    side shows its speed only at its ends, which move by less than a voxel in this short time.
+    Therefore batches up to 0.5 s away are compared too, in fine steps. ``fields`` holds, for each
+    batch, the distance fields of its sweeps.
     """
     near_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
     coarse = 2 * _STEP_M / near_s
@@ -130,19 +121,13 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
 
 
 def _batches_around(n: int, step_s: float, clock: Clock) -> list[int]:
-    """Return the indices of the batches one and two steps of ``step_s`` before and after batch n.
-
-    Batches beyond the ends of the stretch are left out.
-    """
+    """Return the existing batches one and two steps of ``step_s`` before and after batch n."""
     asked = [clock.at(n, later_s) for later_s in (-2 * step_s, -step_s, step_s, 2 * step_s)]
     return sorted({m for m in asked if m is not None})
 
 
 def _best(group: Group, around: Sequence[Sequence[DistanceField]], velocities: Float) -> Float:
-    """Return the velocity (3,) among (V,3) that brings the group nearest to candidates.
-
-    ``around`` has, for each batch compared with, the distance fields of its sweeps.
-    """
+    """Return the velocity (3,) among (V,3) that brings the group nearest to candidates."""
     cost = np.zeros(len(velocities))
     for batch in around:
         nearness = np.zeros((len(velocities), len(group.points)), np.uint8)
@@ -163,13 +148,7 @@ def _grid(n: int) -> Float:
 def _spread(
     points: Float, low: Float, step: float, offsets: Int, values: Bytes, grid: Bytes
 ) -> None:
-    """Raise the cells of ``grid`` around each of (N,3) points to the given values, in place.
-
-    Args:
-        low: (3,) corner of the grid.
-        offsets: (K,3) cells of the side ``step`` relative to the point's cell.
-        values: (K,) value for each offset.
-    """
+    """Raise the cells of ``grid`` at ``offsets`` (K,3) from points (N,3) to ``values`` (K,)."""
     for i in range(len(points)):
         x, y, z = (
             int((points[i, 0] - low[0]) / step),
@@ -194,11 +173,7 @@ def _look_up(
     nearness: Bytes,
     found: Bytes,
 ) -> None:
-    """Raise ``found`` (V,N), in place, to the grid's values at the N moved points.
-
-    Point i moves at velocity v for ``elapsed_s[v] - late_s[i]``. Cells outside the grid count as 0.
-    The velocities from ``first`` up to ``last`` are handled.
-    """
+    """Raise ``found`` (V,N), in place, to the grid's values at N points moved at V velocities."""
     num_x, num_y, num_z = nearness.shape
     for v in range(first, last):
         for i in range(len(points)):

@@ -23,17 +23,17 @@ class Cloud:
     Attributes:
         points: (M,3) metres, key frame, displaced by scene flow.
         rigid_points: (M,3) metres, key frame, by registration only, as in rigid accumulation.
-        frame: (M,) int32 frame number of the source sweep.
-        since_key_ns: (M,) int64 ns, source sweep's reference time minus key sweep's reference time.
-        row: (M,) int64 index of the point's row in the file of the source sweep.
-        lidar: (M,) uint8 index of the scanner that measured the point.
-        moving: (M,) bool, True if the point belongs to a moving object.
-        instance: (M,) int32 number of the moving object, -1 for none.
-        velocity_m_s: (M,3) float32 at the key's time, key frame, ego-motion removed; 0 if static.
-        confidence: (M,) float32 relative score of 0 to 1.
-        intensity: (M,) float32 of 0 to 1.
-        rgb: (M,3) uint8, black for points that no camera observed.
-        far: (M,) bool, True if the source sweep is beyond the window (``accumulate.far_m``).
+        frame: (M,) frame number of the source sweep.
+        since_key_ns: (M,) ns, source sweep's reference time minus key sweep's reference time.
+        row: (M,) index of the point's row in the file of the source sweep.
+        lidar: (M,) index of the scanner that measured the point.
+        moving: (M,) True if the point belongs to a moving object.
+        instance: (M,) number of the moving object, -1 for none.
+        velocity_m_s: (M,3) at the key's time, key frame, ego-motion removed; 0 if static.
+        confidence: (M,) relative score of 0 to 1.
+        intensity: (M,) from 0 to 1.
+        rgb: (M,3), black for points that no camera observed.
+        far: (M,) True if the source sweep is beyond the window (``accumulate.far_m``).
     """
 
     points: Float
@@ -96,14 +96,10 @@ class Patches(NamedTuple):
 
     A patch is the piece of surface around a point, as large as the spacing of the rays there. It
     occludes what lies behind it (`densify.depth.patches`).
-
-    Attributes:
-        normal: (M,3) float32 normal of the tangent plane, of any length, key frame.
-        spacing_m: (M,2) float32 distance to the neighbouring rays of the same sweep: in azimuth,
-            then in elevation.
     """
 
-    normal: Float32
+    normal: Float32  # (M,3) normal of the tangent plane, of any length, key frame
+    # (M,2) distance to the neighbouring rays of the same sweep: in azimuth, then in elevation
     spacing_m: Float32
 
     def joined(self, other: Patches) -> Patches:
@@ -117,32 +113,18 @@ class Patches(NamedTuple):
 
 @dataclass(frozen=True)
 class StandingWorld:
-    """K points on static surfaces along the road, from n sweeps.
+    """K points on static surfaces along the road, from n sweeps."""
 
-    Attributes:
-        points: (K,3) float32 metres, in the world of the registered window.
-        normal: (K,3) float32 normal of the tangent plane, of any length, same frame.
-        spacing_m: (K,2) float32 distance to the neighbouring rays of the same sweep, as in
-            `Patches`.
-        source: (K,) int32 index of the source sweep in ``frames``.
-        row: (K,) int64 row of the point in the file of the source sweep.
-        lidar: (K,) uint8 index of the scanner.
-        intensity: (K,) float32 of 0 to 1.
-        frames: Frame numbers of the n sweeps.
-        stamp_ns: (n,) int64 reference times.
-        left_out: Frame numbers of sweeps without a reliable registration.
-    """
-
-    points: Float32
-    normal: Float32
-    spacing_m: Float32
-    source: NDArray[np.int32]
-    row: Int
-    lidar: NDArray[np.uint8]
-    intensity: Float32
-    frames: tuple[int, ...]
-    stamp_ns: Int
-    left_out: tuple[int, ...] = ()
+    points: Float32  # (K,3) metres, in the world of the registered window
+    normal: Float32  # (K,3) normal of the tangent plane, of any length, same frame
+    spacing_m: Float32  # (K,2) distance to the neighbouring rays of the same sweep, as in `Patches`
+    source: NDArray[np.int32]  # (K,) index of the source sweep in ``frames``
+    row: Int  # (K,) row of the point in the file of the source sweep
+    lidar: NDArray[np.uint8]  # (K,) index of the scanner
+    intensity: Float32  # (K,) of 0 to 1
+    frames: tuple[int, ...]  # frame numbers of the n sweeps
+    stamp_ns: Int  # (n,) reference times
+    left_out: tuple[int, ...] = ()  # frame numbers of sweeps without a reliable registration
 
     def select(self, keep: Bool | Int) -> StandingWorld:
         """Return a world with only the points of a (K,) mask, or of an array of point indices."""
@@ -232,19 +214,12 @@ class Camera:
 
 @dataclass(frozen=True)
 class CameraView:
-    """The viewpoint of a depth map.
-
-    Attributes:
-        camera: The camera.
-        T_cam_key: (4,4) pose of the key frame in the camera frame at the time the map shows.
-        late_s: Time the map shows minus the key's reference time, seconds.
-        number: Number of the image; None if the map shows no image.
-    """
+    """The viewpoint of a depth map."""
 
     camera: Camera
-    T_cam_key: Float
-    late_s: float
-    number: int | None
+    T_cam_key: Float  # (4,4) pose of the key frame in the camera frame at the time the map shows
+    late_s: float  # time the map shows minus the key's reference time, seconds
+    number: int | None  # number of the image; None if the map shows no image
 
 
 @dataclass(frozen=True)
@@ -253,14 +228,14 @@ class DepthMap:
 
     Attributes:
         camera: Name of the camera.
-        depth_m: (H,W) float32 metres of measured pixels, 0 elsewhere.
-        filled_m: (H,W) float32 metres of measured and interpolated pixels, 0 elsewhere.
-        confidence: (H,W) float32 of 0 to 1, for every pixel with a depth in ``filled_m``.
-        frame: (H,W) int32 frame number of the sweep that measured the pixel, -1 elsewhere.
-        reason: (M,) uint8 `Reason` of each point of the cloud; empty if the cloud is not kept.
-        age_s: (H,W) float32 seconds between the exposure of the image and the sweep that measured
-            the pixel, nan where ``filled_m`` has no depth. None until
-            `densify.depth.views.with_ages` computes it.
+        depth_m: (H,W) metres of measured pixels, 0 elsewhere.
+        filled_m: (H,W) metres of measured and interpolated pixels, 0 elsewhere.
+        confidence: (H,W) of 0 to 1, for every pixel with a depth in ``filled_m``.
+        frame: (H,W) frame number of the sweep that measured the pixel, -1 elsewhere.
+        reason: (M,) `Reason` of each point of the cloud; empty if the cloud is not kept.
+        age_s: (H,W) seconds between the exposure of the image and the sweep that measured the
+            pixel, nan where ``filled_m`` has no depth. None until `densify.depth.views.with_ages`
+            computes it.
         measure: ``z`` for depth along the optical axis, ``range`` for distance from the lens.
         warnings: Sentences about requested steps that could not be done.
         evidence: (P,8) `densify.depth.confidence.features` of the pixels with a depth, before laser
@@ -281,14 +256,9 @@ class DepthMap:
     def to_points(self, view: CameraView, filled: bool = True) -> Float:
         """Return the map's pixels as points (K,3) in the key frame, metres, row by row.
 
-        Moving objects are at their position at the exposure of the image.
-
-        Args:
-            view: Viewpoint of the map, from ``Result.views``.
-            filled: Include interpolated pixels.
-
-        Raises:
-            InputError: The camera is not rectified, or the map holds ranges.
+        Moving objects are at their position at the exposure of the image. ``view`` is from
+        ``Result.views``. ``filled`` includes interpolated pixels. Raises InputError if the camera
+        is not rectified or the map holds ranges.
         """
         camera = view.camera
         if not camera.is_rectified or self.measure != "z":

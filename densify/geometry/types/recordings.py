@@ -72,57 +72,41 @@ class LidarSequence(Protocol):
 
 @dataclass(frozen=True)
 class BoxView:
-    """The camera image in which an annotator drew the boxes.
-
-    Attributes:
-        camera: The camera.
-        left_out_px: (R,4) left, top, right, bottom of R image rectangles that are not annotated.
-    """
+    """The camera image in which an annotator drew the boxes."""
 
     camera: Camera
+    # (R,4) left, top, right, bottom of R image rectangles that are not annotated
     left_out_px: Float
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """The K annotated boxes of one sweep.
+    """The K annotated boxes of one sweep."""
 
-    Attributes:
-        track: (K,) text identifying the object in all sweeps; empty for an untracked object.
-        T_lidar_box: (K,4,4) pose of each box in the lidar frame at the reference time, for points
-            compensated for ego-motion. The box frame is in the middle of the box, x to the front,
-            z up.
-        size_m: (K,3) length, width, height.
-        offset_ns: (K,) int64 time since the reference time at which the lidar frame of
-            ``T_lidar_box`` is taken; None for 0.
-        lidar: (K,) index of the scanner whose points a box encloses, -1 for all scanners; None if
-            every box encloses the points of all scanners.
-        view: Image in which the boxes were drawn; None for boxes all around the vehicle.
-    """
-
+    # (K,) text identifying the object in all sweeps; empty for an untracked object
     track: NDArray[Any]
+    # (K,4,4) pose of each box in the lidar frame at the reference time, for points compensated for
+    # ego-motion. The box frame is in the middle of the box, x to the front, z up.
     T_lidar_box: Float
-    size_m: Float
+    size_m: Float  # (K,3) length, width, height
+    # (K,) time since the reference time at which the lidar frame of ``T_lidar_box`` is taken; None
+    # for 0
     offset_ns: Int | None = None
+    # (K,) index of the scanner whose points a box encloses, -1 for all scanners; None if every box
+    # encloses the points of all scanners
     lidar: Int | None = None
+    # Image in which the boxes were drawn; None for boxes all around the vehicle
     view: BoxView | None = None
 
 
 @dataclass(frozen=True)
 class SweepTruth:
-    """The ground truth of the N points of a raw sweep, in the same order.
+    """The ground truth of the N points of a raw sweep, in the same order."""
 
-    Attributes:
-        T_world_lidar: (4,4) lidar pose at the reference time.
-        points: (N,3) metres, positions at the reference time, lidar frame at that time.
-        instance: (N,) int32 number of the object, -1 for the static scene.
-        moving: (N,) bool, True if the object moves at the reference time.
-    """
-
-    T_world_lidar: Float
-    points: Float
-    instance: NDArray[np.int32]
-    moving: Bool
+    T_world_lidar: Float  # (4,4) lidar pose at the reference time
+    points: Float  # (N,3) metres, positions at the reference time, lidar frame at that time
+    instance: NDArray[np.int32]  # (N,) number of the object, -1 for the static scene
+    moving: Bool  # (N,) True if the object moves at the reference time
 
 
 class Truth(Protocol):

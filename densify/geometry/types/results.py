@@ -24,28 +24,19 @@ class ObjectTrack:
 
     The origin of the object frame is the middle of the box. Its x axis is along the motion at the
     key's time, and its z axis is parallel to the z axis of the key frame.
-
-    Attributes:
-        instance: Number of the object, as in `Cloud`.
-        size_m: (3,) length, width and height of the box. It stands on the ground, and is completed
-            to the usual size of a vehicle where no ray passed.
-        frames: Frame numbers of the n sweeps, ascending.
-        stamp_ns: (n,) int64 reference times.
-        T_key_object: (n,4,4) poses in the key frame, ego-motion removed.
-        velocity_m_s: (n,3) velocity of the middle of the box, key frame, ego-motion removed.
-        num_points: (n,) number of points of the object in each sweep.
-        seen_size_m: (3,) size of the box around its points.
-        sides_seen: Sides of the box that were seen: of front, rear, left, right and top.
     """
 
-    instance: int
+    instance: int  # number of the object, as in `Cloud`
+    # (3,) length, width and height of the box. It stands on the ground, and is completed to the
+    # usual size of a vehicle where no ray passed.
     size_m: Float
-    frames: tuple[int, ...]
-    stamp_ns: Int
-    T_key_object: Float
-    velocity_m_s: Float
-    num_points: Int
-    seen_size_m: Float
+    frames: tuple[int, ...]  # frame numbers of the n sweeps, ascending
+    stamp_ns: Int  # (n,) reference times
+    T_key_object: Float  # (n,4,4) poses in the key frame, ego-motion removed
+    velocity_m_s: Float  # (n,3) velocity of the middle of the box, key frame, ego-motion removed
+    num_points: Int  # (n,) number of points of the object in each sweep
+    seen_size_m: Float  # (3,) size of the box around its points
+    # Sides of the box that were seen: of front, rear, left, right and top
     sides_seen: tuple[str, ...] = ()
 
 
@@ -54,16 +45,11 @@ class Prior:
     """A depth image supplied by the user, for example from a network, that completes a depth map.
 
     It has the size of the map.
-
-    Attributes:
-        value: (H,W) float32 depth or inverse depth, relative or metric; 0 for no value.
-        sky: (H,W) bool, True for pixels that stay without depth.
-        source: File of the image, for messages.
     """
 
-    value: Float32
-    sky: Bool
-    source: str
+    value: Float32  # (H,W) depth or inverse depth, relative or metric; 0 for no value
+    sky: Bool  # (H,W) True for pixels that stay without depth
+    source: str  # file of the image, for messages
 
 
 @dataclass(frozen=True)
@@ -72,43 +58,28 @@ class PriorFit:
 
     It is one fit for the whole image, before local correction. Kind ``depth``: z = scale p + shift
     (m). ``inverse``: 1/z = scale p + shift (1/m). ``log``: ln z = scale ln p + shift.
-
-    Attributes:
-        kind: ``depth``, ``inverse`` or ``log``.
-        scale: Factor of the fit.
-        shift: Offset of the fit, in the unit above.
-        residual: Mean of |ln z - ln measured| over the measured pixels, each limited to ln 1.25.
-            Pixels are weighted for each octave of depth to count alike.
-        wrong: Share of the measured pixels off by more than 25 %, with the same weights.
-        used: True if the prior fits well enough to be used.
     """
 
-    kind: str
+    kind: str  # ``depth``, ``inverse`` or ``log``
     scale: float
-    shift: float
+    shift: float  # offset of the fit, in the unit above
+    # Mean of |ln z - ln measured| over the measured pixels, each limited to ln 1.25. Pixels are
+    # weighted for each octave of depth to count alike.
     residual: float
-    wrong: float
-    used: bool
+    wrong: float  # share of the measured pixels off by more than 25 %, with the same weights
+    used: bool  # true if the prior fits well enough to be used
 
 
 @dataclass(frozen=True)
 class FullDepth:
-    """A depth map completed with a prior.
+    """A depth map completed with a prior."""
 
-    Attributes:
-        depth_m: (H,W) float32 metres, 0 for none. Pixels with a depth in ``DepthMap.filled_m``
-            keep it.
-        confidence: (H,W) float32 of 0 to 1; pixels of the prior are below all others.
-        from_prior: (H,W) bool, True for pixels whose depth is from the prior.
-        fit: Fit of the prior to the map.
-        source: File of the prior.
-    """
-
+    # (H,W) metres, 0 for none. Pixels with a depth in ``DepthMap.filled_m`` keep it.
     depth_m: Float32
-    confidence: Float32
-    from_prior: Bool
-    fit: PriorFit
-    source: str
+    confidence: Float32  # (H,W) of 0 to 1; pixels of the prior are below all others
+    from_prior: Bool  # (H,W) True for pixels whose depth is from the prior
+    fit: PriorFit  # fit of the prior to the map
+    source: str  # file of the prior
 
 
 Progress = Callable[[str, int, int], None]

@@ -24,10 +24,10 @@ class Sweep:
         stamp_ns: Reference time: begin, middle or end of the revolution, as the data set defines.
         points: (N,3) metres, lidar frame. A raw sweep has each point in the lidar frame at its own
             firing time, a deskewed sweep all points in the frame at ``stamp_ns``.
-        intensity: (N,) float32 of 0 to 1.
-        offset_ns: (N,) int64 firing time minus ``stamp_ns``; None if the data has no point times.
-        lidar: (N,) uint8 index of the scanner that fired.
-        row: (N,) int64 row of the return in the source file, whose invalid rows are not read.
+        intensity: (N,) from 0 to 1.
+        offset_ns: (N,) firing time minus ``stamp_ns``; None if the data has no point times.
+        lidar: (N,) index of the scanner that fired.
+        row: (N,) row of the return in the source file, whose invalid rows are not read.
         scanner_origins: (S,3) metres, lidar frame, position of each of the S scanners; None if all
             are at the origin.
         R_scanner_lidar: (S,3,3) rotation from the lidar axes to the axes of each scanner, whose z
@@ -83,19 +83,13 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The lidar poses of n sweeps.
+    """The lidar poses of n sweeps."""
 
-    Attributes:
-        frames: Frame numbers, ascending.
-        stamp_ns: (n,) int64 reference times.
-        T_world_lidar: (n,4,4) poses at the reference times.
-        R_level_lidar: (3,3) rotation that makes the z axis of the lidar point up; the identity
-            unless the lidar is mounted tilted.
-    """
-
-    frames: tuple[int, ...]
-    stamp_ns: Int
-    T_world_lidar: Float
+    frames: tuple[int, ...]  # frame numbers, ascending
+    stamp_ns: Int  # (n,) reference times
+    T_world_lidar: Float  # (n,4,4) poses at the reference times
+    # (3,3) rotation that makes the z axis of the lidar point up; the identity unless the lidar is
+    # mounted tilted
     R_level_lidar: Float = field(default_factory=lambda: np.eye(3))
 
     def part(self, frames: Sequence[int], origin: int) -> Trajectory:
@@ -114,21 +108,14 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class RegisteredSweep:
-    """A sweep with its pose, usually deskewed.
+    """A sweep with its pose, usually deskewed."""
 
-    Attributes:
-        sweep: Sweep with points in the lidar frame at ``sweep.stamp_ns``.
-        T_world_lidar: (4,4) lidar pose at the reference time.
-        twist_before: (6,) velocity (rotation rad/s, translation m/s) of the lidar before the
-            reference time, in the lidar frame. Deskewing moves a raw point fired at offset t to
-            ``exp(t · twist) @ p_raw``.
-        twist_after: (6,) velocity of the lidar after the reference time.
-    """
-
-    sweep: Sweep
-    T_world_lidar: Float
+    sweep: Sweep  # sweep with points in the lidar frame at ``sweep.stamp_ns``
+    T_world_lidar: Float  # (4,4) lidar pose at the reference time
+    # (6,) velocity (rotation rad/s, translation m/s) of the lidar before the reference time, in the
+    # lidar frame. Deskewing moves a raw point fired at offset t to ``exp(t · twist) @ p_raw``.
     twist_before: Float
-    twist_after: Float
+    twist_after: Float  # (6,) velocity of the lidar after the reference time
 
     @property
     def frame(self) -> int:
@@ -187,9 +174,9 @@ class FlowField:
 
     Attributes:
         displacement: (N,3) metres from the reference time to the target time; exactly 0 if static.
-        moving: (N,) bool, True if the point is confirmed to move.
-        instance: (N,) int32 number of the moving object, -1 for none.
-        lost: (N,) bool, True if the point's object cannot be followed to the target time.
+        moving: (N,) True if the point is confirmed to move.
+        instance: (N,) number of the moving object, -1 for none.
+        lost: (N,) True if the point's object cannot be followed to the target time.
         to_reference: (N,3) metres that the object itself moves between the point's firing and the
             reference time; None if unknown.
         velocity_m_s: (N,3) velocity at the target time; None if unknown.
@@ -230,14 +217,10 @@ class Motion(Protocol):
 
 @dataclass(frozen=True)
 class StretchFlow:
-    """Scene flow between neighbouring sweeps of a stretch.
-
-    Attributes:
-        stretch: The sweeps.
-        steps: (frame, target frame) -> flow of the points of the first sweep.
-    """
+    """Scene flow between neighbouring sweeps of a stretch."""
 
     stretch: Stretch
+    # (frame, target frame) -> flow of the points of the first sweep
     steps: Mapping[tuple[int, int], FlowField]
 
     @staticmethod

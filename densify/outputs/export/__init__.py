@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write a finished run in the formats of other tools.
-
-`config.plugins.EXPORTS` lists the formats. The file export.yaml beside the exported files records
-run, to (format), min_confidence, max_age_ms (null for any age), density (camera -> measured, filled
--> before, after the thresholds: shares of the pixels), num_points (before, after), version.
-"""
+"""Write a finished run in the formats of other tools, listed in `config.plugins.EXPORTS`."""
 
 from __future__ import annotations
 
@@ -24,6 +19,8 @@ from densify.outputs.atomic import plain
 from densify.outputs.export.finished_run import FinishedRun, Kept, finished_runs
 from densify.outputs.store import writing
 
+# Fields: run, to (format), min_confidence, max_age_ms (null for any age), density (camera ->
+# measured, filled -> before, after the thresholds: shares of the pixels), num_points, version
 _RECORD = "export.yaml"
 
 
@@ -55,9 +52,8 @@ def export_run(
         to: Name of a format in `densify.config.plugins.EXPORTS`.
         out: Folder to write into, None for ``RUN/export/FORMAT``.
         min_confidence: Least confidence of an exported pixel or point, 0 to 1.
-        max_age_ms: Greatest time in ms from the image's exposure (pixels) or the key sweep (points)
-            to the sweep that measured it, None for any. A filled pixel has the age of the nearest
-            measured pixel.
+        max_age_ms: Greatest time from the source sweep to the image's exposure (pixels) or the key
+            sweep (points), None for any. A filled pixel has the age of the nearest measured pixel.
         cameras: Names of the cameras, None for all.
         overwrite: Replace an earlier export.
     """

@@ -1,13 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Write images with cameras, depth and points, for COLMAP, Gaussian splatting and nerfstudio.
 
-COLMAP's text model: https://colmap.github.io/format.html. nerfstudio's folder: ``ns-train
-depth-nerfacto --data DIR``.
-
 The world is the lidar frame of the first key sweep. The centre of the upper left pixel is (0.5,
-0.5). Lenses are OpenCV's. COLMAP's poses are world to camera. nerfstudio's poses are camera to
-world with OpenGL's axes: x right, y up, the camera looks along -z. nerfstudio's depth is in
-millimetres.
+0.5). COLMAP's poses are world to camera, see https://colmap.github.io/format.html.
 """
 
 from __future__ import annotations
@@ -35,6 +30,7 @@ from densify.readers.decoded_files import decode_image
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
 _INVERSE_STEPS = 65536  # the training of Gaussian splatting divides by this number
+# nerfstudio's poses are camera to world. In OpenGL's axes y is up and the camera looks along -z.
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -50,10 +46,7 @@ class Picture(NamedTuple):
 
 
 def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``images/`` and ``sparse/0/`` with cameras.txt, images.txt and points3D.txt.
-
-    The model has the points that a camera observed.
-    """
+    """Write ``images/`` and COLMAP's model ``sparse/0/`` of the points that a camera observed."""
     pictures = write_images(runs, folder)
     _write_model(pictures, _observed(_world_cloud(runs)), folder)
 
@@ -61,17 +54,14 @@ def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:
 def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write the input of 3-D Gaussian splatting (Kerbl et al., SIGGRAPH 2023).
 
-    The input is a COLMAP model of the static world, also as points3D.ply, with depth maps. Each
-    moving object is a file of its own, in its own frame.
+    The static world is a COLMAP model, also as points3D.ply. Depth maps are for ``-d depths``:
+    inverse depth is ``value / 65536 * scale + offset``, by ``sparse/0/depth_params.json``. The
+    training takes an empty pixel as infinitely far. Images are therefore transparent, and not
+    trained, where no depth is measured, filled or from a prior.
 
-    The training reads ``depths/NAME.png`` and ``sparse/0/depth_params.json`` with ``-d depths``.
-    Inverse depth is ``value / 65536 * scale + offset``. The training takes an empty pixel as
-    infinitely far. Images are therefore transparent, and not trained, where no depth is measured,
-    filled or from a prior.
-
-    ``movers/0003.ply`` has all points of object 3. ``movers/others.ply`` has moving points without
-    a track, in the key sweep's lidar frame. ``tracks.json`` is the movers.json of the run. With
-    several runs, each has its folder ``movers/000120/`` with ``tracks.json``.
+    ``movers/0003.ply`` has the points of object 3 in its own frame, ``movers/others.ply`` moving
+    points without a track in the key sweep's lidar frame. ``tracks.json`` is the run's movers.json.
+    With several runs, each has its folder ``movers/000120/``.
     """
     pictures = pictures_of(runs, flat=True)
     static = _world_cloud(runs)
@@ -125,10 +115,9 @@ def _write_movers(run: FinishedRun, folder: Path) -> None:
 
 
 def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``transforms.json``, ``images/``, ``depth/CAMERA.npy`` and ``cloud.ply``.
+    """Write transforms.json, images, depth and cloud for ``ns-train depth-nerfacto --data DIR``.
 
-    Depth is measured depth in float32 millimetres, 0 for no depth. The cloud has the points that a
-    camera observed.
+    ``depth/CAMERA.npy`` has measured depth in float32 millimetres, 0 for no depth.
     """
     pictures = write_images(runs, folder)
     fisheyes = {picture.camera.model == "fisheye" for picture in pictures}
@@ -174,10 +163,7 @@ def _frame(picture: Picture) -> dict[str, Any]:
 
 
 def pictures_of(runs: Sequence[FinishedRun], flat: bool = False) -> list[Picture]:
-    """Return the images of the runs with poses in one world, the first key sweep's lidar frame.
-
-    ``flat`` gives file names without folders, which the reader of Gaussian splatting drops.
-    """
+    """Return the images of the runs with poses in the lidar frame of the first key sweep."""
     pictures = []
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
         for name in run.cameras:
@@ -186,6 +172,7 @@ def pictures_of(runs: Sequence[FinishedRun], flat: bool = False) -> list[Picture
                 if len(runs) > 1:
                     file = f"{run.key:06d}/{name}"
                 T_cam_world = view.T_cam_key @ poses.inverse(T_world_key)
+                # The reader of Gaussian splatting drops folders from file names.
                 file = file.replace("/", "_") if flat else file
                 pictures.append(Picture(file, run, name, view.camera, T_cam_world, data))
     if not pictures:
@@ -217,11 +204,7 @@ def _world_cloud(runs: Sequence[FinishedRun]) -> StoredCloud:
 
 
 def intrinsics(camera: Camera) -> dict[str, float]:
-    """Return fx, fy, cx, cy in pixels and the lens coefficients, by OpenCV's names.
-
-    A pinhole has k1 k2 p1 p2 and, if present, k3 k4 k5 k6. A fisheye has k1 to k4. A pinhole
-    without distortion has no coefficients.
-    """
+    """Return fx, fy, cx, cy in pixels and the lens coefficients, if any, by OpenCV's names."""
     names = _FISHEYE_LENS if camera.model == "fisheye" else _LENS
     lens, K = list(camera.distortion), camera.K
     if camera.model == "mei" or any(lens[len(names) :]) or K[0, 1]:

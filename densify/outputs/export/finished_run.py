@@ -43,15 +43,7 @@ class Kept(NamedTuple):
 
 
 class FinishedRun:
-    """The folder of one densified key sweep. Files are read on demand and may raise InputError.
-
-    Attributes:
-        key: Frame number of the key sweep.
-        stamp_ns: Reference time of the key sweep in ns since 1970.
-        data: Specification of the recording.
-        recording: Name of the recording.
-        density: Camera -> ``measured``, ``filled`` -> share of pixels, for the maps read so far.
-    """
+    """The folder of one densified key sweep. Files are read on demand and may raise InputError."""
 
     def __init__(
         self,
@@ -69,6 +61,7 @@ class FinishedRun:
             )
         with damage_named(path):
             record = read_yaml(path)[0]
+            # stamp_ns: the key sweep's reference time in ns since 1970; data: text of --data
             self.key, self.stamp_ns = int(record["key"]), int(record["stamp_ns"])
             self.data = str(record["data"])
             last = self.data.rstrip("/").rpartition("/")[2]
@@ -76,6 +69,7 @@ class FinishedRun:
         self.folder, self._chosen = folder, cameras
         self._min_confidence = stored_confidence(min_confidence)
         self._max_age = stored_age(np.inf if max_age_ms is None else max_age_ms / 1000)
+        # Camera -> measured, filled -> share of pixels, for the maps read so far
         self.density: dict[str, dict[str, Kept]] = {}
         self._num_points: dict[Path, Kept] = {}
 
@@ -132,10 +126,7 @@ class FinishedRun:
         return data
 
     def maps(self, camera: str) -> dict[str, NDArray[Any]]:
-        """Return kind -> (H,W) stored values (`densify.outputs.depth_png`) within the thresholds.
-
-        The kinds are depth, depth_filled, confidence and age. Pixels beyond a threshold are 0.
-        """
+        """Return kind (as in `_KINDS`) -> (H,W) stored values, 0 beyond a threshold."""
         maps: dict[str, NDArray[Any]] = {}
         for kind, dtype in _KINDS.items():
             path = map_path(self.folder, kind, camera)
@@ -200,10 +191,7 @@ def finished_runs(
     max_age_ms: float | None = None,
     cameras: Sequence[str] | None = None,
 ) -> list[FinishedRun]:
-    """Return the run in a folder, or the runs below it, ordered by parent folder and frame number.
-
-    Arguments as in `densify.outputs.export.export_run`.
-    """
+    """Return the run in a folder, or the runs below it by parent folder and frame number."""
     places = sorted(
         path.parent for level in ("*", "*/*") for path in folder.glob(f"{level}/run.yaml")
     )
@@ -271,13 +259,10 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
 
 
 def key_poses(runs: Sequence[FinishedRun]) -> Iterator[Float]:
-    """Yield ``T_world_key`` (4,4) of each run. The world is the first key sweep's lidar frame.
-
-    Of two consecutive key sweeps, one must be in the window of the other.
-    """
+    """Yield ``T_world_key`` (4,4) of each run. The world is the first key sweep's lidar frame."""
     T_world_key = np.eye(4)
     for before, run in zip([None, *runs], runs, strict=False):
-        if before is not None:
+        if before is not None:  # one key sweep must be in the window of the other
             T_world_key = T_world_key @ _relative_pose(before, run)
         yield T_world_key
 

@@ -1,14 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write boxes and tracks as KITTI tracking labels (Geiger, Lenz, Urtasun, CVPR 2012).
-
-The tree is that of `densify.readers.kitti.tracking`, which reads it. A sequence is a recording, a
-frame is a key::
-
-    label_02/0000.txt   calib/0000.txt   velodyne/0000/000120.bin   image_02/0000/000120.png
-
-Objects of neighbouring keys have one track number if their tracks overlap in time and space. Their
-size is that of the keys that saw most of them.
-"""
+"""Write boxes and tracks as KITTI tracking labels (Geiger, Lenz, Urtasun, CVPR 2012)."""
 
 from __future__ import annotations
 
@@ -43,11 +34,11 @@ class _Labelled(NamedTuple):
 
 
 def write_kitti_tracking(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write labels, calibration, key sweeps and images of one camera.
+    """Write labels, calibration, key sweeps (deskewed) and images of one camera.
 
-    A box is where the key sweep measured the object. Points are deskewed. The type follows from the
-    size: Pedestrian, Cyclist, Car or Truck. ``occluded`` is 3, unknown. ``truncated`` is 1 at the
-    border of the image. Objects outside the image are left out, as in the data set.
+    `densify.readers.kitti.tracking` reads the tree. A sequence is a recording, a frame is a key. A
+    box is where the key sweep measured the object. Its type follows from the size. ``occluded`` is
+    3, unknown. ``truncated`` is 1 at the image's border. Objects out of view are left out.
     """
     for number, (_, together) in enumerate(groupby(runs, key=lambda run: run.folder.parent)):
         name, lines = f"{number:04d}", list[str]()
@@ -101,10 +92,7 @@ def _calibration(view: CameraView) -> str:
 def _line(
     track: ObjectTrack, number: int, run: FinishedRun, view: CameraView, cloud: StoredCloud
 ) -> str:
-    """Return the label line of an object, empty if it is out of view.
-
-    cloud: points of the key sweep.
-    """
+    """Return the label line of an object by the key sweep's points, "" if it is out of view."""
     mine = cloud.moving & (cloud.instance == track.instance)
     late_m = -np.median(cloud.displacement[mine], axis=0) if mine.any() else np.zeros(3)
     T_key_object = track.T_key_object[track.frames.index(run.key)].copy()
@@ -165,7 +153,7 @@ def _numbered(runs: Sequence[FinishedRun]) -> list[_Labelled]:
 def _found_again(run: FinishedRun, keys: Sequence[_Labelled]) -> list[int | None]:
     """Return for each track of a run the number it has in earlier keys, None for a new one."""
     away: list[tuple[float, int, int]] = []
-    for key in keys:
+    for key in keys:  # tracks must overlap in time and space
         shared = sorted(run.scene.T_key_lidar.keys() & key.run.scene.T_key_lidar.keys())
         if not shared:
             continue
@@ -196,10 +184,8 @@ def _apart_m(track: ObjectTrack, other: ObjectTrack, T_track_other: Float) -> fl
 
 
 def _sized(track: ObjectTrack, every: Sequence[ObjectTrack]) -> ObjectTrack:
-    """Return a track with the length and width that its object has in all keys (``every``).
-
-    Keys that saw both ends count, else the longest box. A side that was seen keeps its place.
-    """
+    """Return a track with the length and width that its object has in all keys (``every``)."""
+    # Keys that saw both ends count, else the longest box. A side that was seen keeps its place.
     for axis, ends in enumerate(_ENDS):
         whole = [t for t in every if {*ends} <= {*t.sides_seen}]
         size_m = (

@@ -25,19 +25,12 @@ _PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar", "u2": "
 
 
 def write_npy(run: FinishedRun, folder: Path) -> None:
-    """Write (H,W) float32 arrays, one .npy file for each kind of map and camera.
-
-    The kinds are ``depth`` and ``depth_filled`` in metres, 0 for no depth, and ``confidence``, 0 to
-    1.
-    """
+    """Write (H,W) float32 .npy: depth, depth_filled (metres, 0 none) and confidence (0 to 1)."""
     _write_maps(run, folder, ".npy", lambda path, _, values: np.save(path, values))
 
 
 def write_exr(run: FinishedRun, folder: Path) -> None:
-    """Write the maps of `write_npy` as OpenEXR files with one 32-bit channel, without loss.
-
-    The channel is ``Z`` for depth and ``Y`` for confidence.
-    """
+    """Write the maps of `write_npy` as 32-bit OpenEXR, channel Z for depth, Y for confidence."""
     library = needed("OpenEXR", "exr", "EXR files")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
 
@@ -64,13 +57,11 @@ def _write_maps(
 def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write a KITTI depth completion tree (`densify.outputs.kitti_tree`).
 
-    Maps are ``SPLIT/DRIVE/proj_depth/KIND/CAMERA/0000000120.png``. Beside proj_depth are the image
-    ``CAMERA/data/0000000120.png`` and K, row by row, in ``intrinsics/CAMERA/0000000120.txt``.
-
-    KIND is groundtruth (measured), groundtruth_filled, confidence, and velodyne_raw (single sweep)
-    if the run has it. Recordings unknown to the benchmark are in train. files.txt has a line for
-    each map with an image: paths of image, measured and filled depth. annotations.json has the same
-    paths with ``cam_in`` (fx fy cx cy) and ``depth_scale``, for Metric3D.
+    Maps are ``SPLIT/DRIVE/proj_depth/KIND/CAMERA/0000000120.png``, KIND as in that module. Beside
+    proj_depth are ``CAMERA/data/0000000120.png`` and K in ``intrinsics/CAMERA/0000000120.txt``.
+    Recordings unknown to the benchmark are in train. files.txt has a line for each map: paths of
+    image, measured and filled depth. annotations.json adds ``cam_in`` (fx fy cx cy) and
+    ``depth_scale``, for Metric3D.
     """
     files: list[dict[str, Any]] = []
     for run in runs:
@@ -131,10 +122,7 @@ def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 
 def write_pcd(run: FinishedRun, folder: Path) -> None:
-    """Write ``cloud.pcd``, binary PCD 0.7 of the Point Cloud Library, with the same columns.
-
-    The colour is the column ``rgb``, three bytes packed into a float.
-    """
+    """Write ``cloud.pcd``, binary PCD 0.7 with the same columns, colour as one float ``rgb``."""
     from pypcd4 import Encoding, PointCloud
 
     columns = run.cloud().columns()

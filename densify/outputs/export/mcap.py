@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Write one key sweep or a drive as MCAP in Foxglove's schemas (extra ``mcap``).
+"""Write one key sweep or a drive as MCAP in Foxglove's schemas, for Foxglove and Lichtblick.
 
-Foxglove and Lichtblick show the file. Topics, with "key" for the key sweep's lidar frame::
+Topics, with "key" for the key sweep's lidar frame::
 
     /tf                FrameTransform: world -> key, key -> vehicle and each camera
     /cloud, /sweep     PointCloud: accumulated cloud at the key sweep's time; sweeps as measured
     /movers            SceneUpdate: boxes of moving objects, by time
-    /CAMERA/image, /CAMERA/calibration, /CAMERA/depth, /CAMERA/depth_filled
-                       CompressedImage, CameraCalibration, RawImage (32FC1, metres)
+    /CAMERA/image, /CAMERA/calibration, /CAMERA/depth, /CAMERA/depth_filled (32FC1, metres)
 """
 
 from __future__ import annotations

@@ -11,10 +11,7 @@ from densify.outputs.export.finished_run import FinishedRun, colours, timelines
 
 
 def show(runs: Sequence[FinishedRun]) -> None:
-    """Show static and moving points and the boxes of objects, with a time line over several runs.
-
-    The call returns when the user closes the window.
-    """
+    """Show points and boxes, with a time line of several runs, until the window is closed."""
     o3d, shown = needed("open3d", "open3d", "Windows with the cloud"), []
     for at, line in enumerate(timelines(runs)):
         cloud, key = line.cloud, line.run.key

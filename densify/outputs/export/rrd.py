@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Write one key sweep or a drive for rerun's viewer (https://rerun.io, extra ``rerun``).
+"""Write one key sweep or a drive for rerun's viewer (https://rerun.io).
 
-Time lines are ``time`` (the recording's clock as UNIX time) and ``frame``. Entities in
-``world/key``, the key sweep's lidar frame::
+Time lines: ``time`` (UNIX, the recording's clock), ``frame``. In ``world/key``, its lidar frame::
 
     cloud/static, cloud/moving, sweep, vehicle    the cloud, each sweep as measured, lidar poses
     movers/box, movers/path     moving objects; labels give object number and speed

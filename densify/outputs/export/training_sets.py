@@ -25,8 +25,7 @@ _LOG_STEPS = 65533  # MoGe divides by this number
 def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write a scene that map-anything reads (format: its data_processing/README.md).
 
-    scene_meta.json has camera-to-world poses with OpenCV's axes. Images are in ``images/``.
-    Measured depth is in ``depth/NAME.exr`` in metres, 0 for no depth.
+    Poses are camera to world. ``depth/NAME.exr`` is measured depth in metres, 0 for no depth.
     """
     library = needed("OpenEXR", "exr", "EXR files")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
@@ -69,9 +68,8 @@ def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
 def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write a training set that MoGe reads (format: its docs/train.md and moge/utils/io.py).
 
-    .index.txt lists the folders of the images. A folder has image.jpg, depth.png and meta.json (K
-    scaled to an image of width and height 1). depth.png has 16 bits: measured depth on a
-    logarithmic scale from ``near`` to ``far``, 0 for no depth.
+    .index.txt lists the folders with image.jpg, meta.json (K for width and height 1) and depth.png:
+    16 bits, measured depth on a logarithmic scale from ``near`` to ``far``, 0 for no depth.
     """
     names = []
     for run in runs:

@@ -68,10 +68,7 @@ class KeyFiles:
         return KeyFiles(folder / "compare", about, methods)
 
     def read(self, read: Callable[[Path], T], name: str, optional: bool = False) -> T | None:
-        """Return a file's content by a function of its path; note it in ``missing`` if damaged.
-
-        An ``optional`` file that does not exist is not noted.
-        """
+        """Return a file's content by a function of its path; note it in ``missing`` if damaged."""
         path = self.maps / name
         if optional and not path.is_file():
             return None
@@ -82,11 +79,7 @@ class KeyFiles:
             return None
 
     def camera(self, name: str) -> dict[str, NDArray[Any]]:
-        """Return kind -> (H,W) stored values, for the map called CAMERA or CAMERA/NUMBER.
-
-        The kinds are the maps of the run and of its scene. The measured depth of a baseline has the
-        name of its method as kind.
-        """
+        """Return kind or name of a baseline -> (H,W) stored values of a map and its scene."""
         maps: dict[str, NDArray[Any]] = {}
         of_methods = {f"scene/{method}": np.uint16 for method in self.methods}
         for place, bits in {**_MAPS, **of_methods}.items():
@@ -110,7 +103,6 @@ class KeyFiles:
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:
-    """Return the value if it is a mapping, else an empty mapping."""
     return value if isinstance(value, dict) else {}
 
 
@@ -122,10 +114,7 @@ def write_report(result: Result, context: Context, folder: Path) -> None:
 
 
 def key_page(files: KeyFiles, folder: str) -> bytes:
-    """Return the bytes of the HTML page; a cloud with too many points is thinned out.
-
-    ``folder`` is the run's, as the user names it. It is "" for a comparison.
-    """
+    """Return the HTML page. ``folder`` is the run's, as the user names it, "" for a comparison."""
     scene = files.read(read_scene, "scene/scene.json", optional=True)
     views, sweeps = (scene.table["views"], scene.table["sweeps"]) if scene else ({}, [])
     focal_px = {name: view.camera.focal_px for name, view in (scene.views if scene else {}).items()}

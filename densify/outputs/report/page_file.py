@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write one HTML file with data, script and style. It opens from disk and loads no other file.
-
-The page uses WebGL2 and the browser's own inflate, because a copy of three.js would add 700 kB.
-Content of other files is JSON, which the script inserts as text. The page's content security policy
-allows no request and only its one script, by hash.
-"""
+"""Write one HTML file with data, script and style. It opens from disk and loads no other file."""
 
 from __future__ import annotations
 
@@ -45,24 +40,18 @@ _GRAY = 50, 190  # gray of reflectance 0 and 1, for points without colour
 _NEAR_M, _MOVING_WEIGHT = 4.0, 100.0
 
 
+# The page uses WebGL2 and the browser's own inflate: a copy of three.js would add 700 kB.
 class Blobs:
-    """Collect the packed arrays of a page: bytes sorted by significance, deflated, in base64.
-
-    ``page/unpack.js`` unpacks them. 16-bit PNG would lose depth, because browsers decode PNG to 8
-    bits.
-
-    Attributes:
-        texts: Name of the blob -> base64 text.
-    """
+    """Collect the packed arrays of a page, which ``page/unpack.js`` unpacks."""
 
     def __init__(self) -> None:
+        # Name -> bytes sorted by significance, deflated, base64; 16-bit PNG would come as 8 bits.
         self.texts: dict[str, str] = {}
 
     def add(self, array: NDArray[Any]) -> dict[str, Any]:
         """Pack integers (N,) or (H,W), 0 to 2^32, and return how the page unpacks them.
 
-        The values are packed in 8, 16 or 32 bits. They are stored directly or as differences along
-        the last axis, whichever is smaller.
+        They are stored directly or as differences along the last axis, whichever is smaller.
         """
         array = array.astype(np.min_scalar_type(int(array.max(initial=0))))
         steps = np.diff(array, axis=-1, prepend=array.dtype.type(0))
@@ -99,8 +88,8 @@ def packed_camera(
 ) -> dict[str, Any]:
     """Pack the maps of `KeyFiles.camera` into ``blobs`` and return the camera's entry in the page.
 
-    Source sweep, age and the flag "measured" share one map of indices into ``sources``. A row of
-    ``sources`` is [index of the sweep + 1, age in ms + 1, measured 0 or 1], 0 where unknown.
+    The map ``source`` has indices into ``sources``, whose rows are [index of the sweep + 1, age in
+    ms + 1, measured 0 or 1], 0 where unknown.
     """
     nothing = np.zeros_like(next(iter(maps.values())), np.uint16)
     depth, filled, sweep, age = (
@@ -128,10 +117,10 @@ def packed_cloud(
 ) -> dict[str, Any]:
     """Pack a thinned cloud into ``blobs`` and return its entry in the page, moving points first.
 
-    Positions are 16-bit integers: ``low_m`` + ``step_m`` times the integer. ``sweep`` has indices
-    in ``frames``. ``mover`` is 0 for static points, 1 for moving points without a track, 2 and up
-    for tracked objects, by ``instances``. ``displaced`` is 32768 plus the displacement beyond rigid
-    alignment in steps of ``displaced_step_m``, for moving points only.
+    Positions are ``low_m`` + ``step_m`` times 16-bit integers. ``sweep`` has indices in ``frames``.
+    ``mover`` is 0 for static points, 1 for moving points without a track, 2 and up for tracked
+    objects, by ``instances``. ``displaced``, for moving points only, is 32768 plus the displacement
+    beyond rigid alignment in steps of ``displaced_step_m``.
     """
     rows = thinned(cloud.points, cloud.moving, _MOST_POINTS)
     chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])
@@ -162,8 +151,7 @@ def packed_cloud(
 def thinned(points: Float, moving: Bool, most: int) -> Int:
     """Return (K,) ascending indices of at most ``most`` points, drawn with a fixed random seed.
 
-    The probability grows with squared distance from the origin of ``points`` (N,3), so the result
-    is about equally dense in angle. Points of the mask ``moving`` get a larger weight.
+    The probability grows with squared distance from the origin, for equal density in angle.
     """
     if len(points) <= most:
         return np.arange(len(points))

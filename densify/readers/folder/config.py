@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read ``densify.yaml`` beside a recording that no other reader recognises.
-
-The file states what the recording's own files leave open. Every YAML key is optional;
-`densify.readers.folder.reader` describes the defaults. An error names file, line and key.
-"""
+"""Read ``densify.yaml``: optional keys for what the files of a plain folder leave open."""
 
 from __future__ import annotations
 
@@ -167,10 +163,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class CameraFiles:
-    """One camera of the section ``cameras``.
-
-    `Camera` describes model, distortion, max_angle_deg and row_time_s.
-    """
+    """One camera of the section ``cameras``; `Camera` describes the fields without a comment."""
 
     size: tuple[int, int]  # width and height of the images in pixels
     K: Float  # (3,3) intrinsics in pixels

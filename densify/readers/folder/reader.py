@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Read any folder of sweeps: numbered files of points, with stamps, poses and images beside them.
+"""Read any folder of numbered point files, with stamps, poses and images beside them.
 
-A small ``densify.yaml`` states what the files leave open, see `densify.readers.folder.config`.
+``densify.yaml`` (`densify.readers.folder.config`) states what the files leave open.
 
 points: in the lidar's frame, not deskewed. With ``compensated`` they are ego-motion compensated to
     the stamp. The reader undoes this if points have times and poses have stamps. Otherwise it
     discards the times.
-numbers and stamps: as the file names state. If the names are times
-    (``1317042651.468569638.pcd``), files are numbered from 0 in the order of time. Stamps come from
-    names, a file such as ``timestamps.txt``, or the rate. The stamp is the reference time. Times
-    of points count from the stamp, or are absolute on its clock. Their unit is the unit in which a
-    sweep takes about a period.
+numbers: of file names; files named by times (``1317042651.468569638.pcd``) are numbered from 0.
+stamps: reference times, from names, a file such as ``timestamps.txt``, or the rate. Times of points
+    count from the stamp, or are absolute; their unit is that in which a sweep takes a period.
 poses: KITTI's 3x4, 4x4, TUM, tables with quaternions, or VIEWPOINT of PCD files. Poses with stamps
     are interpolated. Poses without stamps belong to the sweeps in order, or to the numbers from 0.
 images: need a calibration; stamped by names, a file, or the sweeps of the same numbers.
@@ -100,11 +98,7 @@ class SweepColumns:
         )
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep.
-
-        The time is the sweep's stamp. Without stamps it is computed from absolute times of the
-        points, or else from the frame number and the rate.
-        """
+        """Return a sweep's stamp; without stamps, a time from absolute point times or the rate."""
         if self.series.stamps_ns is not None:
             return self.series.stamps_ns[frame]
         if self._own_clock is None:
@@ -194,7 +188,6 @@ class Folder(FileSequence):
     """A folder of sweeps as a `LidarSequence`; `findings` states what the reader detected."""
 
     def __init__(self, path: Path | str) -> None:
-        """Read file names, densify.yaml, stamps and poses; the rest is read on request."""
         folder = Path(path)
         self._config = FolderConfig.read(folder)
         known, cameras = self._config.sweeps, self._config.cameras

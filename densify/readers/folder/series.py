@@ -92,16 +92,11 @@ def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path
 def in_time(
     root: Path, paths: Sequence[Path], stamps: str, unit: str, shared: bool = True
 ) -> Series:
-    """Order files by time and find their stamps.
+    """Order files by time and find their stamps; files whose names are times are numbered from 0.
 
-    Files whose names are times are numbered from 0, other files as their names state.
-
-    Args:
-        root: Folder of the recording.
-        stamps: ``names`` if file names are stamps; ``sweeps`` for files without stamps; a stamp
-            file below the root or beside the files; "" to search for a stamp file.
-        unit: Unit of the stamps, "" to detect it.
-        shared: True to search a stamp file in the root too.
+    ``stamps`` is ``names`` if file names are stamps, ``sweeps`` for files without stamps, a stamp
+    file below ``root`` (the recording) or beside the files, or "" to search for one, with
+    ``shared`` in ``root`` too. ``unit`` is the unit of the stamps, "" to detect it.
     """
     by_names = stamps == "names"
     names = [named(path, unit if by_names else "") for path in paths]

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read what KITTI's data sets share: sweeps of the HDL-64E, images, stamps, calibration and poses.
-
-Poses are measured by a GPS/IMU unit (oxts).
-"""
+"""Read what KITTI's data sets share: HDL-64E sweeps, images, stamps, calibration, GPS/IMU poses."""
 
 from __future__ import annotations
 
@@ -30,12 +27,9 @@ _STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
 
 
 class Drive(FileSequence):
-    """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped when it faces forward.
+    """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped when it faces forward."""
 
-    A subclass may set ``revolution_ns``, the duration of one revolution.
-    """
-
-    revolution_ns: int = NOMINAL_PERIOD_NS
+    revolution_ns: int = NOMINAL_PERIOD_NS  # a subclass may set it
 
     def __init__(
         self, name: str, where: Path, sweeps: Path, truth: Path, images: Mapping[str, Path]
@@ -60,10 +54,7 @@ class Drive(FileSequence):
 
 
 def read_points(path: Path) -> tuple[Float, np.ndarray]:
-    """Read the (N,3) points (m, lidar frame) and (N,) reflectances (0 to 1) of a .bin file.
-
-    Points with a position that is not finite are returned as 0 0 0.
-    """
+    """Read (N,3) points (m, lidar frame, 0 0 0 if not finite) and (N,) reflectances (0 to 1)."""
     data = read_bytes(path)
     if len(data) % 16:
         raise InputError(
@@ -76,19 +67,14 @@ def read_points(path: Path) -> tuple[Float, np.ndarray]:
 
 
 def turned_ns(points: Float, revolution_ns: int) -> Int:
-    """Return (N,) int64 firing times since the scanner faced forward, -azimuth / 2π revolutions.
-
-    ``points`` (N,3) are in the lidar frame, not deskewed. In the first half times are negative.
-    """
+    """Return (N,) int64 firing times of points, not deskewed, since the scanner faced forward."""
+    # -0.5 to 0.5: firing times of the first half are negative
     revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     return np.rint(revolution * revolution_ns).astype(np.int64)
 
 
 def read_stamps(path: Path) -> dict[int, int]:
-    """Return the stamps (ns since 1970) of a timestamps file, by frame number.
-
-    Line k, counted from 0, belongs to frame k. Lines that are no stamps are skipped.
-    """
+    """Return stamps (ns since 1970) by frame, the line's number from 0; other lines are skipped."""
     lines = [line.strip() for line in read_text(path).splitlines()]
     stamps_ns = {}
     for frame, line in enumerate(lines):
@@ -124,11 +110,8 @@ def parse_oxts(text: str, where: str) -> Float:
 
 
 def T_mercator_imu(oxts: Float, first: Float) -> Float:
-    """Return the (4,4) pose of the GPS/IMU unit on the Mercator plane (x east, y north, z up).
-
-    As convertOxtsToPose of KITTI's devkit. ``oxts`` and ``first``, the drive's first, are (30,)
-    records; the first one's latitude determines the scale.
-    """
+    """Return the (4,4) pose of the GPS/IMU unit on the Mercator plane (x east, y north, z up)."""
+    # As convertOxtsToPose of KITTI's devkit: the drive's first record determines the scale.
     lat_deg, lon_deg, alt_m, roll, pitch, yaw = oxts[:6]
     scale_m = _EARTH_RADIUS_M * np.cos(np.deg2rad(first[0]))
     T = np.eye(4)
@@ -141,10 +124,7 @@ def T_mercator_imu(oxts: Float, first: Float) -> Float:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibration file of lines ``KEY: numbers``, with or without the colon.
-
-    A missing or malformed entry raises InputError, with file and key, when it is requested.
-    """
+    """A file of lines ``KEY: numbers``, colon optional; bad entries raise InputError on request."""
 
     path: Path
     entries: Mapping[str, str]

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read KITTI-360 (Liao, Xie, Geiger, PAMI 2022) as downloaded.
-
-Its drives are scenes::
+"""Read KITTI-360 (Liao, Xie, Geiger, PAMI 2022) as downloaded; its drives are scenes.
 
     data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/{data/0000000000.bin, timestamps.txt}
     data_2d_raw/2013_05_28_drive_0000_sync/image_00/{data_rect/0000000000.png, timestamps.txt}
@@ -11,9 +9,8 @@ Its drives are scenes::
 
 - Frame numbers are file numbers; some are missing. Line ``frame`` (from 0) of a timestamp file is
   the stamp of ``frame``, the middle of the revolution.
-- Points of the HDL-64E are not deskewed. Their firing times follow from the azimuth and the median
-  period.
-- image_00 and image_01 are rectified. image_02 and image_03 are fisheyes to the sides (Mei's
+- Points of the HDL-64E are not deskewed; azimuth and median period give the firing times.
+- image_00 and image_01 are rectified; image_02 and image_03 are fisheyes to the sides (Mei's
   model), used up to 90 degrees off the axis.
 - Poses are the GPS/IMU unit's and are interpolated, since frames at standstill have no pose.
 """
@@ -52,7 +49,6 @@ class Kitti360(Drive):
     """A KITTI-360 drive as a `LidarSequence`."""
 
     def __init__(self, path: Path, drive: str) -> None:
-        """Read stamps and calibration of a drive, in the folder that contains data_3d_raw/."""
         velodyne = path / "data_3d_raw" / drive / "velodyne_points"
         around = path / "data_2d_raw" / drive
         images = {name: around / name / folder for name, folder in _FOLDERS.items()}

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Read KITTI odometry (Geiger, Lenz, Urtasun, CVPR 2012) and SemanticKITTI.
-
-SemanticKITTI (Behley et al., ICCV 2019) has the same sequences::
+"""Read KITTI odometry (Geiger et al., CVPR 2012) and SemanticKITTI (Behley et al., ICCV 2019).
 
     dataset/sequences/00/velodyne/000000.bin   image_2/000000.png   calib.txt   times.txt
     dataset/poses/00.txt   or SemanticKITTI's  dataset/sequences/00/poses.txt
 
 - Frame numbers are file numbers. ``times.txt`` has seconds since the first frame, at which camera
   and scanner faced forward. Without this file frame k is at k times 100 ms.
-- Points of the HDL-64E are ego-motion compensated to that time and have no firing times. The reader
-  undoes the compensation with the poses, by fixed-point iteration: the firing time of a point
-  depends on its azimuth at firing, and vice versa. Without poses ``offset_ns`` is None.
+- Points of the HDL-64E are ego-motion compensated to that time, without firing times. The poses
+  undo this by fixed-point iteration: firing time and azimuth at firing depend on each other.
+  Without poses ``offset_ns`` is None.
 - Images are rectified and have the size of the first image. ``calib.txt`` has their projections and
   ``Tr``, T_cam_lidar of camera 0. A pose P is T_first_now of camera 0; the scanner's is Tr⁻¹ P Tr.
 """
@@ -58,7 +56,6 @@ class KittiOdometry(Drive):
     """A KITTI odometry sequence as a `LidarSequence`."""
 
     def __init__(self, path: Path) -> None:
-        """Read the stamps and the calibration in the folder of a sequence."""
         images = {p.name: p for p in sorted(path.glob("image_[0-3]"))}
         super().__init__(path.resolve().name, path, path / "velodyne", path, images)
         self._times = path / "times.txt"

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Read KITTI raw drives as downloaded: a folder, with the calibration files in its parent.
+"""Read KITTI raw drives (Geiger et al., IJRR 2013): a folder, with the calibration in its parent.
 
-Geiger, Lenz, Stiller, Urtasun, "Vision meets Robotics: The KITTI Dataset", IJRR 2013. Frame numbers
-are file numbers, and files may be missing. Line ``frame`` (from 0) of a timestamp file is the stamp
-of ``frame``.
+Frame numbers are file numbers and lines, from 0, of timestamp files; files may be missing.
 """
 
 from __future__ import annotations
@@ -42,17 +40,15 @@ def open_recording(path: Path, scene: str | None) -> KittiRaw:
 
 
 class KittiRaw(Drive):
-    """A KITTI raw drive as a `LidarSequence`.
+    """A KITTI raw drive as a `LidarSequence`, stamped at the middle of the revolution.
 
-    The stamp of a sweep is the middle of the revolution (``velodyne_points/timestamps.txt``, or
-    from its start and end, or k times 100 ms). The firing time of a point follows from its azimuth,
-    ``timestamps_start.txt`` and ``timestamps_end.txt``; if one of them is missing, ``offset_ns`` is
-    None. Poses come from ``oxts/``. The world is the frame of the GPS/IMU unit at the first oxts
-    file.
+    Without ``velodyne_points/timestamps.txt`` a stamp is the mean of start and end, or k times 100
+    ms. The firing time of a point follows from its azimuth, ``timestamps_start.txt`` and
+    ``timestamps_end.txt``; if one of them is missing, ``offset_ns`` is None. Poses come from
+    ``oxts/``. The world is the frame of the GPS/IMU unit at the first oxts file.
     """
 
     def __init__(self, path: Path | str) -> None:
-        """Read calibration and stamps of a drive's folder; everything else is read on request."""
         drive = Path(path)
         velodyne = drive / "velodyne_points"
         cameras = _read_cameras(drive)

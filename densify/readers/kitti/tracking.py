@@ -1,17 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Read KITTI tracking (Geiger, Lenz, Urtasun, CVPR 2012).
-
-The path is the folder ``training`` or ``testing``, whose sequences are scenes::
+"""Read KITTI tracking (Geiger et al., CVPR 2012), in ``training`` or ``testing``, by scene.
 
     velodyne/0000/000000.bin   image_02/0000/000000.png   calib/0000.txt   oxts/0000.txt
     label_02/0000.txt    optional: tracked boxes, a line for each object and frame
 
 - Frame numbers are file numbers; sweeps can be missing. Sweep and images k are at k times 100 ms.
-- Points of the HDL-64E are not deskewed. Their firing times follow from the azimuth and a
-  revolution of 100 ms.
-- Images are rectified and have the size of the first image. ``calib`` has their projections,
-  R_rect, Tr_velo_cam and Tr_imu_velo. Poses come from oxts; the world is the frame of the GPS/IMU
-  unit at frame 0.
+- Points of the HDL-64E are not deskewed; azimuth and a 100 ms revolution give the firing times.
+- Images are rectified, with the size of the first image. ``calib`` has projections, R_rect,
+  Tr_velo_cam and Tr_imu_velo. The world is the frame of the GPS/IMU unit (oxts) at frame 0.
 - A label line is ``frame track type truncated occluded alpha left top right bottom height width
   length x y z rotation_y [score]``. x y z is the middle of the box's bottom in rectified camera 0,
   at the time at which the scanner faced the object. rotation_y is the heading about y, 0 along x.
@@ -53,13 +49,9 @@ def open_recording(path: Path, scene: str | None) -> KittiTracking:
 
 
 class KittiTracking(Drive):
-    """A KITTI tracking sequence as a `LidarSequence`, with sweeps 100 ms apart.
-
-    The stamp of a sweep is the time at which the scanner faced forward.
-    """
+    """A KITTI tracking sequence; a sweep is stamped as the scanner faces forward, every 100 ms."""
 
     def __init__(self, path: Path, scene: str) -> None:
-        """Read the calibration of a sequence, in the folder ``path`` that contains velodyne/."""
         images = {folder.name: folder / scene for folder in sorted(path.glob("image_0[0-3]"))}
         name = f"{path.resolve().name}/{scene}"
         super().__init__(name, path, path / "velodyne" / scene, path, images)
@@ -129,10 +121,7 @@ class KittiTracking(Drive):
 
 
 def read_labels(path: Path) -> tuple[Float, Bool]:
-    """Return the (n,16) numbers of a label file's lines, and an (n,) mask of ``DontCare`` lines.
-
-    Numbers are without type and score. Objects in ``DontCare`` rectangles have no boxes.
-    """
+    """Return the (n,16) numbers of label lines, no type and score, and an (n,) DontCare mask."""
     rows, is_area = [], []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
