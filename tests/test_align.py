@@ -35,7 +35,7 @@ def slow_align(model: Model, points, predicted) -> np.ndarray | None:
     tree = cKDTree(model.points)
     _, near = tree.query(model.points, min(12, len(model.points)))
     information = slow_information(model.points, near.reshape(len(model.points), -1))
-    state = predicted.copy()
+    state, points = predicted.copy(), points[:: max(1, len(points) // 250)]
     for gate_m in GATES_M:
         at_model = undo(state, points, CENTRE)
         distance, row = tree.query(at_model, distance_upper_bound=gate_m)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from densify.geometry.compiled import Kernel
-from densify.geometry.nearest import nearest, nearest_k, tree_of
+from densify.geometry.compiled import Kernel, inlined
+from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, for each step
@@ -19,7 +19,7 @@ NUM_NEAR = 12  # neighbours that span a surface
 MIN_FIT = 5  # least number of matches
 _SURFACE_M = 0.05  # noise of a surface point
 _RIDGE = 0.02  # share of the mean variance that is added, for points on a line
-_MAX_MODEL_POINTS = 1500
+_MAX_MODEL_POINTS, _NUM_ALIGNED = 1000, 250  # neighbours on a surface have the same error
 _LOOSE = 10.0  # factor of the covariance: surface points must not stop a slide along the surface
 
 
@@ -62,22 +62,22 @@ class Model:
     """Accumulated surface of an object, to which new points are aligned."""
 
     def __init__(self, points: Float) -> None:
-        self.points = np.zeros((0, 3))  # (M,3) object's frame, about 1500 at most
+        self.points = np.zeros((0, 3))  # (M,3) object's frame, about 1000 at most, ascending in x
         self.add(points)
 
     def add(self, points: Float) -> None:
         """Add (N,3) points in the object's frame, thinning all points if there are too many."""
         points = np.concatenate([self.points, points])
-        if len(points) > _MAX_MODEL_POINTS:
-            points = points[:: len(points) // _MAX_MODEL_POINTS + 1]
-        self.points, self._tree = points, tree_of(points)
-        _, near = nearest_k(self._tree, points, NUM_NEAR)
-        self.information = surface_information(points, near, _LOOSE)
+        points = points[np.argsort(points[:, 0], kind="stable")]
+        self.points = points[:: len(points) // _MAX_MODEL_POINTS + 1]
+        _, near = nearest_k(tree_of(self.points), self.points, NUM_NEAR)
+        self.information = surface_information(self.points, near, _LOOSE)
 
     def covers(self, points: Float, within_m: float) -> Bool:
         """Return (N,) True for (N,3) points (object's frame) within ``within_m`` of the model."""
-        distance_m, _ = nearest(self._tree, points, within_m)
-        return np.isfinite(distance_m)
+        near = np.empty(len(points), np.bool_)
+        _are_near(points, self.points, within_m, near)
+        return near
 
     def align(
         self, points: Float, centre: Float, predicted: Float, prediction_std: Float
@@ -85,7 +85,7 @@ class Model:
         """Return the state (4,) that fits the model to the points, None for too few matches.
 
         Displacement x, y and yaw are solved with Tukey weights. The height z stays as predicted: on
-        an object hit by few beams it would follow the beams.
+        an object hit by few beams it would follow the beams. Of many points some 250 are used.
 
         Args:
             points: (N,3) world, metres, all at one time.
@@ -93,47 +93,87 @@ class Model:
             predicted: (4,) state to start from.
             prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
         """
+        points = points[:: max(1, len(points) // _NUM_ALIGNED)]
         state, prior = predicted.copy(), prediction_std**-2
         for gate_m in GATES_M:
-            at_model = undo(state, points, centre)
-            distance_m, row = nearest(self._tree, at_model, gate_m)
-            num = np.count_nonzero(row >= 0)
+            H, g = np.zeros((3, 3)), np.zeros(3)
+            num = _add_matches(points, state, centre, self.points, self.information, gate_m, H, g)
             if num < MIN_FIT:
                 return None
-            most, yaw = min(1.0, MAX_WEIGHT / num), float(state[3])
-            H, g = np.diag(prior), prior * (predicted - state)[[0, 1, 3]]
-            off, share = at_model - self.points[row], distance_m / gate_m
-            _add_matches(at_model - centre, off, row, share, self.information, yaw, most, H, g)
+            weight = min(1.0, MAX_WEIGHT / num)
+            H = weight * H + np.diag(prior)
+            g = weight * g + prior * (predicted - state)[[0, 1, 3]]
             state[[0, 1, 3]] += np.linalg.solve(H, g)
         return state
 
 
+@inlined
+def _nearest(point: Float, surface: Float, within_m: float) -> tuple[int, float]:
+    """Return the row of the nearest surface point (-1 for none nearer), and its square distance.
+
+    ``surface`` (M,3) ascends in x, so only rows whose x is near enough are compared.
+    """
+    row, square = -1, within_m**2
+    middle = np.searchsorted(surface[:, 0], point[0])
+    for step in (1, -1):
+        i = middle if step > 0 else middle - 1
+        while 0 <= i < len(surface):
+            along = (surface[i, 0] - point[0]) ** 2
+            if along >= square:
+                break
+            apart = along + (surface[i, 1] - point[1]) ** 2 + (surface[i, 2] - point[2]) ** 2
+            if apart < square:
+                row, square = i, apart
+            i += step
+    return row, square
+
+
+@Kernel
+def _are_near(points: Float, surface: Float, within_m: float, near: Bool) -> None:
+    """Write to ``near`` (N,) whether a surface point is within ``within_m`` of each point."""
+    for i in range(len(points)):
+        near[i] = _nearest(points[i], surface, within_m)[0] >= 0
+
+
 @Kernel
 def _add_matches(
-    arms: Float,  # (N,3) from the centre to the points, object's frame
-    off: Float,  # (N,3) from the matched model points to the points
-    row: Int,  # (N,) matched model points, -1 for none
-    share: Float,  # (N,) distance to the match as a share of the greatest distance
-    information: Float,  # (M,3,3) of the model points
-    yaw: float,
-    most: float,  # greatest weight of a match
+    points: Float,  # (N,3) world
+    state: Float,
+    centre: Float,
+    surface: Float,  # (M,3) object's frame, ascending in x
+    information: Float,  # (M,3,3) of the surface
+    gate_m: float,  # greatest distance of a match
     H: Float,
     g: Float,
-) -> None:
-    """Add the normal equations of x, y and yaw to H (3,3) and g (3,), in place."""
+) -> int:
+    """Add the normal equations of x, y and yaw to H (3,3) and g (3,); return how many match."""
     J, JA = np.empty((2, 3, 3))  # J: derivative of the model's point by x, y and yaw
     J[:] = 0.0
-    J[0, 0] = J[1, 1] = np.cos(yaw)
-    J[0, 1] = np.sin(yaw)
+    J[0, 0] = J[1, 1] = np.cos(state[3])
+    J[0, 1] = np.sin(state[3])
     J[1, 0] = -J[0, 1]
-    for i in range(len(row)):
-        if row[i] < 0:
+    at_model, arm, off = np.empty((3, 3))
+    num = 0
+    for i in range(len(points)):
+        for a in range(3):
+            off[a] = points[i, a] - centre[a] - state[a]
+        arm[0] = J[0, 0] * off[0] + J[0, 1] * off[1]
+        arm[1] = J[1, 0] * off[0] + J[1, 1] * off[1]
+        arm[2] = off[2]
+        for a in range(3):
+            at_model[a] = arm[a] + centre[a]
+        row, square = _nearest(at_model, surface, gate_m)
+        if row < 0:
             continue
-        A, weight = information[row[i]], most * (1 - share[i] ** 2) ** 2
-        J[0, 2], J[1, 2] = -arms[i, 1], arms[i, 0]
+        num += 1
+        A, weight = information[row], (1 - square / gate_m**2) ** 2
+        J[0, 2], J[1, 2] = -arm[1], arm[0]
+        for a in range(3):
+            off[a] = at_model[a] - surface[row, a]
         for a in range(3):
             for b in range(3):
                 JA[a, b] = weight * (J[0, a] * A[0, b] + J[1, a] * A[1, b])
-            g[a] += JA[a, 0] * off[i, 0] + JA[a, 1] * off[i, 1] + JA[a, 2] * off[i, 2]
+            g[a] += JA[a, 0] * off[0] + JA[a, 1] * off[1] + JA[a, 2] * off[2]
             for b in range(3):
                 H[a, b] += JA[a, 0] * J[0, b] + JA[a, 1] * J[1, b]
+    return num

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.geometry.types import Int, Sweep
+from densify.geometry.types import Float, Int, Sweep
 
 _CELL_RAD, _OF_POINTS = np.deg2rad(2.0), 120_000  # some 50 rays of a sweep of so many points
 _CELL_DEPTH = 0.08  # of the range
@@ -24,18 +24,22 @@ def without_lone(sweep: Sweep) -> Sweep:
     """Remove lone returns, counting ``num_lone``, if their number suggests snow, rain or dust."""
     if len(sweep) < _LEAST:
         return sweep
-    num = count_around(sweep)
+    place, many = _places(sweep), _MANY * len(sweep)
+    num = _count_in_cells(place)
+    if np.count_nonzero(num == 1) <= many:
+        return sweep
+    # The larger count of two grids, half a cell apart: a surface may lie on a cell border.
+    num = np.maximum(num, _count_in_cells(place + [[0.0], [0.5], [0.5], [0.5]]))
     lone = num <= _FEW
     is_noise = 2 * np.count_nonzero(lone) > len(sweep)
-    if np.count_nonzero(num == 1) <= _MANY * len(sweep) or is_noise:
+    if np.count_nonzero(num == 1) <= many or is_noise:
         return sweep
     return replace(sweep.select(~lone), num_lone=int(lone.sum()))
 
 
-def count_around(sweep: Sweep) -> Int:
-    """Return the (N,) number of returns around each return, itself included."""
-    # The larger count of two grids, half a cell apart: a surface may lie on a cell border.
-    around = np.zeros(len(sweep), np.int64)
+def _places(sweep: Sweep) -> Float:
+    """Return the (4,N) scanner, azimuth, elevation and log range of the returns, in cells."""
+    place = np.empty((4, len(sweep)))
     for lidar in np.unique(sweep.lidar).tolist():
         mine = sweep.lidar == lidar
         x, y, z = (sweep.points[mine] - sweep.origin_m(lidar)).T
@@ -43,12 +47,15 @@ def count_around(sweep: Sweep) -> Int:
         cell_rad = _CELL_RAD * np.sqrt(_OF_POINTS / len(range_m))
         elevation_rad = np.arcsin(np.clip(z / np.maximum(range_m, 1e-9), -1, 1))
         depth = np.log(np.maximum(range_m, 1e-3)) / _CELL_DEPTH
-        place = np.stack([np.arctan2(y, x) / cell_rad, elevation_rad / cell_rad, depth])
-        num = np.zeros(len(range_m), np.int64)
-        for shift in (0.0, 0.5):
-            cell = np.floor(place + shift).astype(np.int64)
-            cell -= cell.min(axis=1, keepdims=True)
-            flat = np.ravel_multi_index(tuple(cell), tuple(cell.max(axis=1) + 1))
-            num = np.maximum(num, np.bincount(flat)[flat])
-        around[mine] = num
-    return around
+        place[0, mine] = lidar
+        place[1:, mine] = np.arctan2(y, x) / cell_rad, elevation_rad / cell_rad, depth
+    return place
+
+
+def _count_in_cells(place: Float) -> Int:
+    """Return the (N,) number of returns in the cell of each place (4,N), itself included."""
+    cell = np.floor(place).astype(np.int64)
+    cell -= cell.min(axis=1, keepdims=True)
+    flat = np.ravel_multi_index(tuple(cell), tuple(cell.max(axis=1) + 1))
+    num: Int = np.bincount(flat)[flat]
+    return num

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from densify.free_space.rays import aim
-from densify.geometry.arrays import Float, Float32
+from densify.geometry.arrays import Float, Float32, Int
 from densify.geometry.types import RegisteredSweep
 
 FEW_POINTS = 200  # too few to measure anything
@@ -24,7 +24,7 @@ _MANY_POINTS = 15_000
 _SECTOR_RAD = np.deg2rad(5.0)
 
 _RING_BIN_RAD, _LINE_BIN_RAD, _CELL_RAD = np.deg2rad([0.02, 0.5, 1.0])
-_MIN_PROMINENCE = 0.5
+_VALLEY = 0.5  # greatest count between two rings, as a share of both peaks
 _MIN_RETURNS_PER_RING = 30
 _MIN_RING_SHARE = 0.8
 _NEAR_RING = 0.2  # share of the gap to the next ring
@@ -138,8 +138,7 @@ def find_rings(elevation: Float32) -> Float | None:
     of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
     returns = np.bincount(of_return, minlength=int(np.pi / _RING_BIN_RAD) + 2).astype(float)
     count = ndimage.gaussian_filter1d(returns, 1.0)
-    peaks, found = signal.find_peaks(count, prominence=0)
-    peaks = peaks[found["prominences"] >= _MIN_PROMINENCE * count[peaks]]
+    peaks = _peaks(count)
     if not 3 <= len(peaks) <= len(elevation) / _MIN_RETURNS_PER_RING:
         return None
     rings: Float = (peaks + 0.5) * _RING_BIN_RAD - 0.5 * np.pi
@@ -149,6 +148,22 @@ def find_rings(elevation: Float32) -> Float | None:
         return None
     total = np.bincount(nearest[close], elevation[close].astype(float), len(rings))
     return total / np.bincount(nearest[close], minlength=len(rings))
+
+
+def _peaks(count: Float) -> Int:
+    """Return the indices of maxima (ascending) with a valley of half their height between them."""
+    peaks, top, bottom, rises = [], 0, 0, True
+    for i, num in enumerate(count.tolist()):
+        if rises and num > count[top]:
+            top = i
+        elif rises and num < _VALLEY * count[top]:
+            peaks.append(top)
+            bottom, rises = i, False
+        elif not rises and num < count[bottom]:
+            bottom = i
+        elif not rises and _VALLEY * num > count[bottom]:
+            top, rises = i, True
+    return np.array(peaks, np.int64)
 
 
 def fires_by_azimuth(rays: Aimed) -> bool:

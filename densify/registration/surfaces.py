@@ -21,9 +21,10 @@ from densify.registration.odometry import search_twist
 
 _REACH_NS = 1_050_000_000
 _NUM_IN_REACH = 10  # sweeps of the last second; a larger number is thinned evenly
+_FRESH_NS = 250_000_000  # age of the latest sweep up to which a surface serves the next sweeps too
 _NUM_START = 3  # sweeps of the first surfaces, at their expected poses
-_NUM_POINTS = 15_000  # number of points of a sweep
 _VOXEL_M = 0.25
+_NUM_POINTS = 15_000  # number of points of a sweep
 # Neighbours must include the next rings. Points of one ring give normals of noise, which lean
 # towards the scanner and tilt the vehicle by 0.03 degrees a sweep.
 _NUM_NEIGHBORS, _NUM_NEIGHBORS_OF_FEW = 20, 50
@@ -73,6 +74,8 @@ class _SweepRow:
         self._num_neighbors, self._match_m = num_neighbors, match_m
         self._T: Float = np.tile(np.eye(4), (len(sweeps), 1, 1))
         self._points: list[Float] = []  # of the sweeps aligned so far, in the world
+        # The surface in use, its pose in the world, and the index of its latest sweep
+        self._surface: tuple[Surface, Float, int] | None = None
 
     def register(self, twist: Float, twists: Float | None = None) -> tuple[Float, list[Float]]:
         """Return poses and points of `register_on_surfaces`, from an initial velocity (6,)."""
@@ -86,7 +89,7 @@ class _SweepRow:
             before = range(i - 1, first - 1, -1) if i >= num_start else range(0)
             twist = self._place(i, i, T_guess, twist, before)
         if num > 2:
-            twist = poses.twist_to(self._T, stamp_ns, num_start + 1)
+            twist, self._surface = poses.twist_to(self._T, stamp_ns, num_start + 1), None
             for i in range(num_start - 1, -1, -1):
                 twist = twist if twists is None else twists[i + 1]
                 T_guess = self._T[i + 1] @ poses.exp(-twist * step_s[i])
@@ -100,18 +103,30 @@ class _SweepRow:
         """Align sweep i with ``others``, nearest first; return the velocity before ``step``."""
         self._T[i] = T_guess  # without others the sweep keeps its prediction
         if others:
-            chosen = others[:: max(1, round(len(others) / _NUM_IN_REACH))]
-            around = np.concatenate([self._points[j] for j in chosen])
-            around = poses.transform(poses.inverse(T_guess), around)
-            surface, T = Surface.of(around, _VOXEL_M, self._num_neighbors), np.eye(4)
+            surface, T_world_surface = self._surface_for(i, others)
+            T = poses.inverse(T_world_surface) @ T_guess
             for match_m in self._match_m:
                 source = thin(deskew_points(self._sweeps[i], twist), _VOXEL_M)
                 T_aligned, _, information = align(surface, source, T, match_m)
                 slid = information @ poses.log(poses.inverse(T) @ T_aligned)
                 motion = np.linalg.solve(information + _HELD, slid)
                 T = T @ poses.exp(np.asarray(motion, np.float64))
-                self._T[i] = T_guess @ T
+                self._T[i] = T_world_surface @ T
                 twist = poses.twist_to(self._T, self.stamp_ns, step)
         points = poses.transform(self._T[i], deskew_points(self._sweeps[i], twist))
         self._points[i : i + 1] = [points]
         return twist
+
+    def _surface_for(self, i: int, others: range) -> tuple[Surface, Float]:
+        """Return a surface to align sweep i with, and its pose in the world (4,4)."""
+        if self._surface is not None:
+            surface, T_world_surface, nearest = self._surface
+            if abs(self.stamp_ns[i] - self.stamp_ns[nearest]) < _FRESH_NS:
+                return surface, T_world_surface
+        T_world_surface = self._T[i].copy()
+        chosen = others[:: max(1, round(len(others) / _NUM_IN_REACH))]
+        around = np.concatenate([self._points[j] for j in chosen])
+        around = poses.transform(poses.inverse(T_world_surface), around)
+        surface = Surface.of(around, _VOXEL_M, self._num_neighbors)
+        self._surface = surface, T_world_surface, others[0]
+        return surface, T_world_surface

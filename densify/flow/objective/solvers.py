@@ -27,10 +27,7 @@ _LEVEL_FACTOR = 10 ** (2 / 3)  # greatest factor between the alphas of two level
 _LEAST_ALPHA = 0.1  # last level for alpha = 0
 _LEVEL_TOLERANCE = 2e-3  # a level ends when an alternation lowers the energy by less (share)
 _MAX_ALTERNATIONS, _MAX_LAST_ALTERNATIONS = 4, 100  # per level before the last, on the last
-_MAX_PRODUCTS, _RESIDUAL_DROP = (
-    20,
-    0.2,
-)  # matches are provisional, and a full solution is not needed
+_MAX_PRODUCTS, _RESIDUAL_DROP = 20, 0.2  # matches are provisional: no full solution is needed
 
 
 @dataclass(frozen=True)

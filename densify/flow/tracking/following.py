@@ -67,9 +67,12 @@ def velocities_beside(
     """
     points = batch.obstacles.points[members]
     tree, middle = tree_of(points), points.mean(0, keepdims=True)
-    for track, shape in objects:
-        at_s = track.seen_at(batch.time_ns)
-        if is_near(tree, track.place(shape.points, at_s), _BESIDE_M).any():
+    for thing in objects:
+        track, at_s = thing.track, thing.track.seen_at(batch.time_ns)
+        if (
+            thing.may_be_near(points, at_s, _BESIDE_M)
+            and is_near(tree, track.place(thing.shape.points, at_s), _BESIDE_M).any()
+        ):
             yield track.velocity_m_s(middle, at_s)[0]
 
 

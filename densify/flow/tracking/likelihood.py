@@ -218,9 +218,10 @@ def _returns_near(
     """Return the (N,3) points within ``reach_m`` of places (M,3), world, on no given object."""
     rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
     rows = rows[is_near(tree_of(places), c.points[rows], reach_m)]
-    for track, shape in objects:
-        if len(rows):
-            rows = rows[~shape.near(track.undo(c.points[rows], c.time_s[rows]), LINK_M)]
+    for thing in objects:
+        points, time_s = c.points[rows], c.time_s[rows]
+        if len(rows) and thing.may_be_near(points, time_s, LINK_M):
+            rows = rows[~thing.shape.near(thing.track.undo(points, time_s), LINK_M)]
     return c.points[rows]
 
 

@@ -211,6 +211,17 @@ class MovingObject(NamedTuple):
     track: Track
     shape: Shape
 
+    def may_be_near(self, points: Float, time_s: float | Float, within_m: float) -> bool:
+        """Return False if the box around the object and that of (N,3) world points are apart.
+
+        Points are measured at one time, or at (N,) times.
+        """
+        at_s, rim = float(np.mean(time_s)), self.shape.rim
+        way_m = float(np.ptp(time_s) * np.linalg.norm(self.track.path.rate(at_s)[:2]))
+        rim = self.track.place(rim, at_s)
+        apart_m = np.maximum(points.min(0) - rim.max(0), rim.min(0) - points.max(0))
+        return bool((apart_m <= within_m + way_m).all())
+
     def heading(self, at_s: float) -> Float:
         """Return (2,) the unit vector along the object at a time, world.
 
