@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
 from densify.depth.neighbours import DIRECTIONS, NONE, extended, first_known, offset
 from densify.geometry.arrays import Bool, Float32, Int
@@ -23,14 +24,13 @@ from densify.geometry.compiled import Kernel, inlined
 
 MOST_CONFIDENCE = 0.2
 """Greatest confidence of a boundary pixel, least confidence of any other measured pixel."""
-_LEAST_SHARE = 0.97  # share of the votes for a pixel that is kept
+LEAST_SHARE = 0.97  # share of the votes for a pixel that is kept
 _BLUR_PX = 0.6  # standard deviation; it removes noise and the pattern of the colour filter
 _LEAST_LIGHT = 70.0  # L of the lightest hundredth; a darker image is lightened
 _SUREST = 2.5  # greatest -log10 of the share of the votes against
 VOTERS_REACH = 6.0
 """Greatest distance of a voting pixel, in spacings of neighbouring rays."""
 _DECAY = 1.2  # distance at which a vote counts half, in spacings of neighbouring rays
-_SAME_M, _SAME_FRACTION = 0.2, 0.05  # tolerance within which a surface agrees with a depth
 _COLOURS = 6.0  # standard deviation of the colours of a surface, in L*a*b*
 _THROUGH = 0.001  # weight of a vote across an edge of the image
 _STRIDE = 3.0  # number of compared colours per spacing of rays, on the path to a voter
@@ -60,7 +60,7 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
         share = vote(layers, known, pixel, layers.rim_m.flat[pixel], surely=True)
     accepted = np.full(len(pixel), rims == "keep")
     if rims == "image":
-        accepted = share >= _LEAST_SHARE
+        accepted = share >= LEAST_SHARE
     depth_m, confidence = layers.depth_m.copy(), layers.confidence.copy()
     depth_m.flat[pixel[accepted]] = layers.rim_m.flat[pixel[accepted]]
     sure = np.clip(-np.log10(np.maximum(1 - share, 1e-9)) / _SUREST, 0, 1)
@@ -152,7 +152,7 @@ def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
 def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
     """Fill in the 16 votes on the pixel in row v, column u; return the numbers for and against."""
     # depth in metres, gap in px; steps: to the voter in each direction, 0 without a vote
-    same = _SAME_M + _SAME_FRACTION * depth
+    same = HIDDEN_M + HIDDEN_FRACTION * depth
     num_for, num_against = 0, 0
     for d in range(len(steps)):
         k = _steps_to(voters.steps, d, v, u)

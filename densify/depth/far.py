@@ -12,8 +12,10 @@ import numpy as np
 
 from densify.depth.accumulate import confidence_of
 from densify.depth.exposure import AT_ONCE, Exposure
+from densify.depth.image_points import HIDDEN_FRACTION
 from densify.depth.patches import tangents
 from densify.free_space.range_image import RangeImage
+from densify.free_space.seen_through import FREE_MARGIN
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.compiled import num_threads
@@ -34,9 +36,7 @@ from densify.geometry.types import (
 
 _MOST_RANGE_M = 60.0
 _MOST_SPACING_M = 0.05  # enough, as many sweeps measure a surface; larger patches hide edges
-_FREE = 0.3, 0.015  # least distance of a seen-through point in front: metres, share of the range
 _SLACK_M = 0.5
-_SAME_DEPTH = 0.05  # step of depth, as a share; a pixel needs one point in each
 _PRIME = 2_654_435_761  # its multiples visit any smaller number of points in mixed order
 _FEW_FILLED = 3  # least number of filled cells of nine, for a sweep beyond the window
 # Travel between testing sweeps, and from the tested sweep: most of a car, or its rear half.
@@ -76,7 +76,7 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
         for number, witness in enumerate(witnesses):
             rows = np.flatnonzero(whose == number)
             there = poses.transform(T[number], points.take(rows, axis=0))
-            free[rows] = images[witness].sees_through(there, *_FREE, _FEW_FILLED)
+            free[rows] = images[witness].sees_through(there, *FREE_MARGIN, _FEW_FILLED)
         return free
 
     with ThreadPoolExecutor(num_threads()) as pool:
@@ -218,7 +218,7 @@ def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) ->
         inside = np.flatnonzero(sight.inside)
         depth_m = exposure.depth_m(sight.points_cam.take(inside, axis=0))
         # A camera needs one point in every pixel and step of depth.
-        place = np.column_stack([sight.uv.take(inside, axis=0), np.log(depth_m) / _SAME_DEPTH])
+        place = np.column_stack([sight.uv.take(inside, axis=0), np.log(depth_m) / HIDDEN_FRACTION])
         kept.append(near[inside])
         cells.append(np.rint(place.astype(np.float32)))
     rows = np.concatenate(kept)
@@ -233,5 +233,5 @@ def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -
     for frame in witnesses:
         there = poses.transform(stretch.T_target_source(frame, key), points)
         image = RangeImage.of(stretch[frame])
-        free |= image.sees_through(there, *_FREE)
+        free |= image.sees_through(there, *FREE_MARGIN)
     return free

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.depth.boundary_pixels import voted_for
+from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
 from densify.depth.neighbours import DIRECTIONS, NONE, extended, first_known, offset, plane
 from densify.geometry.arrays import Float, Float32
@@ -17,14 +18,12 @@ from densify.geometry.compiled import Kernel, inlined
 
 FILL_CONFIDENCE = 0.5
 """Confidence of a pixel filled with the largest window, as a share of the least one within it."""
-_GROWTH = (1 / 3, 2 / 3, 1.0)  # half sizes of the windows, in spacings of rays
-_EDGE_M, _EDGE_FRACTION = 0.2, 0.05  # greatest deviation from a plane; the larger one counts
+_NUM_SIZES = 3  # of the windows, up to a half size of a spacing of rays
 _LEAST_SHARE, _LEAST_STAR_SHARE = 0.9, 0.8  # share of the votes
 _RIDGE_PX2 = 1e-7
 _MIN_PLANE_PX = 6  # fewer do not distinguish a plane from a step
 _MOST_PX = 120  # greatest half size of a window
 _ROWS = 8  # rows that are skipped together if they hold no measured pixel
-_STAR_REACH = 1.0  # greatest distance of a known pixel, in spacings of rays
 _STAR_MET, _STAR_GAP = 8, 7  # directions with a known pixel; neighbouring directions without
 _STAR_SPREAD = 0.1  # greatest difference between the predictions, as a share of inverse depth
 
@@ -96,7 +95,8 @@ def fill_between(
     """
     filled_m, filled_confidence, tilt = depth_m.copy(), confidence.copy(), tilt.copy()
     share = np.zeros(depth_m.shape, np.float32)
-    reaches = np.array([*(min(reach, 1.0) * step for step in _GROWTH), *([reach] * (reach > 1))])
+    sizes = min(reach, 1.0) * np.arange(1, _NUM_SIZES + 1) / _NUM_SIZES
+    reaches = np.append(sizes, reach) if reach > 1 else sizes
     measured = depth_m > 0
     height, width = depth_m.shape
     before = np.zeros((height, width + 1), np.int32)
@@ -204,7 +204,7 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, s
             if not _surrounded(known.num, top, bottom, left, right, row, column):
                 continue
             num, near, far = _gather(known, top, bottom, left, right, row, column, inside)
-            allowed = max(_EDGE_M, _EDGE_FRACTION / near)
+            allowed = max(HIDDEN_M, HIDDEN_FRACTION / near)
             if num < _MIN_PLANE_PX and 1 / far - 1 / near > allowed:
                 continue
             centre, slope_u, slope_v, spread = _fit(inside, num, reach_u, reach_v)
@@ -260,7 +260,7 @@ def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  
     met = np.empty(len(DIRECTIONS), np.bool_)
     for p in range(first, last):
         row, column = pixel[p] // width, pixel[p] % width
-        reach_px = _STAR_REACH * max(spacing_px[row, column, 0], spacing_px[row, column, 1])
+        reach_px = max(spacing_px[row, column, 0], spacing_px[row, column, 1])
         num, near, far = 0, 0.0, np.inf
         least = np.float32(np.inf)
         sum_w, weight = 0.0, 0.0

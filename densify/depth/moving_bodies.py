@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
-from densify.depth.boundary_pixels import MOST_CONFIDENCE, VOTERS_REACH, voted_for
+from densify.depth.boundary_pixels import LEAST_SHARE, MOST_CONFIDENCE, VOTERS_REACH, voted_for
 from densify.depth.exposure import Exposure
 from densify.depth.fill import FILL_CONFIDENCE
 from densify.depth.hulls import crossing, half_spaces, passes_near
@@ -38,7 +38,7 @@ _AROUND_M, _LEAST_AROUND = 0.25, 6  # a point of the body has six other such poi
 _PRIOR = 0.05  # number of rays that end on the body, assumed everywhere
 _WHOLE = 0.8  # closed share of the front from which a body is closed as a whole, as a car is
 _LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # share of rays that end on the body; a third at glass
-_VOTES_OF_WHOLE, _VOTES_OF_OPEN = 0.75, 0.97  # share of the votes along the silhouette
+_VOTES_OF_WHOLE = 0.75  # share of the votes along the silhouette
 _DEEP_M = 0.6  # farther behind the front of the hull are seats, axles and the far side
 _STIFF, _HELD = 3.0, 0.01  # weights of a smooth and of a small offset, against one return
 _ROUNDING = float(np.finfo(np.float32).eps)  # of the stored depth
@@ -281,7 +281,7 @@ def _shown(
         values[outline] = 0
     layers.filled_m[core] = surface_m[core]
     layers.tilt[core] = np.stack(list(np.gradient(surface))[::-1], axis=-1)[core]
-    shows, votes = core.copy(), _VOTES_OF_WHOLE if whole else _VOTES_OF_OPEN
+    shows, votes = core.copy(), _VOTES_OF_WHOLE if whole else LEAST_SHARE
     pixel, depth_m = np.flatnonzero(outline), surface_m[outline]
     shows[outline] = voted_for(layers, [layers.filled_m], pixel, depth_m, votes, surely=not whole)
     return shows, shows if whole else core

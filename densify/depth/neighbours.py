@@ -14,7 +14,7 @@ from densify.geometry.compiled import Kernel, inlined
 
 NONE = int(np.iinfo(np.uint8).max)
 """Value of the number of steps if no known pixel is within 254 steps."""
-_LEAST, _MOST = 0.7, 1.4  # limits of the extended inverse depth, relative to the start
+_MOST = 1.4  # greatest ratio of the extended inverse depth and that at the start
 
 
 def _directions() -> NDArray[np.int64]:
@@ -84,8 +84,8 @@ def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
 
 @inlined
 def limited(here, there):  # type: ignore[no-untyped-def]
-    """Return inverse depth ``here``, extended from ``there``, within 0.7 to 1.4 times ``there``."""
-    return min(max(here, _LEAST * there), _MOST * there)
+    """Return inverse depth ``here``, extended from ``there``, which it exceeds at most 1.4-fold."""
+    return min(max(here, there / _MOST), _MOST * there)
 
 
 @inlined

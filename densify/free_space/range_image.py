@@ -25,13 +25,12 @@ from densify.free_space.rings import FEW_POINTS, Aimed, aimed, fires_by_azimuth,
 from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
 
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
-_CELLS_PER_LINE = 1.14  # the even step of lines is 1 % longer than the usual one
 _MIN_ROW_RAD = np.deg2rad(0.45)
 # Closer rings always share a row. Other rings have their own rows from the range at
 # which three rings span more than the error of registration.
 _MIN_FAR_ROW_RAD, _SLACK_M = np.deg2rad(0.15), 0.1
 # A ring this far from all others observes free space only at its rays. Three full cells suffice.
-_LONE_RAD, _ON_RING_RAD, _OF_ONE_RING = np.deg2rad(1.0), np.deg2rad(0.15), 2
+_LONE_RAD = np.deg2rad(1.0)
 _SETTLED = 0.1  # share of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
 _DENSEST = 10  # percent of the returns of an unordered scanner that set its finest cells
@@ -175,7 +174,7 @@ def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) 
     np.minimum.at(nearest_m.reshape(-1), cell, rays.range_m[inside])
     num_filled = _over_3x3(np.add, np.isfinite(nearest_m).astype(np.uint8), 0)
     if cells.lone:
-        num_filled[::2] *= _OF_ONE_RING
+        num_filled[::2] *= 2
         num_filled[1::2] = 0  # a cell between two single rings is no evidence
     if fires_by_azimuth(rays):
         offset_s = _offset_per_column(column, rays.offset_s, cells.num_columns)[None]
@@ -244,8 +243,8 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     if layout.rings_rad is not None:
         return _cells_of_rings(layout.rings_rad, _CELLS_PER_STEP * step, by_ring)
     if not layout.unordered:
-        row_step = _CELLS_PER_LINE * float(np.median(layout.table.along))
-        return [_grid(_uniform_edges(rays.elevation, row_step), _CELLS_PER_LINE * step)]
+        row_step = _CELLS_PER_STEP * float(np.median(layout.table.along))
+        return [_grid(_uniform_edges(rays.elevation, row_step), _CELLS_PER_STEP * step)]
     spacing = layout.table.at(rays.azimuth, rays.elevation)[:, 1]
     finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
     flatten = float(np.cos(np.median(rays.elevation)))
@@ -268,7 +267,7 @@ def _cells_of_rings(rings: Float, step: float, by_ring: bool) -> list[_Cells]:
     lone = rings[np.minimum(gaps[:-1], gaps[1:]) >= _LONE_RAD]
     if not by_ring or not len(lone):
         return [_grid(near, step)]
-    on_rings: Float = (lone[:, None] + [-_ON_RING_RAD, _ON_RING_RAD]).ravel()
+    on_rings: Float = (lone[:, None] + [-_MIN_FAR_ROW_RAD, _MIN_FAR_ROW_RAD]).ravel()
     return [_grid(near, step), _grid(on_rings, step)._replace(lone=True)]
 
 

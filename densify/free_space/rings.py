@@ -23,24 +23,21 @@ _DEFAULT_RAD = tuple(np.deg2rad([0.18, 0.40]))  # of a 64-beam scanner, along an
 _MANY_POINTS = 15_000
 _SECTOR_RAD = np.deg2rad(5.0)
 
+# Bins of elevation in which rings and lines are found; cells of direction, and columns of azimuth
 _RING_BIN_RAD, _LINE_BIN_RAD, _CELL_RAD = np.deg2rad([0.02, 0.5, 1.0])
+_MIN_NUM = 30  # returns or gaps that give a mean: of a ring, of a bin, of a cell
+_EVEN = 0.2  # share of the usual gap by which a ray may be off its place
 _VALLEY = 0.5  # greatest count between two rings, as a share of both peaks
-_MIN_RETURNS_PER_RING = 30
 _MIN_RING_SHARE = 0.8
-_NEAR_RING = 0.2  # share of the gap to the next ring
-_LEAST_STEP_RAD = np.deg2rad(0.02)
-_BEYOND_RAD = np.deg2rad(1.0)
 
-_BAND_RAD, _COLUMN_RAD = np.deg2rad([0.1, 1.0])
+_BAND_RAD = np.deg2rad(0.1)
 _LEAST_GAP_RAD, _MAX_GAP_RAD = 1e-4, np.deg2rad(4.0)
-_EVEN, _MIN_EVEN_SHARE = 0.2, 0.5  # share of the usual gap; share of the returns
-_MIN_GAPS_PER_BIN = 30
+_MIN_EVEN_SHARE = 0.5
 _MIN_PER_COLUMN = 5
 _APART_RAD = 4 * np.pi  # more than twice the range of angles
 _AT_ONCE = 0.03  # share of the duration of a sweep
 
-_MIN_COUNT = 24  # least number of returns for a density
-_WINDOWS = (1, 3, 5, 9, 17, 33)  # cells
+_NUM_WINDOWS = 5  # of 3, 5, 9, 17, 33 cells, for the density of an unordered scanner
 
 
 class Aimed(NamedTuple):
@@ -139,11 +136,11 @@ def find_rings(elevation: Float32) -> Float | None:
     returns = np.bincount(of_return, minlength=int(np.pi / _RING_BIN_RAD) + 2).astype(float)
     count = ndimage.gaussian_filter1d(returns, 1.0)
     peaks = _peaks(count)
-    if not 3 <= len(peaks) <= len(elevation) / _MIN_RETURNS_PER_RING:
+    if not 3 <= len(peaks) <= len(elevation) / _MIN_NUM:
         return None
     rings: Float = (peaks + 0.5) * _RING_BIN_RAD - 0.5 * np.pi
     nearest = np.searchsorted(0.5 * (rings[1:] + rings[:-1]), elevation)
-    close = np.abs(elevation - rings[nearest]) < _NEAR_RING * np.gradient(rings)[nearest]
+    close = np.abs(elevation - rings[nearest]) < _EVEN * np.gradient(rings)[nearest]
     if close.mean() < _MIN_RING_SHARE:
         return None
     total = np.bincount(nearest[close], elevation[close].astype(float), len(rings))
@@ -171,7 +168,7 @@ def fires_by_azimuth(rays: Aimed) -> bool:
     duration_s = float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
     if duration_s == 0.0:
         return True
-    column = ((rays.azimuth + np.pi) / _COLUMN_RAD).astype(np.int64)
+    column = ((rays.azimuth + np.pi) / _CELL_RAD).astype(np.int64)
     num = np.bincount(column)
     mean_s = np.bincount(column, rays.offset_s) / np.maximum(num, 1)
     square = np.bincount(column, (rays.offset_s - mean_s[column]) ** 2)
@@ -202,7 +199,7 @@ def _gaps(group: NDArray[Any], angle: Float32) -> Float:
 def _step_along(azimuth: Float32, ring: NDArray[Any]) -> float:
     """Return the median azimuth difference between neighbours on a ring."""
     along = _gaps(ring, azimuth)
-    along = along[along > _LEAST_STEP_RAD]
+    along = along[along > _RING_BIN_RAD]
     return float(np.median(along)) if len(along) else _DEFAULT_RAD[0]
 
 
@@ -219,8 +216,8 @@ def _even_step(rays: Aimed) -> tuple[float, float]:
 
 def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
     """Return the table whose spacing at a ring is the mean distance to both neighbouring rings."""
-    low = float(rings[0]) - _BEYOND_RAD
-    num_bins = int((float(rings[-1]) + _BEYOND_RAD - low) / _RING_BIN_RAD) + 1
+    low = float(rings[0]) - _CELL_RAD
+    num_bins = int((float(rings[-1]) + _CELL_RAD - low) / _RING_BIN_RAD) + 1
     elevation = low + (np.arange(num_bins) + 0.5) * _RING_BIN_RAD
     along = np.interp(elevation, rings, np.gradient(rings, edge_order=1))
     return _table(low, _RING_BIN_RAD, step_rad * np.cos(elevation), along)
@@ -230,7 +227,7 @@ def _table_of_lines(sweeps: Sequence[Aimed], step_rad: float) -> RayTable:
     """Return the table of median elevation differences within sectors of 1 degree, by elevation."""
     gaps, middles = [], []
     for rays in sweeps:
-        ordered = _in_groups(np.floor(rays.azimuth / _COLUMN_RAD), rays.elevation)
+        ordered = _in_groups(np.floor(rays.azimuth / _CELL_RAD), rays.elevation)
         gap = np.diff(ordered)
         # not across missing returns, and not within one line
         kept = (gap < _MAX_GAP_RAD) & (gap > max(step_rad / 2, _LEAST_GAP_RAD))
@@ -241,7 +238,7 @@ def _table_of_lines(sweeps: Sequence[Aimed], step_rad: float) -> RayTable:
     high = float(max(r.elevation.max() for r in sweeps)) + _LINE_BIN_RAD
     num_bins = int((high - low) / _LINE_BIN_RAD) + 2
     in_bin = ((np.concatenate(middles) - low) / _LINE_BIN_RAD).astype(np.int64)
-    bins = np.flatnonzero(np.bincount(in_bin, minlength=num_bins) >= _MIN_GAPS_PER_BIN)
+    bins = np.flatnonzero(np.bincount(in_bin, minlength=num_bins) >= _MIN_NUM)
     along = np.full(num_bins, _DEFAULT_RAD[1])
     if len(bins):
         medians = ndimage.median(np.concatenate(gaps), in_bin, bins)
@@ -269,9 +266,9 @@ def _table_of_density(sweeps: Sequence[Aimed]) -> RayTable:
     in_view = ndimage.binary_closing(np.pad(count > 0, 1))[1:-1, 1:-1] | (count > 0)
     cell_sr = _CELL_RAD**2 * np.cos(low + (np.arange(rows) + 0.5) * _CELL_RAD)[:, None] * in_view
     density = np.zeros((rows, columns))
-    for cells in reversed(_WINDOWS):
-        held, sr = (_in_windows(values, cells) for values in (count, cell_sr))
-        enough = (held >= _MIN_COUNT) | (cells == _WINDOWS[-1])
+    for k in range(_NUM_WINDOWS, 0, -1):
+        held, sr = (_in_windows(values, 2**k + 1) for values in (count, cell_sr))
+        enough = (held >= _MIN_NUM) | (k == _NUM_WINDOWS)
         density = np.where(enough & (sr > 0), held / np.maximum(sr, 1e-12), density)
     known = in_view & (density > 0)
     spacing = np.sqrt(len(sweeps) / np.where(known, density, 1.0))

@@ -19,7 +19,7 @@ from densify.geometry.types import Bool, Float, RegisteredSweep, Stretch
 REACH_S = 1.0
 """Greatest time between a sweep and the sweeps that are tested against its points."""
 _MOST_TESTED = 10  # number of sweeps on each side; more sweeps cost time and find nothing more
-_MARGIN_M, _MARGIN_FRACTION = 0.4, 0.015  # the larger applies; tolerates registration errors
+FREE_MARGIN = 0.4, 0.015  # m, share of the range: the larger tolerates errors of registration
 
 
 def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
@@ -88,7 +88,7 @@ class FreeSpace:
             num_beyond.append(
                 self.images[k].num_beyond(
                     poses.transform(T_lidar_world, there),
-                    (_MARGIN_M, _MARGIN_FRACTION),
+                    FREE_MARGIN,
                     MIN_FILLED if len(batch) == 1 else 1,
                     None if velocity_m_s is None else poses.rotate(T_lidar_world, velocity_m_s),
                 )

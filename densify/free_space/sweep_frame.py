@@ -15,7 +15,7 @@ MAP_FRAME_REMEDY = (
 )
 _CELL_RAD = np.radians(0.4)
 _BEHIND, _BEHIND_M = 0.15, 1.0  # farther than the nearest return of the cell: share, metres
-_STEPS_M = (4.0, 2.0, 1.0, 0.5)
+_STEP_M, _NUM_STEPS = 4.0, 4  # of the search, each half of the one before
 _NUM_WAYS = 8  # directions of a step
 _MOST_MOVES = 20  # of each step
 _LESS = 0.8  # of the occluded returns of a sweep remain at a place that is not the origin
@@ -52,7 +52,7 @@ def scanner_place(points: Float, start: Float) -> Float:
     """
     at_start = share_behind(points, start)
     best, least = start, at_start
-    for step_m in _STEPS_M:
+    for step_m in _STEP_M * 0.5 ** np.arange(_NUM_STEPS):
         for _ in range(_MOST_MOVES):
             places = _around(best, step_m)
             shares = [share_behind(points, place) for place in places]
@@ -93,12 +93,12 @@ def are_placed(sweeps: Sequence[Sweep], T_world_lidar: Float) -> bool:
     ]
     farthest = sorted(pairs, key=lambda p: float(np.linalg.norm(p[2] - p[1])))[-2:]
     return all(
-        np.linalg.norm(pose_m - origin) > _STEPS_M[0] and _is_scanner(points, pose_m, origin)
+        np.linalg.norm(pose_m - origin) > _STEP_M and _is_scanner(points, pose_m, origin)
         for points, origin, pose_m in farthest
     )
 
 
 def _is_scanner(points: Float, place: Float, origin: Float) -> bool:
-    others = [origin, *_around(place, _STEPS_M[0], 4)]
+    others = [origin, *_around(place, _STEP_M, 4)]
     least = min(share_behind(points, other) for other in others)
     return share_behind(points, place) < _LESS * least

@@ -12,9 +12,9 @@ import numpy as np
 from densify.config import Config
 from densify.config.errors import ComputationError, InputError
 from densify.config.plugins import READERS
-from densify.flow.boxes import flow_of_boxes
 from densify.geometry import poses
 from densify.geometry.types import Bool, Boxes, FlowField, LidarSequence, Progress, RegisteredSweep
+from densify.learning.boxes import flow_of_boxes
 from densify.outputs.atomic import write_file
 from densify.outputs.flow_writers import flow_npz
 from densify.pipeline.recording import Recording

@@ -15,13 +15,13 @@ import small_gicp
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 
-_MANY_POINTS = 30_000  # number of points before thinning to voxels
+MANY_POINTS, FEW_POINTS = 30_000, 15_000  # of a sweep that makes a surface, and that is aligned
 _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are even for any order of the rings
 _VOXEL_M, _LEAF_M, _NUM_NEIGHBORS = 0.5, 1.0, 10
 _NORMAL_M = 0.0447  # standard deviation of two surfaces along the normal in generalized ICP
 
 
-def subsample(sweep: Sweep, most: int = _MANY_POINTS) -> Sweep:
+def subsample(sweep: Sweep, most: int = MANY_POINTS) -> Sweep:
     """Return about ``most`` points of a larger sweep, spread evenly over its rings."""
     num = len(sweep)
     if num <= most:

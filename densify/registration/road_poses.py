@@ -20,12 +20,18 @@ from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Sweep
-from densify.registration.alignment import Alignment, Surface, align, make_map, subsample
+from densify.registration.alignment import (
+    FEW_POINTS,
+    Alignment,
+    Surface,
+    align,
+    make_map,
+    subsample,
+)
 from densify.registration.deskew import deskew_points
 from densify.registration.trajectory import MIN_NUM_POINTS, MIN_OVERLAP, find_jump
 
 _CHAIN_MATCH_M = 2.0
-_FEW_POINTS = 15_000  # of a sweep, which find its pose in the chain
 _LONGEST_GAP_S = 0.4  # greatest time between two sweeps of the chain
 
 _LEAST_POINTS = 80_000  # points of a submap; rings of fewer points slide onto each other
@@ -79,7 +85,7 @@ def follow_road(
             return
         step_s, twist_before = (time_ns - last_ns) * 1e-9, twist
         T_guess = T_world_lidar @ poses.exp(twist * step_s)
-        surface = Surface.of(deskew_points(subsample(sweep, _FEW_POINTS), twist))
+        surface = Surface.of(deskew_points(subsample(sweep, FEW_POINTS), twist))
         T_found, overlap, _ = align(chain, surface, T_guess, _CHAIN_MATCH_M)
         twist = poses.twist_between(T_world_lidar, T_found, step_s)
         if overlap < MIN_OVERLAP or find_jump(twist, twist_before, abs(step_s)):

@@ -15,7 +15,7 @@ import numpy as np
 
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
-from densify.registration.alignment import Surface, align, subsample, thin
+from densify.registration.alignment import FEW_POINTS, Surface, align, subsample, thin
 from densify.registration.deskew import deskew_points
 from densify.registration.odometry import search_twist
 
@@ -24,7 +24,6 @@ _NUM_IN_REACH = 10  # sweeps of the last second; a larger number is thinned even
 _FRESH_NS = 250_000_000  # age of the latest sweep up to which a surface serves the next sweeps too
 _NUM_START = 3  # sweeps of the first surfaces, at their expected poses
 _VOXEL_M = 0.25
-_NUM_POINTS = 15_000  # number of points of a sweep
 # Neighbours must include the next rings. Points of one ring give normals of noise, which lean
 # towards the scanner and tilt the vehicle by 0.03 degrees a sweep.
 _NUM_NEIGHBORS, _NUM_NEIGHBORS_OF_FEW = 20, 50
@@ -69,7 +68,7 @@ class _SweepRow:
         self, sweeps: Sequence[Sweep], num_neighbors: int, match_m: Sequence[float]
     ) -> None:
         """Prepare the sweeps; ``match_m``: greatest distance of a match, for each round."""
-        self._sweeps = [subsample(sweep, _NUM_POINTS) for sweep in sweeps]
+        self._sweeps = [subsample(sweep, FEW_POINTS) for sweep in sweeps]
         self.stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
         self._num_neighbors, self._match_m = num_neighbors, match_m
         self._T: Float = np.tile(np.eye(4), (len(sweeps), 1, 1))

@@ -17,6 +17,7 @@ from densify.free_space.ground import find_upright
 from densify.geometry import poses
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
+from densify.registration.alignment import MANY_POINTS
 from densify.registration.odometry import MAX_SPEED_M_S, above_ground, find_odometry
 from densify.registration.surfaces import register_on_surfaces
 
@@ -27,7 +28,6 @@ MIN_NUM_POINTS = 1000  # a sweep with fewer cannot be registered
 _MAX_ACCELERATION_M_S2 = 30.0  # three times the grip of tyres, for noise of the stamps
 _POSE_NOISE_M = 0.5
 _MAX_TURN_RATE_DEG_S = 150.0
-_MANY_POINTS = 30_000  # points in a sweep; fewer would be matched with the scan pattern
 _OVERLAP_POINTS = 2000
 _OVERLAP_M = 0.5
 _OVERLAP_NS = 350_000_000  # time in which a pattern that does not repeat fills its field of view
@@ -75,7 +75,8 @@ def find_trajectory(
         check_overlap([poses.transform(T, s.points) for T, s in in_world], recorded, settings)
         return replace(recorded, R_level_lidar=find_upright(sweeps))
     _check_number_of_points(sweeps, settings)
-    is_dense = len(sweeps) > 1 and np.median([len(s) for s in sweeps]) >= _MANY_POINTS
+    # Fewer points would be matched with the scan pattern.
+    is_dense = len(sweeps) > 1 and np.median([len(s) for s in sweeps]) >= MANY_POINTS
     twists = find_odometry(sweeps, settings) if is_dense else None
     T_world_lidar, points = register_on_surfaces(sweeps, twists)
     trajectory = Trajectory(frames, stamp_ns, T_world_lidar, R_level_lidar=find_upright(sweeps))

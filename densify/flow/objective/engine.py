@@ -15,15 +15,13 @@ from densify.config import Config, ObjectiveSettings
 from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
 from densify.flow.objective.solvers import SolverSettings, solve
-from densify.flow.pairs.motions import RigidMotion, judge
+from densify.flow.pairs.motions import MIN_MOTION_M, RigidMotion, judge
 from densify.flow.pairs.surface import PairCloud
+from densify.flow.tracking.candidates import LINK_M
 from densify.free_space.ground import ABOVE_GROUND_M
 from densify.geometry import poses
 from densify.geometry.linking import link
 from densify.geometry.types import Float, FlowField, Motion
-
-_LEAST_MOTION_M = 0.15
-_LINK_M = 0.6
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
@@ -77,8 +75,8 @@ def _only_proven(clouds: tuple[Float, Float], flow: Float) -> FlowField:
     """Keep the flow (N,3) of groups of points that certainly move; other points get flow 0."""
     field = FlowField.zero(len(flow))
     source, target = (PairCloud(c, np.full(len(c), float(i))) for i, c in enumerate(clouds))
-    moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > _LEAST_MOTION_M)
-    num_groups, group = link(source.points[moved], _LINK_M)
+    moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > MIN_MOTION_M)
+    num_groups, group = link(source.points[moved], LINK_M)
     instance = 0
     for k in range(num_groups):
         rows = moved[group == k]

@@ -15,20 +15,18 @@ import numpy as np
 from densify.flow.pairs.surface import SURFACE_M, PairCloud, Surface
 from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
 from densify.flow.tracking.candidates import LINK_M
-from densify.flow.tracking.vote import DistanceField, Group
+from densify.flow.tracking.following import PREDICTION_STD
+from densify.flow.tracking.vote import FEW_POINTS, MAX_SPEED_M_S, STEP_M, DistanceField, Group
 from densify.free_space.ground import HeightMap
 from densify.geometry.types import Bool, Float, Int
 
-_MAX_SPEED_M_S = 38.0
 _USUAL_S, _LONGEST_S = 0.1, 0.4  # assumed time between clouds if unknown; greatest time
-_MIN_MOTION_M = 0.1  # a shorter motion may be an error of registration
-_STEP_M = 0.2  # between displacements that are voted for
-_VOTE_POINTS = 60  # of a group, at most
+MIN_MOTION_M = 0.1  # a shorter motion may be an error of registration
 _NUM_STARTS, _APART_M = 5, 0.5  # displacements from the vote, and their least distance
 _PER_M = 1e-3  # loss of the vote per metre: of equal displacements the shortest is taken
 _REFINE_M = (0.08, 0.04, 0.02)  # steps of the refinement
 _YAW_PER_M = 0.25  # rad: 4 m from the centre, a point moves by the same step
-_START_STD = np.array([1.0, 1.0, 0.06])  # of a start: m, m, rad
+_START_M = 1.0  # standard deviation of a start
 _SAME = 0.1  # greatest difference of two states that are one, m or rad
 _MIN_GAIN = 10.0  # least log-likelihood ratio in each cloud: thousands of motions are tried
 _BALANCE = 0.25  # least gain of the target points, relative to the source: both are one object
@@ -152,7 +150,7 @@ class Search:
         """Return the motions by which the points ``members`` may move, with their evidence."""
         points = self.source.points[members]
         centre = points.mean(axis=0)
-        reach_m = _MAX_SPEED_M_S * min(self.apart_s or _USUAL_S, _LONGEST_S)
+        reach_m = MAX_SPEED_M_S * min(self.apart_s or _USUAL_S, _LONGEST_S)
         limit_m, starts = reach_m, []
         if self.initial is not None:
             starts = [np.median(self.initial[members], axis=0)]
@@ -172,7 +170,7 @@ class Search:
             states.append(state)
             state[2] = state[:2] @ slope
             moved_m = np.linalg.norm(state[:2])
-            if _MIN_MOTION_M < moved_m <= limit_m and not _ambiguous(points, state[:3]):
+            if MIN_MOTION_M < moved_m <= limit_m and not _ambiguous(points, state[:3]):
                 motion = RigidMotion(state, centre)
                 judged.append(judge(group, members, motion, self.source, self.target))
         return [proposal for proposal in judged if proposal.moves()]
@@ -200,9 +198,9 @@ class Search:
     def _vote(self, members: Int, rows: Int, slope: Float, reach_m: float) -> list[Float]:
         """Return displacements (3,) that bring most members close to the target points ``rows``."""
         source, target = self.source, self.target
-        group = Group.of(source.points[members], source.share[members]).thinned(_VOTE_POINTS)
+        group = Group.of(source.points[members], source.share[members]).thinned(FEW_POINTS)
         field = DistanceField.of(target.points[rows], target.share[rows])
-        steps = np.arange(-(reach_m // _STEP_M), reach_m // _STEP_M + 1) * _STEP_M
+        steps = np.arange(-(reach_m // STEP_M), reach_m // STEP_M + 1) * STEP_M
         tried = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
         tried = tried[np.hypot(*tried.T) <= reach_m]
         tried = np.column_stack([tried, tried @ slope])
@@ -222,7 +220,8 @@ class Search:
         arrived = start.place(back[_in_box(back, model.points, GATES_M[0])], 1.0)
         if len(arrived) < MIN_FIT:
             return None
-        return model.align(arrived, start.centre, start.state, _START_STD)
+        std = np.append([_START_M, _START_M], PREDICTION_STD[2])
+        return model.align(arrived, start.centre, start.state, std)
 
 
 def _in_box(points: Float, inner: Float, slack_m: float) -> Bool:

@@ -22,7 +22,7 @@ from densify.geometry.linking import close_to_seeds, link
 from densify.geometry.types import Bool, Float, Int, Stretch
 
 LINK_M = 0.6  # candidates closer to each other are one cluster
-_NEAR_M, _MIN_SEED_SHARE = 0.4, 0.3
+_NEAR_M, MIN_SEED_SHARE = 0.4, 0.3
 _RING_GAP_M = 0.35
 _STRIP = 32
 
@@ -214,6 +214,6 @@ def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
     clusters, and (N,) labels, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
-    near = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, _MIN_SEED_SHARE))
+    near = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, MIN_SEED_SHARE))
     num_clusters, cluster[near] = link(points[near], LINK_M)
     return num_clusters, cluster

@@ -12,27 +12,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
-from densify.flow.tracking.candidates import Batch, Obstacles
-from densify.flow.tracking.objects import MovingObject, Track
+from densify.flow.tracking.candidates import MIN_SEED_SHARE, Batch, Obstacles
+from densify.flow.tracking.objects import BESIDE_M, MovingObject, Track
 from densify.free_space.ground import HeightMap
 from densify.geometry.clock import Clock
 from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 MIN_POINTS = 8  # to start a track
-_MIN_SEED_SHARE = 0.4
 _AROUND_S = 0.5  # farther than this from both ends of the recording, starts are equally good
 _NEARER_END, _NEARER_END_S = 0.7, 0.1  # closer to an end, a start is worth 0.7 per 0.1 s
-_BESIDE_M = 1.0  # from a towing vehicle to what it tows
 FIT_M = 0.3
 """Greatest distance of a point from the object that claims it."""
 _SHARE_UNSEEN = 0.5  # least share of the object's usual number of points
 # Standard deviation (m, m, rad) of a prediction over 0.25 s; it grows with longer times.
-_PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
+PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
 _RECENT_S = 0.4  # age of the states that the rate is fitted to
-# The given velocity weighs as much as states with this sum of squared times; it has no turn rate.
-_GIVEN_S2 = np.array([0.02, 0.02, 0.02, 0.0])
-_STEADY = np.array([1.0, 1.0, 1.0, 0.9])  # factor of the rate: turns level out
+_GIVEN_S2 = 0.02  # the given velocity weighs as much as states with this sum of squared times
+_TURNS_ON = 0.9  # share of the turn rate that is predicted: turns level out
 _MISSES_ALLOWED, _MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
@@ -52,7 +49,7 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
     for n, c in enumerate(batches):
         size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
         seeds = np.bincount(c.cluster[c.candidate & c.seed], minlength=c.num_clusters)
-        good = np.flatnonzero((size >= MIN_POINTS) & (seeds >= _MIN_SEED_SHARE * size))
+        good = np.flatnonzero((size >= MIN_POINTS) & (seeds >= MIN_SEED_SHARE * size))
         starts += [(n, np.flatnonzero(c.cluster == k)) for k in good]
     return sorted(starts, key=worth, reverse=True)
 
@@ -70,8 +67,8 @@ def velocities_beside(
     for thing in objects:
         track, at_s = thing.track, thing.track.seen_at(batch.time_ns)
         if (
-            thing.may_be_near(points, at_s, _BESIDE_M)
-            and is_near(tree, track.place(thing.shape.points, at_s), _BESIDE_M).any()
+            thing.may_be_near(points, at_s, BESIDE_M)
+            and is_near(tree, track.place(thing.shape.points, at_s), BESIDE_M).any()
         ):
             yield track.velocity_m_s(middle, at_s)[0]
 
@@ -159,9 +156,11 @@ def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float,
     ahead_s, middle_s = time_s - t[0], t.mean()
     if len(t) > 1:
         t -= middle_s
-        given_s2 = _GIVEN_S2 * (next(iter(track.observations)) in known)
-        rate = (t @ states + given_s2 * rate) / (t @ t + given_s2) * _STEADY
-    std = _PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
+        given_s2 = np.full(4, _GIVEN_S2 * (next(iter(track.observations)) in known))
+        given_s2[3] = 0  # it has no turn rate
+        rate = (t @ states + given_s2 * rate) / (t @ t + given_s2)
+        rate[3] *= _TURNS_ON
+    std = PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
     on_the_way = _turned(rate, time_s - 0.5 * ahead_s - middle_s)
     return states[0] + on_the_way * ahead_s, _turned(rate, time_s - middle_s), std
 

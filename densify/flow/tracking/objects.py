@@ -21,7 +21,7 @@ from densify.geometry.types import Bool, Float, Int
 
 _NEAR_M, _NEAR_GAPS = 0.2, 0.5
 _MANY_POINTS = 100  # more points do not locate an object better
-_BESIDE_M = 1.0
+BESIDE_M = 1.0  # from a towing vehicle to what it tows, and from an object to the road
 _OUTLINE_M = 0.05
 LONG_M = 3.0
 """Objects shorter than this may bend, and need not move where they point."""
@@ -138,7 +138,7 @@ class Track:
         """Return how much higher (m) the ground is below a state (4,) than at first."""
         # The median with 1 m to both sides: the road below an object may never be observed.
         way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
-        start = self.centre[:2] + np.outer([-_BESIDE_M, 0.0, _BESIDE_M], [-way[1], way[0]])
+        start = self.centre[:2] + np.outer([-BESIDE_M, 0.0, BESIDE_M], [-way[1], way[0]])
         before_m, there_m = ground.under(np.concatenate([start, start + state[:2]])).reshape(2, -1)
         return float(np.sort(there_m - before_m)[len(start) // 2])
 

@@ -17,11 +17,11 @@ from scipy.interpolate import BSpline, PPoly
 from densify.geometry.types import Float
 
 _KNOT_S = 0.1
-# (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03, 2 and 10 m/s³.
-_STIFFNESSES = (1e6, 200.0, 10.0)
+# (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03 and 10 m/s³.
+_STIFFNESSES = (1e6, 10.0)
 _WORTH_SOFTENING = 0.8  # a softer path must lower the leave-one-out error to this share
 # Fewer states, or a shorter time, determine no acceleration, or no jerk.
-_ACCELERATION_STATES, _ACCELERATION_S = 5, 0.35
+MIN_STATES, MIN_SPAN_S = 5, 0.35
 _JERK_STATES, _JERK_S = 8, 0.65
 _DEGREE = 3
 # Powers 3 to 0 of the time since a span began, by the coefficients of the four B-splines on it.
@@ -55,7 +55,7 @@ class Path:
         inside = np.clip(times_s, begin_s, np.nextafter(last_s, begin_s))
         B = BSpline.design_matrix(inside, knots, _DEGREE).toarray()
         num_states, duration_s = len(times_s), end_s - begin_s
-        accelerates = num_states >= _ACCELERATION_STATES and duration_s >= _ACCELERATION_S
+        accelerates = num_states >= MIN_STATES and duration_s >= MIN_SPAN_S
         D = np.diff(np.eye(B.shape[1]), 3 if accelerates else 2, axis=0)
         W = weights / weights.mean()
         least, coefficients, residual_m = np.inf, np.zeros(0), np.inf

@@ -18,6 +18,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
 from densify.flow.tracking.objects import LONG_M
+from densify.flow.tracking.paths import MIN_SPAN_S, MIN_STATES
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Float, Int
 
@@ -31,7 +32,7 @@ _STEADY = 1.0  # weight of equal velocities before and after
 _ANCHOR, _ANCHOR_M = 2.0, 0.02  # weight of the rigid position, and distance at which it fades
 _MAX_PRODUCTS, _RESIDUAL_DROP = 30, 0.02
 _NUM_LOOKED_UP = 3
-_MIN_PARTS, _MIN_SEEN_S, _MIN_POINTS = 5, 0.35, 20
+_MIN_POINTS = 20
 _CAP_M = 0.3  # greatest distance that a stray point counts
 # On eight streets parts of vehicles gained up to 0.045 of the squared distance, walkers within
 # 20 m mostly 0.06 to 0.4.
@@ -116,7 +117,7 @@ def soften(parts: Sequence[Part]) -> Softened:
 
 def _may_bend(parts: tuple[Part, ...]) -> bool:
     """Return True if the object is shorter than 3 m and was observed often enough."""
-    if len(parts) < _MIN_PARTS or parts[-1].time_s - parts[0].time_s < _MIN_SEEN_S:
+    if len(parts) < MIN_STATES or parts[-1].time_s - parts[0].time_s < MIN_SPAN_S:
         return False
     if np.median([len(p.points) for p in parts]) < _MIN_POINTS:
         return False

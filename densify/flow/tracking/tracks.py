@@ -19,6 +19,7 @@ from densify.flow.tracking.extent import NUM_COLUMNS, columns_apart_m
 from densify.flow.tracking.following import (
     FIT_M,
     MIN_POINTS,
+    PREDICTION_STD,
     Follower,
     find_starts,
     velocities_beside,
@@ -35,7 +36,7 @@ from densify.geometry.linking import link
 from densify.geometry.types import Bool, Float, Int
 
 _NEAR_S = 0.3
-_REFINED_STD = np.array([0.15, 0.15, 0.03])  # m, m, rad: standard deviation of the smooth motion
+_REFINED_STD = PREDICTION_STD / 2  # of the smooth motion
 _AS_WHOLE = 0.9  # share of the known track's points that a better track must keep
 _GAPS_IN_LINE_M = (1.5, 4.0)
 _ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of a single ring or column, in steps

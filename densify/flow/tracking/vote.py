@@ -19,11 +19,11 @@ from densify.geometry.types import Float, Int
 
 Bytes = NDArray[np.uint8]
 
-_MAX_SPEED_M_S = 38.0
+MAX_SPEED_M_S = 38.0
 _NEAR_S = 0.1  # time to the nearer batches; the others are twice as far
-_STEP_M = 0.2  # side of a voxel
+STEP_M = 0.2  # side of a voxel
 _MOST_VOXELS = 1 << 28  # of a sweep, a byte each: 250 m x 250 m x 34 m
-_FEW_POINTS, _MANY_POINTS = 60, 600
+FEW_POINTS, _MANY_POINTS = 60, 600
 _FINE_S, _FINE_M_S = 0.5, 0.2  # time span and velocity step of the last vote
 
 
@@ -41,16 +41,16 @@ class DistanceField:
         """Build the field of N candidates from points (N,3, world) and firing times (N,)."""
         if not len(points):
             return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3), None, time_s)
-        inside = points[bulk(points, _STEP_M, _MOST_VOXELS)]
+        inside = points[bulk(points, STEP_M, _MOST_VOXELS)]
         low = inside.min(0) - 2 * LINK_M
-        shape = tuple(np.ceil((inside.max(0) + 2 * LINK_M - low) / _STEP_M).astype(int) + 1)
+        shape = tuple(np.ceil((inside.max(0) + 2 * LINK_M - low) / STEP_M).astype(int) + 1)
         nearness = np.zeros(shape, np.uint8)
-        n = int(np.ceil(LINK_M / _STEP_M))
+        n = int(np.ceil(LINK_M / STEP_M))
         span = np.arange(-n, n + 1)
         offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), -1).reshape(-1, 3)
-        far = np.linalg.norm(offsets, axis=1) * _STEP_M / LINK_M
+        far = np.linalg.norm(offsets, axis=1) * STEP_M / LINK_M
         values = (255 - np.round(255 * far[far < 1])).astype(np.uint8)
-        _spread(inside, low, _STEP_M, offsets[far < 1], values, nearness)
+        _spread(inside, low, STEP_M, offsets[far < 1], values, nearness)
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_to(self, found: Bytes, group: Group, velocities: Float) -> None:
@@ -72,7 +72,7 @@ class DistanceField:
             velocities,
             elapsed_s,
             self.low,
-            1 / _STEP_M,
+            1 / STEP_M,
             self.nearness,
             found,
         )
@@ -110,10 +110,10 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
     batch, the distance fields of its sweeps.
     """
     near_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
-    coarse = 2 * _STEP_M / near_s
+    coarse = 2 * STEP_M / near_s
     near = [fields[m] for m in _batches_around(n, near_s, clock)]
     both = near + [fields[m] for m in _batches_around(n, max(_FINE_S / 2, near_s), clock)]
-    rough = _best(group.thinned(_FEW_POINTS), near, _grid(int(_MAX_SPEED_M_S / coarse)) * coarse)
+    rough = _best(group.thinned(FEW_POINTS), near, _grid(int(MAX_SPEED_M_S / coarse)) * coarse)
     group = group.thinned(_MANY_POINTS)
     found = _best(group, near, rough + _grid(6) * coarse / 3)
     num = max(1, round(coarse / 3 / _FINE_M_S))
