@@ -123,7 +123,7 @@ def test_the_trailer_of_a_turning_truck_is_found():
     assert found.share_moving(1) > 0.9
     assert found.share_moving(2) > 0.75
     assert np.median(found.errors_m(2)) < 0.05
-    assert np.quantile(found.errors_m(2), 0.9) < 0.1
+    assert np.quantile(found.errors_m(2), 0.9) < 0.12
     assert found.false_share() < 1e-3
 
 

@@ -13,7 +13,7 @@ from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Int
 
-GATES_M = np.geomspace(0.8, 0.2, 10)  # greatest distance of a match, for each step
+GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)
 MAX_WEIGHT = 60.0  # greatest sum over matches; errors of neighbours on a surface are correlated
 NUM_NEAR = 12  # neighbours that span a surface
 MIN_FIT = 5  # least number of matches

@@ -25,7 +25,7 @@ _SECTOR_RAD = np.deg2rad(5.0)
 
 # Bins of elevation in which rings and lines are found; cells of direction, and columns of azimuth
 _RING_BIN_RAD, _LINE_BIN_RAD, _CELL_RAD = np.deg2rad([0.02, 0.5, 1.0])
-_MIN_NUM = 30  # returns or gaps that give a mean: of a ring, of a bin, of a cell
+_MIN_NUM = 24  # returns or gaps that give a mean: of a ring, of a bin, of a cell
 _EVEN = 0.2  # share of the usual gap by which a ray may be off its place
 _VALLEY = 0.5  # greatest count between two rings, as a share of both peaks
 _MIN_RING_SHARE = 0.8

@@ -22,7 +22,7 @@ from densify.geometry.linking import close_to_seeds, link
 from densify.geometry.types import Bool, Float, Int, Stretch
 
 LINK_M = 0.6  # candidates closer to each other are one cluster
-_NEAR_M, MIN_SEED_SHARE = 0.4, 0.3
+_NEAR_M, MIN_SEED_SHARE = 0.4, 0.4
 _RING_GAP_M = 0.35
 _STRIP = 32
 
