@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from densify.flow.tracking import soften as module
-from densify.flow.tracking.soften import Part, Softened, soften
+from densify.flow.tracking.soften import Snapshot, Softened, soften
 
 SWEEP_S, STRIDE_S, SWING = 0.1, 1.2, 0.5
 SENSOR = np.array([2.0, -8.0, 1.7])
@@ -65,13 +65,13 @@ class Body:
         order = order[on_beam[order]]
         rows = order[np.unique(cell[order], return_index=True)[1]]
         noise = rng.normal(scale=sigma_m, size=(len(rows), 1)) * ray[rows] / range_m[rows, None]
-        return Seen(rows, Part(place[rows] + noise, time_s))
+        return Seen(rows, Snapshot(place[rows] + noise, time_s))
 
 
 @dataclass
 class Seen:
     rows: np.ndarray
-    part: Part
+    part: Snapshot
 
 
 def tube(rng, count, centre, low_m, high_m, radius_m) -> np.ndarray:
@@ -86,7 +86,7 @@ def scans(body: Body, num=11, seed=0, sigma_m=0.01) -> list[Seen]:
     return [body.scan(k * SWEEP_S, rng, sigma_m) for k in range(num)]
 
 
-def parts_of(seen: list[Seen]) -> list[Part]:
+def parts_of(seen: list[Seen]) -> list[Snapshot]:
     return [s.part for s in seen]
 
 
@@ -95,15 +95,15 @@ def voxels(points: np.ndarray, size_m: float) -> set[tuple[int, ...]]:
 
 
 def accumulated(result: Softened, at: int) -> np.ndarray:
-    return np.concatenate([result.carry(i, at) for i in range(len(result.parts))])
+    return np.concatenate([result.carry(i, at) for i in range(len(result.snapshots))])
 
 
-def rigid(parts: list[Part]) -> Softened:
+def rigid(parts: list[Snapshot]) -> Softened:
     still = tuple(np.zeros_like(p.points) for p in parts)
     return Softened(tuple(parts), still, still, np.inf, {})
 
 
-def forced(parts: list[Part]) -> Softened:
+def forced(parts: list[Snapshot]) -> Softened:
     """At the softest, whatever held-out parts say."""
     bending = module._Bending(tuple(parts))
     for level in range(len(module._ALPHAS)):
@@ -182,7 +182,7 @@ def test_a_rigid_object_stays_rigid_to_the_bit(sigma_m):
     assert result.alpha == np.inf
     assert result.held_out_m  # it was tried
     assert not any(flow.any() for flow in (*result.to_next, *result.to_previous))
-    assert result.carry(0, 10) is result.parts[0].points
+    assert result.carry(0, 10) is result.snapshots[0].points
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_a_rigid_object_stays_rigid_to_the_bit(sigma_m):
     ids=["long", "few sweeps", "few points"],
 )
 def test_what_cannot_be_told_is_not_tried(body, num, every):
-    parts = [Part(p.points[::every], p.time_s) for p in parts_of(scans(body, num))]
+    parts = [Snapshot(p.points[::every], p.time_s) for p in parts_of(scans(body, num))]
     result = soften(parts)
     assert result.alpha == np.inf and not result.held_out_m
     assert not any(flow.any() for flow in (*result.to_next, *result.to_previous))
@@ -200,7 +200,7 @@ def test_what_cannot_be_told_is_not_tried(body, num, every):
 def test_edges_and_gaps_do_not_pull():
     points = scans(Body.column())[0].part.points
     points = points[np.abs(points[:, 2] - 1.0) > 0.15]
-    result = forced([Part(points, 0.0), Part(points, 0.1)])
+    result = forced([Snapshot(points, 0.0), Snapshot(points, 0.1)])
     assert np.abs(result.to_next[0]).max() < 1e-9
 
 
@@ -211,7 +211,7 @@ def test_carrying_adds_up_the_steps_both_ways():
     rng = np.random.default_rng(1)
     points = rng.random((30, 3))
     step = np.array([0.1, -0.2, 0.05])
-    parts = tuple(Part(points + k * step, float(k)) for k in range(4))
+    parts = tuple(Snapshot(points + k * step, float(k)) for k in range(4))
     onward, still = np.tile(step, (30, 1)), np.zeros((30, 3))
     result = Softened(
         parts, (onward, onward, onward, still), (still, -onward, -onward, -onward), 1.0, {}
@@ -226,7 +226,7 @@ def test_limbs_that_cross_keep_their_way():
     high, low = np.array([0.0, 0.0, 0.002]), np.zeros(3)
     steps = np.repeat([forth, -forth], 5, axis=0)
     start = np.repeat([high, low], 5, axis=0)  # one leg over the other, meeting at part 1
-    parts = tuple(Part(start + (k - 1) * steps, float(k)) for k in range(3))
+    parts = tuple(Snapshot(start + (k - 1) * steps, float(k)) for k in range(3))
     still = np.zeros_like(steps)
     result = Softened(parts, (steps, steps, still), (still, -steps, -steps), 1.0, {})
     np.testing.assert_allclose(result.carry(0, 2), start + steps, atol=1e-6)
@@ -239,7 +239,7 @@ def test_a_solve_minimises_what_the_docstring_says(monkeypatch):
     monkeypatch.setattr(module, "_RESIDUAL_DROP", 1e-12)
     monkeypatch.setattr(module, "_MAX_PRODUCTS", 2000)
     rng = np.random.default_rng(3)
-    parts = tuple(Part(rng.random((12, 3)), t) for t in (0.0, 0.1, 0.3))
+    parts = tuple(Snapshot(rng.random((12, 3)), t) for t in (0.0, 0.1, 0.3))
     bending = module._Bending(parts)
     n = len(bending._source)
     pull = rng.normal(size=(n, 3))

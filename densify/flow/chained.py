@@ -25,7 +25,7 @@ class ChainedMotion:
     # Function that returns the flow of sweep index i to index j = i ± 1, in the lidar frame of
     # sweep i. It is called on demand, once for each (i, j).
     step: Callable[[int, int], FlowField]
-    _found: dict[tuple[int, int], FlowField] = field(default_factory=dict, repr=False)
+    _flows: dict[tuple[int, int], FlowField] = field(default_factory=dict, repr=False)
 
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of all points of sweep ``frame`` to the reference time of ``target``.
@@ -36,60 +36,61 @@ class ChainedMotion:
         points. A point is lost if its object has no points in the next sweep, or if no moving point
         is within 0.5 m.
         """
-        here, there = self.stretch.frames.index(frame), self.stretch.frames.index(target)
-        return self._flow(here, there)
+        i, j = self.stretch.frames.index(frame), self.stretch.frames.index(target)
+        return self._flow(i, j)
 
-    def _flow(self, here: int, there: int) -> FlowField:
+    def _flow(self, i: int, j: int) -> FlowField:
         num_sweeps = len(self.stretch.sweeps)
-        if here == there and num_sweeps > 1:  # a step to a neighbour has the moving points
-            step = self._flow(here, here + 1 if here + 1 < num_sweeps else here - 1)
+        if i == j and num_sweeps > 1:  # a step to a neighbour has the moving points
+            step = self._flow(i, i + 1 if i + 1 < num_sweeps else i - 1)
             return replace(step, displacement=np.zeros_like(step.displacement))
-        if here == there:
-            return FlowField.zero(len(self.stretch.sweeps[here].sweep))
-        if (here, there) not in self._found:
-            near = here + (1 if there > here else -1)
-            if near == there:
-                found = self._with_velocity(self.step(here, there), here, there)
+        if i == j:
+            return FlowField.zero(len(self.stretch.sweeps[i].sweep))
+        if (i, j) not in self._flows:
+            k = i + (1 if j > i else -1)  # the neighbour of sweep i towards j
+            if k == j:
+                flow = self._with_velocity(self.step(i, j), i, j)
             else:
-                found = self._follow(here, near, self._flow(near, there))
-            self._found[here, there] = found
-        return self._found[here, there]
+                flow = self._follow(i, k, self._flow(k, j))
+            self._flows[i, j] = flow
+        return self._flows[i, j]
 
-    def _with_velocity(self, step: FlowField, here: int, there: int) -> FlowField:
-        stamps_ns = [self.stretch.sweeps[i].sweep.stamp_ns for i in (here, there)]
+    def _with_velocity(self, step: FlowField, source: int, target: int) -> FlowField:
+        stamps_ns = [self.stretch.sweeps[i].sweep.stamp_ns for i in (source, target)]
         velocity_m_s = step.displacement / ((stamps_ns[1] - stamps_ns[0]) * 1e-9)
         return replace(step, velocity_m_s=velocity_m_s)
 
-    def _follow(self, i: int, near: int, onward: FlowField) -> FlowField:
-        """Chain the flow of sweep i to its neighbour ``near`` with the flow ``onward`` there."""
-        step = self._flow(i, near)
-        here, there = self.stretch.sweeps[i], self.stretch.sweeps[near]
-        T_there_here = self.stretch.T_target_source(there.frame, here.frame)
+    def _follow(self, i: int, k: int, flow_k: FlowField) -> FlowField:
+        """Chain the flow of sweep i to its neighbour k with ``flow_k``, from k to the target."""
+        step = self._flow(i, k)
+        sweep_i, sweep_k = self.stretch.sweeps[i], self.stretch.sweeps[k]
+        T_k_i = self.stretch.T_target_source(sweep_k.frame, sweep_i.frame)
         displacement, lost = step.displacement.copy(), step.lost.copy()
         velocity_m_s = np.zeros_like(displacement)
-        known_at = there.sweep.points + onward.total - onward.displacement
+        # (N,3) at the reference time of sweep k
+        points_k = sweep_k.sweep.points + flow_k.total - flow_k.displacement
         for instance in np.unique(step.instance[step.moving]):
-            mine = np.flatnonzero(step.moving & (step.instance == instance))
-            theirs = np.flatnonzero(onward.moving & ~onward.lost & (onward.instance == instance))
-            if not len(theirs):
-                lost[mine] = True
+            rows = np.flatnonzero(step.moving & (step.instance == instance))
+            rows_k = np.flatnonzero(flow_k.moving & ~flow_k.lost & (flow_k.instance == instance))
+            if not len(rows_k):
+                lost[rows] = True
                 continue
-            arrived = poses.transform(T_there_here, here.sweep.points[mine] + step.total[mine])
-            gap_m, nearest = nearest_k(tree_of(known_at[theirs]), arrived, _NUM_NEIGHBORS)
+            arrived = poses.transform(T_k_i, sweep_i.sweep.points[rows] + step.total[rows])
+            gap_m, nearest = nearest_k(tree_of(points_k[rows_k]), arrived, _NUM_NEIGHBORS)
             weight = 1 / (gap_m + 1e-3)
             weight /= weight.sum(axis=1, keepdims=True)
-            flow, rest = np.zeros_like(arrived), onward.displacement[theirs]
+            rigid_flow, deviation = np.zeros_like(arrived), flow_k.displacement[rows_k]
             if instance >= 0:
-                T = _object_motion(known_at[theirs], known_at[theirs] + rest)
-                flow = poses.transform(T, arrived) - arrived
-                rest = known_at[theirs] + rest - poses.transform(T, known_at[theirs])
+                T = _object_motion(points_k[rows_k], points_k[rows_k] + deviation)
+                rigid_flow = poses.transform(T, arrived) - arrived
+                deviation = points_k[rows_k] + deviation - poses.transform(T, points_k[rows_k])
             else:
-                lost[mine[gap_m[:, 0] > _MAX_GAP_M]] = True
-            R_there_here = T_there_here[:3, :3]
-            displacement[mine] += (flow + _mean(rest, nearest, weight)) @ R_there_here
-            if onward.velocity_m_s is not None:
-                theirs_m_s = onward.velocity_m_s[theirs]
-                velocity_m_s[mine] = _mean(theirs_m_s, nearest, weight) @ R_there_here
+                lost[rows[gap_m[:, 0] > _MAX_GAP_M]] = True
+            R_k_i = T_k_i[:3, :3]
+            displacement[rows] += (rigid_flow + _mean(deviation, nearest, weight)) @ R_k_i
+            if flow_k.velocity_m_s is not None:
+                velocity_k_m_s = flow_k.velocity_m_s[rows_k]
+                velocity_m_s[rows] = _mean(velocity_k_m_s, nearest, weight) @ R_k_i
         return replace(step, displacement=displacement, lost=lost, velocity_m_s=velocity_m_s)
 
 

@@ -45,15 +45,15 @@ def _turned(arms: Float, yaw: float | Float) -> Float:
     return turned
 
 
-def surface_information(points: Float, near: Int, loose: float = 1.0) -> Float:
+def surface_information(points: Float, rows: Int, loose: float = 1.0) -> Float:
     """Return (N,3,3) the inverse covariance (1/m²) of a surface of points (M,3) at N places.
 
-    ``near`` (N,k) are rows of the neighbours that span the surface. ``loose`` multiplies the
+    ``rows`` (N,k) are those of the neighbours that span the surface. ``loose`` multiplies the
     covariance; above 1 the surface constrains less.
     """
-    away = points[near]
-    away -= away.mean(axis=1, keepdims=True)
-    covariance = loose / near.shape[1] * (away.transpose(0, 2, 1) @ away)
+    offset = points[rows]
+    offset -= offset.mean(axis=1, keepdims=True)
+    covariance = loose / rows.shape[1] * (offset.transpose(0, 2, 1) @ offset)
     ridge = _SURFACE_M**2 + _RIDGE / 3 * np.trace(covariance, axis1=1, axis2=2)
     return np.asarray(np.linalg.inv(covariance + ridge[:, None, None] * np.eye(3)))
 
@@ -70,14 +70,14 @@ class Model:
         points = np.concatenate([self.points, points])
         points = points[np.argsort(points[:, 0], kind="stable")]
         self.points = points[:: len(points) // _MAX_MODEL_POINTS + 1]
-        _, near = nearest_k(tree_of(self.points), self.points, NUM_NEAR)
-        self.information = surface_information(self.points, near, _LOOSE)
+        _, rows = nearest_k(tree_of(self.points), self.points, NUM_NEAR)
+        self.information = surface_information(self.points, rows, _LOOSE)
 
     def covers(self, points: Float, within_m: float) -> Bool:
         """Return (N,) True for (N,3) points (object's frame) within ``within_m`` of the model."""
-        near = np.empty(len(points), np.bool_)
-        _are_near(points, self.points, within_m, near)
-        return near
+        covered = np.empty(len(points), np.bool_)
+        _are_near(points, self.points, within_m, covered)
+        return covered
 
     def align(
         self, points: Float, centre: Float, predicted: Float, prediction_std: Float
@@ -129,10 +129,10 @@ def _nearest(point: Float, surface: Float, within_m: float) -> tuple[int, float]
 
 
 @Kernel
-def _are_near(points: Float, surface: Float, within_m: float, near: Bool) -> None:
-    """Write to ``near`` (N,) whether a surface point is within ``within_m`` of each point."""
+def _are_near(points: Float, surface: Float, within_m: float, covered: Bool) -> None:
+    """Write to ``covered`` (N,) whether a surface point is within ``within_m`` of each point."""
     for i in range(len(points)):
-        near[i] = _nearest(points[i], surface, within_m)[0] >= 0
+        covered[i] = _nearest(points[i], surface, within_m)[0] >= 0
 
 
 @Kernel

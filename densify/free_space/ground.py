@@ -53,8 +53,8 @@ class HeightMap:
         """
         inside = bulk(np.concatenate([points[:, :2] for points in clouds]), CELL_M, _MOST_CELLS)
         ends = np.cumsum([len(points) for points in clouds])[:-1]
-        each = zip(clouds, np.split(inside, ends), strict=True)
-        clouds = [points[rows] for points, rows in each]
+        cloud_rows = zip(clouds, np.split(inside, ends), strict=True)
+        clouds = [points[rows] for points, rows in cloud_rows]
         low, shape = _grid(clouds)
         cells = [_cells(points, low, shape[1]) for points in clouds]
         heights = _median_of_low(clouds, cells, shape[0] * shape[1]).reshape(shape)
@@ -85,10 +85,10 @@ class HeightMap:
 
         Only points within 30 m of the lidar are judged, where the ground is measured densely.
         """
-        near = np.flatnonzero(np.hypot(points[:, 0], points[:, 1]) < _DENSE_M)
-        deep = np.zeros(len(points), bool)
-        deep[near] = self.above(poses.transform(T_world_lidar, points[near])) < -_BELOW_M
-        return deep
+        rows = np.flatnonzero(np.hypot(points[:, 0], points[:, 1]) < _DENSE_M)
+        is_below = np.zeros(len(points), bool)
+        is_below[rows] = self.above(poses.transform(T_world_lidar, points[rows])) < -_BELOW_M
+        return is_below
 
 
 def _grid(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
@@ -111,8 +111,8 @@ def _median_of_low(clouds: Sequence[Float], cells: Sequence[Int], num_cells: int
     low = np.full((len(clouds), num_cells), np.nan, np.float32)
     for points, cell, low_m in zip(clouds, cells, low, strict=True):
         z = points[:, 2]
-        below_1 = (z - z.min(initial=0)) / (z.max(initial=0) - z.min(initial=0) + 1)
-        order = np.argsort(cell + below_1)  # by cell, then by height
+        scaled_height = (z - z.min(initial=0)) / (z.max(initial=0) - z.min(initial=0) + 1)
+        order = np.argsort(cell + scaled_height)  # by cell, then by height
         first = np.flatnonzero(np.diff(cell[order], prepend=-1))  # of each cell, lowest first
         count = np.diff(first, append=len(order))
         stray = np.maximum(1, (_STRAY * count).astype(int))
@@ -188,12 +188,12 @@ def _ground_normal(points: Float) -> Float | None:
     a, b, c = points[rng.integers(len(points), size=(_NUM_TRIES, 3))].transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     normal *= np.where(normal[:, 2:] < 0, -1, 1)
-    level = normal[:, 2] > np.hypot(*normal[:, :2].T)  # a floor and not a wall
-    normal = normal[level] / np.linalg.norm(normal[level], axis=1, keepdims=True)
-    from_origin = np.einsum("ij,ij->i", normal, a[level])
-    above = points @ normal.T - from_origin
-    on_plane = np.abs(above) < ABOVE_GROUND_M
-    share = np.where(from_origin < 0, on_plane.mean(axis=0), 0) - (above < -ABOVE_GROUND_M).mean(
+    is_floor = normal[:, 2] > np.hypot(*normal[:, :2].T)  # a floor and not a wall
+    normal = normal[is_floor] / np.linalg.norm(normal[is_floor], axis=1, keepdims=True)
+    from_origin = np.einsum("ij,ij->i", normal, a[is_floor])
+    height_m = points @ normal.T - from_origin
+    on_plane = np.abs(height_m) < ABOVE_GROUND_M
+    share = np.where(from_origin < 0, on_plane.mean(axis=0), 0) - (height_m < -ABOVE_GROUND_M).mean(
         axis=0
     )
     if share.max(initial=0) < _LEAST_SHARE:

@@ -24,37 +24,37 @@ def without_lone(sweep: Sweep) -> Sweep:
     """Remove lone returns, counting ``num_lone``, if their number suggests snow, rain or dust."""
     if len(sweep) < _LEAST:
         return sweep
-    place, many = _places(sweep), _MANY * len(sweep)
-    num = _count_in_cells(place)
-    if np.count_nonzero(num == 1) <= many:
+    coordinates, max_alone = _places(sweep), _MANY * len(sweep)
+    num = _count_in_cells(coordinates)
+    if np.count_nonzero(num == 1) <= max_alone:
         return sweep
     # The larger count of two grids, half a cell apart: a surface may lie on a cell border.
-    num = np.maximum(num, _count_in_cells(place + [[0.0], [0.5], [0.5], [0.5]]))
+    num = np.maximum(num, _count_in_cells(coordinates + [[0.0], [0.5], [0.5], [0.5]]))
     lone = num <= _FEW
     is_noise = 2 * np.count_nonzero(lone) > len(sweep)
-    if np.count_nonzero(num == 1) <= many or is_noise:
+    if np.count_nonzero(num == 1) <= max_alone or is_noise:
         return sweep
     return replace(sweep.select(~lone), num_lone=int(lone.sum()))
 
 
 def _places(sweep: Sweep) -> Float:
     """Return the (4,N) scanner, azimuth, elevation and log range of the returns, in cells."""
-    place = np.empty((4, len(sweep)))
+    coordinates = np.empty((4, len(sweep)))
     for lidar in np.unique(sweep.lidar).tolist():
-        mine = sweep.lidar == lidar
-        x, y, z = (sweep.points[mine] - sweep.origin_m(lidar)).T
+        of_lidar = sweep.lidar == lidar
+        x, y, z = (sweep.points[of_lidar] - sweep.origin_m(lidar)).T
         range_m = np.sqrt(x * x + y * y + z * z)
         cell_rad = _CELL_RAD * np.sqrt(_OF_POINTS / len(range_m))
         elevation_rad = np.arcsin(np.clip(z / np.maximum(range_m, 1e-9), -1, 1))
         depth = np.log(np.maximum(range_m, 1e-3)) / _CELL_DEPTH
-        place[0, mine] = lidar
-        place[1:, mine] = np.arctan2(y, x) / cell_rad, elevation_rad / cell_rad, depth
-    return place
+        coordinates[0, of_lidar] = lidar
+        coordinates[1:, of_lidar] = np.arctan2(y, x) / cell_rad, elevation_rad / cell_rad, depth
+    return coordinates
 
 
-def _count_in_cells(place: Float) -> Int:
-    """Return the (N,) number of returns in the cell of each place (4,N), itself included."""
-    cell = np.floor(place).astype(np.int64)
+def _count_in_cells(coordinates: Float) -> Int:
+    """Return the (N,) number of returns in each return's cell, from `_places` (4,N)."""
+    cell = np.floor(coordinates).astype(np.int64)
     cell -= cell.min(axis=1, keepdims=True)
     flat = np.ravel_multi_index(tuple(cell), tuple(cell.max(axis=1) + 1))
     num: Int = np.bincount(flat)[flat]

@@ -63,9 +63,9 @@ class ScannerImage(NamedTuple):
         """Return (N,) True for points (N,3), lidar frame, at whose range the image is used."""
         if self.from_m == 0 and self.to_m == np.inf:
             return np.ones(len(points), bool)
-        away = points - self.origin_m
-        squared = np.einsum("ij,ij->i", away, away)
-        return np.asarray((squared >= self.from_m**2) & (squared < self.to_m**2))
+        from_scanner = points - self.origin_m
+        range_m2 = np.einsum("ij,ij->i", from_scanner, from_scanner)
+        return np.asarray((range_m2 >= self.from_m**2) & (range_m2 < self.to_m**2))
 
 
 @dataclass(frozen=True)
@@ -113,14 +113,14 @@ class RangeImage:
         self,
         points: Float,
         margins_m: tuple[float, float],
-        least: int = 1,
+        min_filled: int = 1,
         velocity_m_s: Float | Float32 | None = None,
     ) -> NDArray[np.int16]:
         """Return (S,N) for each of S images the filled cells around N points, if all are beyond.
 
         The count is far below 0 if a return is not beyond the point by ``margins_m`` (metres, share
-        of the range), and 0 if fewer than ``least`` of nine cells are filled. The counts of several
-        sweeps may be added. Points and velocities are as in `sees_through`.
+        of the range), and 0 if fewer than ``min_filled`` of nine cells are filled. The counts of
+        several sweeps may be added. Points and velocities are as in `sees_through`.
         """
         points32 = np.ascontiguousarray(points, np.float32)
         velocity = np.zeros((0, 3), np.float32)
@@ -128,14 +128,14 @@ class RangeImage:
             velocity = np.ascontiguousarray(velocity_m_s, np.float32)
         margins = np.array(margins_m, np.float32)
         beyond = np.zeros((len(self.scanners), len(points)), np.int16)
-        for scanner, own in zip(self.scanners, beyond, strict=True):
+        for scanner, scanner_beyond in zip(self.scanners, beyond, strict=True):
             used = scanner.in_range(points32)
-            some, velocity_of_some = points32, velocity
+            queries, velocities = points32, velocity
             if not used.all():
-                some, velocity_of_some = points32[used], velocity[used[: len(velocity)]]
-            num = np.zeros(len(some), np.int16)
-            see_beyond.over_rows(len(num), some, velocity_of_some, scanner, margins, least, num)
-            own[used] = num
+                queries, velocities = points32[used], velocity[used[: len(velocity)]]
+            num = np.zeros(len(queries), np.int16)
+            see_beyond.over_rows(len(num), queries, velocities, scanner, margins, min_filled, num)
+            scanner_beyond[used] = num
         return beyond
 
 
@@ -259,16 +259,17 @@ def _cells_of_rings(rings: Float, step: float, by_ring: bool) -> list[_Cells]:
     middle = 0.5 * (rings[1:] + rings[:-1])
     outer: Float = 2 * rings[[0, -1]] - middle[[0, -1]]
     edges: Float = np.concatenate([outer[:1], middle, outer[1:]])
-    near, far = (_no_closer(edges, least) for least in (_MIN_ROW_RAD, _MIN_FAR_ROW_RAD))
-    if by_ring and len(near) != len(far):
-        far_m = _SLACK_M / (1.5 * float(np.diff(far).min()))
-        return [_grid(near, step)._replace(to_m=far_m), _grid(far, step)._replace(from_m=far_m)]
+    # coarse rows for near points, fine rows for far points
+    coarse, fine = (_no_closer(edges, row_rad) for row_rad in (_MIN_ROW_RAD, _MIN_FAR_ROW_RAD))
+    if by_ring and len(coarse) != len(fine):
+        far_m = _SLACK_M / (1.5 * float(np.diff(fine).min()))
+        return [_grid(coarse, step)._replace(to_m=far_m), _grid(fine, step)._replace(from_m=far_m)]
     gaps = np.diff(rings, prepend=-np.inf, append=np.inf)
     lone = rings[np.minimum(gaps[:-1], gaps[1:]) >= _LONE_RAD]
     if not by_ring or not len(lone):
-        return [_grid(near, step)]
+        return [_grid(coarse, step)]
     on_rings: Float = (lone[:, None] + [-_MIN_FAR_ROW_RAD, _MIN_FAR_ROW_RAD]).ravel()
-    return [_grid(near, step), _grid(on_rings, step)._replace(lone=True)]
+    return [_grid(coarse, step), _grid(on_rings, step)._replace(lone=True)]
 
 
 def _grid(edges: NDArray[np.floating], step: float) -> _Cells:

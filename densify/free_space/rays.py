@@ -117,10 +117,10 @@ def aim(begin, end, points, offset_s, origin, axes, twists, rays):  # type: igno
             )
         _from_scanner(x, y, z, size, origin, axes)
         for k in range(size):
-            level = np.sqrt(x[k] * x[k] + y[k] * y[k])
+            horizontal_m = np.sqrt(x[k] * x[k] + y[k] * y[k])
             rays[0, start + k] = _azimuth(x[k], y[k])
-            rays[1, start + k] = _azimuth(level, z[k])
-            rays[2, start + k] = np.sqrt(level * level + z[k] * z[k])
+            rays[1, start + k] = _azimuth(horizontal_m, z[k])
+            rays[2, start + k] = np.sqrt(horizontal_m * horizontal_m + z[k] * z[k])
 
 
 @inlined
@@ -163,12 +163,12 @@ def _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row,
 
 
 @Kernel
-def see_beyond(begin, end, points, velocity, image, margins, least, beyond):  # type: ignore[no-untyped-def]
+def see_beyond(begin, end, points, velocity, image, margins, min_filled, beyond):  # type: ignore[no-untyped-def]
     """Add to ``beyond`` (N,) int16 the number of returns of one scanner beyond each point.
 
     Counted are the filled cells among the 3 x 3 cells around a point, if they are at least
-    ``least``. If any of their returns is not beyond the point, `HIDES` is subtracted instead. All
-    other arrays are float32.
+    ``min_filled``. If any of their returns is not beyond the point, `HIDES` is subtracted instead.
+    All other arrays are float32.
 
     Args:
         points: (N,3) positions in metres, lidar frame at the reference time.
@@ -185,11 +185,11 @@ def see_beyond(begin, end, points, velocity, image, margins, least, beyond):  # 
         size = min(_BLOCK, end - start)
         _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column)
         for k in range(size):
-            i, level = start + k, np.sqrt(x[k] * x[k] + y[k] * y[k])
+            i, horizontal_m = start + k, np.sqrt(x[k] * x[k] + y[k] * y[k])
             r, c = row[k], column[k]
-            if r < 0 or image.num_filled[r, c] < least:
+            if r < 0 or image.num_filled[r, c] < min_filled:
                 continue
-            range_m = np.sqrt(level * level + z[k] * z[k])
+            range_m = np.sqrt(horizontal_m * horizontal_m + z[k] * z[k])
             margin_m = max(margins[0], margins[1] * range_m)
             away_s = abs(image.offset_s[0 if by_azimuth else r, c] - time_s[k])
             if by_azimuth:

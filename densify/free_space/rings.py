@@ -56,7 +56,7 @@ def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
     offset_s = np.zeros(len(rows), np.float32)
     if sweep.offset_ns is not None:
         offset_s = (sweep.offset_ns[rows] * 1e-9).astype(np.float32)
-    seen = np.empty((3, len(rows)), np.float32)
+    rays = np.empty((3, len(rows)), np.float32)
     aim.over_rows(
         len(rows),
         sweep.points.take(rows, axis=0).astype(np.float32),
@@ -64,9 +64,9 @@ def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
         sweep.origin_m(lidar).astype(np.float32),
         sweep.axes(lidar).astype(np.float32, order="C"),
         np.stack([registered.twist_before, registered.twist_after]).astype(np.float32),
-        seen,
+        rays,
     )
-    return Aimed(seen[0], seen[1], seen[2], offset_s)
+    return Aimed(rays[0], rays[1], rays[2], offset_s)
 
 
 class RayTable(NamedTuple):
@@ -110,15 +110,15 @@ def measure(sweeps: Sequence[Aimed]) -> Layout:
     if sum(len(rays.azimuth) for rays in sweeps) < FEW_POINTS:
         step, along = _DEFAULT_RAD
         return Layout(None, False, step, _table(0.0, 1.0, np.array([step]), np.array([along])))
-    some = [_some_sectors(rays) for rays in sweeps]
-    rings = find_rings(np.concatenate([rays.elevation for rays in some]))
+    sampled = [_some_sectors(rays) for rays in sweeps]
+    rings = find_rings(np.concatenate([rays.elevation for rays in sampled]))
     if rings is not None:
         middle = 0.5 * (rings[1:] + rings[:-1])
-        steps = [_step_along(r.azimuth, np.searchsorted(middle, r.elevation)) for r in some]
+        steps = [_step_along(r.azimuth, np.searchsorted(middle, r.elevation)) for r in sampled]
         step = float(np.median(steps))
         return Layout(rings, False, step, _table_of_rings(rings, step))
-    step, even = np.median([_even_step(rays) for rays in some], axis=0).tolist()
-    if even >= _MIN_EVEN_SHARE and fires_by_azimuth(some[0]):
+    step, even_share = np.median([_even_step(rays) for rays in sampled], axis=0).tolist()
+    if even_share >= _MIN_EVEN_SHARE and fires_by_azimuth(sampled[0]):
         return Layout(None, False, step, _table_of_lines(sweeps, step))
     table = _table_of_density(sweeps)
     step = float(np.median(table.at(sweeps[0].azimuth, sweeps[0].elevation)[:, 0]))
@@ -179,9 +179,9 @@ def fires_by_azimuth(rays: Aimed) -> bool:
 def _some_sectors(rays: Aimed) -> Aimed:
     """Return every fourth sector of an all-round view, which is enough evidence."""
     if len(rays.azimuth) > _MANY_POINTS:
-        some = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
-        if some.mean() > 0.1:
-            return Aimed(*(column[some] for column in rays))
+        in_sector = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
+        if in_sector.mean() > 0.1:
+            return Aimed(*(column[in_sector] for column in rays))
     return rays
 
 
@@ -192,8 +192,8 @@ def _in_groups(group: NDArray[Any], angle: Float32) -> Float:
 
 def _gaps(group: NDArray[Any], angle: Float32) -> Float:
     """Return the differences between neighbouring angles of the same group, see `_in_groups`."""
-    found: Float = np.diff(_in_groups(group, angle))
-    return found[found < 2 * np.pi]
+    gaps: Float = np.diff(_in_groups(group, angle))
+    return gaps[gaps < 2 * np.pi]
 
 
 def _step_along(azimuth: Float32, ring: NDArray[Any]) -> float:
@@ -267,9 +267,9 @@ def _table_of_density(sweeps: Sequence[Aimed]) -> RayTable:
     cell_sr = _CELL_RAD**2 * np.cos(low + (np.arange(rows) + 0.5) * _CELL_RAD)[:, None] * in_view
     density = np.zeros((rows, columns))
     for k in range(_NUM_WINDOWS, 0, -1):
-        held, sr = (_in_windows(values, 2**k + 1) for values in (count, cell_sr))
-        enough = (held >= _MIN_NUM) | (k == _NUM_WINDOWS)
-        density = np.where(enough & (sr > 0), held / np.maximum(sr, 1e-12), density)
+        num_in_window, sr = (_in_windows(values, 2**k + 1) for values in (count, cell_sr))
+        enough = (num_in_window >= _MIN_NUM) | (k == _NUM_WINDOWS)
+        density = np.where(enough & (sr > 0), num_in_window / np.maximum(sr, 1e-12), density)
     known = in_view & (density > 0)
     spacing = np.sqrt(len(sweeps) / np.where(known, density, 1.0))
     nearest = ndimage.distance_transform_edt(~known, return_indices=True)[1]

@@ -55,9 +55,9 @@ class FreeSpace:
             clock.batches(),
         )
 
-    def gap_m(self, place: Float, i: int) -> float:
+    def gap_m(self, position: Float, i: int) -> float:
         """Return the metres between neighbouring rings of sweep i at a (3,) world position."""
-        in_lidar = poses.transform(self.T_lidar_world[i], place[None])
+        in_lidar = poses.transform(self.T_lidar_world[i], position[None])
         return float(self.sensors.finest_gap_m(in_lidar)[0])
 
     def others(self, i: int) -> list[int]:
@@ -82,12 +82,12 @@ class FreeSpace:
         """
         batch, num_beyond = self._batch_of[j], []
         for k in batch:
-            there, T_lidar_world = points, self.T_lidar_world[k]
+            points_k, T_lidar_world = points, self.T_lidar_world[k]
             if velocity_m_s is not None and k != j:
-                there = points + (self.clock.time_s[k] - self.clock.time_s[j]) * velocity_m_s
+                points_k = points + (self.clock.time_s[k] - self.clock.time_s[j]) * velocity_m_s
             num_beyond.append(
                 self.images[k].num_beyond(
-                    poses.transform(T_lidar_world, there),
+                    poses.transform(T_lidar_world, points_k),
                     FREE_MARGIN,
                     MIN_FILLED if len(batch) == 1 else 1,
                     None if velocity_m_s is None else poses.rotate(T_lidar_world, velocity_m_s),

@@ -47,14 +47,14 @@ class SensorModel(Layout):
         holding = [s for s in sweeps if (s.sweep.lidar == lidar).any()]
         middles = (np.arange(_NUM_SWEEPS) + 0.5) * len(holding) / _NUM_SWEEPS
         chosen = [holding[i] for i in np.unique(middles.astype(int))]
-        seen = [aimed(s, lidar) for s in chosen]
-        elevation = np.concatenate([rays.elevation for rays in seen])
+        aimed_sweeps = [aimed(s, lidar) for s in chosen]
+        elevation = np.concatenate([rays.elevation for rays in aimed_sweeps])
         return SensorModel(
-            **vars(measure(seen)),
+            **vars(measure(aimed_sweeps)),
             origin_m=chosen[0].sweep.origin_m(lidar),
             axes=chosen[0].sweep.axes(lidar),
             elevation_rad=(float(elevation.min()), float(elevation.max())),
-            azimuth_rad=_view(np.concatenate([rays.azimuth for rays in seen])),
+            azimuth_rad=_view(np.concatenate([rays.azimuth for rays in aimed_sweeps])),
         )
 
     @property
@@ -79,10 +79,10 @@ class SensorModel(Layout):
 
         They are as seen from the scanner, in its axes.
         """
-        away = points - self.origin_m
-        x, y, z = (away if np.array_equal(self.axes, np.eye(3)) else away @ self.axes.T).T
-        level = np.hypot(x, y)
-        return np.arctan2(y, x), np.arctan2(z, level), np.hypot(level, z)
+        ray = points - self.origin_m
+        x, y, z = (ray if np.array_equal(self.axes, np.eye(3)) else ray @ self.axes.T).T
+        horizontal_m = np.hypot(x, y)
+        return np.arctan2(y, x), np.arctan2(z, horizontal_m), np.hypot(horizontal_m, z)
 
     def sees(self, azimuth: Float, elevation: Float) -> Bool:
         """Return (N,) True for directions, in radians, within the scanner's field of view."""
@@ -128,8 +128,8 @@ class Sensors:
         """Return `SensorModel.gap_m` (N,) at points (N,3) of the scanner ``lidar`` (N,) of each."""
         gap_m = np.zeros(len(points))
         for number, model in self.models.items():
-            mine = np.flatnonzero(lidar == number)
-            gap_m[mine] = model.gap_m(points[mine])[0]
+            rows = np.flatnonzero(lidar == number)
+            gap_m[rows] = model.gap_m(points[rows])[0]
         return gap_m
 
     def finest_gap_m(self, points: Float) -> Float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find the place from which a sweep was measured: from it, fewest returns lie behind others."""
+"""Find the position from which a sweep was measured: from it, fewest returns lie behind others."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ _APART_M = 1.0  # least distance between the scanner's places that shows its mot
 _STILL_M = 0.5
 
 
-def _around(place: Float, step_m: float, num: int = _NUM_WAYS) -> Float:
-    """Return (num,3) places at the distance ``step_m`` from a place (3,), at its height."""
-    way_rad = np.arange(num) * (2 * np.pi / num)
-    return place + step_m * np.stack([np.cos(way_rad), np.sin(way_rad), 0 * way_rad], axis=1)
+def _around(position: Float, step_m: float, num: int = _NUM_WAYS) -> Float:
+    """Return (num,3) positions ``step_m`` away from a position (3,), at its height."""
+    yaw_rad = np.arange(num) * (2 * np.pi / num)
+    return position + step_m * np.stack([np.cos(yaw_rad), np.sin(yaw_rad), 0 * yaw_rad], axis=1)
 
 
 def share_behind(points: Float, origin: Float) -> float:
     """Return the share of points (N,3) that lie behind others, seen from ``origin`` (3,)."""
-    way = points - origin
-    range_m = np.linalg.norm(way, axis=1)
-    way, range_m = way[range_m > 0], range_m[range_m > 0]
-    if not len(way):
+    ray = points - origin
+    range_m = np.linalg.norm(ray, axis=1)
+    ray, range_m = ray[range_m > 0], range_m[range_m > 0]
+    if not len(ray):
         return 0.0
-    azimuth = np.floor(np.arctan2(way[:, 1], way[:, 0]) / _CELL_RAD).astype(np.int64)
-    elevation = np.floor(np.arcsin(np.clip(way[:, 2] / range_m, -1, 1)) / _CELL_RAD)
+    azimuth = np.floor(np.arctan2(ray[:, 1], ray[:, 0]) / _CELL_RAD).astype(np.int64)
+    elevation = np.floor(np.arcsin(np.clip(ray[:, 2] / range_m, -1, 1)) / _CELL_RAD)
     cell = (azimuth - azimuth.min()) * 1000 + elevation.astype(np.int64) + 500
     nearest_m = np.full(int(cell.max()) + 1, np.inf)
     np.minimum.at(nearest_m, cell, range_m)
@@ -45,21 +45,21 @@ def share_behind(points: Float, origin: Float) -> float:
 
 
 def scanner_place(points: Float, start: Float) -> Float:
-    """Return the place (3,) at the height of ``start`` (3,) from which a sweep was measured.
+    """Return the position (3,) at the height of ``start`` (3,) from which a sweep was measured.
 
-    The search is a descent in steps of 4 m to 0.5 m. A place counts only if clearly fewer returns
-    are occluded there than at ``start``.
+    The search is a descent in steps of 4 m to 0.5 m. A position counts only if clearly fewer
+    returns are occluded there than at ``start``.
     """
     at_start = share_behind(points, start)
-    best, least = start, at_start
+    best, lowest_share = start, at_start
     for step_m in _STEP_M * 0.5 ** np.arange(_NUM_STEPS):
         for _ in range(_MOST_MOVES):
-            places = _around(best, step_m)
-            shares = [share_behind(points, place) for place in places]
-            if min(shares) >= least:
+            positions = _around(best, step_m)
+            shares = [share_behind(points, position) for position in positions]
+            if min(shares) >= lowest_share:
                 break
-            best, least = places[int(np.argmin(shares))], min(shares)
-    return best if least < _LESS * at_start else start
+            best, lowest_share = positions[int(np.argmin(shares))], min(shares)
+    return best if lowest_share < _LESS * at_start else start
 
 
 def is_still(T_world_lidar: Float) -> bool:
@@ -68,7 +68,7 @@ def is_still(T_world_lidar: Float) -> bool:
 
 
 def way_in_map(first: Sweep, last: Sweep) -> float:
-    """Return the distance (m) between the places from which two raw sweeps were measured.
+    """Return the distance (m) between the positions from which two raw sweeps were measured.
 
     It is 0 for sweeps in their scanner's own frame. Sweeps between which odometry finds no motion
     are in the frame of a map if their rays begin apart.
@@ -76,29 +76,30 @@ def way_in_map(first: Sweep, last: Sweep) -> float:
     end = scanner_place(last.points[::2], last.origin_m(0))
     if np.linalg.norm(end - last.origin_m(0)) < _APART_M:
         return 0.0
-    way_m = float(np.linalg.norm(end - scanner_place(first.points[::2], first.origin_m(0))))
-    return way_m if way_m > _APART_M else 0.0
+    distance_m = float(np.linalg.norm(end - scanner_place(first.points[::2], first.origin_m(0))))
+    return distance_m if distance_m > _APART_M else 0.0
 
 
 def are_placed(sweeps: Sequence[Sweep], T_world_lidar: Float) -> bool:
     """Return True if the rays of sweeps begin at their poses (n,4,4): both are in the world.
 
     The poses must then not be applied again. Fewer returns lie behind others seen from the pose
-    than seen from places around it at the same height, and than seen from the origin. Two sweeps
-    decide: those whose poses are farthest from the origin, if more than 4 m away, where no scanner
-    is mounted.
+    than seen from positions around it at the same height, and than seen from the origin. Two
+    sweeps decide: those whose poses are farthest from the origin, if more than 4 m away, where no
+    scanner is mounted.
     """
-    pairs = [
+    triples = [
         (s.points, s.origin_m(0), T[:3, 3]) for s, T in zip(sweeps, T_world_lidar, strict=True)
     ]
-    farthest = sorted(pairs, key=lambda p: float(np.linalg.norm(p[2] - p[1])))[-2:]
+    # by the distance of the pose (2) from the origin (1)
+    farthest = sorted(triples, key=lambda p: float(np.linalg.norm(p[2] - p[1])))[-2:]
     return all(
         np.linalg.norm(pose_m - origin) > _STEP_M and _is_scanner(points, pose_m, origin)
         for points, origin, pose_m in farthest
     )
 
 
-def _is_scanner(points: Float, place: Float, origin: Float) -> bool:
-    others = [origin, *_around(place, _STEP_M, 4)]
-    least = min(share_behind(points, other) for other in others)
-    return share_behind(points, place) < _LESS * least
+def _is_scanner(points: Float, position: Float, origin: Float) -> bool:
+    alternatives = [origin, *_around(position, _STEP_M, 4)]
+    lowest_share = min(share_behind(points, alternative) for alternative in alternatives)
+    return share_behind(points, position) < _LESS * lowest_share

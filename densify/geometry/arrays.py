@@ -35,16 +35,16 @@ def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
     Otherwise up to 1 % of them, the farthest from their median, are left out, such as a few stray
     returns. If their box is still too large, the points are spread out, and none is left out.
     """
-    everything = np.ones(len(points), bool)
+    all_points = np.ones(len(points), bool)
     if not len(points) or _num_cells(points, cell) <= most_cells:
-        return everything
+        return all_points
     distance = np.abs(points - np.median(points, axis=0)).max(axis=1)
     for share in _SHARES:
-        near = distance <= np.quantile(distance, share)
-        if _num_cells(points[near], cell) <= most_cells:
-            return near
-    return everything
+        kept = distance <= np.quantile(distance, share)
+        if _num_cells(points[kept], cell) <= most_cells:
+            return kept
+    return all_points
 
 
 def _num_cells(points: NDArray[Any], cell: float) -> float:
-    return math.prod(float(np.ptp(along)) / cell + 1 for along in points.T)
+    return math.prod(float(np.ptp(coordinate)) / cell + 1 for coordinate in points.T)

@@ -51,17 +51,17 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
             and is farther than 0.1 m: in z for a pinhole, in range for other lenses.
     """
     lens = _lens(camera)
-    uv, seen = np.full((len(points_cam), 2), np.nan), np.zeros(len(points_cam), bool)
-    away = points_cam[:, 2] if camera.model == "pinhole" else np.linalg.norm(points_cam, axis=1)
-    ahead = np.flatnonzero(away > NEAREST_M)
-    there = points_cam.take(ahead, axis=0)
-    in_view = np.flatnonzero(_in_view(camera, lens, there))
-    ahead, there = ahead[in_view], there.take(in_view, axis=0)
-    uv[ahead] = _pixels(camera, lens, there)
-    u, v = np.rint(uv.take(ahead, axis=0)).T
+    uv, visible = np.full((len(points_cam), 2), np.nan), np.zeros(len(points_cam), bool)
+    depth_m = points_cam[:, 2] if camera.model == "pinhole" else np.linalg.norm(points_cam, axis=1)
+    rows = np.flatnonzero(depth_m > NEAREST_M)
+    points_ahead = points_cam.take(rows, axis=0)
+    in_view = np.flatnonzero(_in_view(camera, lens, points_ahead))
+    rows, points_ahead = rows[in_view], points_ahead.take(in_view, axis=0)
+    uv[rows] = _pixels(camera, lens, points_ahead)
+    u, v = np.rint(uv.take(rows, axis=0)).T
     with np.errstate(invalid="ignore"):
-        seen[ahead] = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
-    return uv, seen
+        visible[rows] = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
+    return uv, visible
 
 
 def rays(camera: Camera, uv: Float) -> Float:
@@ -90,13 +90,14 @@ def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
     lens = _lens(camera)
     range_m = np.linalg.norm(points_cam, axis=1, keepdims=True)
     ray = points_cam / range_m
-    aside = np.cross(ray, np.eye(3)[np.argmin(np.abs(ray), axis=1)])
-    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
-    change = np.zeros((len(ray), 2, 3))
-    for axis in (aside, np.cross(ray, aside)):  # along the ray nothing changes
-        there, back = (_pixels(camera, lens, ray + step * axis) for step in (_STEP_RAD, -_STEP_RAD))
-        change += ((there - back) / (2 * _STEP_RAD))[:, :, None] * axis[:, None, :]
-    return change / range_m[:, :, None]
+    across = np.cross(ray, np.eye(3)[np.argmin(np.abs(ray), axis=1)])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    jacobian = np.zeros((len(ray), 2, 3))
+    # Central differences along two axes: along the ray nothing changes.
+    for axis in (across, np.cross(ray, across)):
+        uv_a, uv_b = (_pixels(camera, lens, ray + step * axis) for step in (_STEP_RAD, -_STEP_RAD))
+        jacobian += ((uv_a - uv_b) / (2 * _STEP_RAD))[:, :, None] * axis[:, None, :]
+    return jacobian / range_m[:, :, None]
 
 
 def depth_along(points_cam: Float, measure: str) -> Float:
@@ -104,19 +105,19 @@ def depth_along(points_cam: Float, measure: str) -> Float:
     return points_cam[:, 2] if measure == "z" else np.linalg.norm(points_cam, axis=1)
 
 
-def converted(camera: Camera, depth_m: Float32, given: str, wanted: str) -> Float32:
+def converted(camera: Camera, depth_m: Float32, from_measure: str, to_measure: str) -> Float32:
     """Convert an (H,W) depth map (metres, 0 none) of a camera from one measure to another.
 
     Measures are ``z``, along the optical axis, and ``range``. Pixels whose ray has z <= 0 become 0,
     unless the measures are the same and the map is returned unchanged.
     """
-    if given == wanted:
+    if from_measure == to_measure:
         return depth_m
     v, u = np.divmod(np.arange(depth_m.size, dtype=np.float64), camera.width_px)
     z = rays(camera, np.column_stack([u, v]))[:, 2].reshape(depth_m.shape)
     ahead = (z > 0) & (depth_m > 0)
-    per = z if wanted == "z" else 1 / np.where(ahead, z, 1.0)
-    return np.where(ahead, depth_m * per, 0.0).astype(np.float32)
+    factor = z if to_measure == "z" else 1 / np.where(ahead, z, 1.0)
+    return np.where(ahead, depth_m * factor, 0.0).astype(np.float32)
 
 
 class _Lens(NamedTuple):
@@ -131,37 +132,37 @@ class _Lens(NamedTuple):
 
 def _lens(camera: Camera) -> _Lens:
     """Return the lens of a camera; raise InputError for an unknown model or bad coefficients."""
-    given = camera.distortion
+    coef = camera.distortion
     if camera.model not in _COEFFICIENTS:
         raise InputError(
             f"camera {camera.name}: model: got {camera.model!r}, expected one of "
             f"{', '.join(_COEFFICIENTS)}; rectify the images if the lens is another"
         )
     lengths = _COEFFICIENTS[camera.model]
-    if len(given) not in lengths or not np.isfinite(given).all() or any(given[len(_RATIONAL) :]):
+    if len(coef) not in lengths or not np.isfinite(coef).all() or any(coef[len(_RATIONAL) :]):
         expected = " or ".join(str(n) for n in lengths if n <= len(_RATIONAL))
         raise InputError(
             f"camera {camera.name}: distortion: expected {expected} finite coefficients of a "
-            f"{camera.model} lens in their usual order, any others 0, got {list(given)}; correct "
+            f"{camera.model} lens in their usual order, any others 0, got {list(coef)}; correct "
             f"the calibration or rectify the images"
         )
-    return _lens_of(camera.model, tuple(given))
+    return _lens_of(camera.model, tuple(coef))
 
 
 @lru_cache
-def _lens_of(model: str, given: tuple[float, ...]) -> _Lens:
+def _lens_of(model: str, coef: tuple[float, ...]) -> _Lens:
     """Return the lens of a model with these coefficients."""
-    below, p1, p2 = [1.0], 0.0, 0.0
+    denominator_terms, p1, p2 = [1.0], 0.0, 0.0
     if model == "fisheye":
-        above = [1.0, *given]
+        numerator_terms = [1.0, *coef]
     elif model == "mei":
-        above = [1.0, *given[1:3]]
-        p1, p2 = given[3:]
+        numerator_terms = [1.0, *coef[1:3]]
+        p1, p2 = coef[3:]
     else:
-        padded = (*given, *[0.0] * len(_RATIONAL))[: len(_RATIONAL)]
-        k1, k2, p1, p2, k3, *others = padded
-        above, below = [1.0, k1, k2, k3], [1.0, *others]
-    numerator, denominator = Polynomial(above), Polynomial(below)
+        padded = (*coef, *[0.0] * len(_RATIONAL))[: len(_RATIONAL)]
+        k1, k2, p1, p2, k3, *k4_to_k6 = padded
+        numerator_terms, denominator_terms = [1.0, k1, k2, k3], [1.0, *k4_to_k6]
+    numerator, denominator = Polynomial(numerator_terms), Polynomial(denominator_terms)
     limit = _stops_growing(numerator, denominator)
     if model == "fisheye":
         limit = min(limit, np.pi**2)
@@ -183,18 +184,18 @@ def _in_view(camera: Camera, lens: _Lens, points_cam: Float) -> Bool:
     """Return (N,) True for directions in the view of the lens, inside or outside the image."""
     x, y, z = points_cam.T
     range_m = np.sqrt(x * x + y * y + z * z)  # norm takes three times as long
-    seen: Bool = z >= range_m * np.cos(np.radians(camera.max_angle_deg))
+    in_view: Bool = z >= range_m * np.cos(np.radians(camera.max_angle_deg))
     if camera.model == "pinhole":
-        seen &= z > 0
+        in_view &= z > 0
     elif camera.model == "mei":
         # On the sphere the radius sin θ / (cos θ + ξ) grows until cos θ = -1/ξ, or has a pole.
         xi = camera.distortion[0]
-        seen &= z > -range_m * (min(xi, 1 / xi) if xi > 0 else 0)
+        in_view &= z > -range_m * (min(xi, 1 / xi) if xi > 0 else 0)
     if np.isfinite(lens.limit):
-        ahead = np.flatnonzero(seen)
-        x, y = _plane(camera, points_cam[ahead])
-        seen[ahead] = x**2 + y**2 < lens.limit
-    return seen
+        rows = np.flatnonzero(in_view)
+        x, y = _plane(camera, points_cam[rows])
+        in_view[rows] = x**2 + y**2 < lens.limit
+    return in_view
 
 
 def _plane(camera: Camera, points_cam: Float) -> tuple[Float, Float]:
@@ -205,10 +206,10 @@ def _plane(camera: Camera, points_cam: Float) -> tuple[Float, Float]:
     if camera.model == "mei":
         depth = z + camera.distortion[0] * np.linalg.norm(points_cam, axis=1)
         return x / depth, y / depth
-    aside = np.hypot(x, y)
+    from_axis = np.hypot(x, y)
     with np.errstate(invalid="ignore", divide="ignore"):
         on_axis = np.where(z > 0, 1.0, np.nan)  # straight behind the lens the angle is undefined
-        stretch = np.where(aside > 0, np.arctan2(aside, z) / aside, on_axis)
+        stretch = np.where(from_axis > 0, np.arctan2(from_axis, z) / from_axis, on_axis)
     return stretch * x, stretch * y
 
 
@@ -250,19 +251,19 @@ def _unbent(lens: _Lens, wanted: Float) -> Float:
     radius = np.tan(np.linspace(0, np.arctan(np.sqrt(lens.limit)), _NUM_ANGLES))
     radius = radius[radius < 1e3]
     bent = radius * lens.numerator(radius**2) / lens.denominator(radius**2)
-    far = np.hypot(*wanted.T)
+    r_bent = np.hypot(*wanted.T)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        xy = wanted * np.where(far > 0, np.interp(far, bent, radius) / far, 1.0)[:, None]
-        left, off = np.arange(len(wanted)), np.full(len(wanted), np.inf)
+        xy = wanted * np.where(r_bent > 0, np.interp(r_bent, bent, radius) / r_bent, 1.0)[:, None]
+        unsolved, error = np.arange(len(wanted)), np.full(len(wanted), np.inf)
         for _ in range(_NUM_STEPS):
-            apart = np.stack(_bent(lens, *xy[left].T)) - wanted[left].T
-            by_x, aside, by_y = _slopes(lens, *xy[left].T)
-            step = np.stack([by_y, -aside]) * apart[0] + np.stack([-aside, by_x]) * apart[1]
-            xy[left] -= (step / (by_x * by_y - aside**2)).T
-            off[left] = np.abs(apart).max(axis=0) / (1 + far[left])
-            left = left[~(off[left] < _CONVERGED)]
-        found = (off < _CONVERGED) & ((xy**2).sum(axis=1) < lens.limit)
-    return np.where(found[:, None], xy, np.nan)
+            residual = np.stack(_bent(lens, *xy[unsolved].T)) - wanted[unsolved].T
+            by_x, cross, by_y = _slopes(lens, *xy[unsolved].T)
+            step = np.stack([by_y, -cross]) * residual[0] + np.stack([-cross, by_x]) * residual[1]
+            xy[unsolved] -= (step / (by_x * by_y - cross**2)).T
+            error[unsolved] = np.abs(residual).max(axis=0) / (1 + r_bent[unsolved])
+            unsolved = unsolved[~(error[unsolved] < _CONVERGED)]
+        converged = (error < _CONVERGED) & ((xy**2).sum(axis=1) < lens.limit)
+    return np.where(converged[:, None], xy, np.nan)
 
 
 def _slopes(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float, Float]:

@@ -60,16 +60,16 @@ class Clock:
                 groups.append([j])
         return tuple(map(tuple, groups))
 
-    def around(self, i: int, reach_s: float, most: int) -> list[int]:
+    def around(self, i: int, reach_s: float, max_per_side: int) -> list[int]:
         """Return the sweeps within ``reach_s`` plus half a period of sweep i, without i, ascending.
 
-        More than ``most`` sweeps on a side are thinned out evenly.
+        More than ``max_per_side`` sweeps on a side are thinned out evenly.
         """
         within_ns = self._slack_ns(reach_s)
         first = int(np.searchsorted(self.time_ns, self.time_ns[i] - within_ns))
         end = int(np.searchsorted(self.time_ns, self.time_ns[i] + within_ns, side="right"))
         before, after = range(i - 1, first - 1, -1), range(i + 1, end)
-        return sorted(_thinned(before, most) + _thinned(after, most))
+        return sorted(_thinned(before, max_per_side) + _thinned(after, max_per_side))
 
     def at(self, i: int, later_s: float) -> int | None:
         """Return the sweep nearest to ``later_s`` after sweep i, None if no sweep is on that side.
@@ -98,7 +98,7 @@ def num_in_batch(period_s: float) -> int:
     return max(1, int(np.ceil(_BATCH_S / period_s + 0.5)) - 1)
 
 
-def _thinned(side: range, most: int) -> list[int]:
-    if len(side) <= most:
+def _thinned(side: range, max_sweeps: int) -> list[int]:
+    if len(side) <= max_sweeps:
         return list(side)
-    return [side[k] for k in np.rint(np.linspace(0, len(side) - 1, most)).astype(int)]
+    return [side[k] for k in np.rint(np.linspace(0, len(side) - 1, max_sweeps)).astype(int)]

@@ -73,22 +73,22 @@ def _imported_code(function: Callable[..., Any]) -> str:
     files = {
         f.__code__.co_filename for f in function.__globals__.values() if isinstance(f, Dispatcher)
     }
-    others = sorted(files - {function.__code__.co_filename})
-    code = b"".join(Path(file).read_bytes() for file in others)
-    return hashlib.sha256(code).hexdigest()[:12] if others else ""
+    other_files = sorted(files - {function.__code__.co_filename})
+    code = b"".join(Path(file).read_bytes() for file in other_files)
+    return hashlib.sha256(code).hexdigest()[:12] if other_files else ""
 
 
 @cache
 def _is_open(folder: Path) -> bool:
     """Return True, and warn, if other users can write to the folder or to its parent."""
-    found = next((f for f in (folder, folder.parent) if others_can_write(f)), None)
-    if found is not None:
+    open_folder = next((f for f in (folder, folder.parent) if others_can_write(f)), None)
+    if open_folder is not None:
         _log.warning(
             "%s: others can write to it; compiled code is not kept there: chmod 700 it, or name "
             "another folder by NUMBA_CACHE_DIR",
-            found,
+            open_folder,
         )
-    return found is not None
+    return open_folder is not None
 
 
 class _Kept(FunctionCache):
@@ -162,15 +162,15 @@ def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> 
     if num_parts <= 1:
         function(0, num_rows, *arguments)
         return
-    bounds = [num_rows * part // num_parts for part in range(num_parts + 1)]
-    parts = list(pairwise(bounds))
-    others = [_pool().submit(function, begin, end, *arguments) for begin, end in parts[1:]]
+    bounds = [num_rows * i // num_parts for i in range(num_parts + 1)]
+    ranges = list(pairwise(bounds))
+    futures = [_pool().submit(function, begin, end, *arguments) for begin, end in ranges[1:]]
     try:
-        function(*parts[0], *arguments)
+        function(*ranges[0], *arguments)
     finally:
-        wait(others)  # before any error is raised: they write into the caller's arrays
-        for other in others:
-            other.result()
+        wait(futures)  # before any error is raised: they write into the caller's arrays
+        for future in futures:
+            future.result()
 
 
 @cache

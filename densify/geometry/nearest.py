@@ -19,8 +19,8 @@ def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Fl
 
     They are inf and -1 for a query (N,d) without a point closer than ``within_m``.
     """
-    distance_m, found = tree.query(queries, distance_upper_bound=within_m)
-    row = np.asarray(found, np.int64)
+    distance_m, tree_row = tree.query(queries, distance_upper_bound=within_m)
+    row = np.asarray(tree_row, np.int64)
     row[row == tree.n] = -1
     return np.asarray(distance_m), row
 
@@ -36,19 +36,19 @@ def is_near(tree: cKDTree, queries: Float, within_m: float) -> Bool:
     return np.isfinite(tree.query(queries, distance_upper_bound=within_m)[0])
 
 
-def thinned(points: Float | Float32, order: Int, step: float, most: int) -> Int:
+def thinned(points: Float | Float32, order: Int, step: float, max_per_cell: int) -> Int:
     """Thin points (N,3) by a grid, and return the rows of the points that are kept, ascending.
 
     The rows ``order`` (K,) are the candidates, the preferred ones first. Each cell of side ``step``
-    keeps up to ``most`` of them. The box around the points has at most 2^63 / N cells.
+    keeps up to ``max_per_cell`` of them. The box around the points has at most 2^63 / N cells.
     """
     cell = np.zeros(len(points), np.int64)
     for x in points.T:
-        along = ((x - x.min(initial=np.inf)) / step).astype(np.int64)
-        cell *= along.max(initial=0) + 1
-        cell += along
+        index = ((x - x.min(initial=np.inf)) / step).astype(np.int64)
+        cell *= index.max(initial=0) + 1
+        cell += index
     bits = len(order).bit_length()  # the lower bits say the place in the order
     ranked = np.sort((cell[order] << bits) + np.arange(len(order)))
-    cell, first = ranked >> bits, np.ones(len(ranked), bool)
-    first[most:] = cell[most:] != cell[:-most]
-    return np.sort(order[ranked[first] & ((1 << bits) - 1)])
+    cell, kept = ranked >> bits, np.ones(len(ranked), bool)
+    kept[max_per_cell:] = cell[max_per_cell:] != cell[:-max_per_cell]
+    return np.sort(order[ranked[kept] & ((1 << bits) - 1)])

@@ -21,14 +21,14 @@ _VOXEL_M, _LEAF_M, _NUM_NEIGHBORS = 0.5, 1.0, 10
 _NORMAL_M = 0.0447  # standard deviation of two surfaces along the normal in generalized ICP
 
 
-def subsample(sweep: Sweep, most: int = MANY_POINTS) -> Sweep:
-    """Return about ``most`` points of a larger sweep, spread evenly over its rings."""
+def subsample(sweep: Sweep, max_points: int = MANY_POINTS) -> Sweep:
+    """Return about ``max_points`` points of a larger sweep, spread evenly over its rings."""
     num = len(sweep)
-    if num <= most:
+    if num <= max_points:
         return sweep
-    place = np.arange(num) * _GOLDEN
-    place -= np.floor(place)
-    return sweep.select(place < most / num)
+    fraction = np.arange(num) * _GOLDEN
+    fraction -= np.floor(fraction)
+    return sweep.select(fraction < max_points / num)
 
 
 class Surface(NamedTuple):
@@ -52,9 +52,9 @@ class Surface(NamedTuple):
     @staticmethod
     def joined(surfaces: Sequence[Surface], T_joined_surface: Float) -> Surface:
         """Return the surface of n surfaces, each with its pose (n,4,4) in the joint frame."""
-        moved = zip(T_joined_surface, surfaces, strict=True)
+        posed = zip(T_joined_surface, surfaces, strict=True)
         return Surface.of(
-            np.concatenate([poses.transform(T, s.points.points()[:, :3]) for T, s in moved])
+            np.concatenate([poses.transform(T, s.points.points()[:, :3]) for T, s in posed])
         )
 
 
@@ -96,11 +96,9 @@ def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> A
     options: dict[str, Any] = {"max_correspondence_distance": match_m, "num_threads": 1}
     if isinstance(target, Surface):
         kind = "GICP" if is_surface else "PLANE_ICP"
-        found = small_gicp.align(
-            target.points, points, target.tree, T_target_source, kind, **options
-        )
+        fit = small_gicp.align(target.points, points, target.tree, T_target_source, kind, **options)
     else:
-        found = small_gicp.align(target, points, T_target_source, **options)
-    num, per_m2 = max(int(found.num_inliers), 1), _NORMAL_M**2 if is_surface else 1.0
-    overlap = found.num_inliers / max(int(points.size()), 1)
-    return Alignment(np.asarray(found.T_target_source), overlap, np.asarray(found.H) * per_m2 / num)
+        fit = small_gicp.align(target, points, T_target_source, **options)
+    num, scale_m2 = max(int(fit.num_inliers), 1), _NORMAL_M**2 if is_surface else 1.0
+    overlap = fit.num_inliers / max(int(points.size()), 1)
+    return Alignment(np.asarray(fit.T_target_source), overlap, np.asarray(fit.H) * scale_m2 / num)

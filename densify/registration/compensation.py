@@ -57,13 +57,13 @@ def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
     elevation = np.arctan2(z, np.hypot(x, y))
     cell = ((elevation + 0.5 * np.pi) / (bins * _BIN_RAD)).astype(np.int64)
     width = max(8, _WINDOW_CELLS // bins)
-    length = -(-int(np.pi / (bins * _BIN_RAD) + 1) // width)
-    count = np.bincount(cell, minlength=length * width).astype(np.float64).reshape(length, width)
-    held = count.sum(axis=1)
-    enough = held > _LEAST_SHARE * len(points)
-    if not enough.any():
+    windows = -(-int(np.pi / (bins * _BIN_RAD) + 1) // width)
+    count = np.bincount(cell, minlength=windows * width).astype(np.float64).reshape(windows, width)
+    total = count.sum(axis=1)
+    dense = total > _LEAST_SHARE * len(points)
+    if not dense.any():
         return 1.0
-    return float(np.median((count[enough] ** 2).sum(axis=1) / held[enough] ** 2) * width)
+    return float(np.median((count[dense] ** 2).sum(axis=1) / total[dense] ** 2) * width)
 
 
 def rings_by_motion(
@@ -121,16 +121,16 @@ def find_compensated(sweep: Sweep, twist: Float, period_s: float) -> Rings | Non
     if np.linalg.norm(twist[3:]) < LEAST_SPEED_M_S:
         return None
     for lidar in np.unique(sweep.lidar).tolist():
-        mine = sweep.select(sweep.lidar == lidar)
-        near, R = sample_rows(mine, COMPENSATED_M), mine.axes(lidar)
-        if not len(near):
+        returns = sweep.select(sweep.lidar == lidar)
+        rows, R = sample_rows(returns, COMPENSATED_M), returns.axes(lidar)
+        if not len(rows):
             continue
-        if mine.offset_ns is None:
-            offset_s = turning_s(mine.points[near], period_s)
+        if returns.offset_ns is None:
+            offset_s = turning_s(returns.points[rows], period_s)
         else:
-            offset_s = np.asarray(mine.offset_ns[near] * 1e-9, np.float64)
-        origins_m = [R @ mine.origin_m(lidar) + [0.0, 0.0, height_m] for height_m in _HEIGHTS_M]
-        rings = rings_by_motion(mine.points[near], offset_s, twist, R, origins_m)
+            offset_s = np.asarray(returns.offset_ns[rows] * 1e-9, np.float64)
+        origins_m = [R @ returns.origin_m(lidar) + [0.0, 0.0, height_m] for height_m in _HEIGHTS_M]
+        rings = rings_by_motion(returns.points[rows], offset_s, twist, R, origins_m)
         if rings.are_compensated:
             return rings
     return None

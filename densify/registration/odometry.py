@@ -53,9 +53,9 @@ def find_odometry(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
     odometry, no_times = KissICP(config), np.empty(0)
     odometry.register_frame(points[0], no_times)
     twists = [search_twist(stamp_ns[rows], [sweeps[row].points for row in rows])]
-    for above, seconds in zip(points[1:], np.diff(stamp_ns[rows]) * 1e-9, strict=True):
+    for sweep_points, seconds in zip(points[1:], np.diff(stamp_ns[rows]) * 1e-9, strict=True):
         odometry.last_delta = poses.exp(twists[-1] * seconds)
-        odometry.register_frame(above, no_times)
+        odometry.register_frame(sweep_points, no_times)
         twists.append(poses.log(odometry.last_delta) / seconds)
     step = np.searchsorted(stamp_ns[rows], stamp_ns).clip(1, len(rows) - 1)
     return np.stack(twists)[step]
@@ -72,9 +72,9 @@ def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
     """
     step_s = np.diff(stamp_ns[:3]) * 1e-9
     step_m = _STEP_M * min(1.0, step_s[0] / _STEP_S)
-    above = [above_ground(p) for p in points[:3]]
+    points_above = [above_ground(p) for p in points[:3]]
     pairs = []
-    for i, (earlier, later) in enumerate(pairwise(above)):
+    for i, (earlier, later) in enumerate(pairwise(points_above)):
         _, rows = np.unique(np.floor(later), axis=0, return_index=True)  # even over 1 m voxels
         sample = later[rows[:: len(rows) // _NUM_SAMPLES + 1]]
         ratio = step_s[i] / step_s[0]
@@ -82,17 +82,17 @@ def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
         pairs.append((tree_of(earlier), sample, ratio, apart_m))
 
     def cost(steps_m: Float) -> Float:
-        parts = np.array_split(steps_m, len(steps_m) // _MOST_STEPS + 1)
-        return np.concatenate([cost_of_few(part) for part in parts])
+        chunks = np.array_split(steps_m, len(steps_m) // _MOST_STEPS + 1)
+        return np.concatenate([cost_of_few(chunk) for chunk in chunks])
 
     def cost_of_few(steps_m: Float) -> Float:
-        sums = 1e-3 * np.linalg.norm(steps_m, axis=1)
+        cost_m = 1e-3 * np.linalg.norm(steps_m, axis=1)
         for tree, sample, ratio, apart_m in pairs:
             moved = (sample + ratio * steps_m[:, None, :]).reshape(-1, 3)
             distance_m, _ = tree.query(moved, distance_upper_bound=_CLOSE_M, workers=-1)
             distance_m = np.minimum(distance_m, _CLOSE_M).reshape(len(steps_m), -1)
-            sums += np.maximum(distance_m - apart_m, 0.0).mean(1)
-        return sums
+            cost_m += np.maximum(distance_m - apart_m, 0.0).mean(1)
+        return cost_m
 
     coarse_m = _grid(np.zeros(2), min(MAX_SPEED_M_S * step_s[0], _MOST_STEP_M), 2 * step_m)
     coarse = coarse_m[np.argmin(cost(coarse_m))]
@@ -112,7 +112,7 @@ def above_ground(points: Float) -> Float:
     if not len(points):
         return points
     x, y, z = points.T
-    row, column = (np.floor(along).astype(np.int64) for along in (x, y))
+    row, column = (np.floor(coordinate).astype(np.int64) for coordinate in (x, y))
     row, column = row - row.min(), column - column.min()
     cell = row * (column.max() + 1) + column
     lowest = np.full(int(cell.max()) + 1, np.inf)

@@ -86,13 +86,13 @@ def follow_road(
         step_s, twist_before = (time_ns - last_ns) * 1e-9, twist
         T_guess = T_world_lidar @ poses.exp(twist * step_s)
         surface = Surface.of(deskew_points(subsample(sweep, FEW_POINTS), twist))
-        T_found, overlap, _ = align(chain, surface, T_guess, _CHAIN_MATCH_M)
-        twist = poses.twist_between(T_world_lidar, T_found, step_s)
+        T_aligned, overlap, _ = align(chain, surface, T_guess, _CHAIN_MATCH_M)
+        twist = poses.twist_between(T_world_lidar, T_aligned, step_s)
         if overlap < MIN_OVERLAP or find_jump(twist, twist_before, abs(step_s)):
             return
         surface = Surface.of(deskew_points(subsample(sweep), twist))  # by the velocity found
-        chain.insert(surface.points, T_found)
-        T_world_lidar, last_ns = T_found, time_ns
+        chain.insert(surface.points, T_aligned)
+        T_world_lidar, last_ns = T_aligned, time_ns
         speed_m_s = float(np.linalg.norm(twist[3:]))
         travel_m += speed_m_s * abs(step_s)
         yield RegisteredSweep(sweep, T_world_lidar, twist, twist), surface
@@ -128,10 +128,10 @@ def relax_poses(
     member, middle = _submaps(known, num_sweeps)
     T, fixed = T_world_lidar[middle], known[middle]
     pairs = [
-        (i, i + apart)
+        (i, i + num_apart)
         for i in range(len(middle))
-        for apart in _APART
-        if i + apart < len(middle) and not (fixed[i] and fixed[i + apart])
+        for num_apart in _APART
+        if i + num_apart < len(middle) and not (fixed[i] and fixed[i + num_apart])
     ]
     used = sorted({i for pair in pairs for i in pair})
 
@@ -151,10 +151,10 @@ def relax_poses(
             return align(submaps[i], submaps[j], poses.inverse(T[i]) @ T[j], _MATCH_M)
 
         graph = _Graph(np.array(pairs, int).reshape(-1, 2), fixed, list(pool.map(aligned, pairs)))
-    relaxed = graph.relaxed(T)
-    change = relaxed @ poses.inverse(T)
-    found = np.where(known[:, None, None], T_world_lidar, change[member] @ T_world_lidar)
-    return Relaxed(found, graph.holds(relaxed)[member])
+    T_relaxed = graph.relaxed(T)
+    change = T_relaxed @ poses.inverse(T)
+    T_sweeps = np.where(known[:, None, None], T_world_lidar, change[member] @ T_world_lidar)
+    return Relaxed(T_sweeps, graph.holds(T_relaxed)[member])
 
 
 def _submaps(known: Bool, num_sweeps: int) -> tuple[Int, Int]:
@@ -163,14 +163,14 @@ def _submaps(known: Bool, num_sweeps: int) -> tuple[Int, Int]:
     begin, end = np.flatnonzero(known)[[0, -1]] + (0, 1)
     row = np.arange(len(known))
     before, after = begin - 1 - row[:begin], row[end:] - end
-    part = np.concatenate(
+    submap = np.concatenate(
         [
             -1 - before // num_sweeps,
             row[: end - begin] // num_sweeps,
             (end - begin - 1) // num_sweeps + 1 + after // num_sweeps,
         ]
     )
-    member = part - part[0]
+    member = submap - submap[0]
     middle = [int(np.median(np.flatnonzero(member == i))) for i in range(member[-1] + 1)]
     return member, np.array(middle)
 
@@ -198,19 +198,20 @@ class _Graph:
     def holds(self, T: Float) -> Bool:
         """Return (m,) True for submaps that reliable alignments connect to fixed ones."""
         target, source = self._ends.T
-        wrong = self.off_m(self._apart(T)) > _MOST_LEFT_M
-        across = np.zeros((2, len(self._fixed)))
-        for gap in range(len(self._fixed) - 1):  # from this submap to the next
+        is_off = self.off_m(self._apart(T)) > _MOST_LEFT_M
+        # per gap from a submap to the next: alignments across it that are off, and all of them
+        counts = np.zeros((2, len(self._fixed)))
+        for gap in range(len(self._fixed) - 1):
             spans = (target <= gap) & (source > gap)
-            across[:, gap] = wrong[spans].sum(), spans.sum()
-        good = across[0] <= _MOST_WRONG * across[1]
-        beside = source - target == 1
-        good[target[beside]] &= self._overlap[beside] >= _LEAST_OVERLAP
+            counts[:, gap] = is_off[spans].sum(), spans.sum()
+        gap_holds = counts[0] <= _MOST_WRONG * counts[1]
+        is_adjacent = source - target == 1
+        gap_holds[target[is_adjacent]] &= self._overlap[is_adjacent] >= _LEAST_OVERLAP
         first, last = np.flatnonzero(self._fixed)[[0, -1]]
-        found = np.ones(len(self._fixed), bool)
-        found[:first] = np.logical_and.accumulate(good[:first][::-1])[::-1]
-        found[last + 1 :] = np.logical_and.accumulate(good[last:-1])
-        return found
+        connected = np.ones(len(self._fixed), bool)
+        connected[:first] = np.logical_and.accumulate(gap_holds[:first][::-1])[::-1]
+        connected[last + 1 :] = np.logical_and.accumulate(gap_holds[last:-1])
+        return connected
 
     def _between(self, T: Float) -> Float:
         """Return (p,4,4) poses of sources in their target's frame, from submap poses (m,4,4)."""
@@ -220,24 +221,24 @@ class _Graph:
         """Return (p,6) the motion (rad, m) of each source away from its aligned pose."""
         return poses.log(self._T_source_target @ self._between(T))
 
-    def off_m(self, apart: Float) -> Float:
+    def off_m(self, residual: Float) -> Float:
         """Return the (p,) RMS distance (m) of two surfaces, the source moved by (p,6) rad, m."""
-        square = np.einsum("pi,pij,pj->p", apart, self._information, apart)
+        square = np.einsum("pi,pij,pj->p", residual, self._information, residual)
         return np.sqrt(np.maximum(square, 0))
 
     def _step(self, T: Float) -> Float:
         """Return (free,6) the next Gauss-Newton step of each free submap, in its own frame."""
-        apart = self._apart(T)
-        weight = 1 / (1 + (self.off_m(apart) / _USUAL_M) ** 2)
+        residual = self._apart(T)
+        weight = 1 / (1 + (self.off_m(residual) / _USUAL_M) ** 2)
         adjoint = poses.carried(poses.inverse(self._between(T))[:, None], np.eye(6))
-        slope = np.zeros((len(apart), 6, 12))  # by the motions of target and source
+        slope = np.zeros((len(residual), 6, 12))  # by the motions of target and source
         slope[:, :, :6], slope[:, :, 6:] = -adjoint.transpose(0, 2, 1), np.eye(6)
-        pull = slope.transpose(0, 2, 1) @ (weight[:, None, None] * self._information)
+        weighted = slope.transpose(0, 2, 1) @ (weight[:, None, None] * self._information)
         # Unknowns of fixed submaps come after all others, and are cut off.
         num = 6 * int((~self._fixed).sum())
         first = np.where(self._fixed, num, 6 * (np.cumsum(~self._fixed) - 1))
-        at = (first[self._ends][:, :, None] + np.arange(6)).reshape(-1, 12)
-        row, column = np.broadcast_arrays(at[:, :, None], at[:, None, :])
-        left = sparse.csc_matrix(((pull @ slope).ravel(), (row.ravel(), column.ravel())))
-        right = np.bincount(at.ravel(), (pull @ apart[:, :, None]).ravel())
-        return -spsolve(left[:num, :num], right[:num]).reshape(-1, 6)
+        unknown = (first[self._ends][:, :, None] + np.arange(6)).reshape(-1, 12)
+        row, column = np.broadcast_arrays(unknown[:, :, None], unknown[:, None, :])
+        matrix = sparse.csc_matrix(((weighted @ slope).ravel(), (row.ravel(), column.ravel())))
+        gradient = np.bincount(unknown.ravel(), (weighted @ residual[:, :, None]).ravel())
+        return -spsolve(matrix[:num, :num], gradient[:num]).reshape(-1, 6)

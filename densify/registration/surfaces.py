@@ -85,8 +85,8 @@ class _SweepRow:
             twist = twist if twists is None else twists[i]
             T_guess = self._T[i - 1] @ poses.exp(twist * step_s[i - 1])
             first = min(int(np.searchsorted(stamp_ns, stamp_ns[i] - _REACH_NS)), i - 1)
-            before = range(i - 1, first - 1, -1) if i >= num_start else range(0)
-            twist = self._place(i, i, T_guess, twist, before)
+            neighbours = range(i - 1, first - 1, -1) if i >= num_start else range(0)
+            twist = self._place(i, i, T_guess, twist, neighbours)
         if num > 2:
             twist, self._surface = poses.twist_to(self._T, stamp_ns, num_start + 1), None
             for i in range(num_start - 1, -1, -1):
@@ -98,17 +98,17 @@ class _SweepRow:
         points = [poses.transform(T_first_world, p) for p in self._points]
         return np.stack([np.eye(4), *(T_first_world @ T for T in self._T[1:])]), points
 
-    def _place(self, i: int, step: int, T_guess: Float, twist: Float, others: range) -> Float:
-        """Align sweep i with ``others``, nearest first; return the velocity before ``step``."""
-        self._T[i] = T_guess  # without others the sweep keeps its prediction
-        if others:
-            surface, T_world_surface = self._surface_for(i, others)
+    def _place(self, i: int, step: int, T_guess: Float, twist: Float, neighbours: range) -> Float:
+        """Align sweep i with ``neighbours``, nearest first; return the velocity before ``step``."""
+        self._T[i] = T_guess  # without neighbours the sweep keeps its prediction
+        if neighbours:
+            surface, T_world_surface = self._surface_for(i, neighbours)
             T = poses.inverse(T_world_surface) @ T_guess
             for match_m in self._match_m:
                 source = thin(deskew_points(self._sweeps[i], twist), _VOXEL_M)
                 T_aligned, _, information = align(surface, source, T, match_m)
-                slid = information @ poses.log(poses.inverse(T) @ T_aligned)
-                motion = np.linalg.solve(information + _HELD, slid)
+                gradient = information @ poses.log(poses.inverse(T) @ T_aligned)
+                motion = np.linalg.solve(information + _HELD, gradient)
                 T = T @ poses.exp(np.asarray(motion, np.float64))
                 self._T[i] = T_world_surface @ T
                 twist = poses.twist_to(self._T, self.stamp_ns, step)
@@ -116,16 +116,16 @@ class _SweepRow:
         self._points[i : i + 1] = [points]
         return twist
 
-    def _surface_for(self, i: int, others: range) -> tuple[Surface, Float]:
+    def _surface_for(self, i: int, neighbours: range) -> tuple[Surface, Float]:
         """Return a surface to align sweep i with, and its pose in the world (4,4)."""
         if self._surface is not None:
             surface, T_world_surface, nearest = self._surface
             if abs(self.stamp_ns[i] - self.stamp_ns[nearest]) < _FRESH_NS:
                 return surface, T_world_surface
         T_world_surface = self._T[i].copy()
-        chosen = others[:: max(1, round(len(others) / _NUM_IN_REACH))]
-        around = np.concatenate([self._points[j] for j in chosen])
-        around = poses.transform(poses.inverse(T_world_surface), around)
-        surface = Surface.of(around, _VOXEL_M, self._num_neighbors)
-        self._surface = surface, T_world_surface, others[0]
+        chosen = neighbours[:: max(1, round(len(neighbours) / _NUM_IN_REACH))]
+        points = np.concatenate([self._points[j] for j in chosen])
+        points = poses.transform(poses.inverse(T_world_surface), points)
+        surface = Surface.of(points, _VOXEL_M, self._num_neighbors)
+        self._surface = surface, T_world_surface, neighbours[0]
         return surface, T_world_surface

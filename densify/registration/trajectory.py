@@ -102,10 +102,10 @@ def _check_stamps(frames: Sequence[int], stamp_ns: Int) -> None:
     """Raise UnfitSweepError where the stamps do not ascend."""
     for (a, b), step_ns in zip(pairwise(frames), np.diff(stamp_ns), strict=True):
         if step_ns <= 0:
-            found = f"{1e-6 * -step_ns:.1f} ms before it" if step_ns else "the same"
+            difference = f"{1e-6 * -step_ns:.1f} ms before it" if step_ns else "the same"
             raise UnfitSweepError(
                 f"registration: the stamp of frame {b} is not after that of frame {a}, but "
-                f"{found}; expected ascending stamps; check the recording's timestamps",
+                f"{difference}; expected ascending stamps; check the recording's timestamps",
                 b,
             )
 
@@ -164,8 +164,8 @@ def check_overlap(
         share = _share_on(above[i], trees[first:i])
         if share < MIN_OVERLAP and stamp_ns[i] - stamp_ns[0] < _OVERLAP_NS:
             end = int(np.searchsorted(stamp_ns, stamp_ns[i] + _OVERLAP_NS))
-            others = trees[first:i] + trees[i + 1 : end]
-            both_ways = _share_on(above[i], others), _share_on(above[i - 1], trees[i:end])
+            trees_around = trees[first:i] + trees[i + 1 : end]
+            both_ways = _share_on(above[i], trees_around), _share_on(above[i - 1], trees[i:end])
             share = max(share, min(both_ways))
         if share < MIN_OVERLAP:
             raise UnplacedSweepError(
@@ -180,17 +180,17 @@ def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
     """Return the share of (N,3) points within 0.5 m of any tree's points; 1 for few points."""
     if min(len(points), sum(tree.n for tree in trees)) < _OVERLAP_POINTS // 10:
         return 1.0
-    left = points[:: len(points) // _OVERLAP_POINTS + 1]
-    num = len(left)
+    unmatched = points[:: len(points) // _OVERLAP_POINTS + 1]
+    num = len(unmatched)
     for tree in trees:
-        distance, _ = tree.query(left, distance_upper_bound=_OVERLAP_M)
-        left = left[~np.isfinite(distance)]
-    return 1 - len(left) / num
+        distance, _ = tree.query(unmatched, distance_upper_bound=_OVERLAP_M)
+        unmatched = unmatched[~np.isfinite(distance)]
+    return 1 - len(unmatched) / num
 
 
 def _advice(settings: RegisterSettings) -> str:
-    other = "kiss-icp" if settings.source == "dataset" else "dataset"
+    alternative = "kiss-icp" if settings.source == "dataset" else "dataset"
     return (
-        f"choose another key or a smaller window, or other poses (register.source={other}); "
+        f"choose another key or a smaller window, or other poses (register.source={alternative}); "
         f"densify doctor says what is wrong with a recording"
     )

@@ -27,23 +27,23 @@ from densify.geometry.types import Float, FlowField, Motion
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     """Return the motion by the published objective, see `EngineModule`; takes no argument."""
 
-    def step(here: int, there: int) -> FlowField:
-        return _step(scene, here, there, settings)
+    def step(i: int, j: int) -> FlowField:
+        return _step(scene, i, j, settings)
 
     return ChainedMotion(scene.stretch, step)
 
 
-def _step(scene: Scene, here: int, there: int, settings: Config) -> FlowField:
-    """Return the flow of sweep index ``here`` to ``there``, in its lidar frame; 0 on the ground."""
+def _step(scene: Scene, i: int, j: int, settings: Config) -> FlowField:
+    """Return the flow of sweep index ``i`` to ``j``, in its lidar frame; 0 on the ground."""
     clouds = [
         poses.transform(s.T_world_lidar, s.sweep.points)
-        for s in (scene.stretch.sweeps[here], scene.stretch.sweeps[there])
+        for s in (scene.stretch.sweeps[i], scene.stretch.sweeps[j])
     ]
-    above, above_there = (scene.ground.above(c) >= ABOVE_GROUND_M for c in clouds)
+    above, target_above = (scene.ground.above(c) >= ABOVE_GROUND_M for c in clouds)
     field = FlowField.zero(len(above))
-    if above.any() and above_there.any():
-        pair = flow_between(clouds[0][above], clouds[1][above_there], settings.objective)
-        R_world_lidar = scene.stretch.sweeps[here].T_world_lidar[:3, :3]
+    if above.any() and target_above.any():
+        pair = flow_between(clouds[0][above], clouds[1][target_above], settings.objective)
+        R_world_lidar = scene.stretch.sweeps[i].T_world_lidar[:3, :3]
         field.displacement[above] = pair.displacement @ R_world_lidar
         field.moving[above] = pair.moving
     return field
@@ -67,8 +67,8 @@ def flow_between(
     flow = solve(source, target, objective, initial).flow
     if settings.static_prior:
         return _only_proven((np.asarray(source, float), np.asarray(target, float)), flow)
-    still = FlowField.zero(len(flow))
-    return replace(still, displacement=flow, moving=np.ones(len(flow), bool))
+    static = FlowField.zero(len(flow))
+    return replace(static, displacement=flow, moving=np.ones(len(flow), bool))
 
 
 def _only_proven(clouds: tuple[Float, Float], flow: Float) -> FlowField:

@@ -47,11 +47,11 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
     num = len(points)
     num_listed = min(num_neighbors, num - 1) + 1  # with the point itself
     nearest = cKDTree(points).query(points, np.arange(1, num_listed + 1))
-    distance_m, column = (np.ravel(found) for found in nearest)
+    distance_m, column = (np.ravel(array) for array in nearest)
     row = np.repeat(np.arange(num), num_listed)
-    other = column != row  # with more than k duplicates the point itself may be missing
+    edge = column != row  # with more than k duplicates the point itself may be missing
     listed = csr_array(
-        (np.exp(-(distance_m[other] ** 2)), (row[other], column[other])), shape=(num, num)
+        (np.exp(-(distance_m[edge] ** 2)), (row[edge], column[edge])), shape=(num, num)
     )
     weights = csr_array(listed.maximum(listed.T) + eye_array(num))
     weights.sort_indices()

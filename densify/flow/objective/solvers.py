@@ -192,8 +192,8 @@ def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
 
 def _levels(first: float, alpha: float) -> list[float]:
     """Return alphas from ``first`` down to ``alpha``, in equal steps of the logarithm."""
-    least = max(alpha, _LEAST_ALPHA)
-    if first <= least:
+    lowest_alpha = max(alpha, _LEAST_ALPHA)
+    if first <= lowest_alpha:
         return [alpha]
-    num_steps = math.ceil(math.log(first / least) / math.log(_LEVEL_FACTOR) - 1e-9)
-    return [*np.geomspace(first, least, num_steps + 1)[:-1].tolist(), alpha]
+    num_steps = math.ceil(math.log(first / lowest_alpha) / math.log(_LEVEL_FACTOR) - 1e-9)
+    return [*np.geomspace(first, lowest_alpha, num_steps + 1)[:-1].tolist(), alpha]

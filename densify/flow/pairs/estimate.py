@@ -92,9 +92,9 @@ def _flow_of_groups(
     middle = np.median(clouds[0], axis=0)  # map coordinates lose nothing
     points = [cloud - middle for cloud in clouds]
     inside = [np.flatnonzero((np.abs(p[:, :2]) < _MAX_EXTENT_M).all(1)) for p in points]
-    near = [p[rows] for p, rows in zip(points, inside, strict=True)]
-    ground = HeightMap.of(near)
-    heights_m = [ground.above(p) for p in near]
+    points_inside = [p[rows] for p, rows in zip(points, inside, strict=True)]
+    ground = HeightMap.of(points_inside)
+    heights_m = [ground.above(p) for p in points_inside]
     above = [rows[h >= ABOVE_GROUND_M] for rows, h in zip(inside, heights_m, strict=True)]
     field = FlowField.zero(len(clouds[0]))
     if not (len(above[0]) and len(above[1])):
@@ -157,18 +157,18 @@ def _shares(times_ns: tuple[Int, Int] | None) -> tuple[list[Float], float] | Non
     """Return firing times as shares of the time between the clouds, and this time (s)."""
     if times_ns is None:
         return None
-    low, high = (np.array([int(of(times)) for times in times_ns]) for of in (np.min, np.max))
+    low, high = (np.array([int(limit(times)) for times in times_ns]) for limit in (np.min, np.max))
     middle = low + (high - low) // 2
-    span, gap = int((high - low).max()), int(middle[1] - middle[0])
-    if 2 * abs(gap) < span:
-        gap = span  # each from its own reference time: the next revolution
-    if gap == 0:
+    span_ns, gap_ns = int((high - low).max()), int(middle[1] - middle[0])
+    if 2 * abs(gap_ns) < span_ns:
+        gap_ns = span_ns  # each from its own reference time: the next revolution
+    if gap_ns == 0:
         return None
     # 0 at the middle of the source's times, 1 at the middle of the target's
     shares = [
-        i + (times - m) / gap for i, (times, m) in enumerate(zip(times_ns, middle, strict=True))
+        i + (times - m) / gap_ns for i, (times, m) in enumerate(zip(times_ns, middle, strict=True))
     ]
-    return shares, abs(gap) * 1e-9
+    return shares, abs(gap_ns) * 1e-9
 
 
 # --- The engine ``pairs``
@@ -178,15 +178,15 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     """Chain the flow of neighbouring sweeps: the engine ``pairs``, for recordings of two sweeps."""
     of_groups = replace(settings, flow=replace(settings.flow, engine="groups"))
 
-    def step(here: int, there: int) -> FlowField:
-        return _step(scene.stretch, here, there, of_groups)
+    def step(i: int, j: int) -> FlowField:
+        return _step(scene.stretch, i, j, of_groups)
 
     return ChainedMotion(scene.stretch, step)
 
 
-def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowField:
-    """Return the flow of sweep ``here`` to the reference time of ``there``, lidar frame."""
-    pair = [stretch.sweeps[i] for i in (here, there)]
+def _step(stretch: Stretch, i: int, j: int, settings: Config) -> FlowField:
+    """Return the flow of sweep ``i`` to the reference time of ``j``, lidar frame."""
+    pair = [stretch.sweeps[k] for k in (i, j)]
     sweeps = [s.sweep for s in pair]
     if min(map(len, sweeps)) == 0:
         return FlowField.zero(len(sweeps[0]))
@@ -204,6 +204,6 @@ def _step(stretch: Stretch, here: int, there: int, settings: Config) -> FlowFiel
     to_reference = None
     if field.to_reference is not None and times_ns[0] is not None:
         # It leads to the middle of the firing times, which need not be the stamp of a sweep.
-        late = int(times_ns[0].min()) + np.ptp(times_ns[0]) / 2
-        to_reference = field.to_reference @ R_lidar_world.T - displacement * (late / apart_ns)
+        middle_ns = int(times_ns[0].min()) + np.ptp(times_ns[0]) / 2
+        to_reference = field.to_reference @ R_lidar_world.T - displacement * (middle_ns / apart_ns)
     return replace(field, displacement=displacement, to_reference=to_reference)

@@ -76,11 +76,11 @@ class Proposal:
         # They would pull the motion: an object shows other parts after it has moved.
         return self.source_gain + float(np.maximum(self.target_gain, 0.0).sum())
 
-    def goes_with(self, other: Proposal) -> bool:
-        """Return True if the other motion, at this group, is nearly the same."""
+    def goes_with(self, proposal: Proposal) -> bool:
+        """Return True if the motion of ``proposal``, at this group, is nearly the same."""
         centre = self.motion.centre[None]
-        off = self.motion.place(centre, 1.0) - other.motion.place(centre, 1.0)
-        return bool(np.linalg.norm(off) < _TOGETHER_M)
+        offset = self.motion.place(centre, 1.0) - proposal.motion.place(centre, 1.0)
+        return bool(np.linalg.norm(offset) < _TOGETHER_M)
 
     def moves(self, free: Bool | None = None) -> bool:
         """Return True if the group certainly moves.
@@ -90,9 +90,9 @@ class Proposal:
         counted = (
             self.target_gain if free is None else self.target_gain[free | (self.target_gain < 0)]
         )
-        least = max(_MIN_GAIN, _BALANCE * self.source_gain)
-        enough = self.source_gain > _MIN_GAIN and counted.sum() > least
-        return bool(enough and self.misfit < _MAX_MISFIT)
+        min_gain = max(_MIN_GAIN, _BALANCE * self.source_gain)
+        gains_enough = self.source_gain > _MIN_GAIN and counted.sum() > min_gain
+        return bool(gains_enough and self.misfit < _MAX_MISFIT)
 
 
 def judge(
@@ -105,17 +105,17 @@ def judge(
     """
     static = replace(motion, state=np.zeros(4))
     members = source.evenly(members)
-    before, near_static = compare(source, members, target, static)
-    after, near_moved = compare(source, members, target, motion)
+    cost_static, near_static = compare(source, members, target, static)
+    cost_moved, near_moved = compare(source, members, target, motion)
     rows = np.union1d(near_static, near_moved)
     points = target.points[rows]
-    around = source.rows_around(points)
-    others = np.setdiff1d(around, members, assume_unique=True)
-    moved = Surface(motion.at_start(source, members)).cost(motion.at_start(target, rows))
-    moved = np.minimum(moved, Surface(source.points[others]).cost(points))
-    target_gain = Surface(source.points[around]).cost(points) - moved
-    gain = float((before - after).sum())
-    return Proposal(group, motion, gain, float(after.mean()), rows, target_gain)
+    rows_around = source.rows_around(points)
+    static_rows = np.setdiff1d(rows_around, members, assume_unique=True)
+    target_cost = Surface(motion.at_start(source, members)).cost(motion.at_start(target, rows))
+    target_cost = np.minimum(target_cost, Surface(source.points[static_rows]).cost(points))
+    target_gain = Surface(source.points[rows_around]).cost(points) - target_cost
+    gain = float((cost_static - cost_moved).sum())
+    return Proposal(group, motion, gain, float(cost_moved.mean()), rows, target_gain)
 
 
 def compare(
@@ -127,7 +127,7 @@ def compare(
     when they are moved back.
     """
     at_start = motion.at_start(source, members)
-    ends = [motion.place(at_start, of(target.share)) for of in (np.min, np.max)]
+    ends = [motion.place(at_start, limit(target.share)) for limit in (np.min, np.max)]
     rows = target.rows_around(np.concatenate(ends))
     back = motion.at_start(target, rows)
     close = _in_box(back, at_start, SURFACE_M)
@@ -184,15 +184,15 @@ class Search:
         x, y = proposal.motion.state[:2] / np.linalg.norm(proposal.motion.state[:2])
         axes = np.array([[x, y, 0, 0], [-y, x, 0, 0], [0, 0, 0, _YAW_PER_M]])
         for step_m in _REFINE_M:
-            start = None
-            while start is not proposal:
-                start = proposal
+            previous = None
+            while previous is not proposal:
+                previous = proposal
                 for axis in (*axes, *-axes):
                     state = proposal.motion.state + step_m * axis
                     state[2] = state[:2] @ slope
                     motion = replace(proposal.motion, state=state)
-                    other = judge(proposal.group, members, motion, self.source, self.target)
-                    proposal = max(proposal, other, key=lambda p: p.gain)
+                    trial = judge(proposal.group, members, motion, self.source, self.target)
+                    proposal = max(proposal, trial, key=lambda p: p.gain)
         return proposal
 
     def _vote(self, members: Int, rows: Int, slope: Float, reach_m: float) -> list[Float]:
@@ -201,16 +201,16 @@ class Search:
         group = Group.of(source.points[members], source.share[members]).thinned(FEW_POINTS)
         field = DistanceField.of(target.points[rows], target.share[rows])
         steps = np.arange(-(reach_m // STEP_M), reach_m // STEP_M + 1) * STEP_M
-        tried = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-        tried = tried[np.hypot(*tried.T) <= reach_m]
-        tried = np.column_stack([tried, tried @ slope])
-        nearness = np.zeros((len(tried), len(group.points)), np.uint8)
-        field.raise_to(nearness, group, tried)
-        score = nearness.mean(axis=1) / 255 - _PER_M * np.linalg.norm(tried, axis=1)
+        displacements = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+        displacements = displacements[np.hypot(*displacements.T) <= reach_m]
+        displacements = np.column_stack([displacements, displacements @ slope])
+        nearness = np.zeros((len(displacements), len(group.points)), np.uint8)
+        field.raise_to(nearness, group, displacements)
+        score = nearness.mean(axis=1) / 255 - _PER_M * np.linalg.norm(displacements, axis=1)
         voted = []
         for _ in range(_NUM_STARTS):
-            voted.append(tried[np.argmax(score)])
-            score[np.linalg.norm(tried - voted[-1], axis=1) < _APART_M] = -1.0
+            voted.append(displacements[np.argmax(score)])
+            score[np.linalg.norm(displacements - voted[-1], axis=1) < _APART_M] = -1.0
         return voted
 
     def _align(self, start: RigidMotion, members: Int, rows: Int) -> Float | None:

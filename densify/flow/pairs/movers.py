@@ -52,14 +52,14 @@ def find_movers(
 def _choose(proposals: list[Proposal], num_targets: int) -> list[Proposal]:
     """Return at most one proposal per group; a target point is explained by one motion only."""
     chosen: dict[int, Proposal] = {}
-    taken = np.full(num_targets, -1)
+    explained_by = np.full(num_targets, -1)  # index in ``chosen``
     for i in np.argsort(-_gain_with_neighbours(proposals), kind="stable"):
         proposal = proposals[i]
         # Two scanners see one object at two positions, hence its groups may share target points.
-        apart = [not proposal.goes_with(other) for other in chosen.values()]
-        free = ~np.array([*apart, False])[taken[proposal.rows]]
+        differs = [not proposal.goes_with(earlier) for earlier in chosen.values()]
+        free = ~np.array([*differs, False])[explained_by[proposal.rows]]
         if proposal.group not in chosen and proposal.moves(free):
-            taken[proposal.rows[proposal.target_gain > 0]] = len(chosen)
+            explained_by[proposal.rows[proposal.target_gain > 0]] = len(chosen)
             chosen[proposal.group] = proposal
     return list(chosen.values())
 
@@ -71,12 +71,12 @@ def _gain_with_neighbours(proposals: list[Proposal]) -> Float:
     centres = np.array([p.motion.centre for p in proposals]).reshape(-1, 3)
     total = np.zeros(len(proposals))
     for i, proposal in enumerate(proposals):
-        best = dict[int, float]()
+        gains = dict[int, float]()
         for j in np.flatnonzero(np.linalg.norm(centres - centres[i], axis=1) < _BESIDE_M):
-            other = proposals[j]
-            if other.goes_with(proposal):
-                best[other.group] = max(other.gain, best.get(other.group, 0.0))
-        total[i] = sum((best | {proposal.group: proposal.gain}).values())
+            neighbour = proposals[j]
+            if neighbour.goes_with(proposal):
+                gains[neighbour.group] = max(neighbour.gain, gains.get(neighbour.group, 0.0))
+        total[i] = sum((gains | {proposal.group: proposal.gain}).values())
     return total
 
 
@@ -91,5 +91,5 @@ def _attach(
     rows = rows[is_near(tree_of(members), source.points[rows], SURFACE_M)]
     if len(rows):
         static = RigidMotion(np.zeros(4), motion.centre)
-        before, after = (compare(source, rows, target, m)[0] for m in (static, motion))
-        instance[rows[after < before]] = k
+        cost_static, cost_moved = (compare(source, rows, target, m)[0] for m in (static, motion))
+        instance[rows[cost_moved < cost_static]] = k

@@ -71,15 +71,15 @@ class Surface:
         if num < _MIN_NEIGHBORS:
             return cost
         ranks = np.arange(1, num + 1)
-        away_m, near = self._tree.query(points, ranks, distance_upper_bound=SURFACE_M)
-        known = np.isfinite(away_m)
-        enough = np.flatnonzero(known.sum(axis=1) >= _MIN_NEIGHBORS)
-        known, near = known[enough], np.asarray(near)[enough]
-        weight = known / known.sum(axis=1, keepdims=True)
-        at = self._points[np.where(known, near, 0)]
-        mean = np.einsum("nk,nki->ni", weight, at)
-        at -= mean[:, None]
-        covariance = at.transpose(0, 2, 1) @ (weight[..., None] * at) + _NOISE_M**2 * np.eye(3)
+        away_m, row = self._tree.query(points, ranks, distance_upper_bound=SURFACE_M)
+        exists = np.isfinite(away_m)
+        enough = np.flatnonzero(exists.sum(axis=1) >= _MIN_NEIGHBORS)
+        exists, row = exists[enough], np.asarray(row)[enough]
+        weight = exists / exists.sum(axis=1, keepdims=True)
+        arms = self._points[np.where(exists, row, 0)]
+        mean = np.einsum("nk,nki->ni", weight, arms)
+        arms -= mean[:, None]
+        covariance = arms.transpose(0, 2, 1) @ (weight[..., None] * arms) + _NOISE_M**2 * np.eye(3)
         off = points[enough] - mean
         squared = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0])
         cost[enough] = np.minimum(squared / 2, MISSING)

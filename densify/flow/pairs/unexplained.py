@@ -17,15 +17,15 @@ _MIN_POINTS, _MIN_UNEXPLAINED = 8, 5  # of a group
 _MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # greatest heights of a group's lowest and highest points
 
 
-def find_unexplained(cloud: PairCloud, other: PairCloud) -> Bool:
-    """Return (N,) True for points of ``cloud`` without a counterpart in ``other``.
+def find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
+    """Return (N,) True for points of ``cloud`` without a counterpart in ``other_cloud``.
 
     A counterpart is a point of the other cloud within 0.1 m, or one of its surfaces.
     """
-    rest = np.flatnonzero(~is_near(tree_of(other.points), cloud.points, _EXPLAINED_M))
-    surface = Surface(other.points[other.evenly(np.arange(len(other.points)))])
+    unmatched = np.flatnonzero(~is_near(tree_of(other_cloud.points), cloud.points, _EXPLAINED_M))
+    surface = Surface(other_cloud.points[other_cloud.evenly(np.arange(len(other_cloud.points)))])
     unexplained = np.zeros(len(cloud.points), bool)
-    unexplained[rest] = surface.cost(cloud.points[rest]) > MISSING / 2
+    unexplained[unmatched] = surface.cost(cloud.points[unmatched]) > MISSING / 2
     return unexplained
 
 
@@ -40,9 +40,9 @@ def group_around(points: Float, unexplained: Bool) -> Int:
     np.minimum.at(low, label, points[:, :2])
     np.maximum.at(high, label, points[:, :2])
     whole = np.linalg.norm(high - low, axis=1) <= _MAX_EXTENT_M
-    group, parts = label.copy(), np.flatnonzero(~whole[label])
-    _, cluster = cluster_around(points[parts], unexplained[parts])
-    group[parts] = np.where(cluster >= 0, num + cluster, -1)
+    group, long_rows = label.copy(), np.flatnonzero(~whole[label])
+    _, cluster = cluster_around(points[long_rows], unexplained[long_rows])
+    group[long_rows] = np.where(cluster >= 0, num + cluster, -1)
     return group
 
 
@@ -53,11 +53,11 @@ def road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
     """
     rows = np.flatnonzero(group >= 0)
     rows = rows[np.argsort(group[rows], kind="stable")]
-    parts = np.split(rows, np.flatnonzero(np.diff(group[rows])) + 1)
+    groups = np.split(rows, np.flatnonzero(np.diff(group[rows])) + 1)
     users = []
-    for part in parts:
-        if len(part) >= _MIN_POINTS and unexplained[part].sum() >= _MIN_UNEXPLAINED:
-            low_m, high_m = np.percentile(height_m[part], (5, 95))
+    for members in groups:
+        if len(members) >= _MIN_POINTS and unexplained[members].sum() >= _MIN_UNEXPLAINED:
+            low_m, high_m = np.percentile(height_m[members], (5, 95))
             if low_m <= _MAX_LOW_M and high_m <= _MAX_HIGH_M:
-                users.append(part)
+                users.append(members)
     return users

@@ -45,10 +45,10 @@ class Strips:
     def rows_inside(self, low: Float, high: Float) -> Int:
         """Return the ascending indices of the points in a box with corners low and high (3,)."""
         low, high = low[:, None], high[:, None]
-        found = np.flatnonzero(((self._low < high) & (self._high > low)).all(axis=0))
-        points = self._strips[found]
-        strip, place = np.nonzero(((points > low) & (points < high)).all(axis=1))
-        return found[strip] * _STRIP + place
+        strip_numbers = np.flatnonzero(((self._low < high) & (self._high > low)).all(axis=0))
+        points = self._strips[strip_numbers]
+        strip, offset = np.nonzero(((points > low) & (points < high)).all(axis=1))
+        return strip_numbers[strip] * _STRIP + offset
 
 
 @dataclass(frozen=True)
@@ -74,16 +74,18 @@ class Obstacles:
     num_clusters: int  # number of clusters; labels are below it
 
     @staticmethod
-    def of(stretch: Stretch, i: int, found: Candidates) -> Obstacles:
+    def of(stretch: Stretch, i: int, candidates: Candidates) -> Obstacles:
         """Return the obstacles of sweep i of the stretch, world frame, from its candidates."""
         registered = stretch.sweeps[i]
         return Obstacles(
-            row=found.row,
-            points=poses.transform(registered.T_world_lidar, registered.sweep.points[found.row]),
-            time_s=firing_times_s(stretch, i, found.row),
-            seed=found.seed,
-            cluster=found.cluster,
-            num_clusters=found.num_clusters,
+            row=candidates.row,
+            points=poses.transform(
+                registered.T_world_lidar, registered.sweep.points[candidates.row]
+            ),
+            time_s=firing_times_s(stretch, i, candidates.row),
+            seed=candidates.seed,
+            cluster=candidates.cluster,
+            num_clusters=candidates.num_clusters,
         )
 
     @property
@@ -111,11 +113,11 @@ class Batch:
     @staticmethod
     def of(sweeps: Sequence[int], obstacles: Sequence[Obstacles], clock: Clock) -> Batch:
         """Build a batch from sweep indices, with the obstacles and clock of the whole stretch."""
-        parts = [obstacles[j] for j in sweeps]
+        of_sweeps = [obstacles[j] for j in sweeps]
         first_ns, last_ns = clock.time_ns[[sweeps[0], sweeps[-1]]].tolist()
-        begins = np.cumsum([0] + [len(part.points) for part in parts[:-1]]).tolist()
+        begins = np.cumsum([0] + [len(c.points) for c in of_sweeps[:-1]]).tolist()
         middle_ns, half_s = (first_ns + last_ns) // 2, (last_ns - first_ns) * 0.5e-9
-        return Batch(tuple(sweeps), middle_ns, half_s, _merged(parts), tuple(begins))
+        return Batch(tuple(sweeps), middle_ns, half_s, _merged(of_sweeps), tuple(begins))
 
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
         """Concatenate the arrays of this batch's sweeps, in the order of ``obstacles``.
@@ -129,32 +131,32 @@ class Batch:
 
         Return sweep index -> ascending rows, without sweeps that have none.
         """
-        parts = np.split(rows, np.searchsorted(rows, self.begins[1:]))
-        own = zip(self.sweeps, parts, self.begins, strict=True)
-        return {j: part - begin for j, part, begin in own if len(part)}
+        rows_of_sweeps = np.split(rows, np.searchsorted(rows, self.begins[1:]))
+        sweeps = zip(self.sweeps, rows_of_sweeps, self.begins, strict=True)
+        return {j: sweep_rows - begin for j, sweep_rows, begin in sweeps if len(sweep_rows)}
 
 
-def _merged(parts: Sequence[Obstacles]) -> Obstacles:
+def _merged(sweeps: Sequence[Obstacles]) -> Obstacles:
     """Concatenate the obstacles of sweeps; clusters within `LINK_M` of each other become one."""
-    if len(parts) == 1:
-        return parts[0]
-    first = np.cumsum([0] + [part.num_clusters for part in parts]).tolist()
+    if len(sweeps) == 1:
+        return sweeps[0]
+    first = np.cumsum([0] + [c.num_clusters for c in sweeps]).tolist()
     label = np.concatenate(
-        [np.where(p.candidate, p.cluster + k, -1) for p, k in zip(parts, first[:-1], strict=True)]
+        [np.where(c.candidate, c.cluster + k, -1) for c, k in zip(sweeps, first[:-1], strict=True)]
     )
-    points = np.concatenate([part.points for part in parts])
+    points = np.concatenate([c.points for c in sweeps])
     candidate = np.flatnonzero(label >= 0)
     num_groups, group = link(points[candidate], LINK_M)
     num = first[-1] + num_groups
-    ends = label[candidate], first[-1] + group
-    together = coo_array((np.ones(len(candidate), bool), ends), shape=(num, num))
-    num_clusters, cluster = connected_components(together, directed=False)
+    edges = label[candidate], first[-1] + group
+    graph = coo_array((np.ones(len(candidate), bool), edges), shape=(num, num))
+    num_clusters, cluster = connected_components(graph, directed=False)
     label[candidate] = cluster[label[candidate]]
     return Obstacles(
-        row=np.concatenate([part.row for part in parts]),
+        row=np.concatenate([c.row for c in sweeps]),
         points=points,
-        time_s=np.concatenate([part.time_s for part in parts]),
-        seed=np.concatenate([part.seed for part in parts]),
+        time_s=np.concatenate([c.time_s for c in sweeps]),
+        seed=np.concatenate([c.seed for c in sweeps]),
         cluster=label,
         num_clusters=int(num_clusters),
     )
@@ -177,11 +179,11 @@ def find_candidates(
         points = points[above]
         seed = np.zeros(len(above), bool)
         for j in space.others(i):
-            rest = np.flatnonzero(~seed)
-            seed[rest] = space.seen_through(points[rest], j)
+            unmarked = np.flatnonzero(~seed)
+            seed[unmarked] = space.seen_through(points[unmarked], j)
         gap_m = space.sensors.gap_m(registered.sweep.points[above], registered.sweep.lidar[above])
-        close = closer_rings(points - registered.T_world_lidar[:3, 3], gap_m)
-        num_clusters, cluster = cluster_around(close, seed)
+        squeezed = closer_rings(points - registered.T_world_lidar[:3, 3], gap_m)
+        num_clusters, cluster = cluster_around(squeezed, seed)
         return Candidates(above, seed, cluster, num_clusters)
 
     with ThreadPoolExecutor() as pool:
@@ -214,6 +216,6 @@ def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
     clusters, and (N,) labels, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
-    near = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, MIN_SEED_SHARE))
-    num_clusters, cluster[near] = link(points[near], LINK_M)
+    rows = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, MIN_SEED_SHARE))
+    num_clusters, cluster[rows] = link(points[rows], LINK_M)
     return num_clusters, cluster

@@ -64,9 +64,9 @@ class SweepPoints:
         return SweepPoints(row, points[row], time_s, height_m[row], gap_m, reach_m)
 
     @staticmethod
-    def together(parts: Sequence[SweepPoints]) -> SweepPoints:
+    def together(batch: Sequence[SweepPoints]) -> SweepPoints:
         """Concatenate the points of the sweeps of one batch, in the order of the sweeps."""
-        columns = (np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SweepPoints))
+        columns = (np.concatenate([getattr(p, f.name) for p in batch]) for f in fields(SweepPoints))
         return SweepPoints(*columns)
 
     @cached_property
@@ -84,42 +84,46 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
     this cut applies only if the rest is shorter than 1.5 m.
     """
     sweeps = sorted(track.claimed)
-    parts = {j: track.points_in(obstacles, [j]) for j in sweeps}
-    points = np.concatenate(list(parts.values()))
+    clouds = {j: track.points_in(obstacles, [j]) for j in sweeps}
+    points = np.concatenate(list(clouds.values()))
     if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
         return Shape.of(points)
     within_m = near_m(space.gap_m(track.centre, sweeps[0]))
-    of = np.repeat(np.arange(len(sweeps)), [len(part) for part in parts.values()])
-    again = np.zeros(len(points), bool)
-    for odd in (False, True):
-        mine = of % 2 == odd
-        if not mine.all():
-            tree = tree_of(points[~mine])
-            again[mine] = is_near(tree, points[mine], _REACH * within_m)
-    moves = ~_is_static(track, obstacles, parts, of, within_m)
-    again &= moves & close_to_seeds(points, moves, _WIDER_M, _MOSTLY)
+    sweep_number = np.repeat(np.arange(len(sweeps)), [len(p) for p in clouds.values()])
+    recurs = np.zeros(len(points), bool)
+    for is_odd in (False, True):
+        same_parity = sweep_number % 2 == is_odd
+        if not same_parity.all():
+            tree = tree_of(points[~same_parity])
+            recurs[same_parity] = is_near(tree, points[same_parity], _REACH * within_m)
+    moves = ~_is_static(track, obstacles, clouds, sweep_number, within_m)
+    recurs &= moves & close_to_seeds(points, moves, _WIDER_M, _MOSTLY)
     seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
-    own = again & close_to_seeds(points, seed, _REACH * within_m, _LEAST_SEEDS)
-    if own.any() and np.linalg.norm(np.ptp(points[own, :2], axis=0)) < _WALKER_M:
-        return Shape.of(points[own])
-    return Shape.of(points[again] if again.any() else points)
+    core = recurs & close_to_seeds(points, seed, _REACH * within_m, _LEAST_SEEDS)
+    if core.any() and np.linalg.norm(np.ptp(points[core, :2], axis=0)) < _WALKER_M:
+        return Shape.of(points[core])
+    return Shape.of(points[recurs] if recurs.any() else points)
 
 
 def _is_static(
-    track: Track, obstacles: Sequence[Obstacles], parts: dict[int, Float], of: Int, reach_m: float
+    track: Track,
+    obstacles: Sequence[Obstacles],
+    clouds: dict[int, Float],
+    sweep_number: Int,
+    reach_m: float,
 ) -> Bool:
     """Return (N,) True for points that more other sweeps confirm as static than as moved."""
-    # parts: N points by sweep index, object's frame; of: (N,) position of their sweep in ``parts``
-    in_object = np.concatenate(list(parts.values()))
-    places = np.concatenate([obstacles[j].points[track.claimed[j]] for j in parts])
-    low, high = places.min(0) - reach_m, places.max(0) + reach_m
-    static, moved = np.zeros((2, len(places)), np.int64)
-    for number, (j, own) in enumerate(parts.items()):
-        others, c = of != number, obstacles[j]
-        there = c.points[c.strips.rows_inside(low, high)]
-        for num, asked, among in ((static, places, there), (moved, in_object, own)):
-            if len(among):
-                num[others] += is_near(tree_of(among), asked[others], reach_m)
+    # clouds: N points by sweep index, object's frame; sweep_number: (N,) rank of each point's sweep
+    in_object = np.concatenate(list(clouds.values()))
+    measured = np.concatenate([obstacles[j].points[track.claimed[j]] for j in clouds])
+    low, high = measured.min(0) - reach_m, measured.max(0) + reach_m
+    static, moved = np.zeros((2, len(measured)), np.int64)
+    for number, (j, cloud) in enumerate(clouds.items()):
+        in_others, c = sweep_number != number, obstacles[j]
+        returns = c.points[c.strips.rows_inside(low, high)]
+        for num, points, observed in ((static, measured, returns), (moved, in_object, cloud)):
+            if len(observed):
+                num[in_others] += is_near(tree_of(observed), points[in_others], reach_m)
     return np.asarray(static > moved)
 
 
@@ -136,18 +140,18 @@ def assign_points(
     ``batch`` are the indices of its sweeps, ``objects`` the confirmed ones, ``obstacles`` those of
     each sweep of the stretch.
     """
-    parts = [SweepPoints.of(stretch, i, ground, obstacles[i], space.sensors) for i in batch]
+    clouds = [SweepPoints.of(stretch, i, ground, obstacles[i], space.sensors) for i in batch]
     attached = []
-    for i, points in zip(batch, parts, strict=True):
+    for i, points in zip(batch, clouds, strict=True):
         attached.append(attach(points, i, objects, space.clock))
     joined = np.concatenate(attached)
-    lengthen(joined, SweepPoints.together(parts), batch[0], objects, space)
-    attached = np.split(joined, np.cumsum([len(mine) for mine in attached])[:-1])
+    lengthen(joined, SweepPoints.together(clouds), batch[0], objects, space)
+    attached = np.split(joined, np.cumsum([len(of_point) for of_point in attached])[:-1])
     instances = []
-    for i, points, mine in zip(batch, parts, attached, strict=True):
-        leave_out_isolated(mine, points, i, objects, space.clock)
+    for i, points, of_point in zip(batch, clouds, attached, strict=True):
+        leave_out_isolated(of_point, points, i, objects, space.clock)
         instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
-        instance[points.row] = mine
+        instance[points.row] = of_point
         instances.append(instance)
     return instances
 
@@ -190,13 +194,13 @@ def leave_out_isolated(
     """
     low = seen.height_m < _AS_LOW_AS_ROAD_M
     for k in np.unique(instance[instance >= 0]):
-        mine = np.flatnonzero(instance == k)
-        doubtful = mine
+        members = np.flatnonzero(instance == k)
+        doubtful = members
         if _speed_m_s(objects[k].track, i, clock) > _WALKS_M_S:
-            doubtful = mine[low[mine]]
-        if len(mine) <= _NUM_BESIDE or not len(doubtful):
+            doubtful = members[low[members]]
+        if len(members) <= _NUM_BESIDE or not len(doubtful):
             continue
-        away_m, _ = nearest_k(tree_of(seen.points[mine]), seen.points[doubtful], 1 + _NUM_BESIDE)
+        away_m, _ = nearest_k(tree_of(seen.points[members]), seen.points[doubtful], 1 + _NUM_BESIDE)
         instance[doubtful[away_m[:, -1] > _ALONE_GAPS * seen.gap_m[doubtful]]] = -1
 
 
@@ -215,47 +219,49 @@ def lengthen(
     """
     batch_s = np.ptp(seen.time_s) if len(seen.time_s) else 0.0
     for k, (track, shape) in enumerate(objects):
-        mine = np.flatnonzero(instance == k)
+        members = np.flatnonzero(instance == k)
         speed_m_s = _speed_m_s(track, i, space.clock)
-        if not len(mine) or speed_m_s <= _WALKS_M_S:
+        if not len(members) or speed_m_s <= _WALKS_M_S:
             continue
         at_s = track.seen_at(space.clock.time_ns[i])
         lane = MovingObject(track, shape).lane(at_s)
         middle = track.place(shape.points.mean(0, keepdims=True), at_s)[0]
-        reach = np.array([1.5 * LANE_M, 1.5 * LANE_M, np.inf])
-        rows = seen.strips.rows_inside(middle - reach, middle + reach)
+        reach_m = np.array([1.5 * LANE_M, 1.5 * LANE_M, np.inf])
+        rows = seen.strips.rows_inside(middle - reach_m, middle + reach_m)
         rows = rows[instance[rows] < 0]
         rows = rows[lane.holds(seen.points[rows], speed_m_s * batch_s)]
         at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
         fits = lane.holds(at_once)
         rows, along = rows[fits], at_once[fits, :2] @ lane.ahead
-        own = track.carry(seen.points[mine], seen.time_s[mine], at_s)[:, :2] @ lane.ahead
+        members_m = (
+            track.carry(seen.points[members], seen.time_s[members], at_s)[:, :2] @ lane.ahead
+        )
         columns_m = columns_apart_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
         hole_m = float(np.clip(NUM_COLUMNS * columns_m, LINK_M, _LONGEST_HOLE_M))
-        linked = _is_linked(along, own, hole_m)
+        linked = _is_linked(along, members_m, hole_m)
         if linked.any():
-            rows, along = rows[linked], along[linked] - np.median(own)
+            rows, along = rows[linked], along[linked] - np.median(members_m)
             instance[rows[_is_free_of_violations(track, seen, rows, along, i, space)]] = k
 
 
-def columns_apart_m(place: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
+def columns_apart_m(point: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
     """Return the distance along a side between neighbouring columns of rays that hit it.
 
-    ``place`` (3,) is on the side, ``ahead`` (2,) a unit vector along it, both in the world.
+    ``point`` (3,) is on the side, ``ahead`` (2,) a unit vector along it, both in the world.
     """
-    in_lidar = poses.transform(T_lidar_world, place[None])[0, :2]
+    in_lidar = poses.transform(T_lidar_world, point[None])[0, :2]
     x, y = T_lidar_world[:2, :2] @ ahead
     aside_m = max(abs(float(in_lidar @ [-y, x])), 1e-3)
     column_rad = min(model.azimuth_step_rad for model in sensors.models.values())
     return column_rad * float(in_lidar @ in_lidar) / aside_m
 
 
-def _is_linked(along: Float, own: Float, hole_m: float) -> Bool:
-    """Return (N,) True for positions connected to any of ``own`` (M,) by steps up to ``hole_m``."""
-    everything = np.concatenate([along, own])
-    order = np.argsort(everything, kind="stable")
-    run = np.zeros(len(everything), np.int64)
-    run[order[1:]] = np.cumsum(np.diff(everything[order]) > hole_m)
+def _is_linked(along: Float, members_m: Float, hole_m: float) -> Bool:
+    """Return (N,) True for positions linked to ``members_m`` (M,) by steps up to ``hole_m``."""
+    all_along = np.concatenate([along, members_m])
+    order = np.argsort(all_along, kind="stable")
+    run = np.zeros(len(all_along), np.int64)
+    run[order[1:]] = np.cumsum(np.diff(all_along[order]) > hole_m)
     return np.isin(run[: len(along)], run[len(along) :])
 
 
@@ -271,12 +277,12 @@ def _is_free_of_violations(
     def up_to(steps: Int) -> Int:
         return np.bincount(steps, minlength=2 * num_steps).reshape(2, num_steps).cumsum(axis=1)
 
-    ends = np.zeros((2, num_steps), bool)
+    is_blocked = np.zeros((2, num_steps), bool)
     in_object = track.undo(seen.points[rows], seen.time_s[rows])
     for j in space.others(i):
         violations = up_to(step[track.seen_through(in_object, j, space)])
-        ends |= violations > _MAX_VIOLATIONS * up_to(step)
-    kept: Bool = ~np.logical_or.accumulate(ends, axis=1).ravel()[step]
+        is_blocked |= violations > _MAX_VIOLATIONS * up_to(step)
+    kept: Bool = ~np.logical_or.accumulate(is_blocked, axis=1).ravel()[step]
     return kept
 
 

@@ -64,11 +64,11 @@ def velocities_beside(
     """
     points = batch.obstacles.points[members]
     tree, middle = tree_of(points), points.mean(0, keepdims=True)
-    for thing in objects:
-        track, at_s = thing.track, thing.track.seen_at(batch.time_ns)
+    for moving_object in objects:
+        track, at_s = moving_object.track, moving_object.track.seen_at(batch.time_ns)
         if (
-            thing.may_be_near(points, at_s, BESIDE_M)
-            and is_near(tree, track.place(thing.shape.points, at_s), BESIDE_M).any()
+            moving_object.may_be_near(points, at_s, BESIDE_M)
+            and is_near(tree, track.place(moving_object.shape.points, at_s), BESIDE_M).any()
         ):
             yield track.velocity_m_s(middle, at_s)[0]
 
@@ -87,9 +87,9 @@ class Follower:
 
         ``members`` are rows of the obstacles of batch ``start``; ``velocity`` (3,) is m/s, world.
         """
-        here, rate = self.batches[start].obstacles, np.append(velocity, 0.0)
-        seen_s = float(here.time_s[members].mean())
-        points = _at_once(here, members, rate, seen_s)
+        obstacles, rate = self.batches[start].obstacles, np.append(velocity, 0.0)
+        seen_s = float(obstacles.time_s[members].mean())
+        points = _at_once(obstacles, members, rate, seen_s)
         track = Track(points.mean(0))
         track.add(start, self.batches[start], np.zeros(4), seen_s, members)
         model = Model(points)
@@ -98,10 +98,10 @@ class Follower:
             while 0 <= n < len(self.batches) and (
                 abs(n - last) <= 1 + _MISSES_ALLOWED or self.clock.near(n, last, _MISSED_S)
             ):
-                found = self._find(model, track, rate, n)
-                if found is not None:
+                alignment = self._find(model, track, rate, n)
+                if alignment is not None:
                     last = n
-                    state, seen_s, rows, points = found
+                    state, seen_s, rows, points = alignment
                     track.add(n, self.batches[n], state, seen_s, rows)
                     model.add(undo(state, points, track.centre))
                 n += direction
@@ -111,21 +111,21 @@ class Follower:
         self, model: Model, track: Track, rate: Float, n: int
     ) -> tuple[Float, float, Int, Float] | None:
         """Align the candidates of batch n with the object so far; None if too few points fit."""
-        batch, recent = self.batches[n], self.clock.num_in(_RECENT_S)
+        batch, num_recent = self.batches[n], self.clock.num_in(_RECENT_S)
         c, centre = batch.obstacles, track.centre
-        about, about_rate, _ = _predict(track, rate, recent, track.seen_at(batch.time_ns))
-        expected = apply(about, model.points, centre)
-        slack_m = GATES_M[0] + batch.half_s * np.abs(about_rate[:3])
+        rough_state, rough_rate, _ = _predict(track, rate, num_recent, track.seen_at(batch.time_ns))
+        expected = apply(rough_state, model.points, centre)
+        slack_m = GATES_M[0] + batch.half_s * np.abs(rough_rate[:3])
         inside = c.strips.rows_inside(expected.min(0) - slack_m, expected.max(0) + slack_m)
         inside = inside[batch.gather(self.free)[inside]]
-        rows, enough = inside[c.cluster[inside] >= 0], float(MIN_FIT)
+        rows, min_num_rows = inside[c.cluster[inside] >= 0], float(MIN_FIT)
         if len(rows) < MIN_FIT:  # no sweep saw through the object, but it may be there
-            usual = float(np.median([track.num_points(m) for m in track.observations]))
-            rows, enough = inside, max(MIN_FIT, _SHARE_UNSEEN * usual)
-        if len(rows) < enough:
+            usual_num = float(np.median([track.num_points(m) for m in track.observations]))
+            rows, min_num_rows = inside, max(MIN_FIT, _SHARE_UNSEEN * usual_num)
+        if len(rows) < min_num_rows:
             return None
         seen_s = float(c.time_s[rows].mean())
-        predicted, rate, std = _predict(track, rate, recent, seen_s)
+        predicted, rate, std = _predict(track, rate, num_recent, seen_s)
         predicted[2] = track.rise_m(self.ground, predicted)
         target = _at_once(c, rows, rate, seen_s)
         state = model.align(target, centre, predicted, std)
@@ -133,7 +133,7 @@ class Follower:
             return None
         state[2] = track.rise_m(self.ground, state)
         fit = model.covers(undo(state, target, centre), FIT_M)
-        if fit.sum() < enough:
+        if fit.sum() < min_num_rows:
             return None
         return state, seen_s, rows[fit], target[fit]  # the (K,3) points at seen_s, world
 
@@ -161,8 +161,8 @@ def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float,
         rate = (t @ states + given_s2 * rate) / (t @ t + given_s2)
         rate[3] *= _TURNS_ON
     std = PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
-    on_the_way = _turned(rate, time_s - 0.5 * ahead_s - middle_s)
-    return states[0] + on_the_way * ahead_s, _turned(rate, time_s - middle_s), std
+    mean_rate = _turned(rate, time_s - 0.5 * ahead_s - middle_s)
+    return states[0] + mean_rate * ahead_s, _turned(rate, time_s - middle_s), std
 
 
 def _turned(rate: Float, later_s: float) -> Float:

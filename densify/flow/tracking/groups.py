@@ -16,7 +16,7 @@ from densify.flow.tracking.candidates import Candidates, Obstacles, firing_times
 from densify.flow.tracking.extent import Instance, assign_points, find_shape, is_known_at
 from densify.flow.tracking.objects import MovingObject, Track
 from densify.flow.tracking.pieces import join_pieces
-from densify.flow.tracking.soften import Part, Softened, soften
+from densify.flow.tracking.soften import Snapshot, Softened, soften
 from densify.flow.tracking.tracks import find_tracks
 from densify.geometry import poses
 from densify.geometry.clock import Clock
@@ -47,26 +47,26 @@ class GroupMotion:
         The flow excludes ego-motion and is in the lidar frame of ``frame``. Points of an object are
         lost if the target is more than 0.2 s before its first or after its last observation.
         """
-        here, there = self.stretch.frames.index(frame), self.stretch.frames.index(target)
-        registered, instance = self.stretch.sweeps[here], self.instance[here]
+        i, j = self.stretch.frames.index(frame), self.stretch.frames.index(target)
+        registered, instance = self.stretch.sweeps[i], self.instance[i]
         R_lidar_world = registered.T_world_lidar[:3, :3].T
         clock = Clock.of(self.stretch)
-        here_s, there_s = clock.time_s[here], clock.time_s[there]
+        source_s, target_s = clock.time_s[i], clock.time_s[j]
         to_reference, displacement, velocity_m_s = np.zeros((3, len(instance), 3))
         lost = np.zeros(len(instance), bool)
-        for k, mine in _rows_of(instance):
-            track, seen_s = self.tracks[k], firing_times_s(self.stretch, here, mine)
-            measured = poses.transform(registered.T_world_lidar, registered.sweep.points[mine])
+        for k, rows in _rows_of(instance):
+            track, seen_s = self.tracks[k], firing_times_s(self.stretch, i, rows)
+            measured = poses.transform(registered.T_world_lidar, registered.sweep.points[rows])
             in_object = track.undo(measured, seen_s)
             at_reference, arrived = in_object, in_object
             if k in self.bendings:
-                at_reference, arrived = self.bendings[k].carry(here, there, clock, seen_s)
-            at_reference = track.place(at_reference, here_s)
-            arrived = track.place(arrived, there_s)
-            to_reference[mine] = (at_reference - measured) @ R_lidar_world.T
-            displacement[mine] = (arrived - at_reference) @ R_lidar_world.T
-            velocity_m_s[mine] = track.velocity_m_s(arrived, there_s) @ R_lidar_world.T
-            lost[mine] = not is_known_at(track, there, clock)
+                at_reference, arrived = self.bendings[k].carry(i, j, clock, seen_s)
+            at_reference = track.place(at_reference, source_s)
+            arrived = track.place(arrived, target_s)
+            to_reference[rows] = (at_reference - measured) @ R_lidar_world.T
+            displacement[rows] = (arrived - at_reference) @ R_lidar_world.T
+            velocity_m_s[rows] = track.velocity_m_s(arrived, target_s) @ R_lidar_world.T
+            lost[rows] = not is_known_at(track, j, clock)
         moving = instance >= 0
         number = np.append(self.number, -1)[instance].astype(np.int32)
         return FlowField(displacement, moving, number, lost, to_reference, velocity_m_s)
@@ -76,18 +76,18 @@ class GroupMotion:
 class Bending:
     """The non-rigid motion of one object."""
 
-    sweeps: tuple[int, ...]  # sweep index of each part of ``softened``, ascending
+    sweeps: tuple[int, ...]  # sweep index of each snapshot in ``softened``, ascending
     softened: Softened  # points of the object in each of these sweeps, and how the points bend
 
-    def carry(self, here: int, there: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
-        """Return the (N,3) points of sweep ``here`` at two reference times, object's frame.
+    def carry(self, i: int, j: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
+        """Return the (N,3) points of sweep ``i`` at two reference times, object's frame.
 
-        The times are those of sweep ``here``, and of sweep ``there`` or the nearest sweep that
+        The times are those of sweep ``i``, and of sweep ``j`` or the nearest sweep that
         observed the object. ``seen_s`` (N,) are the firing times.
         """
-        n, m = (self.sweeps.index(i) for i in (here, clock.nearest(there, self.sweeps)))
-        points = self.softened.parts[n].points
-        late_s = clock.time_s[here] - seen_s
+        n, m = (self.sweeps.index(sweep) for sweep in (i, clock.nearest(j, self.sweeps)))
+        points = self.softened.snapshots[n].points
+        late_s = clock.time_s[i] - seen_s
         at_reference = points + self.softened.velocity_m_s(n) * late_s[:, None]
         return at_reference, at_reference + self.softened.carry(n, m) - points
 
@@ -111,7 +111,7 @@ def motion_of(
     None estimates them by a vote of neighbouring sweeps.
     """
     stretch, space = scene.stretch, scene.space
-    obstacles = [Obstacles.of(stretch, i, found) for i, found in enumerate(candidates)]
+    obstacles = [Obstacles.of(stretch, i, of_sweep) for i, of_sweep in enumerate(candidates)]
     tracks = find_tracks(obstacles, space, scene.ground, velocities_m_s)
     objects = [MovingObject(track, find_shape(track, obstacles, space)) for track in tracks]
 
@@ -121,15 +121,15 @@ def motion_of(
         return [np.full(len(stretch.sweeps[i].sweep), -1, np.int32) for i in batch]
 
     def bending(k: int) -> Bending:
-        parts, sweeps = [], []
+        snapshots, sweeps = [], []
         for i, registered in enumerate(stretch.sweeps):
-            mine = np.flatnonzero(instance[i] == k)
-            if len(mine):
-                at = poses.transform(registered.T_world_lidar, registered.sweep.points[mine])
-                seen_s = firing_times_s(stretch, i, mine)
-                parts.append(Part(tracks[k].undo(at, seen_s), float(seen_s.mean())))
+            rows = np.flatnonzero(instance[i] == k)
+            if len(rows):
+                points = poses.transform(registered.T_world_lidar, registered.sweep.points[rows])
+                seen_s = firing_times_s(stretch, i, rows)
+                snapshots.append(Snapshot(tracks[k].undo(points, seen_s), float(seen_s.mean())))
                 sweeps.append(i)
-        return Bending(tuple(sweeps), soften(parts))
+        return Bending(tuple(sweeps), soften(snapshots))
 
     with ThreadPoolExecutor() as pool:
         instance = tuple(chain.from_iterable(pool.map(members, space.batches)))
@@ -141,9 +141,9 @@ def motion_of(
             for k, track in enumerate(tracks)
             if space.gap_m(track.centre, min(track.claimed)) <= _FINE_M
         ]
-        found = dict(zip(fine, pool.map(bending, fine), strict=True))
-    bent = {k: b for k, b in found.items() if np.isfinite(b.softened.alpha)}
-    return GroupMotion(stretch, tuple(tracks), instance, bent, number)
+        estimated = dict(zip(fine, pool.map(bending, fine), strict=True))
+    bendings = {k: b for k, b in estimated.items() if np.isfinite(b.softened.alpha)}
+    return GroupMotion(stretch, tuple(tracks), instance, bendings, number)
 
 
 def _rows_of(instance: Instance) -> list[tuple[int, Int]]:

@@ -37,12 +37,12 @@ Judge = Callable[[Track, "Evidence"], None]
 class Places(NamedTuple):
     """Counts of what other sweeps observed at positions where the object is at another time."""
 
-    taken: int  # number of positions with a return of something else
-    empty: int  # number of positions in observed free space
+    num_occupied: int  # number of positions with a return of something else
+    num_free: int  # number of positions in observed free space
 
-    def log_taken(self) -> float:
-        """Return the log odds that a position is taken, near 0 for few observations."""
-        return float(np.log((self.taken + _GIVEN) / (self.empty + _GIVEN)))
+    def log_occupied(self) -> float:
+        """Return the log odds that a position is occupied, near 0 for few observations."""
+        return float(np.log((self.num_occupied + _GIVEN) / (self.num_free + _GIVEN)))
 
 
 class Violations(NamedTuple):
@@ -69,7 +69,7 @@ class Evidence(NamedTuple):
     def terms(self) -> dict[str, float]:
         """Return the value of each term of the log odds, by its name in ``likelihood.json``."""
         static, moved, tests = self.violations
-        less, more = sorted([self.before.log_taken(), self.after.log_taken()])
+        less, more = sorted([self.before.log_occupied(), self.after.log_occupied()])
         return {
             "removed": float(np.log((max(static - moved, 0) + 1) / (tests + 1))),
             "left": float(np.log((moved + _GIVEN) / (static + _GIVEN))),
@@ -117,23 +117,23 @@ def judge(
         return Verdict(-np.inf, -np.inf)
     violations = count_violations(track, obstacles, space)
     within_m = near_m(space.gap_m(track.centre, next(iter(track.claimed))))
-    best = Places(0, violations.tests)
-    found = Evidence(
+    best_case = Places(0, violations.tests)
+    evidence = Evidence(
         violations,
-        best,
-        best,
+        best_case,
+        best_case,
         track.path.travelled_m() / within_m,
         track.path.residual_m / within_m,
         _slenderness(track, obstacles, within_m),
     )
     # Vacated positions cost most time. They are skipped if the other terms already reject.
-    if judged is not None or found.log_odds(own_table()) > 0:
+    if judged is not None or evidence.log_odds(own_table()) > 0:
         before, after = find_places_left(track, obstacles, space, objects, within_m)
-        found = found._replace(before=before, after=after)
+        evidence = evidence._replace(before=before, after=after)
     if judged is not None:
-        judged(track, found)
-    none_left = found._replace(violations=violations._replace(moved=0))
-    return Verdict(found.log_odds(own_table()), none_left.log_odds(own_table()))
+        judged(track, evidence)
+    without_violations = evidence._replace(violations=violations._replace(moved=0))
+    return Verdict(evidence.log_odds(own_table()), without_violations.log_odds(own_table()))
 
 
 def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Violations:
@@ -145,18 +145,20 @@ def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSp
             if i in track.claimed:
                 rows = track.claimed[i]
                 tested[i] = rows[:: len(rows) // num + 1]
-    others = {i: frozenset(space.others(i)) for i in tested}
+    observers = {i: frozenset(space.others(i)) for i in tested}
     points = {i: obstacles[i].points[rows] for i, rows in tested.items()}
-    body = {i: track.undo(points[i], obstacles[i].time_s[rows]) for i, rows in tested.items()}
+    in_object = {i: track.undo(points[i], obstacles[i].time_s[rows]) for i, rows in tested.items()}
     static = moved = num_tests = 0
     for j, *_ in space.batches:
-        sources = [i for i in tested if j in others[i]]
+        sources = [i for i in tested if j in observers[i]]
         if sources:
-            carried = track.place(np.concatenate([body[i] for i in sources]), space.clock.time_s[j])
+            carried = track.place(
+                np.concatenate([in_object[i] for i in sources]), space.clock.time_s[j]
+            )
             velocity_m_s = track.velocity_m_s(carried, space.clock.time_s[j])
-            both = np.concatenate([carried, *(points[i] for i in sources)])
+            positions = np.concatenate([carried, *(points[i] for i in sources)])
             velocity_m_s = np.concatenate([velocity_m_s, np.zeros_like(carried)])
-            violated = space.seen_through(both, j, velocity_m_s)
+            violated = space.seen_through(positions, j, velocity_m_s)
             moved += int(violated[: len(carried)].sum())
             static += int(violated[len(carried) :].sum())
             num_tests += len(carried)
@@ -168,8 +170,8 @@ def _slenderness(track: Track, obstacles: Sequence[Obstacles], within_m: float) 
     # A long, low guard rail shows no motion along itself, and is seen through between two rings.
     # within_m: accuracy of the height
     points = track.points_in(obstacles, track.claimed)
-    way = (track.path(track.path.end_s) - track.path(track.path.begin_s))[:2]
-    along_m = float(np.ptp(points[:, :2] @ way)) / max(float(np.hypot(*way)), 1e-9)
+    motion = (track.path(track.path.end_s) - track.path(track.path.begin_s))[:2]
+    along_m = float(np.ptp(points[:, :2] @ motion)) / max(float(np.hypot(*motion)), 1e-9)
     return max(1.0, along_m / (float(np.ptp(points[:, 2])) + within_m))
 
 
@@ -187,41 +189,42 @@ def find_places_left(
     ``within_m`` away. Returns of ``objects``, the other confirmed ones, do not count.
     """
     sweeps = list(track.claimed)
-    parts = [
+    sampled = [
         obstacles[i].points[rows[:: len(rows) // _NUM_ASKED + 1]]
         for i, rows in track.claimed.items()
     ]
-    everywhere, of_place = np.concatenate(parts), np.repeat(sweeps, [len(part) for part in parts])
+    # sweep: (P,) index of the sweep that measured each position
+    positions, sweep = np.concatenate(sampled), np.repeat(sweeps, [len(p) for p in sampled])
     tree = tree_of(track.points_in(obstacles, sweeps))
     rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
     room_m = LINK_M + REACH_S * float(np.linalg.norm(rate[:2]))
     counts = np.zeros((2, 2), np.int64)
     for batch in space.batches:
-        away_m, _ = nearest(tree, track.undo(everywhere, space.clock.time_s[batch[0]]), room_m)
-        left = (away_m > LINK_M) & np.isfinite(away_m)
-        left &= (of_place < batch[0]) | (of_place > batch[-1])
-        if not left.any():
+        away_m, _ = nearest(tree, track.undo(positions, space.clock.time_s[batch[0]]), room_m)
+        is_vacated = (away_m > LINK_M) & np.isfinite(away_m)
+        is_vacated &= (sweep < batch[0]) | (sweep > batch[-1])
+        if not is_vacated.any():
             continue
-        places, is_after = everywhere[left], of_place[left] < batch[0]
-        returns = [_returns_near(places, within_m, obstacles[j], objects) for j in batch]
-        taken = is_near(tree_of(np.concatenate(returns)), places, within_m)
-        empty = space.seen_through(places, batch[0]) & ~taken
+        vacated, is_after = positions[is_vacated], sweep[is_vacated] < batch[0]
+        returns = [_returns_near(vacated, within_m, obstacles[j], objects) for j in batch]
+        is_occupied = is_near(tree_of(np.concatenate(returns)), vacated, within_m)
+        is_free = space.seen_through(vacated, batch[0]) & ~is_occupied
         for count, side in zip(counts, (~is_after, is_after), strict=True):
-            count += [np.count_nonzero(taken & side), np.count_nonzero(empty & side)]
+            count += [np.count_nonzero(is_occupied & side), np.count_nonzero(is_free & side)]
     before, after = counts.tolist()
     return Places(*before), Places(*after)
 
 
 def _returns_near(
-    places: Float, reach_m: float, c: Obstacles, objects: Sequence[MovingObject]
+    positions: Float, reach_m: float, c: Obstacles, objects: Sequence[MovingObject]
 ) -> Float:
-    """Return the (N,3) points within ``reach_m`` of places (M,3), world, on no given object."""
-    rows = c.strips.rows_inside(places.min(0) - reach_m, places.max(0) + reach_m)
-    rows = rows[is_near(tree_of(places), c.points[rows], reach_m)]
-    for thing in objects:
+    """Return the (N,3) points within ``reach_m`` of positions (M,3), world, on no given object."""
+    rows = c.strips.rows_inside(positions.min(0) - reach_m, positions.max(0) + reach_m)
+    rows = rows[is_near(tree_of(positions), c.points[rows], reach_m)]
+    for moving_object in objects:
         points, time_s = c.points[rows], c.time_s[rows]
-        if len(rows) and thing.may_be_near(points, time_s, LINK_M):
-            rows = rows[~thing.shape.near(thing.track.undo(points, time_s), LINK_M)]
+        if len(rows) and moving_object.may_be_near(points, time_s, LINK_M):
+            rows = rows[~moving_object.shape.near(moving_object.track.undo(points, time_s), LINK_M)]
     return c.points[rows]
 
 

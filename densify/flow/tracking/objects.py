@@ -70,9 +70,9 @@ class Track:
 
     def add(self, n: int, batch: Batch, state: Float, seen_s: float, rows: Int) -> None:
         """Add the observation in batch n: state (4,), mean firing time, ascending obstacle rows."""
-        mine = batch.split(rows)
-        self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(mine))
-        self.claimed |= mine
+        rows_by_sweep = batch.split(rows)
+        self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(rows_by_sweep))
+        self.claimed |= rows_by_sweep
 
     def smooth(self) -> None:
         """Fit ``path`` to the states, in place; observations with more points weigh more."""
@@ -110,17 +110,17 @@ class Track:
 
     def points_in(self, obstacles: Sequence[Obstacles], sweeps: Iterable[int]) -> Float:
         """Return the (N,3) points of the object in some sweeps (by index), object's frame."""
-        parts = [np.zeros((0, 3))]
+        clouds = [np.zeros((0, 3))]
         for j in sweeps:
             c, rows = obstacles[j], self.claimed[j]
-            parts.append(self.undo(c.points[rows], c.time_s[rows]))
-        return np.concatenate(parts)
+            clouds.append(self.undo(c.points[rows], c.time_s[rows]))
+        return np.concatenate(clouds)
 
     def rows_in(self, batch: Batch) -> Int:
         """Return the indices, in the batch's obstacles, of the object's points."""
         sweeps = zip(batch.sweeps, batch.begins, strict=True)
-        own = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
-        return np.concatenate([np.zeros(0, np.int64), *own])  # all may have been taken away
+        rows = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
+        return np.concatenate([np.zeros(0, np.int64), *rows])  # all may have been taken away
 
     def num_points(self, n: int) -> int:
         """Return the number of the object's points in batch index n."""
@@ -137,10 +137,10 @@ class Track:
     def rise_m(self, ground: HeightMap, state: Float) -> float:
         """Return how much higher (m) the ground is below a state (4,) than at first."""
         # The median with 1 m to both sides: the road below an object may never be observed.
-        way = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
-        start = self.centre[:2] + np.outer([-BESIDE_M, 0.0, BESIDE_M], [-way[1], way[0]])
-        before_m, there_m = ground.under(np.concatenate([start, start + state[:2]])).reshape(2, -1)
-        return float(np.sort(there_m - before_m)[len(start) // 2])
+        ahead = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
+        start = self.centre[:2] + np.outer([-BESIDE_M, 0.0, BESIDE_M], [-ahead[1], ahead[0]])
+        start_m, end_m = ground.under(np.concatenate([start, start + state[:2]])).reshape(2, -1)
+        return float(np.sort(end_m - start_m)[len(start) // 2])
 
     def seen_at(self, time_ns: int) -> float:
         """Estimate when (s) the sweep with reference time ``time_ns`` measures the object."""
@@ -198,9 +198,9 @@ class Shape:
         score = np.zeros(len(angles))
         for turned in (angles, angles + np.pi / 2):
             across = np.outer(np.cos(turned), points[:, 0]) + np.outer(np.sin(turned), points[:, 1])
-            place = ((across + reach_m) / _BIN_M).astype(np.int64)
-            place += num * np.arange(len(angles))[:, None]
-            counts = np.bincount(place.ravel(), minlength=num * len(angles))
+            bin_number = ((across + reach_m) / _BIN_M).astype(np.int64)
+            bin_number += num * np.arange(len(angles))[:, None]
+            counts = np.bincount(bin_number.ravel(), minlength=num * len(angles))
             score += (counts.reshape(-1, num) ** 2).sum(axis=1)
         return float(angles[np.argmax(score)])
 
@@ -217,10 +217,10 @@ class MovingObject(NamedTuple):
         Points are measured at one time, or at (N,) times.
         """
         at_s, rim = float(np.mean(time_s)), self.shape.rim
-        way_m = float(np.ptp(time_s) * np.linalg.norm(self.track.path.rate(at_s)[:2]))
+        travel_m = float(np.ptp(time_s) * np.linalg.norm(self.track.path.rate(at_s)[:2]))
         rim = self.track.place(rim, at_s)
         apart_m = np.maximum(points.min(0) - rim.max(0), rim.min(0) - points.max(0))
-        return bool((apart_m <= within_m + way_m).all())
+        return bool((apart_m <= within_m + travel_m).all())
 
     def heading(self, at_s: float) -> Float:
         """Return (2,) the unit vector along the object at a time, world.

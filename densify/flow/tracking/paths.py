@@ -58,20 +58,20 @@ class Path:
         accelerates = num_states >= MIN_STATES and duration_s >= MIN_SPAN_S
         D = np.diff(np.eye(B.shape[1]), 3 if accelerates else 2, axis=0)
         W = weights / weights.mean()
-        least, coefficients, residual_m = np.inf, np.zeros(0), np.inf
+        least_error_m, coefficients, residual_m = np.inf, np.zeros(0), np.inf
         jerks = num_states >= _JERK_STATES and duration_s >= _JERK_S
         for stiffness in _STIFFNESSES if jerks else _STIFFNESSES[:1]:
             solve = np.linalg.solve(B.T @ (W[:, None] * B) + stiffness * D.T @ D, B.T * W)
             leverage = np.einsum("ij,ji->i", B, solve)
-            found = solve @ states
-            missed_m = np.linalg.norm((states - B @ found)[:, :2], axis=1)
+            fitted = solve @ states
+            missed_m = np.linalg.norm((states - B @ fitted)[:, :2], axis=1)
             left_out_m = missed_m / np.maximum(1 - leverage, 1e-3)
             error_m = float(np.sqrt(np.average(left_out_m**2, weights=W)))
-            if error_m < _WORTH_SOFTENING * least:
+            if error_m < _WORTH_SOFTENING * least_error_m:
                 freedom = max(num_states - leverage.sum() - 0.5, 0.5)
                 mean_square = float(np.average(missed_m**2, weights=W))
                 residual_m = float(np.sqrt(mean_square * num_states / freedom))
-                least, coefficients = error_m, found
+                least_error_m, coefficients = error_m, fitted
         return Path(knots, coefficients, begin_s, end_s, residual_m)
 
     @cached_property

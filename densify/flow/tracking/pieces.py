@@ -48,8 +48,8 @@ class _Piece(NamedTuple):
 
     def within(self, track: Track, sweeps: Sequence[int]) -> Float:
         """Return the (N,3) points of some sweeps in the object's frame of a track."""
-        parts = [track.undo(self.points[i], self.seen_s[i]) for i in sweeps]
-        return np.concatenate([np.zeros((0, 3)), *parts])
+        clouds = [track.undo(self.points[i], self.seen_s[i]) for i in sweeps]
+        return np.concatenate([np.zeros((0, 3)), *clouds])
 
 
 def join_pieces(
@@ -62,22 +62,22 @@ def join_pieces(
     """
     pieces = _pieces(stretch, tracks, instance, space)
     number, carrier = np.arange(len(tracks)), np.arange(len(tracks))
-    left = sorted(pieces, key=lambda k: (-pieces[k].num_points, k))
-    while left:
-        k = left.pop(0)
+    unjoined = sorted(pieces, key=lambda k: (-pieces[k].num_points, k))
+    while unjoined:
+        k = unjoined.pop(0)
         joined, grows = [pieces[k]], True
         while grows:
-            every = np.concatenate([p.within(tracks[k], list(p.points)) for p in joined])
-            whole = MovingObject(tracks[k], Shape.of(every))
-            times = set().union(*(p.points for p in joined))
-            same = [other for other in left if _is_part(pieces[other], whole, times, space)]
-            number[same] = k
-            for other in same:
-                if not _moves_by_itself(pieces[other], tracks[k], space):
-                    carrier[other] = k
-            joined += [pieces[other] for other in same]
-            left = [other for other in left if other not in same]
-            grows = bool(same)
+            points = np.concatenate([p.within(tracks[k], list(p.points)) for p in joined])
+            whole = MovingObject(tracks[k], Shape.of(points))
+            sweeps = set().union(*(p.points for p in joined))
+            added = [m for m in unjoined if _is_part(pieces[m], whole, sweeps, space)]
+            number[added] = k
+            for m in added:
+                if not _moves_by_itself(pieces[m], tracks[k], space):
+                    carrier[m] = k
+            joined += [pieces[m] for m in added]
+            unjoined = [m for m in unjoined if m not in added]
+            grows = bool(added)
     return Joined(number, carrier)
 
 
@@ -87,10 +87,10 @@ def _moves_by_itself(piece: _Piece, track: Track, space: FreeSpace) -> bool:
         return False  # a shorter path is known less well
     middle = sorted(piece.points)[len(piece.points) // 2]
     at_s = space.clock.time_s[middle]
-    there = piece.track.place(piece.within(piece.track, [middle]), at_s)
-    off_m_s = piece.track.velocity_m_s(there, at_s) - track.velocity_m_s(there, at_s)
+    positions = piece.track.place(piece.within(piece.track, [middle]), at_s)
+    difference_m_s = piece.track.velocity_m_s(positions, at_s) - track.velocity_m_s(positions, at_s)
     # The motion of a side that slides along itself is wrong, that of half a turning truck is not.
-    return bool(np.linalg.norm(off_m_s[:, :2], axis=1).max() <= _SAME_M_S)
+    return bool(np.linalg.norm(difference_m_s[:, :2], axis=1).max() <= _SAME_M_S)
 
 
 def _pieces(
@@ -109,12 +109,12 @@ def _pieces(
     return pieces
 
 
-def _is_part(piece: _Piece, whole: MovingObject, times: set[int], space: FreeSpace) -> bool:
-    """Return True if a piece belongs to an object that is seen in the sweeps ``times``."""
+def _is_part(piece: _Piece, whole: MovingObject, sweeps: set[int], space: FreeSpace) -> bool:
+    """Return True if a piece belongs to an object that is seen in ``sweeps``."""
     # It touches the object in most common sweeps, and moves alike or lies in the object's box; or
     # it moves alike in the object's lane, at most 0.5 m from the box, or 1.5 m if nothing was seen
     # through between.
-    common = sorted(times & piece.points.keys())
+    common = sorted(sweeps & piece.points.keys())
     if not common:
         return False
     middle = common[len(common) // 2]
@@ -123,45 +123,48 @@ def _is_part(piece: _Piece, whole: MovingObject, times: set[int], space: FreeSpa
     track, shape = whole
     middle_s = space.clock.time_s[middle]
     lane = whole.lane(middle_s)
-    own = track.place(shape.points, middle_s)[:, :2] @ lane.ahead
+    # whole_m, piece_m: coordinates of the points along the heading
+    whole_m = track.place(shape.points, middle_s)[:, :2] @ lane.ahead
     touches, inside = [], []
     for i in common:
         in_object = piece.within(track, [i])
-        there = track.place(in_object, middle_s)
-        along = there[:, :2] @ lane.ahead
-        inside.append(lane.holds(there) & (along >= own.min()) & (along <= own.max()))
+        at_middle = track.place(in_object, middle_s)
+        piece_m = at_middle[:, :2] @ lane.ahead
+        inside.append(
+            lane.holds(at_middle) & (piece_m >= whole_m.min()) & (piece_m <= whole_m.max())
+        )
         close = nearest(shape.tree, in_object)[0] < piece.near_m[i]
         touches.append((close | shape.within_outline(in_object)).any())
     touching = bool(np.mean(touches) >= _MOSTLY)
     if touching and np.concatenate(inside).mean() >= _MOSTLY:
         return True
-    there = piece.track.place(piece.within(piece.track, common), middle_s)
+    at_middle = piece.track.place(piece.within(piece.track, common), middle_s)
     beside = [i for i in common if space.clock.near(i, middle, _BESIDE_S)]
     drift = [
-        track.carry(there, middle_s, end_s) - piece.track.carry(there, middle_s, end_s)
+        track.carry(at_middle, middle_s, end_s) - piece.track.carry(at_middle, middle_s, end_s)
         for end_s in space.clock.time_s[[beside[0], beside[-1]]]
     ]
-    least_m = max(_DRIFT_M, float(np.median(np.concatenate([piece.near_m[i] for i in common]))))
-    unsure_m = _SIGMAS * np.hypot(track.path.residual_m, piece.track.path.residual_m)
-    if np.linalg.norm(np.concatenate(drift)[:, :2], axis=1).max() > least_m + unsure_m:
+    tolerance_m = max(_DRIFT_M, float(np.median(np.concatenate([piece.near_m[i] for i in common]))))
+    noise_m = _SIGMAS * np.hypot(track.path.residual_m, piece.track.path.residual_m)
+    if np.linalg.norm(np.concatenate(drift)[:, :2], axis=1).max() > tolerance_m + noise_m:
         return False
     if touching:
         return True
-    along = there[:, :2] @ lane.ahead
-    gap_m = max(along.min() - own.max(), own.min() - along.max())
-    if gap_m > _BUMPERS_M or lane.holds(there).mean() < _MOSTLY:
+    piece_m = at_middle[:, :2] @ lane.ahead
+    gap_m = max(piece_m.min() - whole_m.max(), whole_m.min() - piece_m.max())
+    if gap_m > _BUMPERS_M or lane.holds(at_middle).mean() < _MOSTLY:
         return False
-    if gap_m <= least_m:
+    if gap_m <= tolerance_m:
         return True
-    return not _is_seen_between(track.undo(there, middle_s), whole, common, space)
+    return not _is_seen_between(track.undo(at_middle, middle_s), whole, common, space)
 
 
 def _is_away(piece: _Piece, whole: MovingObject, i: int) -> bool:
     """Return True if a piece is more than 1.5 m away from the box around an object in sweep i."""
-    here, rim = piece.within(whole.track, [i]), whole.shape.rim
+    in_object, rim = piece.within(whole.track, [i]), whole.shape.rim
     return bool(
-        (here.min(axis=0) > rim.max(axis=0) + _BUMPERS_M).any()
-        or (here.max(axis=0) < rim.min(axis=0) - _BUMPERS_M).any()
+        (in_object.min(axis=0) > rim.max(axis=0) + _BUMPERS_M).any()
+        or (in_object.max(axis=0) < rim.min(axis=0) - _BUMPERS_M).any()
     )
 
 

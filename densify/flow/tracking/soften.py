@@ -40,7 +40,7 @@ _MIN_GAIN, _MIN_SHARE_BETTER = 0.05, 0.75
 
 
 @dataclass(frozen=True)
-class Part:
+class Snapshot:
     """The points of one object in one sweep."""
 
     points: Float  # (n,3) metres, n >= 1, in the object's own frame (rigid motion removed)
@@ -49,87 +49,91 @@ class Part:
 
 @dataclass(frozen=True)
 class Softened:
-    """How an object bends from sweep to sweep; its points in one sweep are a `Part`."""
+    """How an object bends from sweep to sweep; its points in one sweep are a `Snapshot`."""
 
-    parts: tuple[Part, ...]  # points of the object in each sweep, by ascending time
-    # For each part (n,3) metres, displacement of its points to the time of the next part relative
-    # to the rigid motion, object's frame. It is 0 for the last part and for a rigid object.
+    snapshots: tuple[Snapshot, ...]  # points of the object in each sweep, by ascending time
+    # For each snapshot (n,3) metres, displacement of its points to the time of the next snapshot
+    # relative to the rigid motion, object's frame; 0 for the last snapshot and for a rigid object
     to_next: tuple[Float, ...]
-    # As ``to_next``, to the time of the previous part; 0 for the first part
+    # As ``to_next``, to the time of the previous snapshot; 0 for the first snapshot
     to_previous: tuple[Float, ...]
-    alpha: float  # weight of smoothness (stiffness) that held-out parts confirmed, inf for rigid
-    # Root mean square distance of held-out parts from their prediction, by the alpha tried, inf
-    # first; empty if nothing was tried
+    # Weight of smoothness (stiffness) that held-out snapshots confirmed, inf for rigid
+    alpha: float
+    # Root mean square distance of held-out snapshots from their prediction, by the alpha tried,
+    # inf first; empty if nothing was tried
     held_out_m: dict[float, float]
 
     def velocity_m_s(self, i: int) -> Float:
-        """Return (n,3) velocities of part i's points beyond the rigid motion, object's frame."""
-        # The mean of the velocities to the next and from the previous part
-        velocities = [np.zeros_like(self.parts[i].points)]
+        """Return (n,3) velocities of snapshot i beyond the rigid motion, object's frame."""
+        # The mean of the velocities to the next and from the previous snapshot
+        velocities = [np.zeros_like(self.snapshots[i].points)]
         for j, moved in ((i + 1, self.to_next[i]), (i - 1, self.to_previous[i])):
-            if 0 <= j < len(self.parts):
-                velocities.append(moved / (self.parts[j].time_s - self.parts[i].time_s))
+            if 0 <= j < len(self.snapshots):
+                velocities.append(moved / (self.snapshots[j].time_s - self.snapshots[i].time_s))
         return np.asarray(np.mean(velocities[1:] or velocities, axis=0))
 
     def carry(self, i: int, j: int) -> Float:
-        """Return the (n,3) points of part i at the time of part j, object's frame."""
-        # At each part in between, a point continues like nearby points that came the same way.
-        at, step = self.parts[i].points, 1 if j > i else -1
+        """Return the (n,3) points of snapshot i at the time of snapshot j, object's frame."""
+        # At each snapshot in between, a point continues like nearby points that came the same way.
+        points, step = self.snapshots[i].points, 1 if j > i else -1
         if i == j or np.isinf(self.alpha):
-            return at
-        onward, back = self.to_next, self.to_previous
+            return points
+        forward, backward = self.to_next, self.to_previous
         if step < 0:
-            onward, back = back, onward
-        moved = onward[i]
+            forward, backward = backward, forward
+        moved = forward[i]
         for k in range(i + step, j, step):
-            at = at + moved
-            moved = _look_up(at, moved, self.parts[k].points, -back[k], onward[k])
-        return at + moved
+            points = points + moved
+            moved = _look_up(points, moved, self.snapshots[k].points, -backward[k], forward[k])
+        return points + moved
 
 
-def soften(parts: Sequence[Part]) -> Softened:
-    """Estimate the bending of one object from its parts, by ascending time.
+def soften(snapshots: Sequence[Snapshot]) -> Softened:
+    """Estimate the bending of one object from its snapshots, by ascending time.
 
-    Every second part is left out, and predicted from the bending between its neighbours. The
-    softest stiffness is taken that predicts clearly better than the rigid object, in most parts.
-    Otherwise the object stays rigid. Objects longer than 3 m, with fewer than 5 parts, less than
-    0.35 s, or a median of fewer than 20 points per part always stay rigid.
+    Every second snapshot is left out, and predicted from the bending between its neighbours. The
+    softest stiffness is taken that predicts clearly better than the rigid object, in most
+    snapshots. Otherwise the object stays rigid. Objects longer than 3 m, with fewer than 5
+    snapshots, less than 0.35 s, or a median of fewer than 20 points per snapshot always stay rigid.
     """
-    parts = tuple(parts)
-    still = tuple(np.zeros_like(part.points) for part in parts)
-    if not _may_bend(parts):
-        return Softened(parts, still, still, np.inf, {})
-    squared = _held_out(parts)
+    snapshots = tuple(snapshots)
+    zero = tuple(np.zeros_like(p.points) for p in snapshots)
+    if not _may_bend(snapshots):
+        return Softened(snapshots, zero, zero, np.inf, {})
+    squared = _held_out(snapshots)
     rms_m = np.sqrt(squared.mean(axis=0)).tolist()
     held_out_m = dict(zip((np.inf, *_ALPHAS), rms_m, strict=True))
     clearly = squared.mean(axis=0) < (1 - _MIN_GAIN) * squared[:, 0].mean()
     mostly = (squared < squared[:, :1]).mean(axis=0) >= _MIN_SHARE_BETTER
     confirmed = np.flatnonzero(clearly & mostly)
     if not len(confirmed):
-        return Softened(parts, still, still, np.inf, held_out_m)
+        return Softened(snapshots, zero, zero, np.inf, held_out_m)
     softest = int(confirmed[-1]) - 1
-    bending = _Bending(parts)
-    for level in range(softest + 1):
+    bending = _Bending(snapshots)
+    for k in range(softest + 1):
         bending.bring_beyond()
-        bending.refine(level)
-    return Softened(parts, *_averaged(parts, *bending.at_points()), _ALPHAS[softest], held_out_m)
+        bending.refine(k)
+    return Softened(
+        snapshots, *_averaged(snapshots, *bending.at_points()), _ALPHAS[softest], held_out_m
+    )
 
 
-def _may_bend(parts: tuple[Part, ...]) -> bool:
+def _may_bend(snapshots: tuple[Snapshot, ...]) -> bool:
     """Return True if the object is shorter than 3 m and was observed often enough."""
-    if len(parts) < MIN_STATES or parts[-1].time_s - parts[0].time_s < MIN_SPAN_S:
+    if len(snapshots) < MIN_STATES or snapshots[-1].time_s - snapshots[0].time_s < MIN_SPAN_S:
         return False
-    if np.median([len(p.points) for p in parts]) < _MIN_POINTS:
+    if np.median([len(p.points) for p in snapshots]) < _MIN_POINTS:
         return False
-    lengths_m = [np.linalg.norm(np.ptp(p.points, axis=0)) for p in parts]
+    lengths_m = [np.linalg.norm(np.ptp(p.points, axis=0)) for p in snapshots]
     return bool(np.median(lengths_m) < LONG_M)
 
 
-def _held_out(parts: tuple[Part, ...]) -> Float:
-    """Return the mean squared distance (m²) of each held-out part from its prediction."""
-    errors = np.zeros((len(parts) - 2, 1 + len(_ALPHAS)))  # part i + 1, level k - 1; 0 is rigid
+def _held_out(snapshots: tuple[Snapshot, ...]) -> Float:
+    """Return the mean squared distance (m²) of each held-out snapshot from its prediction."""
+    # errors[i, k]: snapshot i + 1 at alpha k - 1; k = 0 is rigid
+    errors = np.zeros((len(snapshots) - 2, 1 + len(_ALPHAS)))
     for first in (0, 1):
-        kept, left_out = parts[first::2], parts[first + 1 :: 2]
+        kept, left_out = snapshots[first::2], snapshots[first + 1 :: 2]
         bending = _Bending(kept)
         for k in range(1 + len(_ALPHAS)):
             if k:
@@ -142,19 +146,19 @@ def _held_out(parts: tuple[Part, ...]) -> Float:
 
 def _squared_distance(a: Float, b: Float) -> float:
     """Return the mean squared, capped distance (m²) of nearest points, both ways."""
-    there = np.minimum(nearest(tree_of(b), a)[0], _CAP_M)
-    back = np.minimum(nearest(tree_of(a), b)[0], _CAP_M)
-    return float((there**2).mean() + (back**2).mean()) / 2
+    a_to_b_m = np.minimum(nearest(tree_of(b), a)[0], _CAP_M)
+    b_to_a_m = np.minimum(nearest(tree_of(a), b)[0], _CAP_M)
+    return float((a_to_b_m**2).mean() + (b_to_a_m**2).mean()) / 2
 
 
 class _Bending:
-    """Solver of the flow from each part (points of the object in one sweep) to its neighbours."""
+    """Solver of the flow from each snapshot to the next and to the previous one."""
 
-    def __init__(self, parts: tuple[Part, ...]) -> None:
-        self._parts = parts
-        self._nodes = [p.points[_one_per_voxel(p.points)] for p in parts]
-        n = len(parts)
-        # A hop leads to the next or the previous part. Their nodes lie side by side in one cloud.
+    def __init__(self, snapshots: tuple[Snapshot, ...]) -> None:
+        self._snapshots = snapshots
+        self._nodes = [p.points[_one_per_voxel(p.points)] for p in snapshots]
+        n = len(snapshots)
+        # A hop leads to the next or the previous snapshot. The nodes of all hops lie side by side.
         self._hops = [(i, i + 1) for i in range(n - 1)] + [(i, i - 1) for i in range(1, n)]
         everything = np.concatenate(self._nodes)
         self._apart_m = float(np.ptp(everything, axis=0).max()) + 10.0
@@ -166,18 +170,18 @@ class _Bending:
         self._flow = np.zeros_like(self._source)  # (nodes, 3) beyond the rigid motion
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
 
-    def refine(self, level: int) -> None:
-        """Find all targets again and solve for the flow, in place; level 0 is the stiffest."""
+    def refine(self, k: int) -> None:
+        """Find all targets again and solve for the flow, in place; alpha k = 0 is the stiffest."""
         # Minimise, for fixed targets t: Σ w |f - t|² + Σ a |f|² + steady + alpha tr(Fᵀ L F).
         # The anchor a holds a node until it clearly left the rigid position (Geman, McClure 1987).
         moved = self._source + self._flow
-        near = nearest_k(tree_of(self._target), moved, _NUM_BLURRED)[1]
-        there, distance_m = _blurred(self._target, near, moved, _BLURS_M[level])
-        own, _ = _blurred(moved, self._around, moved, _BLURS_M[level])
-        weight = np.clip(1 - (distance_m / _REACHES_M[level]) ** 2, 0, 1) ** 2  # Tukey
+        neighbours = nearest_k(tree_of(self._target), moved, _NUM_BLURRED)[1]
+        target_mean, distance_m = _blurred(self._target, neighbours, moved, _BLURS_M[k])
+        source_mean, _ = _blurred(moved, self._around, moved, _BLURS_M[k])
+        weight = np.clip(1 - (distance_m / _REACHES_M[k]) ** 2, 0, 1) ** 2  # Tukey
         anchor = _ANCHOR / (1 + (self._flow**2).sum(axis=1) / _ANCHOR_M**2) ** 2
-        pull = weight[:, None] * (self._flow + there - own)
-        matrix = diags_array(weight + anchor) + self._steady + _ALPHAS[level] * self._laplacian
+        pull = weight[:, None] * (self._flow + target_mean - source_mean)
+        matrix = diags_array(weight + anchor) + self._steady + _ALPHAS[k] * self._laplacian
         jacobi = diags_array(1 / (matrix.diagonal() + 1e-9))
         for axis in range(3):
             start, rhs = self._flow[:, axis], pull[:, axis]
@@ -187,7 +191,7 @@ class _Bending:
             )
 
     def bring_beyond(self) -> None:
-        """Fill holes in the target of each hop from a to b by the part beyond b, moved to b."""
+        """Fill holes in the target of each hop from a to b by the snapshot beyond b, moved to b."""
         flows = self._by_hop()
         targets = []
         for a, b in self._hops:
@@ -197,21 +201,21 @@ class _Bending:
         self._target = self._side_by_side(targets)
 
     def between(self, i: int, time_s: float) -> Float:
-        """Return the (N,3) nodes of parts i and i + 1, both moved to a time between them."""
+        """Return the (N,3) nodes of snapshots i and i + 1, both moved to a time between them."""
         flows = self._by_hop()
-        start_s, end_s = self._parts[i].time_s, self._parts[i + 1].time_s
+        start_s, end_s = self._snapshots[i].time_s, self._snapshots[i + 1].time_s
         share = (time_s - start_s) / (end_s - start_s)
         forth = self._nodes[i] + share * flows[i, i + 1]
         return np.concatenate([forth, self._nodes[i + 1] + (1 - share) * flows[i + 1, i]])
 
     def at_points(self) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-        """Return the flow (n,3) of each part's points to the next and to the previous part."""
-        to_next = [np.zeros_like(p.points) for p in self._parts]
-        to_previous = [np.zeros_like(p.points) for p in self._parts]
+        """Return the flow (n,3) of each snapshot's points to the next and the previous one."""
+        to_next = [np.zeros_like(p.points) for p in self._snapshots]
+        to_previous = [np.zeros_like(p.points) for p in self._snapshots]
         for (a, b), flow in self._by_hop().items():
-            nodes, points = self._nodes[a], self._parts[a].points
-            found = _look_up(points, np.zeros_like(points), nodes, np.zeros_like(nodes), flow)
-            (to_next if b > a else to_previous)[a] = found
+            nodes, points = self._nodes[a], self._snapshots[a].points
+            moved = _look_up(points, np.zeros_like(points), nodes, np.zeros_like(nodes), flow)
+            (to_next if b > a else to_previous)[a] = moved
         return tuple(to_next), tuple(to_previous)
 
     def _by_hop(self) -> dict[tuple[int, int], Float]:
@@ -222,33 +226,33 @@ class _Bending:
 
     def _steadiness(self) -> csr_array:
         """Return the (nodes, nodes) matrix of ``|f_next / dt_next + f_before / dt_before|²``."""
-        # f are displacements to the next and the previous part. The sum is 0 at constant velocity.
+        # f: displacements to the next and the previous snapshot; the sum is 0 at constant velocity
         number = {hop: k for k, hop in enumerate(self._hops)}
-        times_s = [p.time_s for p in self._parts]
+        times_s = [p.time_s for p in self._snapshots]
         opposite = np.arange(len(self._source))
-        own, crossed = np.zeros((2, len(self._source)))
+        diagonal, crossed = np.zeros((2, len(self._source)))
         for (a, b), k in number.items():
-            other = number.get((a, 2 * a - b))
-            if other is None:
+            opposite_hop = number.get((a, 2 * a - b))
+            if opposite_hop is None:
                 continue
             rows = slice(self._start[k], self._start[k + 1])
-            opposite[rows] = np.arange(self._start[other], self._start[other + 1])
+            opposite[rows] = np.arange(self._start[opposite_hop], self._start[opposite_hop + 1])
             u, v = 1 / abs(times_s[b] - times_s[a]), 1 / abs(times_s[2 * a - b] - times_s[a])
             scale = 2 * _STEADY / (u * u + v * v)  # a weight of 1 for equal times
-            own[rows], crossed[rows] = scale * u * u, scale * u * v
+            diagonal[rows], crossed[rows] = scale * u * u, scale * u * v
         row = np.arange(len(opposite))
         coupling = coo_array((crossed, (row, opposite)), shape=(len(row), len(row)))
-        return csr_array(diags_array(own) + coupling)
+        return csr_array(diags_array(diagonal) + coupling)
 
 
 def _laplacian(points: Float) -> csr_array:
     """Return the (n,n) Laplacian ``(D - W) / mean(D)`` of the neighbour graph of points (n,3)."""
     # W[i, j] = exp(-|p_i - p_j|² / 1 m²) where either is among the 6 nearest of the other
     n = len(points)
-    distance_m, near = nearest_k(tree_of(points), points, _NUM_NEIGHBORS + 1)
+    distance_m, neighbours = nearest_k(tree_of(points), points, _NUM_NEIGHBORS + 1)
     row, rank = np.nonzero(distance_m <= _LINK_M)
     weights = coo_array(
-        (np.exp(-(distance_m[row, rank] ** 2)), (row, near[row, rank])), shape=(n, n)
+        (np.exp(-(distance_m[row, rank] ** 2)), (row, neighbours[row, rank])), shape=(n, n)
     ).tocsr()
     weights = weights.maximum(weights.T)
     degree = weights.sum(axis=1)
@@ -256,15 +260,15 @@ def _laplacian(points: Float) -> csr_array:
 
 
 def _averaged(
-    parts: tuple[Part, ...], to_next: tuple[Float, ...], to_previous: tuple[Float, ...]
+    snapshots: tuple[Snapshot, ...], to_next: tuple[Float, ...], to_previous: tuple[Float, ...]
 ) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-    """Average each flow with the reversed flow back from the part where its points arrive."""
+    """Average each flow with the reversed flow back from the snapshot where its points arrive."""
 
-    def mean(a: int, b: int, onward: Float, back: Float) -> Float:
-        arrived = parts[a].points + onward
-        return (onward + _look_up(arrived, onward, parts[b].points, -back, -back)) / 2
+    def mean(a: int, b: int, flow: Float, reverse: Float) -> Float:
+        arrived = snapshots[a].points + flow
+        return (flow + _look_up(arrived, flow, snapshots[b].points, -reverse, -reverse)) / 2
 
-    last = len(parts) - 1
+    last = len(snapshots) - 1
     forth = [mean(i, i + 1, to_next[i], to_previous[i + 1]) for i in range(last)]
     back = [mean(i + 1, i, to_previous[i + 1], to_next[i]) for i in range(last)]
     return (*forth, to_next[last]), (to_previous[0], *back)
@@ -276,9 +280,9 @@ def _one_per_voxel(points: Float) -> Int:
     return np.sort(np.unique(voxel, axis=0, return_index=True)[1]).astype(np.int64)
 
 
-def _blurred(points: Float, near: Int, at: Float, blur_m: float) -> tuple[Float, Float]:
+def _blurred(points: Float, neighbours: Int, at: Float, blur_m: float) -> tuple[Float, Float]:
     """Return (N,3) Gaussian means of ``points[near[i]]`` around ``at[i]``, nearest distances."""
-    around = points[near]
+    around = points[neighbours]
     away = around - at[:, None]
     squared = np.einsum("nki,nki->nk", away, away)
     nearest = squared.min(axis=1)
@@ -287,11 +291,13 @@ def _blurred(points: Float, near: Int, at: Float, blur_m: float) -> tuple[Float,
     return np.einsum("nk,nki->ni", weight, around), np.sqrt(nearest)
 
 
-def _look_up(at: Float, came: Float, points: Float, known_came: Float, values: Float) -> Float:
+def _look_up(
+    points: Float, moved: Float, known_points: Float, known_moved: Float, values: Float
+) -> Float:
     """Interpolate values (M,3) of known points with similar position and last displacement."""
-    known, asked = np.hstack([points, known_came]), np.hstack([at, came])
-    near = nearest_k(tree_of(known), asked, _NUM_LOOKED_UP)[1]
-    distance_m = np.linalg.norm(known[near] - asked[:, None], axis=2)
+    known, queries = np.hstack([known_points, known_moved]), np.hstack([points, moved])
+    neighbours = nearest_k(tree_of(known), queries, _NUM_LOOKED_UP)[1]
+    distance_m = np.linalg.norm(known[neighbours] - queries[:, None], axis=2)
     weight = 1 / (distance_m + 1e-3) ** 2
     weight /= weight.sum(axis=1, keepdims=True)
-    return np.einsum("nk,nki->ni", weight, values[near])
+    return np.einsum("nk,nki->ni", weight, values[neighbours])

@@ -126,6 +126,7 @@ class _Search:
 
     def _track_of(self, members: Int, n: int) -> tuple[Track, Verdict]:
         """Return the most likely track of ``members`` of batch n's obstacles, and its verdict."""
+        # best, restarted: a track and its verdict
         best = self._follow(members, n, self._velocity_of(members, n))
         # adjacent objects, such as a towing vehicle
         for velocity in velocities_beside(self.batches[n], members, self._objects):
@@ -137,9 +138,9 @@ class _Search:
             for k in sorted({min(track.observations), max(track.observations)} - {n}):
                 rows = track.rows_in(self.batches[k])
                 if len(rows) >= MIN_POINTS:
-                    found = self._follow(rows, k, self._velocity_of(rows, k))
-                    if found[0].total_points() >= _AS_WHOLE * track.total_points():
-                        best = _better(best, found)
+                    restarted = self._follow(rows, k, self._velocity_of(rows, k))
+                    if restarted[0].total_points() >= _AS_WHOLE * track.total_points():
+                        best = _better(best, restarted)
         return best
 
     def _follow(self, members: Int, n: int, velocity: Float) -> tuple[Track, Verdict]:
@@ -152,13 +153,13 @@ class _Search:
         """Claim free candidates in or near the object that its motion explains, in place."""
         # Otherwise these points would start a track of their own.
         shape = self._shape_of(track)
-        for j, own in track.claimed.items():
+        for j, claimed in track.claimed.items():
             c = self._obstacles[j]
-            there = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
-            rows = c.strips.rows_inside(there.min(0) - LINK_M, there.max(0) + LINK_M)
-            rows = self._unclaimed(j, rows, own)
+            rim = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
+            rows = c.strips.rows_inside(rim.min(0) - LINK_M, rim.max(0) + LINK_M)
+            rows = self._unclaimed(j, rows, claimed)
             rows = rows[shape.near(track.undo(c.points[rows], c.time_s[rows]), FIT_M)]
-            track.claimed[j] = np.concatenate([own, self._without_violations(track, j, rows)])
+            track.claimed[j] = np.concatenate([claimed, self._without_violations(track, j, rows)])
 
     def _claim_in_line(self, track: Track) -> None:
         """Claim free clusters of single rings or columns ahead of and behind the object."""
@@ -167,31 +168,31 @@ class _Search:
         space, shape = self._space, self._shape_of(track)
         at_s = next(iter(track.observations.values())).seen_s
         lane = MovingObject(track, shape).lane(at_s)
-        found, parts = {}, [track.place(shape.points, at_s)]
-        for j, own in track.claimed.items():
+        rows_in_line, clouds = {}, [track.place(shape.points, at_s)]
+        for j, claimed in track.claimed.items():
             c = self._obstacles[j]
-            there = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
-            rows = c.strips.rows_inside(there.min(0) - LANE_M, there.max(0) + LANE_M)
-            rows = self._unclaimed(j, rows, own)
+            rim = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
+            rows = c.strips.rows_inside(rim.min(0) - LANE_M, rim.max(0) + LANE_M)
+            rows = self._unclaimed(j, rows, claimed)
             rows = rows[_few_rays(c, rows, space.T_lidar_world[j], space.sensors)]
             rows = rows[lane.holds(track.carry(c.points[rows], c.time_s[rows], at_s))]
-            found[j] = rows = self._without_violations(track, j, rows)
-            parts.append(track.carry(c.points[rows], c.time_s[rows], at_s))
+            rows_in_line[j] = rows = self._without_violations(track, j, rows)
+            clouds.append(track.carry(c.points[rows], c.time_s[rows], at_s))
         j = next(iter(track.claimed))
         columns_m = columns_apart_m(track.centre, lane.ahead, space.T_lidar_world[j], space.sensors)
         gap_m = float(np.clip(NUM_COLUMNS * columns_m, *_GAPS_IN_LINE_M))
-        points = np.concatenate(parts)
+        points = np.concatenate(clouds)
         points[:, :2] -= (1 - LINK_M / gap_m) * (points[:, :2] @ lane.ahead)[:, None] * lane.ahead
         _, group = link(points, LINK_M)
         linked = np.isin(group, group[: len(shape.points)])
-        ends = np.cumsum([len(part) for part in parts])
-        for (j, rows), together in zip(found.items(), np.split(linked, ends)[1:-1], strict=True):
-            track.claimed[j] = np.concatenate([track.claimed[j], rows[together]])
+        ends = np.cumsum([len(cloud) for cloud in clouds])
+        for (j, rows), kept in zip(rows_in_line.items(), np.split(linked, ends)[1:-1], strict=True):
+            track.claimed[j] = np.concatenate([track.claimed[j], rows[kept]])
 
-    def _unclaimed(self, j: int, rows: Int, own: Int) -> Int:
-        """Return those ``rows`` of sweep j's obstacles that are free candidates and not ``own``."""
+    def _unclaimed(self, j: int, rows: Int, claimed: Int) -> Int:
+        """Return the ``rows`` of sweep j's obstacles that are free candidates, not ``claimed``."""
         rows = rows[self._free[j][rows] & (self._obstacles[j].cluster[rows] >= 0)]
-        return np.setdiff1d(rows, own, assume_unique=True)
+        return np.setdiff1d(rows, claimed, assume_unique=True)
 
     def _without_violations(self, track: Track, j: int, rows: Int) -> Int:
         """Return those ``rows`` of sweep j that, moved with the track, are never seen through."""
@@ -203,9 +204,9 @@ class _Search:
         return rows
 
 
-def _better(known: tuple[Track, Verdict], found: tuple[Track, Verdict]) -> tuple[Track, Verdict]:
+def _better(best: tuple[Track, Verdict], trial: tuple[Track, Verdict]) -> tuple[Track, Verdict]:
     """Return the found track and verdict if clearly more likely, else the known track."""
-    return found if known[1].is_clearly_below(found[1].log_odds) else known
+    return trial if best[1].is_clearly_below(trial[1].log_odds) else best
 
 
 def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -> Bool:
@@ -237,11 +238,11 @@ def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> 
     sweeps: tuple[list[int], list[int]] = [], []
     for n, seen in sorted(track.observations.items()):
         sweeps[n % 2].extend(seen.sweeps)
-    points = [track.points_in(obstacles, some) for some in sweeps]
+    points = [track.points_in(obstacles, half) for half in sweeps]
     if not all(map(len, points)):
         return
     models = [Model(x) for x in points]
-    before = dict(track.observations), track.path
+    unrefined = dict(track.observations), track.path  # poses and path before
     for n, seen in track.observations.items():
         target = track.place(track.points_in(obstacles, seen.sweeps), seen.seen_s)
         predicted = track.path(seen.seen_s)
@@ -250,5 +251,5 @@ def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> 
             state[2] = track.rise_m(ground, state)
             track.observations[n] = replace(seen, state=state)
     track.smooth()
-    if track.path.residual_m > before[1].residual_m:
-        track.observations, track.path = before
+    if track.path.residual_m > unrefined[1].residual_m:
+        track.observations, track.path = unrefined

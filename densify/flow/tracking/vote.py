@@ -53,8 +53,8 @@ class DistanceField:
         _spread(inside, low, STEP_M, offsets[far < 1], values, nearness)
         return DistanceField(nearness, low, tree_of(points), time_s)
 
-    def raise_to(self, found: Bytes, group: Group, velocities: Float) -> None:
-        """Raise ``found`` (V,N) to the nearness of the moved group to this sweep's candidates.
+    def raise_to(self, nearness: Bytes, group: Group, velocities: Float) -> None:
+        """Raise ``nearness`` (V,N) to the nearness of the moved group to this sweep's candidates.
 
         Each of N points moves at each of the (V,3) velocities (m/s, world) to the time at which
         this sweep would measure the group. Nearness is 0 to 255.
@@ -74,7 +74,7 @@ class DistanceField:
             self.low,
             1 / STEP_M,
             self.nearness,
-            found,
+            nearness,
         )
 
 
@@ -93,9 +93,9 @@ class Group:
         middle_s = float(time_s.mean())
         return Group(points, time_s - middle_s, middle_s, points.mean(axis=0))
 
-    def thinned(self, most: int) -> Group:
-        """Return the group with at most ``most`` points, evenly chosen."""
-        step = len(self.points) // most + 1
+    def thinned(self, max_points: int) -> Group:
+        """Return the group with at most ``max_points`` points, evenly chosen."""
+        step = len(self.points) // max_points + 1
         points, late_s = (np.ascontiguousarray(a[::step]) for a in (self.points, self.late_s))
         return Group(points, late_s, self.middle_s, self.middle)
 
@@ -110,14 +110,18 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
     batch, the distance fields of its sweeps.
     """
     near_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
-    coarse = 2 * STEP_M / near_s
-    near = [fields[m] for m in _batches_around(n, near_s, clock)]
-    both = near + [fields[m] for m in _batches_around(n, max(_FINE_S / 2, near_s), clock)]
-    rough = _best(group.thinned(FEW_POINTS), near, _grid(int(MAX_SPEED_M_S / coarse)) * coarse)
+    coarse_m_s = 2 * STEP_M / near_s
+    near_fields = [fields[m] for m in _batches_around(n, near_s, clock)]
+    all_fields = near_fields + [
+        fields[m] for m in _batches_around(n, max(_FINE_S / 2, near_s), clock)
+    ]
+    rough_m_s = _best(
+        group.thinned(FEW_POINTS), near_fields, _grid(int(MAX_SPEED_M_S / coarse_m_s)) * coarse_m_s
+    )
     group = group.thinned(_MANY_POINTS)
-    found = _best(group, near, rough + _grid(6) * coarse / 3)
-    num = max(1, round(coarse / 3 / _FINE_M_S))
-    return _best(group, both, found + _grid(num) * coarse / 3 / num)
+    finer_m_s = _best(group, near_fields, rough_m_s + _grid(6) * coarse_m_s / 3)
+    num = max(1, round(coarse_m_s / 3 / _FINE_M_S))
+    return _best(group, all_fields, finer_m_s + _grid(num) * coarse_m_s / 3 / num)
 
 
 def _batches_around(n: int, step_s: float, clock: Clock) -> list[int]:
@@ -170,11 +174,11 @@ def _look_up(
     elapsed_s: Float,
     low: Float,
     cells_per_m: float,
+    grid: Bytes,
     nearness: Bytes,
-    found: Bytes,
 ) -> None:
-    """Raise ``found`` (V,N), in place, to the grid's values at N points moved at V velocities."""
-    num_x, num_y, num_z = nearness.shape
+    """Raise ``nearness`` (V,N), in place, to the grid's at N points moved at V velocities."""
+    num_x, num_y, num_z = grid.shape
     for v in range(first, last):
         for i in range(len(points)):
             moving_s = elapsed_s[v] - late_s[i]
@@ -182,4 +186,4 @@ def _look_up(
             y = int((points[i, 1] + velocities[v, 1] * moving_s - low[1]) * cells_per_m)
             z = int((points[i, 2] + velocities[v, 2] * moving_s - low[2]) * cells_per_m)
             if 0 <= x < num_x and 0 <= y < num_y and 0 <= z < num_z:
-                found[v, i] = max(found[v, i], nearness[x, y, z])
+                nearness[v, i] = max(nearness[v, i], grid[x, y, z])

@@ -56,9 +56,9 @@ class Cloud:
         x, y, z = (self.points - self.rigid_points).T
         return np.sqrt(x * x + y * y + z * z).astype(np.float32)
 
-    def joined(self, other: Cloud) -> Cloud:
-        """Return a cloud of this cloud's points, then the other cloud's points."""
-        return Cloud(**{n: np.concatenate([c, vars(other)[n]]) for n, c in vars(self).items()})
+    def joined(self, cloud: Cloud) -> Cloud:
+        """Return a cloud of this cloud's points, then the points of ``cloud``."""
+        return Cloud(**{n: np.concatenate([c, vars(cloud)[n]]) for n, c in vars(self).items()})
 
     def select(self, keep: Bool | Int) -> Cloud:
         """Return a cloud with only the points of an (M,) mask, or of an array of point indices."""
@@ -102,9 +102,9 @@ class Patches(NamedTuple):
     # (M,2) distance to the neighbouring rays of the same sweep: in azimuth, then in elevation
     spacing_m: Float32
 
-    def joined(self, other: Patches) -> Patches:
-        """Return these patches, then the patches of another cloud."""
-        return Patches(*(np.concatenate(both) for both in zip(self, other, strict=True)))
+    def joined(self, patches: Patches) -> Patches:
+        """Return these patches, then ``patches``, of another cloud."""
+        return Patches(*(np.concatenate(columns) for columns in zip(self, patches, strict=True)))
 
     def select(self, keep: Bool) -> Patches:
         """Return the patches of ``cloud.select(keep)``, for an (M,) mask ``keep``."""
@@ -277,7 +277,7 @@ class DepthMap:
     def counts(self) -> dict[str, int]:
         """Return the number of points per `Reason`, by its name in lower case."""
         counts = np.bincount(self.reason, minlength=max(Reason) + 1)
-        return {which.name.lower(): int(counts[which]) for which in Reason}
+        return {reason.name.lower(): int(counts[reason]) for reason in Reason}
 
 
 @dataclass(frozen=True)
