@@ -105,7 +105,7 @@ def vote_twin(pixel, depth_m, known_m, tilt, colours, gap_px, surely):
                     one = 1 / (1 + step / (stage._DECAY * gap))
                     one *= np.exp(-change / (2 * stage._COLOURS**2)) + stage._THROUGH
                     votes += one
-                    same_m = stage._SAME_M + stage._SAME_FRACTION * depth_m
+                    same_m = stage.HIDDEN_M + stage.HIDDEN_FRACTION * depth_m
                     votes_for += one * (abs(1 / here - depth_m) <= same_m)
                     break
         least = min(least, votes_for / votes if votes else 0.0)

@@ -37,7 +37,7 @@ _MIN_PER_COLUMN = 5
 _APART_RAD = 4 * np.pi  # more than twice the range of angles
 _AT_ONCE = 0.03  # share of the duration of a sweep
 
-_NUM_WINDOWS = 5  # of 3, 5, 9, 17, 33 cells, for the density of an unordered scanner
+_NUM_WINDOWS = 5  # of 1, 3, 7, 15, 31 cells, for the density of an unordered scanner
 
 
 class Aimed(NamedTuple):
@@ -267,7 +267,7 @@ def _table_of_density(sweeps: Sequence[Aimed]) -> RayTable:
     cell_sr = _CELL_RAD**2 * np.cos(low + (np.arange(rows) + 0.5) * _CELL_RAD)[:, None] * in_view
     density = np.zeros((rows, columns))
     for k in range(_NUM_WINDOWS, 0, -1):
-        num_in_window, sr = (_in_windows(values, 2**k + 1) for values in (count, cell_sr))
+        num_in_window, sr = (_in_windows(values, 2**k - 1) for values in (count, cell_sr))
         enough = (num_in_window >= _MIN_NUM) | (k == _NUM_WINDOWS)
         density = np.where(enough & (sr > 0), num_in_window / np.maximum(sr, 1e-12), density)
     known = in_view & (density > 0)
