@@ -24,7 +24,8 @@ from densify.geometry.nearest import is_near, nearest, tree_of
 from densify.geometry.types import Float
 
 _NUM_STATES = 3  # fewer states always lie on a line
-_NUM_ASKED = 60  # number of tested points of a batch
+NUM_ASKED = 60
+"""Number of tested points of a batch."""
 _GIVEN = 5.0  # observations added to both counts, because few observations are weak evidence
 _CLEARLY = 1.0  # difference of the log odds of two motions that exceeds noise
 _ROUGH = 0.1  # accuracy of a state, as a share of the neighbour distance
@@ -140,7 +141,7 @@ def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSp
     """Count how often other sweeps see through sampled track points, as static and as moved."""
     tested = {}
     for batch in space.batches:
-        num = _NUM_ASKED // len(batch)
+        num = NUM_ASKED // len(batch)
         for i in batch:
             if i in track.claimed:
                 rows = track.claimed[i]
@@ -190,7 +191,7 @@ def find_places_left(
     """
     sweeps = list(track.claimed)
     sampled = [
-        obstacles[i].points[rows[:: len(rows) // _NUM_ASKED + 1]]
+        obstacles[i].points[rows[:: len(rows) // NUM_ASKED + 1]]
         for i, rows in track.claimed.items()
     ]
     # sweep: (P,) index of the sweep that measured each position

@@ -24,7 +24,7 @@ from densify.flow.tracking.following import (
     find_starts,
     velocities_beside,
 )
-from densify.flow.tracking.likelihood import Judge, Verdict, judge
+from densify.flow.tracking.likelihood import NUM_ASKED, Judge, Verdict, judge
 from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track
 from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.free_space.ground import HeightMap
@@ -95,7 +95,12 @@ class _Search:
             members = cluster[untaken]
             if len(members) < MIN_POINTS:
                 continue
-            track, verdict = self._track_of(members, n)
+            beside = velocities_beside(self.batches[n], members, self._objects)
+            velocities = [self._velocity_of(members, n), *beside]
+            velocities = [v for v in velocities if self._may_move(members, n, v)]
+            if not velocities:
+                continue
+            track, verdict = self._track_of(members, n, velocities)
             for j, rows in track.claimed.items():
                 untried[j][rows] = False
             if verdict.moves:
@@ -124,12 +129,32 @@ class _Search:
             velocity = np.median(self.batches[n].gather(self._velocities_m_s)[members], axis=0)
         return velocity
 
-    def _track_of(self, members: Int, n: int) -> tuple[Track, Verdict]:
-        """Return the most likely track of ``members`` of batch n's obstacles, and its verdict."""
+    def _may_move(self, members: Int, n: int, velocity: Float) -> bool:
+        """Return True if other sweeps see less often through the points once they are moved.
+
+        ``members`` are of batch n's obstacles. Without any evidence they may move.
+        """
+        c, rows = self.batches[n].obstacles, members[:: len(members) // NUM_ASKED + 1]
+        points, time_s = c.points[rows], c.time_s[rows]
+        velocity_m_s = np.repeat([velocity, np.zeros(3)], len(rows), axis=0)
+        num_seen_through = np.zeros(2, np.int64)  # moved, static
+        for m, batch in enumerate(self.batches):
+            if m != n and self.clock.near(m, n, _NEAR_S):
+                j = batch.sweeps[0]
+                moved = points + (self._space.clock.time_s[j] - time_s)[:, None] * velocity
+                asked = np.concatenate([moved, points])
+                seen_through = self._space.seen_through(asked, j, velocity_m_s)
+                num_seen_through += seen_through.reshape(2, -1).sum(axis=1)
+        return bool(num_seen_through[0] < num_seen_through[1] or not num_seen_through.any())
+
+    def _track_of(self, members: Int, n: int, velocities: Sequence[Float]) -> tuple[Track, Verdict]:
+        """Return the most likely track of ``members`` of batch n's obstacles, and its verdict.
+
+        It starts at the first velocity, and at the others if free-space violations remain.
+        """
         # best, restarted: a track and its verdict
-        best = self._follow(members, n, self._velocity_of(members, n))
-        # adjacent objects, such as a towing vehicle
-        for velocity in velocities_beside(self.batches[n], members, self._objects):
+        best = self._follow(members, n, velocities[0])
+        for velocity in velocities[1:]:
             if best[1].is_clearly_below(best[1].at_most):
                 best = _better(best, self._follow(members, n, velocity))
         track, verdict = best
