@@ -21,7 +21,7 @@ from densify.registration.odometry import search_twist
 
 _REACH_NS = 1_050_000_000
 _NUM_IN_REACH = 10  # sweeps of the last second; a larger number is thinned evenly
-_FRESH_NS = 250_000_000  # age of the latest sweep up to which a surface serves the next sweeps too
+_FRESH_NS = 350_000_000  # age of the latest sweep up to which a surface serves the next sweeps too
 _NUM_START = 3  # sweeps of the first surfaces, at their expected poses
 _VOXEL_M = 0.25
 # Neighbours must include the next rings. Points of one ring give normals of noise, which lean
