@@ -295,6 +295,12 @@ def test_own_vehicle_is_what_stays_beside_it(good: Sample) -> None:
     assert before.verdict == Verdict.FINE
 
 
+def test_a_kerb_that_runs_along_the_road_is_no_own_vehicle(good: Sample) -> None:
+    kerb = np.random.default_rng(0).uniform([-4.5, 3.0, -1.2], [4.5, 3.4, -1.1], (2000, 3))
+    (found,) = points.check_own_vehicle(with_sweeps(good, lambda sweep: with_points(sweep, kerb)))
+    assert found.verdict == Verdict.FINE, found
+
+
 def test_returns_of_the_own_vehicle_are_no_rings(good: Sample) -> None:
     turn, down = np.linspace(-np.pi, np.pi, 400), np.deg2rad(np.repeat([-26.0, -21.0], 200))
     roof = np.stack([np.cos(turn) * np.cos(down), np.sin(turn) * np.cos(down), np.sin(down)], 1)

@@ -19,6 +19,7 @@ _MEDIAN_RANGE_M = (1.5, 60.0)
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
 _CELL_M, _CLOSE_M = 0.1, 6.0
 _LEAST_OWN = 20
+_WIDEST_M = 2.6  # of a road vehicle; kerbs and rails stay beside it too, but farther out
 _LEAST_WITHOUT = 0.005  # share of the rows
 _NEAR_M = 25.0
 _UP = {
@@ -151,9 +152,11 @@ def _own_returns(spots: list[Spot]) -> tuple[float, int]:
     """Return the range (m) of the farthest own-vehicle returns, and their number of 0.1 m cells."""
     # The lowest layer is excluded, because ground is at the same position in all sweeps too.
     cells = []
-    for sweep in [s for spot in spots for s in (spot.sweeps[0], spot.sweeps[-1])]:
+    for sweep, twist in [(s, p.twist) for p in spots for s in (p.sweeps[0], p.sweeps[-1])]:
         range_m = np.linalg.norm(sweep.points, axis=1)
         close = sweep.points[range_m < _CLOSE_M]
+        right = np.array([twist[4], -twist[3]]) / np.hypot(twist[3], twist[4])
+        close = close[np.abs(close[:, :2] @ right) < _WIDEST_M]
         near = sweep.points[range_m < _NEAR_M]
         floor_m = np.percentile(near[:, 2], 10) if len(near) else 0.0
         close = close[close[:, 2] > floor_m + 0.4]
