@@ -16,6 +16,7 @@ from densify.config import Config
 from densify.config.errors import InputError
 from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, clocks, paths, points, rings
 from densify.doctor.paths import changed
+from densify.free_space.sectors import lost_deg
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
 from densify.geometry.types import Camera, RegisteredSweep, Sweep, Trajectory
@@ -109,6 +110,9 @@ def test_lost_packets_blind_sectors_and_sweeps_in_a_map_are_named(good: Sample) 
     (lost,) = points.check_directions(with_sweeps(good, lambda s: cut(s, False)))
     assert lost.verdict == Verdict.SUSPICIOUS
     assert lost.values["lost_deg"] == pytest.approx(30, abs=1)
+    often = np.full((7, 360), 90)
+    often[::2, 100:240] = 0
+    np.testing.assert_array_equal(lost_deg(often), [140, 0] * 3 + [140])
     (blind,) = points.check_directions(with_sweeps(good, lambda s: cut(s, True)))
     assert blind.verdict == Verdict.SUSPICIOUS and "20 to 50 deg" in blind.evidence
     assert points.check_frame(good)[0].verdict == Verdict.FINE
@@ -298,6 +302,22 @@ def test_own_vehicle_is_what_stays_beside_it(good: Sample) -> None:
 def test_a_kerb_that_runs_along_the_road_is_no_own_vehicle(good: Sample) -> None:
     kerb = np.random.default_rng(0).uniform([-4.5, 3.0, -1.2], [4.5, 3.4, -1.1], (2000, 3))
     (found,) = points.check_own_vehicle(with_sweeps(good, lambda sweep: with_points(sweep, kerb)))
+    assert found.verdict == Verdict.FINE, found
+
+
+@pytest.mark.parametrize(("rise_deg", "num_below"), [(6, 0), (3, 0), (0, 300)])
+def test_a_road_that_rises_or_mirrors_is_no_own_vehicle(
+    good: Sample, rise_deg: float, num_below: int
+) -> None:
+    R = Rotation.from_euler("y", -rise_deg, degrees=True).as_matrix()
+
+    def on_a_slope(sweep: Sweep) -> Sweep:
+        x, y = np.random.default_rng(0).uniform(-5.5, 5.5, (2, 6000))
+        road = np.stack([x, y, np.full(6000, -1.75)], axis=1)
+        road[:num_below, 2] -= 3
+        return replace(sweep, points=np.concatenate([road, sweep.points[6000:]]) @ R.T)
+
+    (found,) = points.check_own_vehicle(with_sweeps(good, on_a_slope))
     assert found.verdict == Verdict.FINE, found
 
 

@@ -27,7 +27,7 @@ _SLOW_S = 0.15  # period; at 5 Hz the motion of a truck along its own side is am
 _OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image
 _LEAST_SIDE = 2  # sweeps on each side of the key, over which recorded poses are compared
 _MUCH_NEAR = 0.2  # share of the points; a car's own returns were 0 to 14 %
-_MUCH_BELOW = 0.002  # share of the points; clean recordings have up to 0.0015
+_MUCH_BELOW = 0.0025  # share of the points; clean recordings have up to 0.0021
 _MUCH_MOVES = 1 / 3  # share of the points; most returns are of ground and buildings
 
 
