@@ -348,6 +348,13 @@ def test_checks_that_cannot_be_made_are_named(street: Faulty) -> None:
         assert one[check] == Verdict.UNKNOWN, check
 
 
+def test_a_recording_of_every_tenth_sweep_has_whole_turns(good: Sample, street: Faulty) -> None:
+    (found,) = clocks.check_point_times(
+        with_fault(good, street, stamp_ns=lambda frame, ns: ns + (frame - 112) * 900_000_000)
+    )
+    assert found.verdict == Verdict.FINE and "one of 10 turns" in found.evidence
+
+
 def test_points_without_times_are_named(good: Sample) -> None:
     untimed = with_sweeps(good, lambda sweep: replace(sweep, offset_ns=None))
     for check in (clocks.check_point_times, clocks.check_deskewing):

@@ -178,7 +178,8 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
 
     The score of the given pose, the best within 0.3 degrees, is compared with all turns up to 2.7
     degrees. The image is off if another turn is better by two standard errors, which are those of
-    the sum over the discontinuities of the difference between both.
+    the sum over the discontinuities of the difference between both, and if that turn stands out:
+    the best of many turns is better by chance too where discontinuities are few.
 
     Args:
         camera: Camera with its pose at the exposure.
@@ -190,7 +191,9 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
     scores, given = lines.scores(turns), (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
     best = [turns[part][np.argmax(scores[part])] for part in (given, ~given)]
     better = np.diff(lines.strengths(np.array(best)), axis=0)
-    return bool(better.sum() > _CLEARLY * np.sqrt((better**2).sum()))
+    rival = scores[_is_beside(turns, best[1])].max()
+    stands_out = rival - np.median(scores) < _AS_HIGH * (scores[~given].max() - np.median(scores))
+    return bool(stands_out and better.sum() > _CLEARLY * np.sqrt((better**2).sum()))
 
 
 def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
