@@ -212,13 +212,16 @@ def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
     on_grid = np.sum([line.scores(grid, thin) for line in lines], axis=0)
     usual = float(np.median(on_grid)) * thin
     starts = _starts(grid, on_grid, free)
-    best, *others = _simplest(lines, [_climbed(lines, start, free) for start in starts], usual)
+    best, others, are_equal = _simplest(
+        lines, [_climbed(lines, start, free) for start in starts], usual
+    )
     beside = _is_beside(grid, best)
     rival = grid[beside][np.argmax(on_grid[beside])]
-    rivals = _sum(lines, rival), usual, *others
+    rival_score = _sum(lines, rival)
     lines = [_Lines.of(camera, view, best) for view in views]
     more = _climbed(lines, np.zeros(4), free)
-    return Fit(best + more, _error(lines, more, free), _sum(lines, more), *rivals)
+    error, height = _error(lines, more, free), _sum(lines, more)
+    return Fit(best + more, error, height, rival_score, usual, others, are_equal)
 
 
 def _starts(grid: Float, on_grid: Float, free: Bool) -> list[Float]:
