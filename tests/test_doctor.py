@@ -144,6 +144,17 @@ def test_a_fault_is_named(good: Sample, street: Faulty, name: str) -> None:
     assert verdict >= Verdict.SUSPICIOUS, found
 
 
+def test_a_scanner_that_drops_out_is_named(good: Sample) -> None:
+    def two(sweep: Sweep) -> Sweep:
+        lidar = (np.arange(len(sweep)) % 2) * (sweep.frame != FRAMES[1])
+        origins = np.zeros((2, 3))
+        return replace(sweep, lidar=lidar.astype(sweep.lidar.dtype), scanner_origins=origins)
+
+    found = {f.check: f for f in points.check_sensors(with_sweeps(good, two))}
+    assert found["scanner 1"].verdict == Verdict.SUSPICIOUS
+    assert f"none in sweeps {FRAMES[1]}" in found["scanner 1"].evidence
+
+
 def test_compensated_sweeps_are_told_from_fired_ones(good: Sample) -> None:
     def compensated(spot: Spot) -> Spot:
         straight = tuple(

@@ -229,7 +229,11 @@ def check_sensors(sample: Sample) -> list[Finding]:
         )
         if max(without) > _LEAST_WITHOUT:
             text += f", {100 * max(without):.0f} % of the rows without a return"
-        is_broken = min(counts) < 0.5 * max(counts)
+        every = (s for spot in sample.spots for s in spot.sweeps)
+        without_it = [s.frame for s in every if not (s.lidar == number).any()]
+        if without_it:
+            text += f", none in sweeps {format_frames(without_it)}"
+        is_broken = bool(without_it) or min(counts) < 0.5 * max(counts)
         found = finding(
             f"scanner {number}",
             SUSPICIOUS if is_broken else FINE,

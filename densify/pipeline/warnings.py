@@ -85,6 +85,13 @@ def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
             f"{sum(untimed.values()):,} points of sweeps {format_frames(untimed)} are left out: "
             f"their times lie outside their sweep, the driver wrote them wrong"
         )
+    for lidar in np.unique(np.concatenate([np.unique(sweep.lidar) for sweep in sweeps])):
+        silent = [sweep.frame for sweep in sweeps if not (sweep.lidar == lidar).any()]
+        if silent:
+            yield (
+                f"sweeps {format_frames(silent)} have no returns of scanner {lidar}, which others "
+                f"have: static surfaces that it alone sees are of other sweeps"
+            )
     num_lone = sum(sweep.num_lone for sweep in sweeps)
     if num_lone:
         share = num_lone / (num_lone + sum(len(sweep) for sweep in sweeps))
