@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""A key of a training set is judged beside its neighbours, and the command says so."""
+"""A key of a training set is judged beside its neighbours, and put aside if it is far worse."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from densify.dataset.manifest import KeyRecord, read_manifests
+from densify.dataset import key as one_key
+from densify.dataset import make
+from densify.dataset.key import Job
+from densify.dataset.loader import DepthDataset
+from densify.dataset.manifest import KeyRecord
 from densify.dataset.neighbours import worse_than_neighbours
-from densify.dataset.plan import Recipe, plan, write_plan
 from densify.dataset.report import write_report
 from tests.command import exit_code
-from tests.dataset_scenes import DRIVE, FRAMES
+from tests.dataset_scenes import DRIVE, FRAMES, OPTIONS, keys_of, maps_in, statuses
 
 
 def drive_of(shares: list[float | None], name: str = DRIVE, **scores: Any) -> dict:
@@ -33,7 +35,7 @@ def drive_of(shares: list[float | None], name: str = DRIVE, **scores: Any) -> di
 
 
 def keys_in(records: dict) -> list[int]:
-    return [key for _, key in worse_than_neighbours(records)]
+    return [key for _, key in worse_than_neighbours(records, 4.0)]
 
 
 def test_ends_stand_out() -> None:
@@ -53,9 +55,9 @@ def test_outliers_count_by_the_worst_camera() -> None:
     records = drive_of([0.0] * 12, outliers={"a": 0.01, "b": None})
     bad = records[DRIVE, 4]
     records[bad.name] = replace(bad, scores={"ghost": 0, "outliers": {"a": 0.01, "b": 0.05}})
-    ((name, text),) = worse_than_neighbours(records).items()
+    ((name, text),) = worse_than_neighbours(records, 4.0).items()
     assert name == (DRIVE, 4) and "held-out outliers of the neighbouring keys" in text
-    assert "ghosts" not in text.partition(";")[0]
+    assert "ghosts" not in text
 
 
 def test_what_is_not_known_is_not_judged() -> None:
@@ -66,19 +68,28 @@ def test_what_is_not_known_is_not_judged() -> None:
     assert keys_in(records) == []
 
 
-def test_the_command_and_the_page_say_so(border_drive: Path, tmp_path: Path, capsys) -> None:
-    write_plan(tmp_path, Recipe(), plan([str(border_drive)], None, Recipe()))
-    records = [
-        KeyRecord(DRIVE, key, "done", frames=(key,), scores={"ghost": 0.02 * (key == FRAMES[0])})
-        for key in FRAMES
-    ]
-    (tmp_path / "manifest.jsonl").write_bytes(b"".join(record.to_line() for record in records))
-    assert exit_code("dataset", "--status", tmp_path) == 0
-    said = f"{DRIVE} key {FRAMES[0]}: more than 4 times the ghosts of the neighbouring keys"
-    assert f"densify: warning: {said}" in capsys.readouterr().err
-    assert exit_code("dataset", "--status", tmp_path, "--json") == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert [(w["drive"], w["key"]) for w in answer["worse_than_neighbours"]] == [(DRIVE, FRAMES[0])]
-    (page,) = write_report(tmp_path)
+def test_a_key_far_worse_than_its_neighbours_is_put_aside(
+    border_drive: Path, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    """Its files go, default loading leaves it out, and command, status and page say so."""
+
+    def made(job_and_key: tuple[Job, int]) -> KeyRecord:
+        record = one_key.make_key(job_and_key)
+        return replace(record, scores={**record.scores, "ghost": 0.02 * (record.key == FRAMES[0])})
+
+    monkeypatch.setattr(make, "make_key", made)
+    out, cheap = tmp_path / "set", (*OPTIONS, "--method", "none", "--workers", "1")
+    command = ("dataset", "--data", border_drive, *cheap, "--out", out)
+    said = f"{DRIVE} {FRAMES[0]} aside: more than 4 times the ghosts of the neighbouring keys"
+    for _ in range(2):  # made, and continued with nothing to make
+        assert exit_code(*command) == 0
+        assert said in capsys.readouterr().out
+    assert exit_code("dataset", "--status", out) == 0
+    assert said in capsys.readouterr().out
+    assert keys_of(maps_in(out)) == {*FRAMES} - {FRAMES[0]}
+    assert [sample["frame"] for sample in DepthDataset(out)] == [*FRAMES][1:]
+    (page,) = write_report(out)
     assert page.read_text().count("times the ghosts of the neighbouring keys") == 1
-    assert read_manifests(tmp_path)[DRIVE, FRAMES[0]].status == "done"
+    everything = tmp_path / "everything"
+    assert exit_code(*command[:-1], everything, "--set", "dataset.max_ratio=null") == 0
+    assert statuses(everything)[FRAMES[0]] == "done"

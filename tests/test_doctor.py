@@ -16,11 +16,13 @@ from densify.config import Config
 from densify.config.errors import InputError
 from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, clocks, paths, points, rings
 from densify.doctor.paths import changed
+from densify.free_space.sectors import lost_deg
 from densify.geometry import poses
-from densify.geometry.types import RegisteredSweep, Sweep, Trajectory
+from densify.geometry.cameras import image_points
+from densify.geometry.types import Camera, RegisteredSweep, Sweep, Trajectory
 from densify.readers.street import Street
 from densify.readers.timeline import Timeline
-from densify.scores.edge_fit import best_fit, turned
+from densify.scores.edge_fit import Silhouettes, View, best_fit, image_edges, turned
 from tests.command import exit_code
 from tests.recording_faults import FAULTS, Faulty
 
@@ -108,6 +110,9 @@ def test_lost_packets_blind_sectors_and_sweeps_in_a_map_are_named(good: Sample) 
     (lost,) = points.check_directions(with_sweeps(good, lambda s: cut(s, False)))
     assert lost.verdict == Verdict.SUSPICIOUS
     assert lost.values["lost_deg"] == pytest.approx(30, abs=1)
+    often = np.full((7, 360), 90)
+    often[::2, 100:240] = 0
+    np.testing.assert_array_equal(lost_deg(often), [140, 0] * 3 + [140])
     (blind,) = points.check_directions(with_sweeps(good, lambda s: cut(s, True)))
     assert blind.verdict == Verdict.SUSPICIOUS and "20 to 50 deg" in blind.evidence
     assert points.check_frame(good)[0].verdict == Verdict.FINE
@@ -137,6 +142,17 @@ def test_a_fault_is_named(good: Sample, street: Faulty, name: str) -> None:
     found = WHO_NAMES[asked](with_fault(good, street, **changes))
     verdict = max((f.verdict for f in found if asked in f.check), default=Verdict.FINE)
     assert verdict >= Verdict.SUSPICIOUS, found
+
+
+def test_a_scanner_that_drops_out_is_named(good: Sample) -> None:
+    def two(sweep: Sweep) -> Sweep:
+        lidar = (np.arange(len(sweep)) % 2) * (sweep.frame != FRAMES[1])
+        origins = np.zeros((2, 3))
+        return replace(sweep, lidar=lidar.astype(sweep.lidar.dtype), scanner_origins=origins)
+
+    found = {f.check: f for f in points.check_sensors(with_sweeps(good, two))}
+    assert found["scanner 1"].verdict == Verdict.SUSPICIOUS
+    assert f"none in sweeps {FRAMES[1]}" in found["scanner 1"].evidence
 
 
 def test_compensated_sweeps_are_told_from_fired_ones(good: Sample) -> None:
@@ -183,6 +199,61 @@ def test_a_turned_camera_is_told_with_the_line_that_mends_it(good: Sample, axis:
             mended[:3] = yaml.safe_load(told.remedy)["T_cam_lidar"]
             left = mended @ poses.inverse(camera.T_cam_lidar)
             assert np.rad2deg(np.linalg.norm(poses.log(left)[:3])) < 0.6
+
+
+@pytest.mark.parametrize(("axis", "turn_deg"), [(1, 1.0), (1, -1.0), (0, -0.75)])
+def test_a_turn_is_not_taken_for_a_late_clock(
+    good: Sample, street: Faulty, axis: int, turn_deg: float
+) -> None:
+    for camera in street.cameras.values():
+        views, _ = cameras.camera_views(good, camera, {})
+        wrong = turned(camera, turn_deg * np.eye(4)[axis])
+        calibration, clock = cameras.check_calibration(wrong, views)
+        assert calibration.verdict >= Verdict.SUSPICIOUS
+        assert clock.verdict == Verdict.FINE and not clock.remedy
+        mended = np.eye(4)
+        mended[:3] = yaml.safe_load(calibration.remedy)["T_cam_lidar"]
+        left_deg = np.rad2deg(poses.log(mended @ poses.inverse(camera.T_cam_lidar))[:3])
+        assert np.linalg.norm(left_deg[:2]) < 0.3  # sixteen rings tell little of a roll
+
+
+def passing(yaw_deg: float, late_s: float, is_fence: bool) -> tuple[Camera, list[View]]:
+    """Boards 20 m beside a straight road, or anywhere there, in a camera that looks at them."""
+    T_cam_lidar = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    K = np.array([[700.0, 0, 500], [0, 700, 200], [0, 0, 1]])
+    camera = Camera("left", 1000, 400, K, T_cam_lidar)
+    right = turned(camera, yaw_deg * np.eye(4)[1])
+    rng, views = np.random.default_rng(0), []
+    twist, half = np.array([0, 0, 0, 4.0, 0, 0]), np.linspace(-0.5, 0.5, 15)
+    for _ in range(12):
+        image, edges, is_level = np.full((400, 1000, 3), 60, np.uint8), [], []
+        for x_m in rng.uniform(-11, 11, 8):
+            middle = np.array([x_m, 20.0 if is_fence else rng.uniform(8, 40), 0])
+            sides = [[(end, 0, h) for h in 2 * half] for end in (-0.5, 0.5)]
+            ends = [[(h, 0, end) for h in half] for end in (-1, 1)]
+            edges += [middle + np.concatenate([*sides, *ends])]
+            is_level += [np.repeat([False, True], 2 * len(half))]
+            in_camera = poses.transform(right.T_cam_lidar, edges[-1] - late_s * twist[3:])
+            corners = image_points(right, in_camera)[0]
+            low, high = np.rint([corners.min(axis=0), corners.max(axis=0)]).astype(int).clip(0)
+            image[low[1] : high[1], low[0] : high[0]] = rng.integers(120, 255)
+        silhouettes = Silhouettes(np.concatenate(edges), np.concatenate(is_level))
+        views.append(View(silhouettes, *image_edges(image, 700.0), twist, 0.0))
+    return camera, views
+
+
+def test_explanations_that_fit_equally_well_are_all_given() -> None:
+    """Along a fence a turn looks like a clock that is off, and along posts at any distance not."""
+    for yaw_deg, late_s in ((1.5, 0.0), (0.0, 0.13)):
+        told = cameras.check_calibration(*passing(yaw_deg, late_s, is_fence=True))
+        assert len(told) == 1 and told[0].verdict == Verdict.SUSPICIOUS
+        assert "explanations fit" in told[0].evidence and "or" in told[0].evidence
+        assert "T_cam_lidar: [" not in told[0].remedy
+        calibration, clock = cameras.check_calibration(*passing(yaw_deg, late_s, is_fence=False))
+        assert (calibration.verdict >= Verdict.SUSPICIOUS) == (yaw_deg > 0)
+        assert (clock.verdict >= Verdict.SUSPICIOUS) == (late_s > 0)
+    (right,) = cameras.check_calibration(*passing(0.0, 0.0, is_fence=True))
+    assert right.verdict == Verdict.UNKNOWN
 
 
 def test_images_of_another_place_are_not_fine(good: Sample) -> None:
@@ -239,6 +310,28 @@ def test_own_vehicle_is_what_stays_beside_it(good: Sample) -> None:
     assert before.verdict == Verdict.FINE
 
 
+def test_a_kerb_that_runs_along_the_road_is_no_own_vehicle(good: Sample) -> None:
+    kerb = np.random.default_rng(0).uniform([-4.5, 3.0, -1.2], [4.5, 3.4, -1.1], (2000, 3))
+    (found,) = points.check_own_vehicle(with_sweeps(good, lambda sweep: with_points(sweep, kerb)))
+    assert found.verdict == Verdict.FINE, found
+
+
+@pytest.mark.parametrize(("rise_deg", "num_below"), [(6, 0), (3, 0), (0, 300)])
+def test_a_road_that_rises_or_mirrors_is_no_own_vehicle(
+    good: Sample, rise_deg: float, num_below: int
+) -> None:
+    R = Rotation.from_euler("y", -rise_deg, degrees=True).as_matrix()
+
+    def on_a_slope(sweep: Sweep) -> Sweep:
+        x, y = np.random.default_rng(0).uniform(-5.5, 5.5, (2, 6000))
+        road = np.stack([x, y, np.full(6000, -1.75)], axis=1)
+        road[:num_below, 2] -= 3
+        return replace(sweep, points=np.concatenate([road, sweep.points[6000:]]) @ R.T)
+
+    (found,) = points.check_own_vehicle(with_sweeps(good, on_a_slope))
+    assert found.verdict == Verdict.FINE, found
+
+
 def test_returns_of_the_own_vehicle_are_no_rings(good: Sample) -> None:
     turn, down = np.linspace(-np.pi, np.pi, 400), np.deg2rad(np.repeat([-26.0, -21.0], 200))
     roof = np.stack([np.cos(turn) * np.cos(down), np.sin(turn) * np.cos(down), np.sin(down)], 1)
@@ -264,6 +357,13 @@ def test_checks_that_cannot_be_made_are_named(street: Faulty) -> None:
     unknown = ("stamps", "point times", "registration", "deskewing", "scanners", "own vehicle")
     for check in (*unknown, "motion compensation", "poses", "fast: calibration", "fast: clock"):
         assert one[check] == Verdict.UNKNOWN, check
+
+
+def test_a_recording_of_every_tenth_sweep_has_whole_turns(good: Sample, street: Faulty) -> None:
+    (found,) = clocks.check_point_times(
+        with_fault(good, street, stamp_ns=lambda frame, ns: ns + (frame - 112) * 900_000_000)
+    )
+    assert found.verdict == Verdict.FINE and "one of 10 turns" in found.evidence
 
 
 def test_points_without_times_are_named(good: Sample) -> None:

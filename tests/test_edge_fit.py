@@ -59,6 +59,15 @@ def test_a_map_says_that_its_image_is_off_and_does_not_use_it(recording, scene, 
     ] * (shift_px > 0)
 
 
+def test_the_best_of_many_turns_by_chance_is_no_better_turn(scene) -> None:
+    """Some discontinuities in an image of noise."""
+    camera, silhouettes, image = scene
+    noise = np.random.default_rng(0).integers(0, 255, image.shape).astype(np.uint8)
+    for first in range(20):
+        some = type(silhouettes)(*(column[first::20] for column in silhouettes))
+        assert not is_off(camera, some, noise)
+
+
 def test_a_few_discontinuities_judge_nothing(scene) -> None:
     camera, silhouettes, image = scene
     few = type(silhouettes)(*(column[::100] for column in silhouettes))

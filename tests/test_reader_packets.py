@@ -13,7 +13,7 @@ import pytest
 from densify.config.errors import InputError
 from densify.free_space.rings import find_rings
 from densify.readers import open_sequence
-from densify.readers.ouster import Ouster
+from densify.readers.ouster import Ouster, lost_and_doubled
 from densify.readers.velodyne import MODELS, Velodyne
 
 HEADERS = bytes(42)  # Ethernet, IP, UDP: not looked at
@@ -220,3 +220,35 @@ def test_a_real_ouster(test_data):
     off = np.degrees(np.arctan2(y, x)) + 360 * column / 1024
     spread = np.abs((off - np.median(off % 360) + 180) % 360 - 180)
     assert np.median(spread) < 8  # it turns clockwise; lasers sit up to 4 degrees aside
+    assert sequence.findings() == [
+        ("packets", "192, 0 lost (0.0 %), 0 captured twice and read once")
+    ]
+
+
+def test_lost_and_doubled_packets_of_a_real_ouster_are_told(test_data, tmp_path):
+    pytest.importorskip("ouster.sdk.core")
+    real = test_data / "ouster/OS-1-128_v2.3.0_1024x10_lb_n3.pcap"
+    packets = packets_of(real.read_bytes())
+    largest = max(map(len, packets))
+    returns = [i for i, packet in enumerate(packets) if len(packet) == largest]
+    lost, doubled = returns[70:75], returns[100]  # of the second turn
+    faulty = [p for i, p in enumerate(packets) for _ in range(1 + (i == doubled)) if i not in lost]
+    path = tmp_path / "drive.pcap"
+    path.write_bytes(b"".join(faulty))
+    (tmp_path / "drive.json").write_bytes(
+        real.with_name("OS-1-128_v2.3.0_1024x10.json").read_bytes()
+    )
+    sequence = open_sequence(path)
+    assert sequence.findings()[0][1].startswith("187, 5 lost (2.6 %), 1 captured twice")
+    assert len(np.unique(sequence[1].row % 1024)) <= 1024 - 5 * 16
+
+
+def test_packets_of_an_ouster_are_counted_over_turns() -> None:
+    """Its count of turns wraps, packets may come late, and it may send some columns only."""
+    turn, column = (a.ravel() for a in np.mgrid[65_534:65_538, 256:768:16])
+    late = np.arange(len(turn))
+    late[[31, 32]] = 32, 31
+    assert lost_and_doubled(turn[late] % 65_536, column[late]) == (0, 0)
+    kept = np.setdiff1d(np.arange(len(turn)), [5, 40, 41])
+    again = np.concatenate([kept[:50], kept[49:]])
+    assert lost_and_doubled(turn[again] % 65_536, column[again]) == (3, 1)

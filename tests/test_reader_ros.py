@@ -367,6 +367,18 @@ def test_encodings_that_cannot_be_read_are_named_by_info(tmp_path, capsys):
     assert "expected JPEG or PNG" in dict(sequence.findings())["no camera"]
 
 
+def test_messages_recorded_twice_are_read_once_and_late_ones_in_order(tmp_path):
+    maker = Maker()
+    for i in (0, 1, 3, 2, 2, 4):
+        maker.cloud(scan(60 + i), STAMP_NS + i * PERIOD_NS)
+    sequence = open_sequence(maker.write(tmp_path))
+    assert [sequence.stamp_ns(f) for f in sequence.frames] == [
+        STAMP_NS + i * PERIOD_NS for i in range(5)
+    ]
+    assert [len(sequence[f]) for f in sequence.frames] == [60, 61, 62, 63, 64]
+    assert sequence.gaps() == ["/points: 1 messages were recorded twice and are read once"]
+
+
 def test_an_only_row_needs_no_step(tmp_path):
     sequence = open_sequence(bad_cloud(row_step=0)().write(tmp_path))
     np.testing.assert_array_equal(sequence[1].points[:, 0].astype("f4"), scan()["x"])

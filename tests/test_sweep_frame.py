@@ -40,11 +40,15 @@ def test_few_returns_lie_behind_others_seen_from_the_scanner(street):
     assert share_behind(points, np.zeros(3)) < 0.5 * share_behind(points, np.array([4.0, 0, 0]))
 
 
-def test_the_way_of_the_scanner_in_a_map(street, placed):
+@pytest.mark.parametrize("up_m", [0, 1.8])
+def test_the_way_of_the_scanner_in_a_map(street, placed, up_m):
+    """The map begins at the scanner, or at the wheels below it."""
     sweeps, T = placed
+    sweeps = [replace(sweep, points=sweep.points + [0, 0, up_m]) for sweep in sweeps]
     way_m = np.linalg.norm(T[1, :3, 3])
     assert way_m > 3 and abs(way_in_map(*sweeps) - way_m) < 1.5
-    assert way_in_map(street[FRAMES[0]], street[FRAMES[0] + 10]) == 0
+    stored = [street[FRAMES[0]], street[FRAMES[0] + 10]]
+    assert way_in_map(*(replace(s, points=s.points + [0, 0, up_m]) for s in stored)) == 0
     assert is_still(np.stack([np.eye(4)] * 2)) and not is_still(T)
 
 

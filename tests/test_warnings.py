@@ -52,6 +52,16 @@ class Changed(TinySequence):
         return ["a file is missing"] if self._times is None else []
 
 
+class DropsOut(Changed):
+    """A second scanner measures half of the points, but not in the key sweep."""
+
+    def __getitem__(self, frame):
+        sweep = super().__getitem__(frame)
+        lidar = (np.arange(len(sweep)) % 2) * (frame != KEY)
+        origins = np.zeros((2, 3))
+        return replace(sweep, lidar=lidar.astype(sweep.lidar.dtype), scanner_origins=origins)
+
+
 def moved(T_change) -> Camera:
     return replace(CAMERA, T_cam_lidar=T_change @ CAMERA.T_cam_lidar)
 
@@ -69,6 +79,7 @@ def test_nothing_is_said_of_what_is_right():
     [
         (lambda: Changed(), "a file is missing"),
         (lambda: Changed(times=lambda sweep: None), "the points have no times of their own"),
+        (lambda: DropsOut(), f"sweeps {KEY} have no returns of scanner 1, which others have"),
         (
             lambda: Changed(images_ms={"front": {0: 10**12}}),
             "front: no image belongs to the sweep, the nearest was taken 1e+09 s away",

@@ -27,6 +27,7 @@ from densify.dataset.manifest import (
     finished,
     read_manifests,
 )
+from densify.dataset.neighbours import worse_than_neighbours
 from densify.dataset.plan import (
     Drive,
     Recipe,
@@ -130,6 +131,9 @@ def make_dataset(
             _log.info("%d of %d keys finished, %d worker(s)", len(records), num_keys, num_workers)
             made = call_all(make_key, left, num_workers, log, scheduler)
             summary = _record(made, manifest, records, num_keys, report)
+            if recipe.gate.max_ratio is not None:
+                worse = worse_than_neighbours(records, recipe.gate.max_ratio)
+                records |= {record.name: record for record in manifest.set_aside(worse)}
             clear_leftovers(out, age_s)  # hidden folders of killed workers
     return summary
 

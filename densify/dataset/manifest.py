@@ -4,7 +4,7 @@
 The file is ``OUT/manifest.jsonl``, or ``OUT/manifest-2of4.jsonl`` for the second of four shards::
 
     drive, key       the recording's name and the frame number
-    status, reason   done, aside (made, but beyond a limit of the scores and not written) or
+    status, reason   done, aside (made, but beyond a limit of the scores and not kept) or
                      failed; the reason is null for done
     frames           frame numbers of the sweeps in the window
     files            path relative to OUT, with slashes -> bytes, sha256
@@ -24,7 +24,7 @@ import logging
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -168,6 +168,24 @@ class Manifest:
                 os.fsync(file.fileno())
         except OSError as error:
             raise self._not_written(error) from error
+
+    def set_aside(self, reasons: Mapping[Key, str]) -> list[KeyRecord]:
+        """Delete the files of finished key sweeps of this manifest, and record why.
+
+        Key sweeps that are recorded elsewhere stay. The new records are returned.
+        """
+        aside = []
+        for name, (record, _) in _read(self.path).items():
+            if name not in reasons or record.status != "done":
+                continue
+            try:  # files first: if the process is killed here, the key sweep is made again
+                for file in record.files:
+                    (self.path.parent / file).unlink(missing_ok=True)
+            except OSError as error:
+                raise self._not_written(error) from error
+            aside.append(replace(record, status="aside", reason=reasons[name], files={}))
+            self.append(aside[-1])
+        return aside
 
     def _put_in_order(self) -> None:
         data = b"".join(line for _, (_, line) in sorted(_read(self.path).items()))

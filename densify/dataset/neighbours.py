@@ -13,15 +13,16 @@ import numpy as np
 
 from densify.dataset.manifest import Key, KeyRecord
 
-_FACTOR = 4.0
-"""Neighbouring keys share most of their sweeps, so traffic alone changes their scores less."""
 _LEAST_SHARE = 0.001
 """Smaller shares of ghosts or outliers do not matter to a training set."""
 _SCORES = {"ghost": "ghosts", "outliers": "held-out outliers"}
 
 
-def worse_than_neighbours(records: Mapping[Key, KeyRecord]) -> dict[Key, str]:
-    """Return finished keys with far more ghosts or outliers than others around -> what is worse."""
+def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) -> dict[Key, str]:
+    """Return finished keys with far more ghosts or outliers than others around -> what is worse.
+
+    ``max_ratio`` is the greatest share, as a multiple of the median of the neighbours.
+    """
     drives: dict[str, list[KeyRecord]] = defaultdict(list)
     for record in records.values():
         if record.status != "failed":
@@ -32,12 +33,11 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord]) -> dict[Key, str]:
         for score, said in _SCORES.items():
             shares = [_worst(record, score) for record in drive]
             # Twice a window: the keys whose windows an end cuts are the minority of neighbours.
-            for row in _outlying(shares, 2 * max(len(record.frames) for record in drive)):
+            for row in _outlying(shares, 2 * max(len(r.frames) for r in drive), max_ratio):
                 if drive[row].status == "done":
                     found[drive[row].name].append(said)
     return {
-        name: f"more than {_FACTOR:g} times the {' and '.join(said)} of the neighbouring keys; "
-        f"look at it, or put such keys aside by --set dataset.max_ghost or dataset.min_sweeps"
+        name: f"more than {max_ratio:g} times the {' and '.join(said)} of the neighbouring keys"
         for name, said in sorted(found.items())
     }
 
@@ -49,12 +49,12 @@ def _worst(record: KeyRecord, score: str) -> float:
     return max((v for v in values if v is not None), default=np.nan)
 
 
-def _outlying(shares: Sequence[float], num_beside: int) -> Iterator[int]:
-    """Yield the rows whose share exceeds the median of ``num_beside`` rows around by the factor."""
+def _outlying(shares: Sequence[float], num_beside: int, max_ratio: float) -> Iterator[int]:
+    """Yield the rows whose share exceeds the median of ``num_beside`` rows around by the ratio."""
     for row, share in enumerate(shares):
         begin = max(0, min(row - num_beside // 2, len(shares) - num_beside - 1))
         beside = np.array([*shares[begin:row], *shares[row + 1 : begin + num_beside + 1]])
         beside = beside[np.isfinite(beside)]
         # Two keys do not tell which of them is unusual.
-        if len(beside) > 1 and share > max(_LEAST_SHARE, _FACTOR * float(np.median(beside))):
+        if len(beside) > 1 and share > max(_LEAST_SHARE, max_ratio * float(np.median(beside))):
             yield row

@@ -57,6 +57,9 @@ class Gate(Section):
         min_density: Least share of the image's pixels with a measured depth, in every camera.
         max_outliers: Greatest share of outliers against the held-out key sweep, in every camera.
         min_sweeps: Least number of sweeps in the window, which ends and holes in time may cut.
+        max_ratio: Greatest share of ghosts or held-out outliers, as a multiple of the median of the
+            neighbouring key sweeps. These share most of their sweeps, so traffic alone changes
+            their scores less.
         split: Split of the tree, ``train`` or ``val``; ``kitti`` takes KITTI's official split.
     """
 
@@ -64,6 +67,7 @@ class Gate(Section):
     min_density: float | None = within(None, 0, 1)
     max_outliers: float | None = within(None, 0, 1)
     min_sweeps: int | None = within(None, 1, 101)
+    max_ratio: float | None = within(4.0, 1, 1e6)
     split: str = one_of("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import html
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from densify.config.errors import InputError
-from densify.dataset.manifest import Key, KeyRecord, read_manifests
-from densify.dataset.neighbours import worse_than_neighbours
+from densify.dataset.manifest import KeyRecord, read_manifests
 from densify.dataset.plan import planned_keys, read_plan
 from densify.outputs.atomic import write_file
 from densify.outputs.report.key_page import KeyFiles, key_page
@@ -82,8 +81,7 @@ def _set_page(root: Path) -> bytes:
     table, records = read_plan(root) or {}, read_manifests(root)
     counts = Counter[str](record.status for record in records.values())
     counts["to make"] = len(planned_keys(table) - records.keys())
-    worse = worse_than_neighbours(records)
-    keys = [_row(record, worse) for record in sorted(records.values(), key=_badness)]
+    keys = [_row(record) for record in sorted(records.values(), key=_badness)]
     heads = dict.fromkeys(head for row in keys for head in row)
     page = _PAGE.format(
         title=html.escape(f"{root.resolve().name}: {len(records):,} keys"),
@@ -102,14 +100,13 @@ def _badness(record: KeyRecord) -> tuple[Any, ...]:
     return _STATUSES.index(record.status), -share, record.name
 
 
-def _row(record: KeyRecord, worse: Mapping[Key, str]) -> dict[str, Any]:
+def _row(record: KeyRecord) -> dict[str, Any]:
     """Return column title -> cell for the row of a key sweep."""
-    doubts = (worse.get(record.name), *record.warnings)
     row = {
         "recording": record.drive,
         "key": record.key,
         "status": record.status,
-        "reason or warnings": record.reason or "; ".join(filter(None, doubts)),
+        "reason or warnings": record.reason or "; ".join(record.warnings),
         "sweeps": len(record.frames),
         "seconds": record.seconds,
     }

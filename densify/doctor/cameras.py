@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
-from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Verdict, finding
+from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
 from densify.doctor.paths import CAM_AXES, changed
 from densify.doctor.sample import Sample
 from densify.geometry import poses
@@ -21,6 +21,7 @@ from densify.scores.edge_fit import (
     View,
     best_fit,
     image_edges,
+    num_changed,
     score,
     silhouettes_of,
     turned,
@@ -138,41 +139,74 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
         text = f"depth discontinuities lie on image edges with {best}, and not as given"
         return [finding(name, WRONG, text, f"give {best}", **values)]
     off_deg, error_deg = np.abs(fit.offset[:3]), fit.error[:3]
-    if fit.clearness < _CLEARLY or error_deg.max() > _UNSURE_DEG:
+    told = _joint(fit, with_clock)
+    among = [told, *map(_described, fit.others)]
+    num_other = num_changed(fit.others[fit.are_equal]).min(initial=2)
+    is_one_of_many = fit.are_equal.any() and num_changed(fit.offset) >= min(num_other, 2)
+    if is_one_of_many or fit.clearness < _CLEARLY or error_deg[:2].max() > _UNSURE_DEG:
         text = (
             f"no turn of up to 2.7 deg puts the depth discontinuities of {num} sweeps on image "
-            f"edges better than others do: images and sweeps do not show the same, or too little"
+            f"edges better than others do: images and sweeps do not show the same, or too little; "
+            f"the best fit: {told}"
         )
-        verdict = SUSPICIOUS if num > 2 * _LEAST_IMAGES - 1 else UNKNOWN
-        remedy = "check T_cam_lidar, K and the clocks, and that the images are the camera's"
+        if len(among) > 1:
+            text = (
+                f"{len(among)} explanations fit {num} images about equally: {'; or '.join(among)}"
+            )
+        is_as_given = len(among) > 1 and num_changed(fit.offset) == 0
+        verdict = UNKNOWN if is_as_given or num < 2 * _LEAST_IMAGES else SUSPICIOUS
+        remedy = (
+            "check T_cam_lidar, K and the clocks, and that the images are the camera's; sweeps at "
+            "rest tell a turn from a clock"
+        )
         return [finding(name, verdict, text, remedy, **values)]
-    worst = int(np.argmax(off_deg))
+    off = off_deg > np.maximum(_OFF_DEG, 2 * error_deg)
     verdict = FINE
-    if off_deg[worst] > max(_OFF_DEG, 2 * error_deg[worst]):
-        verdict = WRONG if off_deg[worst] - 2 * error_deg[worst] > _WRONG_DEG else SUSPICIOUS
-    text, remedy = _described(camera, fit, verdict, num)
-    calibration = finding(name, verdict, text, remedy, **values)
+    if off.any():
+        is_wrong = (off & (off_deg - 2 * error_deg > _WRONG_DEG)).any()
+        verdict = WRONG if is_wrong else SUSPICIOUS
+    text = f"{told} (best fit of {num} images)"
+    if verdict == FINE:
+        text = f"right within {_OFF_DEG} deg: {text}"
+    if len(among) > 1:
+        text += f"; more changes at once fit about equally: {'; or '.join(among[1:])}"
+    calibration = finding(name, verdict, text, _corrected(camera, fit), **values)
     if with_clock:
         return [calibration, _check_clock(camera, fit, num)]
     text = f"the vehicle is slower than {_LEAST_SPEED_M_S:g} m/s where it was looked at"
     return [calibration, finding(f"{camera.name}: clock", UNKNOWN, text)]
 
 
-def _described(camera: Camera, fit: Fit, verdict: Verdict, num: int) -> tuple[str, str]:
-    """Return a sentence with the error of the calibration, and the corrected line as remedy."""
-    ways = (("higher", "lower"), ("farther right", "farther left"), ("clockwise", "anticlockwise"))
+_WAYS = (("higher", "lower"), ("farther right", "farther left"), ("clockwise", "anticlockwise"))
+
+
+def _joint(fit: Fit, with_clock: bool) -> str:
+    """Return the fitted rotation and delay with their errors, as a clause."""
     turns = [
         f"{abs(turn):.2f} ± {error:.2f} deg {way[int(turn < 0)]}"
-        for turn, error, way in zip(fit.offset, fit.error, ways, strict=False)
+        for turn, error, way in zip(fit.offset, fit.error, _WAYS, strict=False)
     ]
-    text = f"points belong {', '.join(turns)} in the image (best fit of {num} images)"
-    if verdict == FINE:
-        return f"right within {_OFF_DEG} deg: {text}", ""
+    clock = f", images {1e3 * fit.offset[3]:+.0f} ms late" if with_clock else ""
+    return f"points belong {', '.join(turns)} in the image{clock}"
+
+
+def _described(offset: Float) -> str:
+    """Return an offset (4,) of another explanation as a clause."""
+    turns = [
+        f"{abs(turn):.1f} deg {way[int(turn < 0)]}"
+        for turn, way in zip(offset, _WAYS, strict=False)
+    ]
+    return f"{', '.join(turns)} and images {1e3 * offset[3]:+.0f} ms late"
+
+
+def _corrected(camera: Camera, fit: Fit) -> str:
+    """Return the corrected line. Angles that are 0 within two standard errors are left."""
+    offset = np.where(np.abs(fit.offset) > 2 * fit.error, fit.offset, 0.0)
     rows = ", ".join(
-        str([round(float(v), 5) for v in row]) for row in turned(camera, fit.offset).T_cam_lidar[:3]
+        str([round(float(v), 5) for v in row]) for row in turned(camera, offset).T_cam_lidar[:3]
     )
     where = f"cameras.{camera.name} in densify.yaml, or the recording's own calibration file"
-    return text, f"T_cam_lidar: [{rows}]  # {where}"
+    return f"T_cam_lidar: [{rows}]  # {where}"
 
 
 def _check_clock(camera: Camera, fit: Fit, num: int) -> Finding:

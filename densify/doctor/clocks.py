@@ -31,6 +31,7 @@ _CLOSE_M = 1.0
 _LEAST_POINTS = 50
 _CLEARLY, _TOLD = 1.2, 1.05
 _WHOLE_SWEEP = (0.5, 1.5)  # plausible time from first to last point, in periods
+_TURN_S = (0.04, 0.25)  # of existing scanners, 25 to 4 Hz
 
 
 def check_stamps(sample: Sample) -> list[Finding]:
@@ -105,6 +106,8 @@ def check_point_times(sample: Sample) -> list[Finding]:
         verdict, remedy = SUSPICIOUS, "compare the point times with the scanner's rate"
         if _WHOLE_SWEEP[0] <= span <= _WHOLE_SWEEP[1]:
             verdict = FINE
+        elif span < 1 and _TURN_S[0] <= high_s - low_s <= _TURN_S[1]:
+            verdict, text = FINE, f"{text}; one of {round(1 / span)} turns of the scanner was kept"
         elif span < 0.02 or span > 10:
             verdict, remedy = WRONG, "correct the unit of the point times"
         name = "point times" + f" of scanner {lidar}" * (lidar > 0)

@@ -9,6 +9,7 @@ import numpy as np
 
 from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
 from densify.doctor.sample import Sample, Spot
+from densify.free_space.ground import HeightMap, find_upright
 from densify.free_space.sectors import LOST_DEG, blind_sector, by_azimuth, lost_deg
 from densify.free_space.sensor import Sensors
 from densify.free_space.sweep_frame import MAP_FRAME_REMEDY, is_still, way_in_map
@@ -18,7 +19,8 @@ from densify.readers.timeline import format_frames, in_range
 _MEDIAN_RANGE_M = (1.5, 60.0)
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
 _CELL_M, _CLOSE_M = 0.1, 6.0
-_LEAST_OWN = 20
+_LEAST_OWN, _LEAST_HEIGHT_M = 20, 0.4
+_WIDEST_M = 2.6  # of a road vehicle; kerbs and rails stay beside it too, but farther out
 _LEAST_WITHOUT = 0.005  # share of the rows
 _NEAR_M = 25.0
 _UP = {
@@ -143,14 +145,20 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
 
 def _own_returns(spots: list[Spot]) -> tuple[float, int]:
     """Return the range (m) of the farthest own-vehicle returns, and their number of 0.1 m cells."""
-    # The lowest layer is excluded, because ground is at the same position in all sweeps too.
+    # The ground is excluded, because it is at the same position in all sweeps too.
+    R_level_lidar = find_upright([spot.sweeps[0] for spot in spots])
     cells = []
-    for sweep in [s for spot in spots for s in (spot.sweeps[0], spot.sweeps[-1])]:
+    for sweep, twist in [(s, p.twist) for p in spots for s in (p.sweeps[0], p.sweeps[-1])]:
         range_m = np.linalg.norm(sweep.points, axis=1)
         close = sweep.points[range_m < _CLOSE_M]
-        near = sweep.points[range_m < _NEAR_M]
-        floor_m = np.percentile(near[:, 2], 10) if len(near) else 0.0
-        close = close[close[:, 2] > floor_m + 0.4]
+        right = np.array([twist[4], -twist[3]]) / np.hypot(twist[3], twist[4])
+        close = close[np.abs(close[:, :2] @ right) < _WIDEST_M]
+        near, level = (
+            points @ R_level_lidar.T for points in (sweep.points[range_m < _NEAR_M], close)
+        )
+        floor_m = np.percentile(near[:, 2], 10)  # mirror images pull the local ground of one sweep
+        above_m = np.minimum(HeightMap.of([near]).above(level), level[:, 2] - floor_m)
+        close = close[above_m > _LEAST_HEIGHT_M]
         cells.append(np.floor(close / _CELL_M).astype(np.int64))
     everywhere = {tuple(c) for c in cells[0]}
     for other in cells[1:]:
@@ -215,7 +223,11 @@ def check_sensors(sample: Sample) -> list[Finding]:
         )
         if max(without) > _LEAST_WITHOUT:
             text += f", {100 * max(without):.0f} % of the rows without a return"
-        is_broken = min(counts) < 0.5 * max(counts)
+        every = (s for spot in sample.spots for s in spot.sweeps)
+        without_it = [s.frame for s in every if not (s.lidar == number).any()]
+        if without_it:
+            text += f", none in sweeps {format_frames(without_it)}"
+        is_broken = bool(without_it) or min(counts) < 0.5 * max(counts)
         found = finding(
             f"scanner {number}",
             SUSPICIOUS if is_broken else FINE,

@@ -26,9 +26,10 @@ def by_azimuth(sweep: Sweep) -> Int:
 def lost_deg(returns: Int) -> Float:
     """Return the (n,) degrees of azimuth that each sweep lacks and half of the sweeps measured.
 
+    A degree counts as measured if a quarter of the sweeps have returns in it, not just single ones.
     ``returns`` are the (n,360) numbers of `by_azimuth` of each sweep.
     """
-    usual = np.median(returns, axis=0)
+    usual = np.quantile(returns, 0.75, axis=0)
     measured = usual > _FEW * usual.mean()
     lost = (returns == 0) & measured
     width_deg: Float = lost.sum(axis=1) * (360.0 / _NUM_BINS)

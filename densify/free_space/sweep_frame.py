@@ -21,6 +21,7 @@ _MOST_MOVES = 20  # of each step
 _LESS = 0.8  # of the occluded returns of a sweep remain at a place that is not the origin
 _APART_M = 1.0  # least distance between the scanner's places that shows its motion
 _STILL_M = 0.5
+_NEAR_M, _LOWEST_M, _ROOF_M = 30.0, 0.5, 1.8  # heights of scanners above the ground
 
 
 def _around(position: Float, step_m: float, num: int = _NUM_WAYS) -> Float:
@@ -73,11 +74,24 @@ def way_in_map(first: Sweep, last: Sweep) -> float:
     It is 0 for sweeps in their scanner's own frame. Sweeps between which odometry finds no motion
     are in the frame of a map if their rays begin apart.
     """
-    end = scanner_place(last.points[::2], last.origin_m(0))
-    if np.linalg.norm(end - last.origin_m(0)) < _APART_M:
+    start = _start(last)
+    end = scanner_place(last.points[::2], start)
+    if np.linalg.norm(end - start) < _APART_M:
         return 0.0
-    distance_m = float(np.linalg.norm(end - scanner_place(first.points[::2], first.origin_m(0))))
+    distance_m = float(np.linalg.norm((end - scanner_place(first.points[::2], _start(first)))[:2]))
     return distance_m if distance_m > _APART_M else 0.0
+
+
+def _start(sweep: Sweep) -> Float:
+    """Return the origin (3,) of a sweep, on a car's roof if it lies on the ground."""
+    origin = sweep.origin_m(0)
+    is_near = np.hypot(*(sweep.points - origin)[:, :2].T) < _NEAR_M
+    if not is_near.any():
+        return origin
+    floor_m = float(np.percentile(sweep.points[is_near, 2], 10))
+    if origin[2] - floor_m > _LOWEST_M:
+        return origin
+    return np.array([*origin[:2], floor_m + _ROOF_M])
 
 
 def are_placed(sweeps: Sequence[Sweep], T_world_lidar: Float) -> bool:

@@ -27,7 +27,7 @@ _SLOW_S = 0.15  # period; at 5 Hz the motion of a truck along its own side is am
 _OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image
 _LEAST_SIDE = 2  # sweeps on each side of the key, over which recorded poses are compared
 _MUCH_NEAR = 0.2  # share of the points; a car's own returns were 0 to 14 %
-_MUCH_BELOW = 0.002  # share of the points; clean recordings have up to 0.0015
+_MUCH_BELOW = 0.0025  # share of the points; clean recordings have up to 0.0021
 _MUCH_MOVES = 1 / 3  # share of the points; most returns are of ground and buildings
 
 
@@ -78,6 +78,13 @@ def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
             f"{sum(untimed.values()):,} points of sweeps {format_frames(untimed)} are left out: "
             f"their times lie outside their sweep, the driver wrote them wrong"
         )
+    for lidar in np.unique(np.concatenate([np.unique(sweep.lidar) for sweep in sweeps])):
+        silent = [sweep.frame for sweep in sweeps if not (sweep.lidar == lidar).any()]
+        if silent:
+            yield (
+                f"sweeps {format_frames(silent)} have no returns of scanner {lidar}, which others "
+                f"have: static surfaces that it alone sees are of other sweeps"
+            )
     num_lone = sum(sweep.num_lone for sweep in sweeps)
     if num_lone:
         share = num_lone / (num_lone + sum(len(sweep) for sweep in sweeps))

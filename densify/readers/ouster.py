@@ -12,13 +12,18 @@ and no poses.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from densify.config.errors import InputError
 from densify.config.file_content import needed, open_file, read_json, reason
+from densify.geometry.types import Int
 from densify.readers.file_sequence import FileSequence, Returns
+
+_HALF_WRAP = 1 << 15  # the packets count turns with 16 bits
 
 
 def open_recording(path: Path, scene: str | None) -> Ouster:
@@ -75,7 +80,20 @@ class Ouster(FileSequence):
             warnings.simplefilter("ignore")  # the library warns of deprecated names
             T = np.asarray(self._source.sensor_info[0].lidar_to_sensor_transform, np.float64)
         self._origins_m = T[None, :3, 3] * 1e-3
+        self._packets: Any = pcap.PcapPacketSource(str(path), meta=[str(metadata)])
+        self._is_lidar_packet = core.LidarPacket
+        self._column = core.ColHeader.MEASUREMENT_ID
         super().__init__(path.stem, path, range(len(index)))
+
+    def findings(self) -> Sequence[tuple[str, str]]:
+        """Return the number of packets, and of those that are lost or were captured twice."""
+        packets = [p for _, p in self._packets if isinstance(p, self._is_lidar_packet)]
+        turn = np.array([p.frame_id() for p in packets], np.int64)
+        column = [int(p.format.packet_header(self._column, p.buf)[0]) for p in packets]
+        num_lost, num_twice = lost_and_doubled(turn, np.array(column, np.int64))
+        num = len(packets) - num_twice
+        text = f"{num:,}, {num_lost:,} lost ({100 * num_lost / (num + num_lost):.1f} %)"
+        return [("packets", f"{text}, {num_twice:,} captured twice and read once")]
 
     def _returns(self, frame: int) -> Returns:
         try:
@@ -101,3 +119,18 @@ class Ouster(FileSequence):
             np.broadcast_to(since_ns, (scan.h, scan.w)).reshape(-1),
             scanner_origins=self._origins_m,
         )
+
+
+def lost_and_doubled(turn: Int, column: Int) -> tuple[int, int]:
+    """Return the number of packets missing between others, and of those captured a second time.
+
+    Args:
+        turn: (P,) number of the turn of each packet, which wraps at 16 bits.
+        column: (P,) number of the first column of each packet. A sensor with a limited azimuth
+            sends some columns only.
+    """
+    step = np.diff(turn, prepend=turn[:1])
+    turn = np.cumsum((step + _HALF_WRAP) % (2 * _HALF_WRAP) - _HALF_WRAP)
+    sent, place = np.unique(column, return_inverse=True)
+    number = np.unique(turn * len(sent) + place)
+    return int(np.ptp(number)) + 1 - len(number), len(turn) - len(number)

@@ -154,12 +154,16 @@ class RosBag(FileSequence):
         return track.taken_back(placed, stamp_ns)
 
     def gaps(self) -> list[str]:
-        """Return a sentence for each topic whose headers lack stamps."""
-        num = self._bag.num_unstamped
+        """Return a sentence for each topic whose headers lack stamps, or whose messages repeat."""
+        num, num_twice = self._bag.num_unstamped, self._bag.num_twice
         return [
             f"{topic}: {num[topic]} headers have no stamp: taken is when they were recorded"
             for topic in self._index
             if num[topic]
+        ] + [
+            f"{topic}: {num_twice[topic]} messages were recorded twice and are read once"
+            for topic in self._index
+            if num_twice[topic]
         ]
 
     def _check_size(self, camera: Camera, topic: str) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from threading import RLock
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
+from zlib import crc32
 
 from densify.config.errors import InputError
 from densify.config.file_content import needed, open_file, reason
@@ -75,7 +76,9 @@ class Bag:
                 open_file(part).close()  # raises a clear error for an unreadable file
         package = needed(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
         self._lock = RLock()
-        self.num_unstamped = Counter[str]()  # indexed messages without a header stamp, by topic
+        # Indexed messages without a header stamp, and messages recorded twice, by topic
+        self.num_unstamped = Counter[str]()
+        self.num_twice = Counter[str]()
         try:
             self._readers = [package.Reader(file) for file in self._files]
             for reader in self._readers:
@@ -89,17 +92,27 @@ class Bag:
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Index the messages of the topics by ascending stamp, and count those without a stamp."""
+        """Index the messages of the topics by ascending stamp.
+
+        Messages without a stamp are counted. A message that was recorded twice is indexed once and
+        counted.
+        """
         found: dict[str, list[Entry]] = {topic: [] for topic in topics}
+        at = dict.fromkeys(topics, (-1, 0))  # time of recording and turn of the last message
+        read: set[tuple[str, int, int]] = set()
         for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
-            before = found[topic][-1] if found[topic] else None
-            turn = before.turn + 1 if before is not None and before.log_ns == log_ns else 0
+            turn = at[topic][1] + 1 if at[topic][0] == log_ns else 0
+            at[topic] = log_ns, turn
             try:
                 stamp_ns = _stamp_ns(raw, self._is_ros2)
             except struct.error:
                 raise InputError(f"{self.path}: {topic}: a message of {len(raw)} bytes") from None
-            found[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
-            self.num_unstamped[topic] += not stamp_ns
+            content = topic, stamp_ns or log_ns, crc32(raw)
+            self.num_twice[topic] += content in read
+            if content not in read:
+                found[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
+                self.num_unstamped[topic] += not stamp_ns
+            read.add(content)
         return {topic: sorted(entries) for topic, entries in found.items()}
 
     def message(self, topic: str, entry: Entry) -> Any:

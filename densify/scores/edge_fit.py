@@ -33,6 +33,7 @@ _REACH, _STEP = (2.7, 2.7, 2.0, 0.2), (0.3, 0.3, 1.0, 0.05)  # degrees and secon
 _BLURRED = np.array([0.15, 0.15, 0.3, 0.015])  # an offset that moves edges by the blur
 _NUM_ON_GRID, _NUM_STARTS, _NUM_HALVINGS = 4000, 4, 4
 _CLEARLY = 2.0  # standard errors
+_AS_HIGH = 0.8  # of the height of the best score above the median
 
 
 class Silhouettes(NamedTuple):
@@ -64,6 +65,10 @@ class Fit(NamedTuple):
     score: float  # sum of image gradients at the depth discontinuities with this offset
     rival: float  # best score with an offset more than 1 degree or 0.1 s away
     usual: float  # median score of all offsets on the grid
+    # (R,4) offsets that far away with 0.8 times the height of the score above ``usual``
+    others: Float
+    # (R,) True if the best fit is not better by two standard errors of the sum over the images
+    are_equal: Bool
 
     @property
     def clearness(self) -> float:
@@ -150,36 +155,88 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
 
     ``camera`` has its pose at the exposure, ``silhouettes`` are of the sweep nearest in time. The
     image is off if a turn of up to 2.7 degrees scores better than the best within 0.3 degrees, by
-    two standard errors of the sum of their differences at the discontinuities.
+    two standard errors of the sum of their differences at the discontinuities, and if that turn
+    stands out: the best of many turns is better by chance too where discontinuities are few.
     """
     view = View(silhouettes, *image_edges(image, camera.focal_px), np.zeros(6), 0.0)
     lines, turns = _Lines.of(camera, view, np.zeros(4)), _turns(np.zeros(1), np.zeros(1))
     scores, given = lines.scores(turns), (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
     best = [turns[part][np.argmax(scores[part])] for part in (given, ~given)]
     better = np.diff(lines.strengths(np.array(best)), axis=0)
-    return bool(better.sum() > _CLEARLY * np.sqrt((better**2).sum()))
+    rival = scores[_is_beside(turns, best[1])].max()
+    stands_out = rival - np.median(scores) < _AS_HIGH * (scores[~given].max() - np.median(scores))
+    return bool(stands_out and better.sum() > _CLEARLY * np.sqrt((better**2).sum()))
 
 
 def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
-    """Return the best fit of a camera to two or more views, with delay 0 unless ``with_clock``."""
+    """Return the best fit of a camera to two or more views, with delay 0 unless ``with_clock``.
+
+    Of the local maxima that fit equally well, it is the one that changes the fewest parameters.
+    """
     free = np.array([True, True, True, with_clock])
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
     grid = _grid(free)
     thin = sum(len(line.uv) for line in lines) // _NUM_ON_GRID + 1
     on_grid = np.sum([line.scores(grid, thin) for line in lines], axis=0)
+    usual = float(np.median(on_grid)) * thin
+    starts = _starts(grid, on_grid, free)
+    best, others, are_equal = _simplest(
+        lines, [_climbed(lines, start, free) for start in starts], usual
+    )
+    beside = _is_beside(grid, best)
+    rival = grid[beside][np.argmax(on_grid[beside])]
+    rival_score = _sum(lines, rival)
+    lines = [_Lines.of(camera, view, best) for view in views]
+    more = _climbed(lines, np.zeros(4), free)
+    error, height = _error(lines, more, free), _sum(lines, more)
+    return Fit(best + more, error, height, rival_score, usual, others, are_equal)
+
+
+def _starts(grid: Float, on_grid: Float, free: Bool) -> list[Float]:
+    """Return offsets (4,) to climb from: none, the best of each parameter alone, the best of all.
+
+    ``on_grid`` (M,) is the score of each offset of the grid (M,4).
+    """
     starts = [np.zeros(4)]
+    for axis in np.flatnonzero(free):
+        rows = np.flatnonzero((np.delete(np.abs(grid), axis, axis=1) < 1e-9).all(axis=1))
+        starts.append(grid[rows[np.argmax(on_grid[rows])]])
+    num = len(starts) + _NUM_STARTS - 1
     for row in np.argsort(-on_grid):
-        if len(starts) == _NUM_STARTS:
+        if len(starts) == num:
             break
         if all(_is_beside(grid[row], start) for start in starts):
             starts.append(grid[row])
-    best = max((_climbed(lines, start, free) for start in starts), key=lambda at: _sum(lines, at))
-    beside = grid[_is_beside(grid, best)]
-    rival = beside[np.argmax(on_grid[_is_beside(grid, best)])]
-    others = [_sum(lines, rival), float(np.median(on_grid)) * thin]
-    lines = [_Lines.of(camera, view, best) for view in views]
-    more = _climbed(lines, np.zeros(4), free)
-    return Fit(best + more, _error(lines, more, free), _sum(lines, more), *others)
+    return starts
+
+
+def _simplest(
+    lines: Sequence[_Lines], maxima: Sequence[Float], usual: float
+) -> tuple[Float, Float, Bool]:
+    """Return the local maximum (4,) that changes the fewest parameters of those that fit equally.
+
+    The others follow, as in `Fit`: (R,4) offsets, and (R,) True for those that fit equally.
+    """
+    offsets = np.array(maxima)
+    scores = np.stack([line.scores(offsets) for line in lines], axis=1)
+    total = scores.sum(axis=1)
+    top = int(np.argmax(total))
+    worse = scores[top] - scores
+    error = np.sqrt(len(lines)) * worse.std(axis=1, ddof=1)
+    high = total - usual > _AS_HIGH * (total[top] - usual)
+    equal = high & (worse.sum(axis=1) <= _CLEARLY * error)
+    equal[top] = True
+    order = np.lexsort((-total, num_changed(offsets), ~equal))
+    kept = [int(order[0])]
+    for row in order[high[order]]:
+        if all(_is_beside(offsets[row], offsets[other]) for other in kept):
+            kept.append(int(row))
+    return offsets[kept[0]], offsets[kept[1:]], equal[kept[1:]]
+
+
+def num_changed(offsets: Float) -> Any:
+    """Return the (M,) numbers of parameters that offsets (M,4) change by more than 3 blurs."""
+    return (np.abs(offsets) > 3 * _BLURRED).sum(axis=-1)
 
 
 def _grid(free: Bool) -> Float:

@@ -47,7 +47,8 @@ def add(commands: Any) -> None:
         f"{presets()['default']}. It also takes limits. A key beyond a limit is listed in the "
         "manifest and left out of the set: dataset.max_ghost, share of ghosts; "
         "dataset.min_density, share of pixels with a measured depth; dataset.max_outliers, share "
-        "of outliers with the key held out; dataset.min_sweeps, sweeps in the window. "
+        "of outliers with the key held out; dataset.min_sweeps, sweeps in the window; "
+        "dataset.max_ratio, ghosts or outliers, as a multiple of those of neighbouring keys. "
         "dataset.split is kitti, train or val.",
     )
     add_recording(parser, several=True)
@@ -90,7 +91,6 @@ def _so_far(options: argparse.Namespace) -> Iterator[Answer]:
     files = damaged(options.status) if options.verify else []
     lines = [_describe(so_far), *(f"damaged: {name}" for name in files)]
     yield Answer("\n".join(lines), {**_facts(so_far), "damaged": files})
-    tell_doubts(_beside_neighbours(so_far))
     if files:
         raise ComputationError(
             f"--verify: {len(files)} damaged or missing files in {options.status}; run the "
@@ -132,17 +132,9 @@ def _made(options: argparse.Namespace) -> Iterator[Answer]:
     told = [options.out / name for name in _FIRST if (options.out / name).is_file()]
     yield Answer(_describe(summary), _facts(summary), [options.out], first_of(told, _FIRST))
     warned = [(w, r.drive, r.key) for r in summary.records.values() for w in r.warnings]
-    tell_doubts([*_beside_neighbours(summary), *warned])
+    tell_doubts(warned)
     if summary.count("failed"):
         raise ComputationError(f"{summary.count('failed')} of {summary.num_keys} keys not made")
-
-
-def _beside_neighbours(summary: Summary) -> list[tuple[str, str, int]]:
-    """Return what `tell_doubts` takes, for keys that are far worse than their neighbours."""
-    from densify.dataset.neighbours import worse_than_neighbours
-
-    worse = worse_than_neighbours(summary.records)
-    return [(text, drive, key) for (drive, key), text in worse.items()]
 
 
 def _describe(summary: Summary) -> str:
@@ -165,7 +157,7 @@ def _describe(summary: Summary) -> str:
 
 
 def _facts(summary: Summary) -> dict[str, Any]:
-    """Return the numbers of `_describe`, and the keys that are worse than their neighbours."""
+    """Return the numbers of `_describe`."""
     missing = [r for r in summary.records.values() if r.status != "done"]
     told = ("drive", "key", "status", "reason")
     return {
@@ -176,8 +168,4 @@ def _facts(summary: Summary) -> dict[str, Any]:
         "seconds": summary.seconds,
         "means": {score: summary.mean(score) for score in _SCORES},
         "missing": [{name: getattr(record, name) for name in told} for record in missing],
-        "worse_than_neighbours": [
-            {"drive": drive, "key": key, "reason": reason}
-            for reason, drive, key in _beside_neighbours(summary)
-        ],
     }

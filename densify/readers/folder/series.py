@@ -123,7 +123,8 @@ def in_time(
         if found[number] <= found[before]:
             raise InputError(
                 f"{file or by_path[number]}: the time of number {number} is {found[number]} ns, "
-                f"not after {found[before]} ns of the one before; expected times that ascend"
+                f"not after {found[before]} ns of the one before; expected times that ascend: "
+                f"sort the sweeps by time, and remove one that was stored twice"
             )
     return Series(by_path, found, told_by)
 
