@@ -109,10 +109,8 @@ class Model:
 
 @inlined
 def _nearest(point: Float, surface: Float, within_m: float) -> tuple[int, float]:
-    """Return the row of the nearest surface point (-1 for none nearer), and its square distance.
-
-    ``surface`` (M,3) ascends in x, so only rows whose x is near enough are compared.
-    """
+    """Return the row of the nearest surface point (-1 for none nearer), and its square distance."""
+    # The surface ascends in x: only rows whose x is near enough are compared.
     row, square = -1, within_m**2
     middle = np.searchsorted(surface[:, 0], point[0])
     for step in (1, -1):

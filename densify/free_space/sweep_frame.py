@@ -20,7 +20,6 @@ _NUM_WAYS = 8  # directions of a step
 _MOST_MOVES = 20  # of each step
 _LESS = 0.8  # of the occluded returns of a sweep remain at a place that is not the origin
 _APART_M = 1.0  # least distance between the scanner's places that shows its motion
-_STILL_M = 0.5
 _NEAR_M, _LOWEST_M, _ROOF_M = 30.0, 0.5, 1.8  # heights of scanners above the ground
 
 
@@ -65,7 +64,7 @@ def scanner_place(points: Float, start: Float) -> Float:
 
 def is_still(T_world_lidar: Float) -> bool:
     """Return True if the poses (n,4,4) of odometry hardly move, as between sweeps in a map."""
-    return bool(np.linalg.norm(np.ptp(T_world_lidar[:, :3, 3], axis=0)) <= _STILL_M)
+    return bool(np.linalg.norm(np.ptp(T_world_lidar[:, :3, 3], axis=0)) <= _APART_M / 2)
 
 
 def way_in_map(first: Sweep, last: Sweep) -> float:

@@ -193,10 +193,8 @@ def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
 
 
 def _starts(grid: Float, on_grid: Float, free: Bool) -> list[Float]:
-    """Return offsets (4,) to climb from: none, the best of each parameter alone, the best of all.
-
-    ``on_grid`` (M,) is the score of each offset of the grid (M,4).
-    """
+    """Return offsets (4,) to climb from: none, the best of each parameter alone, the best of all."""
+    # on_grid (M,): score of each offset of the grid (M,4)
     starts = [np.zeros(4)]
     for axis in np.flatnonzero(free):
         rows = np.flatnonzero((np.delete(np.abs(grid), axis, axis=1) < 1e-9).all(axis=1))
@@ -213,10 +211,7 @@ def _starts(grid: Float, on_grid: Float, free: Bool) -> list[Float]:
 def _simplest(
     lines: Sequence[_Lines], maxima: Sequence[Float], usual: float
 ) -> tuple[Float, Float, Bool]:
-    """Return the local maximum (4,) that changes the fewest parameters of those that fit equally.
-
-    The others follow, as in `Fit`: (R,4) offsets, and (R,) True for those that fit equally.
-    """
+    """Return the equally good maximum (4,) of fewest changes, then `Fit.others` and `are_equal`."""
     offsets = np.array(maxima)
     scores = np.stack([line.scores(offsets) for line in lines], axis=1)
     total = scores.sum(axis=1)

@@ -130,10 +130,7 @@ class _Search:
         return velocity
 
     def _may_move(self, members: Int, n: int, velocity: Float) -> bool:
-        """Return True if other sweeps see less often through the points once they are moved.
-
-        ``members`` are of batch n's obstacles. Without any evidence they may move.
-        """
+        """Return True if other sweeps see less often through ``members`` once they are moved."""
         c, rows = self.batches[n].obstacles, members[:: len(members) // NUM_ASKED + 1]
         points, time_s = c.points[rows], c.time_s[rows]
         velocity_m_s = np.repeat([velocity, np.zeros(3)], len(rows), axis=0)
@@ -145,14 +142,12 @@ class _Search:
                 asked = np.concatenate([moved, points])
                 seen_through = self._space.seen_through(asked, j, velocity_m_s)
                 num_seen_through += seen_through.reshape(2, -1).sum(axis=1)
+        # without any evidence they may move
         return bool(num_seen_through[0] < num_seen_through[1] or not num_seen_through.any())
 
     def _track_of(self, members: Int, n: int, velocities: Sequence[Float]) -> tuple[Track, Verdict]:
-        """Return the most likely track of ``members`` of batch n's obstacles, and its verdict.
-
-        It starts at the first velocity, and at the others if free-space violations remain.
-        """
-        # best, restarted: a track and its verdict
+        """Return the most likely track of ``members`` of batch n's obstacles, and its verdict."""
+        # best, restarted: a track and its verdict. Other velocities if violations remain.
         best = self._follow(members, n, velocities[0])
         for velocity in velocities[1:]:
             if best[1].is_clearly_below(best[1].at_most):
