@@ -193,7 +193,7 @@ def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
 
 
 def _starts(grid: Float, on_grid: Float, free: Bool) -> list[Float]:
-    """Return offsets (4,) to climb from: none, the best of each parameter alone, the best of all."""
+    """Return offsets (4,) to climb from: none, the best of each parameter, the best of all."""
     # on_grid (M,): score of each offset of the grid (M,4)
     starts = [np.zeros(4)]
     for axis in np.flatnonzero(free):
