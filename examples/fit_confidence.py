@@ -22,7 +22,7 @@ from densify.depth.confidence import WEIGHTS, confidence_of, outlier_probability
 NUM_RIGHT = 15_000  # of a map, a random sample; with their weight they stand for all
 FREE = ("every pixel", "filled pixel", "rejected pixel")  # of either sign; others raise the risk
 REJECTED = [*WEIGHTS].index("rejected pixel")
-SMALL = 5e-4  # penalty on the squares of the weights
+SMALL = 1e-4  # penalty on the squares of the weights
 
 
 class Evidence(NamedTuple):

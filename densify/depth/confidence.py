@@ -33,16 +33,16 @@ from densify.scores.depth_metrics import (
 )
 
 WEIGHTS: Mapping[str, float] = {
-    "every pixel": -7.80,
-    "filled pixel": 0.28,
-    "votes of the image against the depth": 0.57,
-    "rejected boundary pixels within 2 spacings": 0.78,
-    "rejected boundary pixels within 8 spacings": 0.74,
-    "step of depth within a spacing": 0.39,
-    "age": 0.36,
-    "pixels without a depth within 4 spacings": 0.40,
-    "nearness of a depth discontinuity": 0.61,
-    "rejected pixel": 1.0,
+    "every pixel": -8.52,
+    "filled pixel": 0.37,
+    "votes of the image against the depth": 0.44,
+    "rejected boundary pixels within 2 spacings": 0.76,
+    "rejected boundary pixels within 8 spacings": 0.89,
+    "step of depth within a spacing": 0.62,
+    "age": 0.51,
+    "pixels without a depth within 2 spacings": 0.54,
+    "nearness of a depth discontinuity": 0.64,
+    "rejected pixel": 1.30,
 }
 """Weight of each feature, see `features`."""
 _LEAST_VOTES, _LEAST_SHARE, _LEAST_STEP = 0.001, 0.005, 0.03  # smaller values are not told apart
@@ -74,7 +74,7 @@ def features(layers: Layers, since_key_ns: Int, camera: Camera) -> Float32:
     if layers.solid is not None:
         edge[layers.solid] = ALL_ROUND
     step = _step(depth_m, layers.filled_m, _size(1, gap_px)) / tolerance(depth_m, camera)
-    cover = _mean(shown, _size(4, gap_px))
+    cover = _mean(shown, _size(2, gap_px))
     columns = [
         np.ones(shown.shape),
         ~measured,
@@ -82,7 +82,7 @@ def features(layers: Layers, since_key_ns: Int, camera: Camera) -> Float32:
         *(_rejected(layers, _size(reach, gap_px)) for reach in (2, 8)),
         _logarithm(step, _LEAST_STEP),
         _logarithm(age_s, _AGE_S),
-        -np.log10(np.maximum(cover, _LEAST_COVER)),
+        -np.log2(np.maximum(cover, _LEAST_COVER)),
         np.clip(ALL_ROUND - edge, 0, ALL_ROUND - 1),
         rejected,
     ]
