@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from densify.pipeline.run import compare as compare
     from densify.pipeline.run import run as run
     from densify.readers import open_sequence as open_sequence
+    from densify.scores.depth_metrics import outlier_probability as outlier_probability
 
 __version__ = "0.1.0"
 
@@ -49,6 +50,7 @@ _HOME = {
     "estimate_flow": "densify.flow.pairs.estimate",
     "make_dataset": "densify.dataset.make",
     "Recipe": "densify.dataset.plan",
+    "outlier_probability": "densify.scores.depth_metrics",
     "Gate": "densify.dataset.plan",
     "Config": "densify.config",
     "InputError": "densify.config.errors",

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Fit the weights of the confidence to the gate's keys, and check them on recordings left out.
+"""Fit the weights of the confidence to the gate's keys, and check them on drives left out.
 
 python examples/fit_confidence.py [--data DIR] [--keys NAME …]
 
 The weights are printed as ``WEIGHTS`` of densify/depth/confidence.py has them, each with its
-standard error between recordings (jackknife).
+standard error between drives and streets (jackknife). They are fitted to the pixels of the map. The
+weight of rejected pixels alone is fitted to those, with the other weights held.
 """
 
 import argparse
@@ -16,18 +17,19 @@ from scipy.optimize import minimize
 
 from densify.bench.gate import judged_maps
 from densify.config.cache import Cache
-from densify.depth.confidence import WEIGHTS, confidence_of, wrong
+from densify.depth.confidence import WEIGHTS, confidence_of, outlier_probability
 
 NUM_RIGHT = 15_000  # of a map, a random sample; with their weight they stand for all
-FREE = ("every pixel", "filled pixel")  # weights of either sign; the others raise the risk
-SMALL = 1e-3  # penalty on the squares of the weights
-STEPS = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8)
+FREE = ("every pixel", "filled pixel", "rejected pixel")  # of either sign; others raise the risk
+REJECTED = [*WEIGHTS].index("rejected pixel")
+SMALL = 1e-4  # penalty on the squares of the weights
 
 
 class Evidence(NamedTuple):
-    """The features (P,8) of the pixels of one map with a true depth, and whether each is wrong.
+    """The features (P,10) of the pixels of one map with a true depth, and whether each is wrong.
 
-    group: maps of one group are of one recording, and are left out together.
+    Rejected pixels have a depth too. group: maps of one group are of one drive or street, and are
+    left out together.
     """
 
     name: str
@@ -41,41 +43,55 @@ class Evidence(NamedTuple):
 def collected(folder, names):
     """Yield the evidence of each of the gate's keys."""
     for key, depth, truth, outlier in judged_maps(folder, names, Cache()):
-        shown = depth.filled_m > 0
-        known = (truth.depth_m > 0)[shown]
+        some = (depth.filled_m > 0) | (depth.rejected.depth_m > 0)
+        known = (truth.depth_m > 0)[some]
         parts = (outlier, depth.depth_m > 0, truth.moving)
         yield Evidence(
             key.name,
-            key.data,
+            key.data.rpartition("drive_")[2],
             depth.evidence[known].astype(np.float64),
-            *(part[shown][known] for part in parts),
+            *(part[some][known] for part in parts),
         )
 
 
 def fit(maps):
-    """Return the (8,) weights of the logistic regression in which every map counts alike."""
+    """Return the (10,) weights of the logistic regression in which every map counts alike."""
+    weights = fitted(maps, 0, np.array([*WEIGHTS.values()]), np.arange(len(WEIGHTS)) != REJECTED)
+    return fitted(maps, 1, weights, np.arange(len(WEIGHTS)) == REJECTED)
+
+
+def fitted(maps, rejected, weights, free):
+    """Return the weights with the ``free`` ones fitted to the shown, or to the rejected, pixels."""
     rng = np.random.default_rng(0)
     x, y, weight = [], [], []
     for one in maps:
-        bad, right = (np.flatnonzero(one.outlier == is_bad) for is_bad in (True, False))
+        of_kind = one.features[:, REJECTED] == rejected
+        bad, right = (np.flatnonzero(of_kind & (one.outlier == is_bad)) for is_bad in (True, False))
         some = rng.choice(right, min(len(right), NUM_RIGHT), replace=False)
         rows = np.concatenate([bad, some])
         x.append(one.features[rows])
         y.append(one.outlier[rows])
         stands_for = np.where(one.outlier[rows], 1.0, len(right) / max(len(some), 1))
-        weight.append(stands_for / len(one.outlier) / len(maps))
+        weight.append(stands_for / max(of_kind.sum(), 1) / len(maps))
     x, y, weight = (np.concatenate(part) for part in (x, y, weight))
-    penalty = SMALL * np.array([name != "every pixel" for name in WEIGHTS])
+    held, x = x[:, ~free] @ weights[~free], x[:, free]
+    names = [name for name, is_free in zip(WEIGHTS, free, strict=True) if is_free]
+    penalty = SMALL * np.array([name != "every pixel" for name in names])
 
     def loss(w):
-        score = x @ w
+        score = held + x @ w
         value = weight @ np.logaddexp(0, np.where(y, -score, score))
         slope = x.T @ (weight * (1 / (1 + np.exp(-score)) - y))
-        return 100 * value + penalty @ w**2, 100 * slope + 2 * penalty * w
+        return value + penalty @ w**2, slope + 2 * penalty * w
 
-    bounds = [(None if name in FREE else 0, None) for name in WEIGHTS]
-    start = np.array([*WEIGHTS.values()])
-    return minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B").x
+    bounds = [(None if name in FREE else 0, None) for name in names]
+    options = {"ftol": 1e-12, "gtol": 1e-8, "maxiter": 500}
+    found = minimize(
+        loss, weights[free], jac=True, bounds=bounds, method="L-BFGS-B", options=options
+    )
+    made = weights.copy()
+    made[free] = found.x
+    return made
 
 
 def left_out(maps):
@@ -96,20 +112,21 @@ def area(risk, outlier):
 def check(maps, weights):
     """Print expected and found outliers of each map with the weights fitted without it."""
     off, areas = [], []
-    title = ("all", "measured", "moving")
-    print(f"{'expected / found %':34s}" + "".join(f"{part:>16s}" for part in title) + "   area")
+    title = ("all", "measured", "filled", "moving", "rejected")
+    print(f"{'expected / found %':34s}" + "".join(f"{part:>14s}" for part in title) + "   area")
     for one in maps:
-        risk = wrong(confidence_of(one.features, weights[one.group]))
-        every = np.ones(len(risk), bool)
-        parts = [
-            (100 * risk[p].mean(), 100 * one.outlier[p].mean()) if p.any() else None
-            for p in (every, one.measured, one.moving)
-        ]
-        areas.append(area(risk, one.outlier))
-        off.append(abs(np.log2(parts[0][0] / max(parts[0][1], 1e-3))))
-        cells = "".join(f"{'':>16s}" if p is None else f"{p[0]:9.2f} / {p[1]:4.2f}" for p in parts)
+        risk = outlier_probability(confidence_of(one.features, weights[one.group]))
+        shown = one.features[:, REJECTED] == 0
+        filled = shown & ~one.measured
+        parts = (shown, shown & one.measured, filled, shown & one.moving, ~shown)
+        shares = [(risk[p].mean(), one.outlier[p].mean()) if p.any() else None for p in parts]
+        areas.append(area(risk[shown], one.outlier[shown]))
+        off.append(np.log2(shares[0][0] / max(shares[0][1], 1e-5)))
+        cells = "".join(
+            f"{'':14s}" if p is None else f"{100 * p[0]:8.2f} /{100 * p[1]:5.2f}" for p in shares
+        )
         print(f"{one.name[-34:]:34s}{cells}   {areas[-1]:.3f}")
-    print(f"mean |log2(expected / found)| {np.mean(off):.2f}, mean area {np.mean(areas):.3f}")
+    print(f"mean |log2(expected / found)| {np.abs(off).mean():.2f}, mean area {np.mean(areas):.3f}")
 
 
 def main():

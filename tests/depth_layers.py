@@ -7,13 +7,13 @@ import numpy as np
 
 from densify.depth.boundary_pixels import lab
 from densify.depth.layers import Layers
+from densify.depth.measured_pixels import ALL_ROUND
 
 
 def layers_of(
     filled_m,
     measured=None,
     rim_m=None,
-    confidence=0.8,
     spacing_px=(3.0, 3.0),
     tilt=(0.0, 0.0),
     image=None,
@@ -28,9 +28,11 @@ def layers_of(
         depth_m=depth_m.astype(np.float32),
         rim_m=np.asarray(rim_m, np.float32),
         filled_m=filled_m,
-        confidence=np.where(known | (rim_m > 0), np.float32(confidence), np.float32(0)),
         point=np.where(depth_m > 0, np.arange(known.size).reshape(shape), -1).astype(np.int32),
         tilt=np.broadcast_to(np.float32(tilt), two).copy(),
         spacing_px=np.broadcast_to(np.float32(spacing_px), two).copy(),
+        votes=np.ones(shape, np.float32),
+        edge=np.full(shape, np.float32(ALL_ROUND)),
+        rejected_m=np.zeros(shape, np.float32),
         lab=None if image is None else lab(image),
     )

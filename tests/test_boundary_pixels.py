@@ -39,7 +39,7 @@ def scene(seed=0):
         depth[beyond <= -FAT_PX] = z
     known = rng.uniform(size=truth.shape) < 0.33
     depth, rim = (np.where(known, part, 0).astype(np.float32) for part in (depth, rim))
-    layers = layers_of(depth, rim_m=rim, confidence=0.6, spacing_px=(2, 5))
+    layers = layers_of(depth, rim_m=rim, spacing_px=(2, 5))
     image += rng.normal(0, 3, image.shape)
     return layers, image.clip(0, 255).astype(np.uint8), truth
 
@@ -58,6 +58,8 @@ def test_rims_are_kept_on_the_side_where_the_image_has_them():
     assert (kept & rims & ~right).sum() < 0.04 * (rims & ~right).sum()
     assert np.array_equal(made.depth_m[layers.depth_m > 0], layers.depth_m[layers.depth_m > 0])
     assert np.array_equal(made.filled_m, made.depth_m)
+    np.testing.assert_array_equal(made.rejected_m > 0, rims & ~kept)
+    assert made.votes[kept & rims].min() > made.votes[rims & ~kept].max()
 
 
 def test_without_an_image_rims_are_left_out():

@@ -22,6 +22,7 @@ def curve_of(*pairs):
             "outliers_measured": None if e is None else e / 2,
             "density_filled": d,
             "outliers_filled": e,
+            "expected_filled": None if e is None else 2 * e,
         }
         for i, (d, e) in enumerate(pairs)
     ]
@@ -33,10 +34,12 @@ POOR = curve_of((0.45, 0.17), (0.30, 0.12), (0.1, 0.1))
 
 def test_every_camera_and_method_is_drawn_through_its_points() -> None:
     figure = plots.draw_curves({camera: {"icp": POOR, "flow": GOOD} for camera in "abc"})
-    assert [axes.get_title() for axes in figure.axes] == [f"{c}, key held out" for c in "abc"]
+    assert [axes.get_title() for axes in figure.axes] == [*"abc"]
     for axes in figure.axes:
         lines = {line.get_label(): line.get_xydata() for line in axes.lines}
-        assert len(lines) == 4
+        assert len(lines) == 5
+        expected = lines["expected by confidence"]
+        np.testing.assert_allclose(expected, [[48, 0.8], [40, 0.2], [20, 0.0]])
         np.testing.assert_allclose(
             lines["scene flow, filled: 48.0 % of pixels, 0.40 % outliers"],
             [[48, 0.4], [40, 0.1], [20, 0.0]],

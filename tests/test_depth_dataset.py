@@ -138,6 +138,19 @@ def test_every_value_comes_back(made, filled):
             assert sample[name].dtype == torch.float32 and sample[name].is_contiguous()
 
 
+def test_the_least_certain_pixels_are_left_out(made):
+    plain = next(iter(densify.DepthDataset(made.root, filled=True)))
+    risk = densify.outlier_probability(plain["confidence"].numpy())
+    there = plain["dense_depth_m"].numpy() > 0
+    most = risk[there].mean() / 2
+    dialled = next(iter(densify.DepthDataset(made.root, filled=True, max_outliers=most)))
+    kept = dialled["dense_depth_m"].numpy() > 0
+    assert 0 < kept.sum() < there.sum() and risk[kept].mean() <= most
+    assert risk[kept].max() <= risk[there & ~kept].min()
+    for name in ("dense_depth_m", "confidence"):
+        np.testing.assert_array_equal(dialled[name].numpy(), np.where(kept, plain[name].numpy(), 0))
+
+
 def test_which_samples_are_in_the_set(made):
     assert {where_of(s)[1] for s in DepthDataset(made.root, cameras=["image_03"])} == {"image_03"}
     for split, drive in (("val", VAL), ("train", TRAIN)):

@@ -9,7 +9,7 @@ import pytest
 from densify.config import RegisterSettings
 from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
-from densify.geometry.types import Result
+from densify.geometry.types import Reason, Result
 from densify.pipeline.key_result import METHODS
 from densify.pipeline.run import compare
 from densify.readers.timeline import read_sweep
@@ -71,6 +71,29 @@ def test_shapes_and_types_as_documented(moving):
         assert np.isin(depth.frame[depth.frame >= 0], result.frames).all()
         assert ((depth.confidence > 0) == (depth.filled_m > 0)).all()
         assert (depth.filled_m[depth.depth_m > 0] > 0).all()
+
+
+def test_a_point_is_as_certain_as_the_pixel_that_confirms_it(moving):
+    (depth,) = moving["flow"].depth.values()
+    certain = moving["flow"].cloud.confidence
+    kept = certain[depth.reason == Reason.KEPT]
+    assert (kept > 0).mean() > 0.95 and np.isin(kept[kept > 0], depth.confidence).all()
+    assert not certain[depth.reason == Reason.OUTSIDE].any()
+
+
+def test_maps_keep_the_share_of_outliers_that_is_asked_for(moving):
+    rules, shown = moving["flow"], moving["flow"].depth["front"].filled_m > 0
+    own = rules.metrics["expected_outliers"]["front"]["filled"]
+    for share, more in ((own / 3, False), (1.2 * own, True)):
+        config = NEAR | {"project": {"max_outliers": share}}
+        result = compare(tiny(MOVERS), KEY, WINDOW, config=config, methods=("flow",))["flow"]
+        depth, expected = result.depth["front"], result.metrics["expected_outliers"]["front"]
+        assert expected["filled"] <= share
+        dialled = depth.filled_m > 0
+        assert dialled.sum() > shown.sum() if more else dialled.sum() < shown.sum()
+        assert ((dialled | shown) == (dialled if more else shown)).all()
+        assert np.array_equal(depth.frame >= 0, depth.depth_m > 0)
+        assert np.array_equal(np.isfinite(depth.age_s), dialled)
 
 
 def test_nothing_moves_flow_is_icp_to_the_last_bit(static):

@@ -92,7 +92,8 @@ def test_gaps_of_a_fence_are_not_closed(measure):
     dropped = (before.filled_m > 0) & (after.filled_m == 0)
     kept = ~dropped
     assert np.array_equal(after.filled_m[kept], before.filled_m[kept])
-    assert not after.depth_m[dropped].any() and not after.confidence[dropped].any()
+    assert not after.depth_m[dropped].any()
+    assert np.array_equal(after.rejected.depth_m[dropped], before.filled_m[dropped])
     assert np.array_equal(after.frame >= 0, after.depth_m > 0)
 
 

@@ -33,7 +33,7 @@ def measured_at(uv, spacing_px):
         np.stack([spacing, 9 * spacing], 1),
         *(nothing, nothing, nothing > 0),
     )
-    layers = layers_of(PLANE, depth_m > 0, confidence=0.5, tilt=TILT)
+    layers = layers_of(PLANE, depth_m > 0, tilt=TILT)
     layers = replace(layers, point=point)
     return layers, points
 
@@ -58,7 +58,6 @@ def test_pixels_whose_middle_the_spot_covers_are_measured():
     known = made.depth_m > 0
     assert known.sum() > 2 * len(uv)
     np.testing.assert_array_equal(made.depth_m[known], PLANE[known])
-    np.testing.assert_array_equal(made.confidence, layers.confidence)
 
 
 def test_what_is_open_or_of_another_surface_stays_so():

@@ -23,6 +23,7 @@ from densify.config import resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.depth.exposure import key_shots, load_images
+from densify.depth.moving_bodies import far_inside
 from densify.depth.views import HeldOut
 from densify.flow.pairs.estimate import estimate_flow
 from densify.geometry import poses
@@ -180,7 +181,10 @@ def measure(
 
 
 class JudgedMap(NamedTuple):
-    """The depth map of a key, its ground truth, and which (H,W) pixels with both are outliers."""
+    """The depth map of a key, its ground truth, and its outliers (H,W), rejected pixels included.
+
+    Returns of another scanner from far inside a moving body are no truth: they passed its windows.
+    """
 
     key: GateKey
     depth: DepthMap
@@ -196,12 +200,16 @@ def judged_maps(
     for key in _chosen(KEYS, folder, names):
         sequence = _opened(key, folder)
         focal_px = sequence.cameras[key.camera].focal_px
-        depth, truth = _Still(sequence, key, folder, cache).made()
-        both = (truth.depth_m > 0) & (depth.filled_m > 0)
+        depth, truth = _Still(sequence, key, folder, cache).made(through_glass=False)
+        truth = truth._replace(by_disparity=True)
+        depth_m = depth.filled_m
+        if depth.rejected is not None:
+            depth_m = np.maximum(depth_m, depth.rejected.depth_m)
+        both = (truth.depth_m > 0) & (depth_m > 0)
         outlier = np.zeros(both.shape, bool)
-        outlier[both] = truth.outliers(depth.filled_m, both, focal_px)
+        outlier[both] = truth.outliers(depth_m, both, focal_px)
         if key.truth == "stereo":
-            outlier &= ~agrees_beside(truth, depth.filled_m, _ASIDE_PX, focal_px)
+            outlier &= ~agrees_beside(truth, depth_m, _ASIDE_PX, focal_px)
         yield JudgedMap(key, depth, truth, outlier)
 
 
@@ -294,7 +302,9 @@ class _Still:
             if part != "moving" or truth.moving[truth.depth_m > 0].any()
         }
 
-    def made(self) -> tuple[DepthMap, TruthMap]:
+    def made(self, through_glass: bool = True) -> tuple[DepthMap, TruthMap]:
+        """Return the depth map of the key, and its ground truth."""
+        # through_glass: keep returns of another scanner from far inside a moving body
         recording, key, camera = self._recording, self._key.key, self._key.camera
         sequence, settings = recording.sequence, recording.settings
         shots = key_shots(sequence, choose_cameras(sequence, [camera]), key, settings.project)
@@ -302,8 +312,12 @@ class _Still:
         beyond = recording.standing(key)
         scene = scene_of(recording, key, shots, images, beyond, cloud, False, Watch())
         seen = see(scene, "flow", cloud)
-        if self._truth is not None:
-            return scene.views.depth(seen)[camera], self._truth
+        if (truth := self._truth) is not None:
+            if self._key.truth == "scanner" and not through_glass:
+                exposure = scene.views.exposures[camera]
+                inside = far_inside(seen.bodies.values(), exposure, truth.depth_m)
+                truth = truth._replace(depth_m=np.where(inside, np.float32(0), truth.depth_m))
+            return scene.views.depth(seen)[camera], truth
         held_out = HeldOut.of(scene.views, cloud).maps(seen, METHODS["flow"].visible)
         depth, truth_m, moving = held_out[camera]
         return depth, TruthMap(truth_m, moving, by_disparity=True)

@@ -129,6 +129,7 @@ class ProjectSettings(Section):
     visibility: bool = True
     rims: str = one_of("image", "strict", "keep")
     fill_reach: float = within(1.5, 0.1, 5)
+    max_outliers: float | None = within(None, 0.0001, 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()

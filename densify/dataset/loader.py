@@ -17,6 +17,7 @@ from torch.utils.data import Dataset
 from densify.config.errors import InputError
 from densify.dataset.manifest import read_manifests
 from densify.dataset.plan import Drive, drives_of, read_plan
+from densify.depth.confidence import most_certain
 from densify.depth.exposure import key_shots
 from densify.geometry.types import Camera, LidarSequence
 from densify.outputs.depth_png import read_depth_png, read_stored
@@ -50,6 +51,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
         flip: bool = False,
         data: Mapping[str, str | Path] | None = None,
         split: Literal["train", "val"] | None = None,
+        max_outliers: float | None = None,
     ) -> None:
         """Find the finished key sweeps of a training set.
 
@@ -63,8 +65,13 @@ class DepthDataset(Dataset[dict[str, Any]]):
             data: Drive -> new path of its recording, for `densify.open_sequence`, if it has moved
                 since the set was made.
             split: KITTI's split, ``train`` or ``val``, None for both.
+            max_outliers: Greatest expected share of outliers of a dense depth, 0.01 for 1 %. The
+                least certain pixels are left out until it is reached. Pixels that are not in the
+                set are not given back: make it with a ``project.max_outliers`` as high as any that
+                is wanted. None leaves out none.
         """
         self._root, self._crop, self._flip = Path(root), crop, flip
+        self._max_outliers = max_outliers
         self._dense = "groundtruth_filled" if filled else "groundtruth"
         self._drives = _read_drives(self._root)
         self._specs = {name: drive.data for name, drive in self._drives.items()}
@@ -106,12 +113,17 @@ class DepthDataset(Dataset[dict[str, Any]]):
 
         dense_m = read(self._dense, read_depth_png)
         levels = read("confidence", lambda path: read_stored(path, np.uint8, "a confidence map"))
+        # Stored levels are 1 to 255, see `densify.outputs.depth_png.stored_confidence`.
+        confidence = np.where(dense_m > 0, (levels - np.float32(1)) / 254, np.float32(0)).clip(0)
+        if self._max_outliers is not None:
+            kept = dense_m > 0
+            kept[kept] = most_certain(confidence[kept], self._max_outliers)
+            dense_m, confidence = dense_m * kept, confidence * kept
         maps = {
             "image": self._image(name, camera, frame).transpose(2, 0, 1) / np.float32(255),
             "sparse_depth_m": read("velodyne_raw", read_depth_png),
             "dense_depth_m": dense_m,
-            # Stored levels are 1 to 255, see `densify.outputs.depth_png.stored_confidence`.
-            "confidence": np.where(dense_m > 0, (levels - np.float32(1)) / 254, 0).clip(0),
+            "confidence": confidence,
         }
         size_px = camera.height_px, camera.width_px
         height_px, width_px = self._crop or size_px

@@ -19,15 +19,12 @@ from numpy.typing import NDArray
 from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
 from densify.depth.neighbours import DIRECTIONS, NONE, extended, first_known, offset
-from densify.geometry.arrays import Bool, Float32, Int
+from densify.geometry.arrays import Float32, Int
 from densify.geometry.compiled import Kernel, inlined
 
-MOST_CONFIDENCE = 0.2
-"""Greatest confidence of a boundary pixel, least confidence of any other measured pixel."""
 LEAST_SHARE = 0.97  # share of the votes for a pixel that is kept
 _BLUR_PX = 0.6  # standard deviation; it removes noise and the pattern of the colour filter
 _LEAST_LIGHT = 70.0  # L of the lightest hundredth; a darker image is lightened
-_SUREST = 2.5  # greatest -log10 of the share of the votes against
 VOTERS_REACH = 6.0
 """Greatest distance of a voting pixel, in spacings of neighbouring rays."""
 _DECAY = 1.2  # distance at which a vote counts half, in spacings of neighbouring rays
@@ -36,7 +33,8 @@ _THROUGH = 0.001  # weight of a vote across an edge of the image
 _STRIDE = 3.0  # number of compared colours per spacing of rays, on the path to a voter
 _DOUBT = 0.04  # weight of a constant vote, half of it for the depth and half against
 _ASIDE = 0.6  # tested shift of the image, in spacings of neighbouring rays
-_ROUNDED = 1 - 1e-6  # tolerance for rounding of a share
+ROUNDED = 1 - 1e-6
+"""Tolerance for rounding of a share of votes."""
 
 
 def lab(image: NDArray[np.uint8]) -> Float32:
@@ -51,7 +49,7 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
     """Return the layers with the boundary pixels (``rim_m``) accepted that the image confirms.
 
     With ``rims=image`` a pixel is accepted if 97 % of the votes are for its depth. ``keep`` accepts
-    all pixels, ``strict`` none. The ``confidence`` of an accepted pixel is 0 to 0.2 by this share.
+    all pixels, ``strict`` none. The others become ``rejected_m``.
     """
     pixel = np.flatnonzero(layers.rim_m)
     share = np.full(len(pixel), np.float32(0.5))
@@ -61,38 +59,35 @@ def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
     accepted = np.full(len(pixel), rims == "keep")
     if rims == "image":
         accepted = share >= LEAST_SHARE
-    depth_m, confidence = layers.depth_m.copy(), layers.confidence.copy()
+    depth_m, votes = layers.depth_m.copy(), layers.votes.copy()
     depth_m.flat[pixel[accepted]] = layers.rim_m.flat[pixel[accepted]]
-    sure = np.clip(-np.log10(np.maximum(1 - share, 1e-9)) / _SUREST, 0, 1)
-    confidence.flat[pixel] = sure * np.float32(MOST_CONFIDENCE)
-    confidence = np.where(depth_m > 0, confidence, np.float32(0))
-    return replace(layers, depth_m=depth_m, filled_m=depth_m, confidence=confidence)
+    votes.flat[pixel] = share
+    rejected_m = np.where(depth_m > 0, np.float32(0), layers.rim_m)
+    return replace(layers, depth_m=depth_m, filled_m=depth_m, votes=votes, rejected_m=rejected_m)
 
 
-def voted_for(
+def least_votes(
     layers: Layers,
     known_m: Sequence[Float32],
     pixel: Int,
     depth_m: Float32,
-    least_share: float,
     surely: bool = False,
-) -> Bool:
-    """Return (P,) True where enough pixels around confirm the given depth of a pixel, see `vote`.
+) -> Float32:
+    """Return the (P,) least share of the votes for the given depth of a pixel, see `vote`.
 
-    At least ``least_share`` of their votes, 0 to 1, must be for the depth. ``known_m`` are maps
-    (H,W) with the depth in metres of the pixels that vote, 0 for other pixels. Each map must
-    confirm the depth. All maps have the same depths where they vote. The other arguments are as in
-    `vote`.
+    ``known_m`` are maps (H,W) with the depth in metres of the pixels that vote, 0 for other pixels.
+    The least share of the maps counts. All have the same depths where they vote. The other
+    arguments are as in `vote`.
     """
-    confirmed = np.ones(len(pixel), bool)
+    least = np.ones(len(pixel), np.float32)
     steps = None
     for map_m in known_m:
         known = voters(map_m, layers.tilt)
         other_voters = True if steps is None else (known.steps != steps).any(axis=0).flat[pixel]
-        rows, steps = np.flatnonzero(confirmed & other_voters), known.steps
+        rows, steps = np.flatnonzero(other_voters & (least > 0)), known.steps
         share = vote(layers, known, pixel[rows], depth_m[rows], surely)
-        confirmed[rows] = share >= _ROUNDED * least_share
-    return confirmed
+        least[rows] = np.minimum(least[rows], share)
+    return least
 
 
 class Voters(NamedTuple):

@@ -4,7 +4,7 @@
 The probability P is that of a logistic regression (Cox, "The regression analysis of binary
 sequences", 1958) on physical features of the pixel:
 
-    P = 1 / (1 + exp(-(w0 + w1 x1 + ... + w7 x7)))
+    P = 1 / (1 + exp(-(w0 + w1 x1 + ... + w9 x9)))
 
 The weights `WEIGHTS` were fitted to exact truth of simulated streets and to the truth of real
 recordings, each recording with equal weight, by ``examples/fit_confidence.py``.
@@ -20,62 +20,93 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from densify.depth.boundary_pixels import MOST_CONFIDENCE
 from densify.depth.layers import Layers
-from densify.geometry.types import Camera, DepthMap, Float, Float32
+from densify.depth.measured_pixels import ALL_ROUND
+from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32, Int
 from densify.scores.depth_metrics import (
+    DECADES,
     KITTI_BASELINE_M,
     OUTLIER_FRACTION,
     OUTLIER_PX,
     is_outlier_depth,
+    outlier_probability,
 )
 
-DECADES = 5.0
-"""Confidence 1 means one outlier in 10^5 pixels; each 0.2 less means ten times as many."""
-
 WEIGHTS: Mapping[str, float] = {
-    "every pixel": -8.51,
-    "boundary pixel that the image confirms": 2.40,
-    "filled pixel": -0.46,
-    "doubt of a measured pixel": 1.95,
-    "doubt of a filled pixel": 2.24,
-    "rejected boundary pixels within 2 spacings": 1.11,
-    "rejected boundary pixels within 8 spacings": 0.62,
-    "step of depth within a spacing": 1.68,
+    "every pixel": -8.52,
+    "filled pixel": 0.37,
+    "votes of the image against the depth": 0.44,
+    "rejected boundary pixels within 2 spacings": 0.76,
+    "rejected boundary pixels within 8 spacings": 0.89,
+    "step of depth within a spacing": 0.62,
+    "age": 0.51,
+    "pixels without a depth within 2 spacings": 0.54,
+    "nearness of a depth discontinuity": 0.64,
+    "rejected pixel": 1.30,
 }
 """Weight of each feature, see `features`."""
-_LEAST_DOUBT, _LEAST_SHARE = 0.03, 0.005  # smaller values are not told apart
+_LEAST_VOTES, _LEAST_SHARE, _LEAST_STEP = 0.001, 0.005, 0.03  # smaller values are not told apart
+_AGE_S, _LEAST_COVER = 0.03, 0.05
 _NUM_STEPS = 20
 
 
-def features(layers: Layers) -> Float32:
-    """Return the (P,8) features of the P pixels with a depth, row by row, as named in `WEIGHTS`.
+def features(layers: Layers, since_key_ns: Int, camera: Camera) -> Float32:
+    """Return the (P,10) features of the P pixels with a filled or rejected depth, row by row.
 
-    Doubt is 1 minus the rank that the stages give a pixel: by the number of sweeps and points that
-    agree, the distance to a depth discontinuity, the residual, and the distance over which it is
-    filled. Doubts and shares enter by their logarithm to base 10, because probabilities of errors
-    are proportional to powers of them. The step is the logarithm of the ratio of the greatest to
-    the least depth around. Spacings are those of neighbouring rays.
+    Shares, steps and ages enter by their logarithm to base 10, because probabilities of errors are
+    proportional to powers of them. The step is the logarithm of the ratio of the greatest to the
+    least depth around, as a multiple of the tolerance of KITTI's rule. Age and discontinuity are
+    those of the nearest measured pixel. A moving body has no discontinuity. Spacings are those of
+    neighbouring rays.
+
+    Args:
+        layers: The finished map, before `densify.depth.spots`.
+        since_key_ns: (M,) ns from the key sweep of the points of the cloud.
+        camera: Camera of the map.
     """
-    shown, measured = layers.filled_m > 0, layers.depth_m > 0
-    boundary = measured & (layers.rim_m > 0)
-    rank = np.where(boundary, MOST_CONFIDENCE, np.clip(layers.confidence, 0, 1))
-    doubt = np.log10((1 - rank) / _LEAST_DOUBT + 1)
+    shown, rejected = layers.filled_m > 0, layers.rejected_m > 0
+    some, depth_m = shown | rejected, np.where(shown, layers.filled_m, layers.rejected_m)
+    measured = layers.depth_m > 0
     gap_px = float(np.median(layers.gap_px))
-    inverse = np.divide(1, layers.filled_m, out=np.zeros_like(layers.filled_m), where=shown)
-    size = _size(1, gap_px)
-    nearest = ndimage.maximum_filter(inverse, size)
-    farthest = ndimage.minimum_filter(np.where(shown, inverse, np.float32(np.inf)), size)
+    nearest = nearest_measured(layers)
+    age_s = np.abs(since_key_ns[layers.point[nearest]]) * 1e-9 if measured.any() else 0 * depth_m
+    edge = np.where(measured, layers.edge, 0)[nearest]
+    if layers.solid is not None:
+        edge[layers.solid] = ALL_ROUND
+    step = _step(depth_m, layers.filled_m, _size(1, gap_px)) / tolerance(depth_m, camera)
+    cover = _mean(shown, _size(2, gap_px))
     columns = [
-        np.ones(shown.shape, np.float32),
-        boundary,
+        np.ones(shown.shape),
         ~measured,
-        doubt * (measured & ~boundary),
-        doubt * ~measured,
+        _logarithm(1 - layers.votes, _LEAST_VOTES),
         *(_rejected(layers, _size(reach, gap_px)) for reach in (2, 8)),
-        np.log1p(np.log(nearest / farthest, out=np.zeros_like(nearest), where=shown)),
+        _logarithm(step, _LEAST_STEP),
+        _logarithm(age_s, _AGE_S),
+        -np.log2(np.maximum(cover, _LEAST_COVER)),
+        np.clip(ALL_ROUND - edge, 0, ALL_ROUND - 1),
+        rejected,
     ]
-    return np.stack([column[shown] for column in columns], axis=1).astype(np.float32)
+    return np.stack([column[some] for column in columns], axis=1).astype(np.float32)
+
+
+def nearest_measured(layers: Layers) -> tuple[Int, Int]:
+    """Return the (H,W) rows and the (H,W) columns of the nearest measured pixel of each pixel."""
+    row, column = ndimage.distance_transform_edt(
+        layers.depth_m == 0, return_distances=False, return_indices=True
+    )
+    return row, column
+
+
+def tolerance(depth_m: Float32, camera: Camera) -> Float:
+    """Return the error from which a depth in metres is an outlier, as a share of the depth."""
+    px = depth_m.astype(np.float64) / (camera.focal_px * KITTI_BASELINE_M)
+    share: Float = np.maximum(OUTLIER_PX * px, OUTLIER_FRACTION)
+    return share
+
+
+def _logarithm(values: Float | Float32, least: float) -> Float:
+    logarithm: Float = np.log10(values / least + 1)
+    return logarithm
 
 
 def _size(spacings: float, gap_px: float) -> int:
@@ -83,28 +114,93 @@ def _size(spacings: float, gap_px: float) -> int:
     return 2 * max(2, round(spacings * gap_px)) + 1
 
 
-def _rejected(layers: Layers, size_px: int) -> Float32:
+def _mean(mask: Bool, size_px: int) -> Float32:
+    mean: Float32 = ndimage.uniform_filter(mask.astype(np.float32), size_px, mode="constant")
+    return mean
+
+
+def _rejected(layers: Layers, size_px: int) -> Float:
     """Return the (H,W) logarithm of the share of boundary pixels around that are not accepted."""
     rejected, measured = (layers.rim_m > 0) & (layers.depth_m == 0), layers.depth_m > 0
-    share, some = (
-        ndimage.uniform_filter(part.astype(np.float32), size_px, mode="constant")
-        for part in (rejected, rejected | measured)
-    )
-    logarithm: Float32 = np.log10(share / np.maximum(some, 1e-4) / _LEAST_SHARE + 1)
-    return logarithm
+    share = _mean(rejected, size_px) / np.maximum(_mean(rejected | measured, size_px), 1e-4)
+    return _logarithm(share, _LEAST_SHARE)
+
+
+def _step(depth_m: Float32, around_m: Float32, size_px: int) -> Float32:
+    """Return the (H,W) logarithm of the greatest by the least depth of a pixel and those around."""
+    far_m, near_m = np.maximum(depth_m, around_m), np.where(around_m > 0, around_m, np.inf)
+    near_m = np.minimum(near_m, np.where(depth_m > 0, depth_m, np.inf)).astype(np.float32)
+    far_m = np.maximum(ndimage.maximum_filter(around_m, size_px), far_m)
+    near_m = np.minimum(ndimage.minimum_filter(near_m, size_px), near_m)
+    step = np.zeros_like(depth_m)
+    np.log(far_m / near_m, out=step, where=depth_m > 0)
+    return step
 
 
 def confidence_of(evidence: NDArray[np.floating], weights: Float | None = None) -> Float32:
-    """Return the (P,) confidence ``-log10(P) / 5`` of pixels with `features` (P,8)."""
+    """Return the (P,) confidence ``-log10(P) / 5`` of pixels with `features` (P,10)."""
     used = np.array([*WEIGHTS.values()]) if weights is None else weights
     log_p = -np.logaddexp(0, -(evidence @ used)) / np.log(10)
     return np.clip(-log_p / DECADES, 0, 1).astype(np.float32)
 
 
-def wrong(confidence: Float | Float32) -> Float:
-    """Return the probability of an outlier at each confidence, in the shape of the argument."""
-    probability: Float = 10.0 ** (-DECADES * np.asarray(confidence, np.float64))
-    return probability
+def most_certain(confidence: Float32, max_outliers: float, before: Float32 | None = None) -> Bool:
+    """Return (P,) True at the most certain pixels, as many as keep the expected outliers low.
+
+    Args:
+        confidence: (P,) confidences of the pixels to choose from.
+        max_outliers: Greatest expected share of outliers, of the chosen pixels and those before.
+        before: Confidences of pixels that are chosen already; None for none.
+    """
+    first = outlier_probability(np.zeros(0) if before is None else before)
+    best_first = np.argsort(-confidence, kind="stable")
+    sums = first.sum() + np.cumsum(outlier_probability(confidence[best_first]))
+    enough = sums <= max_outliers * (len(first) + 1 + np.arange(len(sums)))
+    chosen = np.zeros(len(confidence), bool)
+    chosen[best_first[: int(np.flatnonzero(enough).max(initial=-1)) + 1]] = True
+    return chosen
+
+
+def with_max_outliers(maps: DepthMap, max_outliers: float | None) -> DepthMap:
+    """Return the map with as many pixels as keep the expected share of outliers at a value.
+
+    If the map expects fewer outliers, the most certain of its rejected pixels are given back. If it
+    expects more, its least certain pixels are left out. A map without calibrated confidence stays.
+
+    Args:
+        maps: Map of the rules with its ``rejected`` pixels.
+        max_outliers: Greatest expected share of outliers of the filled map; None for the map of the
+            rules.
+    """
+    rejected, shown = maps.rejected, maps.filled_m > 0
+    if rejected is None or max_outliers is None:
+        return replace(maps, rejected=None)
+    own, none = maps.confidence[shown], np.float32(0)
+    if shown.any() and outlier_probability(own).mean() > max_outliers:
+        kept = shown.copy()
+        kept[shown] = most_certain(own, max_outliers)
+        depth_m, filled_m, confidence = (
+            np.where(kept, values, none)
+            for values in (maps.depth_m, maps.filled_m, maps.confidence)
+        )
+        frame = np.where(kept, maps.frame, -1)
+    else:
+        back = rejected.depth_m > 0
+        back[back] = most_certain(rejected.confidence[back], max_outliers, own)
+        measured = back & (rejected.frame >= 0)
+        depth_m = np.where(measured, rejected.depth_m, maps.depth_m)
+        filled_m = np.where(back, rejected.depth_m, maps.filled_m)
+        confidence = np.where(back, rejected.confidence, maps.confidence)
+        frame = np.where(measured, rejected.frame, maps.frame)
+    return replace(
+        maps,
+        depth_m=depth_m,
+        filled_m=filled_m,
+        confidence=confidence,
+        frame=frame.astype(np.int32),
+        evidence=None,
+        rejected=None,
+    )
 
 
 def without_times(maps: DepthMap, smear_m: float, camera: Camera, share: float = 1.0) -> DepthMap:
@@ -117,13 +213,18 @@ def without_times(maps: DepthMap, smear_m: float, camera: Camera, share: float =
         smear_m: Half the travel in metres along the camera's axis from sweep to sweep.
         share: Share of the sweeps without times.
     """
-    depth_m, shown = maps.filled_m.astype(np.float64), maps.filled_m > 0
-    px_m = depth_m**2 / (camera.focal_px * KITTI_BASELINE_M)
-    tolerated_m = np.maximum(OUTLIER_PX * px_m, OUTLIER_FRACTION * depth_m)
-    smeared = share * np.clip(1 - tolerated_m / max(smear_m, 1e-9), 0, 1)
-    either = 1 - (1 - wrong(maps.confidence)) * (1 - smeared)
-    confidence = np.clip(-np.log10(np.maximum(either, 10.0**-DECADES)) / DECADES, 0, 1)
-    return replace(maps, confidence=np.where(shown, confidence, 0).astype(np.float32))
+
+    def lowered(confidence: Float32, depth_m: Float32) -> Float32:
+        tolerated_m = depth_m * tolerance(depth_m, camera)
+        smeared = share * np.clip(1 - tolerated_m / max(smear_m, 1e-9), 0, 1)
+        either = 1 - (1 - outlier_probability(confidence)) * (1 - smeared)
+        lower = np.clip(-np.log10(np.maximum(either, 10.0**-DECADES)) / DECADES, 0, 1)
+        return np.where(depth_m > 0, lower, 0).astype(np.float32)
+
+    rejected, confidence = maps.rejected, lowered(maps.confidence, maps.filled_m)
+    if rejected is not None:
+        rejected = rejected._replace(confidence=lowered(rejected.confidence, rejected.depth_m))
+    return replace(maps, confidence=confidence, rejected=rejected)
 
 
 def expected_outliers(maps: DepthMap) -> dict[str, float | None]:
@@ -131,7 +232,9 @@ def expected_outliers(maps: DepthMap) -> dict[str, float | None]:
     shares: dict[str, float | None] = {}
     for name, depth_m in (("measured", maps.depth_m), ("filled", maps.filled_m)):
         some = depth_m > 0
-        shares[name] = float(wrong(maps.confidence[some]).mean()) if some.any() else None
+        shares[name] = (
+            float(outlier_probability(maps.confidence[some]).mean()) if some.any() else None
+        )
     return shares
 
 
@@ -149,7 +252,7 @@ def reliability(maps: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[s
     bad = is_outlier_depth(maps.filled_m[compared], truth_m[compared], camera.focal_px)
     step = np.minimum((confidence * _NUM_STEPS).astype(np.int64), _NUM_STEPS - 1)
     num = np.bincount(step, minlength=_NUM_STEPS)
-    expected = np.bincount(step, wrong(confidence), _NUM_STEPS)
+    expected = np.bincount(step, outlier_probability(confidence), _NUM_STEPS)
     found = np.bincount(step, bad, _NUM_STEPS)
     return [
         {

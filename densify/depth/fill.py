@@ -9,15 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.depth.boundary_pixels import voted_for
+from densify.depth.boundary_pixels import ROUNDED, least_votes
 from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
 from densify.depth.neighbours import DIRECTIONS, NONE, extended, first_known, offset, plane
 from densify.geometry.arrays import Float, Float32
 from densify.geometry.compiled import Kernel, inlined
 
-FILL_CONFIDENCE = 0.5
-"""Confidence of a pixel filled with the largest window, as a share of the least one within it."""
 _NUM_SIZES = 3  # of the windows, up to a half size of a spacing of rays
 _LEAST_SHARE, _LEAST_STAR_SHARE = 0.9, 0.8  # share of the votes
 _RIDGE_PX2 = 1e-7
@@ -31,14 +29,11 @@ _STAR_SPREAD = 0.1  # greatest difference between the predictions, as a share of
 def fill(layers: Layers, reach: float) -> Layers:
     """Fill the pixels that have measured pixels on both sides, if the pixels around confirm them.
 
-    A filled depth stays if at least nine tenths of the votes (`voted_for`) are for it. ``reach`` is
-    the half size of the largest window in spacings of rays.
+    A filled depth stays if at least nine tenths of the votes (`least_votes`) are for it. ``reach``
+    is the half size of the largest window in spacings of rays.
     """
-    measured = np.where(layers.depth_m > 0, layers.confidence, np.float32(0))
-    filled_m, confidence, tilt = fill_between(
-        layers.depth_m, measured, layers.tilt, layers.spacing_px, reach
-    )
-    filled = replace(layers, filled_m=filled_m, confidence=confidence, tilt=tilt)
+    filled_m, tilt = fill_between(layers.depth_m, layers.tilt, layers.spacing_px, reach)
+    filled = replace(layers, filled_m=filled_m, tilt=tilt)
     return _voted(filled, layers.depth_m, _LEAST_SHARE)
 
 
@@ -50,9 +45,10 @@ def _voted(layers: Layers, before_m: Float32, least_share: float) -> Layers:
     # that were not accepted may only vote against. This protects the pillar of a car, which has few
     # measured pixels.
     maps_m = np.maximum(layers.depth_m, layers.rim_m), layers.depth_m
-    depth_m = layers.filled_m.flat[pixel]
-    filled.flat[pixel] = ~voted_for(layers, maps_m, pixel, depth_m, least_share)
-    return layers.without(filled)
+    votes, depth_m = layers.votes.copy(), layers.filled_m.flat[pixel]
+    votes.flat[pixel] = least_votes(layers, maps_m, pixel, depth_m)
+    filled.flat[pixel] = votes.flat[pixel] < ROUNDED * least_share
+    return replace(layers, votes=votes).without(filled)
 
 
 class _Known(NamedTuple):
@@ -63,7 +59,6 @@ class _Known(NamedTuple):
     num: NDArray[np.int32]  # (H+1,W+1) int32 integral image of the measured pixels
     column: NDArray[np.int32]  # (K,) int32 column of each pixel
     inverse: Float  # (K,) float64 inverse depth of each pixel, 1/m
-    confidence: Float32  # (K,) float32 confidence of each pixel
 
 
 class _Inside(NamedTuple):
@@ -72,12 +67,11 @@ class _Inside(NamedTuple):
     inverse: Float
     right: Float
     down: Float
-    confidence: Float32
 
 
 def fill_between(
-    depth_m: Float32, confidence: Float32, tilt: Float32, spacing_px: Float32, reach: float
-) -> tuple[Float32, Float32, Float32]:
+    depth_m: Float32, tilt: Float32, spacing_px: Float32, reach: float
+) -> tuple[Float32, Float32]:
     """Interpolate empty pixels that have measured pixels on both sides.
 
     The window around an empty pixel must hold measured pixels to its left, to its right, above and
@@ -90,11 +84,9 @@ def fill_between(
     is taken. The maps are those of `Layers`, of measured pixels only.
 
     Returns:
-        Copies of depth_m, confidence and tilt with the filled pixels. Their confidence is the least
-            in the window, and lower for a larger window.
+        Copies of depth_m and tilt with the filled pixels.
     """
-    filled_m, filled_confidence, tilt = depth_m.copy(), confidence.copy(), tilt.copy()
-    share = np.zeros(depth_m.shape, np.float32)
+    filled_m, tilt = depth_m.copy(), tilt.copy()
     sizes = min(reach, 1.0) * np.arange(1, _NUM_SIZES + 1) / _NUM_SIZES
     reaches = np.append(sizes, reach) if reach > 1 else sizes
     measured = depth_m > 0
@@ -109,13 +101,9 @@ def fill_between(
         num=num,
         column=np.nonzero(measured)[1].astype(np.int32),
         inverse=1 / depth_m[measured].astype(np.float64),
-        confidence=confidence[measured],
     )
-    _fill.over_rows(
-        depth_m.size, known, spacing_px, reaches, filled_m, filled_confidence, tilt, share
-    )
-    filled_confidence *= 1 - share * np.float32(1 - FILL_CONFIDENCE)
-    return filled_m, filled_confidence, tilt
+    _fill.over_rows(depth_m.size, known, spacing_px, reaches, filled_m, tilt)
+    return filled_m, tilt
 
 
 @inlined
@@ -149,7 +137,6 @@ def _gather(known, top, bottom, left, right, row, column, inside):  # type: igno
                 inside.inverse[num] = there
                 inside.right[num] = known.column[k] - column
                 inside.down[num] = r - row
-                inside.confidence[num] = known.confidence[k]
                 num += 1
     return num, near, far
 
@@ -181,11 +168,11 @@ def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
 
 
 @Kernel
-def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, share):  # type: ignore[no-untyped-def]
+def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ignore[no-untyped-def]
     """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`."""
     height, width = filled_m.shape
     most = (2 * _MOST_PX + 1) ** 2
-    inside = _Inside(np.empty(most), np.empty(most), np.empty(most), np.empty(most, np.float32))
+    inside = _Inside(np.empty(most), np.empty(most), np.empty(most))
     for p in range(first, last):
         row, column = p // width, p % width
         if filled_m[row, column] > 0:
@@ -212,12 +199,7 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, confidence, tilt, s
                 continue
             if centre > 0:
                 filled_m[row, column] = 1 / centre
-                least = np.float32(np.inf)
-                for i in range(num):
-                    least = min(least, inside.confidence[i])
-                confidence[row, column] = least
                 tilt[row, column, 0], tilt[row, column, 1] = slope_u, slope_v
-                share[row, column] = (step + 1) / len(reaches)  # size of the window, of the largest
                 break
 
 
@@ -227,20 +209,16 @@ def fill_stars(layers: Layers) -> Layers:
     At least eight directions must have a known pixel within a spacing of rays, and at most seven
     neighbouring directions none. The surface of each known pixel is extended to the hole. These
     predictions must agree to 10 % of inverse depth. Their mean, weighted by the reciprocal of the
-    steps, needs eight tenths of the votes. The confidence is half the least of the known pixels.
+    steps, needs eight tenths of the votes.
     """
     known = layers.filled_m > 0
     inverse = np.divide(1, layers.filled_m, out=np.zeros_like(layers.filled_m), where=known)
     pixel = np.flatnonzero(~known)
-    found = np.zeros((2, len(pixel)), np.float32)
-    steps, sure = first_known(known), layers.confidence
-    _star.over_rows(len(pixel), pixel, steps, inverse, layers.tilt, sure, layers.spacing_px, found)
-    filled_m, confidence = layers.filled_m.copy(), layers.confidence.copy()
-    pixel, found = pixel[found[0] > 0], found[:, found[0] > 0]
-    filled_m.flat[pixel] = found[0]
-    confidence.flat[pixel] = found[1] * np.float32(FILL_CONFIDENCE)
-    filled = replace(layers, filled_m=filled_m, confidence=confidence)
-    return _voted(filled, layers.filled_m, _LEAST_STAR_SHARE)
+    found_m, steps = np.zeros(len(pixel), np.float32), first_known(known)
+    _star.over_rows(len(pixel), pixel, steps, inverse, layers.tilt, layers.spacing_px, found_m)
+    filled_m = layers.filled_m.copy()
+    filled_m.flat[pixel] = found_m
+    return _voted(replace(layers, filled_m=filled_m), layers.filled_m, _LEAST_STAR_SHARE)
 
 
 @inlined
@@ -254,15 +232,14 @@ def _widest_gap(met):  # type: ignore[no-untyped-def]
 
 
 @Kernel
-def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  # type: ignore[no-untyped-def]
-    """Predict the depth of empty pixels from the first known pixels around them."""
+def _star(first, last, pixel, steps, inverse, tilt, spacing_px, found_m):  # type: ignore[no-untyped-def]
+    """Predict the depth of empty pixels from the first known pixels around them, 0 for none."""
     width = inverse.shape[1]
     met = np.empty(len(DIRECTIONS), np.bool_)
     for p in range(first, last):
         row, column = pixel[p] // width, pixel[p] % width
         reach_px = max(spacing_px[row, column, 0], spacing_px[row, column, 1])
         num, near, far = 0, 0.0, np.inf
-        least = np.float32(np.inf)
         sum_w, weight = 0.0, 0.0
         for d in range(len(DIRECTIONS)):
             k = np.int64(steps[d, row, column])
@@ -273,10 +250,9 @@ def _star(first, last, pixel, steps, inverse, tilt, known, spacing_px, found):  
                 near, far = max(near, w), min(far, w)
                 sum_w += w / k
                 weight += 1 / k
-                least = min(least, known[row + dv, column + du])
                 num += 1
         if num < _STAR_MET or _widest_gap(met) > _STAR_GAP:
             continue
         w = sum_w / weight
         if near - far <= _STAR_SPREAD * w:
-            found[0, p], found[1, p] = 1 / w, least  # depth (m) and least confidence; 0 elsewhere
+            found_m[p] = 1 / w

@@ -21,11 +21,15 @@ class Layers:
     # background. Accepted boundary pixels stay in this layer too.
     rim_m: Float32
     filled_m: Float32  # depth of accepted and of interpolated pixels
-    confidence: Float32  # confidence or rank of each pixel, 0 to 1
     point: NDArray[np.int32]  # index, in the cloud, of the point that measured the pixel; -1 none
     tilt: Float32  # (H,W,2) slope of the surface's inverse depth to the right and down, 1/m per px
     # (H,W,2) spacing of neighbouring rays of one sweep, across and down, at all pixels
     spacing_px: Float32
+    # (H,W) share of the image's votes for the depth of a boundary pixel, a filled or a rejected
+    # pixel; 1 without a vote
+    votes: Float32
+    edge: Float32  # (H,W) distance of measured pixels from a discontinuity, in radii of a spot
+    rejected_m: Float32  # depth of pixels that rules rejected
     lab: Float32 | None = None  # (H,W,3) camera image in L*a*b*, None if there is no image
     solid: Bool | None = None  # true on bodies of moving objects (`MovingBody`)
 
@@ -47,8 +51,8 @@ class Layers:
         """
         dropped = dropped & (self.filled_m > 0)
         rim_m = np.where(dropped & (self.depth_m > 0), self.depth_m, self.rim_m)
-        depth_m, filled_m, confidence = (
-            np.where(dropped, np.float32(0), values)
-            for values in (self.depth_m, self.filled_m, self.confidence)
+        rejected_m = np.where(dropped, self.filled_m, self.rejected_m)
+        depth_m, filled_m = (
+            np.where(dropped, np.float32(0), values) for values in (self.depth_m, self.filled_m)
         )
-        return replace(self, rim_m=rim_m, depth_m=depth_m, filled_m=filled_m, confidence=confidence)
+        return replace(self, rim_m=rim_m, depth_m=depth_m, filled_m=filled_m, rejected_m=rejected_m)

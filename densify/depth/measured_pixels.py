@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.depth.boundary_pixels import MOST_CONFIDENCE
 from densify.depth.image_points import (
     FOOTPRINT,
     HIDDEN_FRACTION,
@@ -35,12 +34,10 @@ _SLACK_M = 0.015  # added to the radius of a discontinuity, for errors of regist
 _EDGE_WINDOW_PX = 1.5  # width beyond the edge in which points must continue the surface
 # Sweeps beyond the window share errors, and continue a surface behind a nearer one.
 _FAR_SWEEPS, _FAR_EDGE = 6, 1.5
-# Greatest loss of confidence by few sweeps, few points, a near edge, a rough fit, occlusion.
-_DOUBTS = np.array([0.45, 0.25, 0.20, 0.10, 0.10])
-_MANY_POINTS, _ROUGH_M = 20, 0.10
 _RIDGE_PX2 = 0.02
 _LEAST_PX, _MOST_PX = 3, 24  # limits of the radius
-_ALL_ROUND = 3.0  # in radii of a discontinuity; farther than this none is near
+ALL_ROUND = 3.0
+"""Extent of a surface without a depth discontinuity nearby, in radii of a discontinuity."""
 _NUM_BITS = np.iinfo(np.int64).bits - 1  # sweeps are counted by their frame number modulo 63
 
 
@@ -49,7 +46,7 @@ class MeasuredPixels(NamedTuple):
 
     winner: Int  # (H·W,) index, in `PointsInImage`, of the point that gives the depth; -1 none
     depth_m: Float32  # (H·W,) float32 depth in metres
-    confidence: Float32  # (H·W,) float32 rank from 0 to 1
+    edge: Float32  # (H·W,) float32 extent of the surface, in radii of a discontinuity
     inside: Bool  # (H·W,) True if no depth discontinuity is near
 
     @staticmethod
@@ -63,21 +60,18 @@ class MeasuredPixels(NamedTuple):
 
 
 def nearest_pixels(
-    points: PointsInImage, confidence: Float32, camera: Camera, reason: NDArray[np.uint8]
+    points: PointsInImage, camera: Camera, reason: NDArray[np.uint8]
 ) -> MeasuredPixels:
     """Return the nearest point of each pixel, without occlusion or support tests.
 
-    ``confidence`` (K,) is that of the points in the image. The ``reason`` (M,) in the cloud becomes
-    NOT_CHOSEN in place.
+    The ``reason`` (M,) of the points in the cloud becomes NOT_CHOSEN in place.
     """
     start, order = sorted_by_pixel(points, np.zeros(len(points.index), np.int64), camera)
     pixel = np.flatnonzero(np.diff(start))
     nearest = order[start[pixel]]
     reason[points.index] = Reason.NOT_CHOSEN
-    inside = np.ones(len(pixel), bool)
-    return MeasuredPixels.at(
-        camera, pixel, nearest, points.depth[nearest], confidence[nearest], inside
-    )
+    inside, edge = np.ones(len(pixel), bool), np.full(len(pixel), np.float32(ALL_ROUND))
+    return MeasuredPixels.at(camera, pixel, nearest, points.depth[nearest], edge, inside)
 
 
 def visible_pixels(
@@ -89,15 +83,14 @@ def visible_pixels(
     from depth discontinuities.
     """
     near = np.flatnonzero(~points.far)
-    many = len(np.unique(points.frame[near]))
-    pixels, why = _settled(points.select(~points.far), camera, many)
+    pixels, why = _settled(points.select(~points.far), camera)
     reason[points.index[near]] = why
     if len(near) == len(points.index):
         return pixels
     if len(near):
         winner = np.where(pixels.winner < 0, -1, near[pixels.winner])
         pixels = pixels._replace(winner=winner)
-    beyond, why = _settled(points, camera, many, taken=pixels.inside)
+    beyond, why = _settled(points, camera, taken=pixels.inside)
     reason[points.index[points.far]] = why[points.far]
     better = beyond.inside
     both = zip(pixels, beyond, strict=True)
@@ -105,14 +98,13 @@ def visible_pixels(
 
 
 def _settled(
-    points: PointsInImage, camera: Camera, many: int, taken: Bool | None = None
+    points: PointsInImage, camera: Camera, taken: Bool | None = None
 ) -> tuple[MeasuredPixels, NDArray[np.uint8]]:
     """Return the pixels that points measure, and the (K,) `Reason` of every point."""
-    behind = distance_behind(points, camera)
-    hidden = behind > 1
+    hidden = distance_behind(points, camera) > 1
     reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
     pixel, winner, found = _found(points, hidden, camera, taken)
-    depth_m, num_sweeps, supported, num_points, residual_m, edge = found
+    depth_m, num_sweeps, supported, edge = found
     if taken is None:
         supported = supported > 0
         inside = edge >= 1
@@ -121,17 +113,7 @@ def _settled(
         supported, inside = num_sweeps >= _FAR_SWEEPS, edge >= _FAR_EDGE
         reason[winner[~inside]] = Reason.EDGE
     reason[winner[~supported]] = Reason.UNSUPPORTED
-    doubts = np.stack(
-        [
-            1 - np.minimum(num_sweeps / max(many, 1), 1),  # ``many`` sweeps leave no doubt
-            1 - np.minimum(num_points / _MANY_POINTS, 1),
-            np.clip(3 - edge, 0, 2) / 2,
-            np.minimum(residual_m / _ROUGH_M, 1),
-            np.clip(behind[winner], 0, 1),
-        ]
-    )
-    confidence = np.maximum(1 - _DOUBTS @ doubts, MOST_CONFIDENCE).astype(np.float32)
-    kept = [column[supported] for column in (winner, depth_m, confidence, inside)]
+    kept = [column[supported] for column in (winner, depth_m, edge, inside)]
     return MeasuredPixels.at(camera, pixel[supported], *kept), reason
 
 
@@ -152,10 +134,10 @@ class _Visible(NamedTuple):
 def _found(
     points: PointsInImage, hidden: Bool, camera: Camera, taken: Bool | None
 ) -> tuple[Int, Int, Float32]:
-    """Return pixels (P,) with visible points, the best point of each, and (6,P) of `_settle`."""
+    """Return pixels (P,) with visible points, the best point of each, and (4,P) of `_settle`."""
     last = int(points.age_ns.max(initial=0)) + 1
     start, order = sorted_by_pixel(points, np.where(hidden, last, points.age_ns), camera)
-    found = np.zeros((6, len(start) - 1), np.float32)
+    found = np.zeros((4, len(start) - 1), np.float32)
     done = np.zeros(len(start) - 1, bool) if taken is None else taken  # left out
     inverse = points.inverse
     edge_px = FOOTPRINT * points.spacing_px[:, 0] + _SLACK_M * points.focal_px[:, 0] * inverse
@@ -214,7 +196,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
     reach_u = _window(_REACH * points.spacing_px[i, 0])
     reach_v = _window(_REACH * points.spacing_px[i, 1])
     wide_u, wide_v = max(reach_u, _window(outer)), max(reach_v, _window(outer))
-    seen, num, behind, squares = np.int64(0), 0, False, 0.0
+    seen, behind = np.int64(0), False
     agree_ns = other_ns = age_ns[i]
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
@@ -242,19 +224,16 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
             m[6] += weight * off
             m[7] += weight * du * off
             m[8] += weight * dv * off
-            squares += weight * off * off
-            num += vouches
-    # A bit for each sweep that agrees; True if no other sweep there is nearer to the key; number of
-    # points in the fit, their weighted sum of squares; True if a point is close behind.
-    return seen, agree_ns <= other_ns, num, squares, behind
+    # A bit for each sweep that agrees; True if no other sweep there is nearer to the key; True if a
+    # point is close behind.
+    return seen, agree_ns <= other_ns, behind
 
 
 @Kernel
 def _settle(first, last, points, shape, taken, found):  # type: ignore[no-untyped-def]
     """Find the depth of each pixel from the surrounding points that agree with its first point."""
-    # found (6,P): depth (m), sweeps that agree, 1 if no sweep nearer to the key disagrees, points
-    # in the fit, their root mean square residual (m), extent of the surface in radii of
-    # discontinuities
+    # found (4,P): depth (m), sweeps that agree, 1 if no sweep nearer to the key disagrees, extent
+    # of the surface in radii of discontinuities
     m, reach = np.empty(9), np.empty(8)
     for p in range(first, last):
         i = points.start[p]
@@ -266,17 +245,15 @@ def _settle(first, last, points, shape, taken, found):  # type: ignore[no-untype
         agree = (AGREE_M + AGREE_FRACTION / w0) * w0 * w0
         inner = points.edge_px[i]
         m[:], reach[:] = 0.0, 0.0
-        seen, supported, num, squares, behind = _look_round(
+        seen, supported, behind = _look_round(
             points, shape, i, u0, v0, centre, agree, inner + _EDGE_WINDOW_PX, m, reach
         )
         off, _, _ = plane(m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], _RIDGE_PX2)
         found[0, p] = 1 / limited(centre + min(max(off, -agree), agree), w0)
-        found[1, p], found[2, p], found[3, p] = _count(seen), supported, num
-        mean = m[6] / m[0]
-        found[4, p] = np.sqrt(max(squares / m[0] - mean * mean, 0.0)) / (w0 * w0)
-        found[5, p] = _ALL_ROUND
+        found[1, p], found[2, p] = _count(seen), supported
+        found[3, p] = ALL_ROUND
         if behind and inner > 0:
             least = reach[0]
             for far in reach[1:]:
                 least = min(least, far)
-            found[5, p] = least / inner
+            found[3, p] = least / inner

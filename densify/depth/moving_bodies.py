@@ -21,9 +21,8 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
-from densify.depth.boundary_pixels import LEAST_SHARE, MOST_CONFIDENCE, VOTERS_REACH, voted_for
+from densify.depth.boundary_pixels import LEAST_SHARE, ROUNDED, VOTERS_REACH, least_votes
 from densify.depth.exposure import Exposure
-from densify.depth.fill import FILL_CONFIDENCE
 from densify.depth.hulls import crossing, half_spaces, passes_near
 from densify.depth.image_points import FOOTPRINT, HIDDEN_FRACTION, HIDDEN_M
 from densify.depth.layers import Layers
@@ -125,7 +124,7 @@ def close_bodies(
     Depths clearly in front of a body stay. Elsewhere inside the outline of its hull only depths of
     moving objects stay. Pixels with a return of the body on its surface count as measured.
     """
-    changed = ("depth_m", "filled_m", "confidence", "tilt", "point")
+    changed = ("depth_m", "filled_m", "rejected_m", "votes", "tilt", "point")
     layers = replace(layers, **{name: getattr(layers, name).copy() for name in changed})
     solid = np.zeros(layers.depth_m.shape, bool)
     for instance, body in bodies.items():
@@ -243,10 +242,6 @@ def _close(
     measured = np.full(surface.shape, -1)
     measured[tuple(axis[oldest_first] for axis in place)] = rows[oldest_first]
     hit = measured >= 0
-    away_px = cv2.distanceTransform((~hit).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    confidence = FILL_CONFIDENCE / (1 + away_px / layers.gap_px)
-    confidence[hit] = np.maximum(layers.confidence[hit], MOST_CONFIDENCE)
-    layers.confidence[shows] = confidence[shows]
     layers.depth_m[shows] = np.where(hit, surface_m, 0)[shows]
     layers.point[hit] = measured[hit]
     return shows
@@ -276,14 +271,14 @@ def _shown(
     outline = inside & ~before & ~core & ~(moves & (layers.depth_m <= surface_m + agree_m))
     if not whole:
         outline &= share >= _LEAST_OF_WHOLE
-    # Other depths in the outline are removed.
-    for values in (layers.depth_m, layers.filled_m, layers.confidence):
-        values[outline] = 0
-    layers.filled_m[core] = surface_m[core]
+    for values in (layers.depth_m, layers.filled_m, layers.rejected_m):
+        values[outline] = 0  # what is seen past a moving object is not given back
+    layers.filled_m[core], layers.votes[core] = surface_m[core], 1
     layers.tilt[core] = np.stack(list(np.gradient(surface))[::-1], axis=-1)[core]
     shows, votes = core.copy(), _VOTES_OF_WHOLE if whole else LEAST_SHARE
     pixel, depth_m = np.flatnonzero(outline), surface_m[outline]
-    shows[outline] = voted_for(layers, [layers.filled_m], pixel, depth_m, votes, surely=not whole)
+    votes_for = least_votes(layers, [layers.filled_m], pixel, depth_m, surely=not whole)
+    layers.votes[outline], shows[outline] = votes_for, votes_for >= ROUNDED * votes
     return shows, shows if whole else core
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from scipy import ndimage, optimize, sparse
 from scipy.sparse import linalg
 
-from densify.depth.boundary_pixels import MOST_CONFIDENCE
 from densify.geometry.types import Bool, DepthMap, Float, Float32, FullDepth, Int, Prior, PriorFit
 
 FAR_M = 120.0
@@ -28,6 +27,7 @@ used prior is off by more than 25 %. Good priors had up to 0.11, priors of other
 _FORMS = {"auto": ("depth", "log", "inverse"), "depth": ("depth", "log"), "inverse": ("inverse",)}
 _MIN_FITTED = 100
 _WRONG = np.log(1.25)
+_MOST_CONFIDENCE = 0.2  # of a pixel of the prior
 _USUAL = 0.05  # error of a prior in the logarithm of depth; a step of more than twice is an edge
 _MAX_CELLS = 40_000
 _SMOOTHNESS = 10.0  # relative to 1 for a cell with all pixels known
@@ -47,7 +47,7 @@ def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
     ``inverse`` or ``auto``.
     """
     known = (prior.value > 0) & ~prior.sky
-    above = MOST_CONFIDENCE + (1 - MOST_CONFIDENCE) * maps.confidence
+    above = _MOST_CONFIDENCE + (1 - _MOST_CONFIDENCE) * maps.confidence
     confidence = np.where(maps.filled_m > 0, above, 0).astype(np.float32)
     measured = known & (maps.depth_m > 0)
     fit = fit_prior(prior.value[measured], maps.depth_m[measured], kind)
@@ -67,7 +67,7 @@ def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
     error = np.hypot(spread, farther + nearer) / _USUAL
     return FullDepth(
         np.where(from_prior, full_m, maps.filled_m),
-        np.where(from_prior, MOST_CONFIDENCE / (1 + error), confidence).astype(np.float32),
+        np.where(from_prior, _MOST_CONFIDENCE / (1 + error), confidence).astype(np.float32),
         from_prior,
         fit,
         prior.source,

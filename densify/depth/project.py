@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from densify.config import ProjectSettings
 from densify.depth.boundary_pixels import accept_boundary_pixels
-from densify.depth.confidence import confidence_of, features
+from densify.depth.confidence import confidence_of, features, nearest_measured
 from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import fill, fill_stars
 from densify.depth.image_points import PointsInImage, points_in_image
@@ -25,7 +25,16 @@ from densify.depth.measured_pixels import MeasuredPixels, nearest_pixels, visibl
 from densify.depth.moving_bodies import MovingBody, close_bodies
 from densify.depth.seen_through import Rays, without_seen_through
 from densify.depth.spots import measure_spots
-from densify.geometry.types import Camera, Cloud, DepthMap, Float32, Patches, Reason
+from densify.geometry.types import (
+    Bool,
+    Camera,
+    Cloud,
+    DepthMap,
+    Float32,
+    Patches,
+    Reason,
+    Rejected,
+)
 
 _BLOCK_PX = 16  # blocks within which the density of rays is about constant
 _JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
@@ -59,25 +68,28 @@ def project(
     if visible:
         pixels = visible_pixels(points, camera, reason)
     else:
-        pixels = nearest_pixels(points, cloud.confidence[points.index], camera, reason)
+        pixels = nearest_pixels(points, camera, reason)
     layers = accept_boundary_pixels(_layers_of(pixels, points, camera, lab), settings.rims)
     if filled:
         layers = fill(layers, settings.fill_reach)
         layers = fill_stars(layers)
         if visible and bodies:
             layers = close_bodies(layers, cloud, exposure, bodies)
-    evidence = None
+    if visible and rays is not None:
+        layers = without_seen_through(layers, cloud, view, rays, reason)
+    layers = replace(layers, rejected_m=np.where(layers.filled_m > 0, 0, layers.rejected_m))
+    some, evidence = (layers.filled_m > 0) | (layers.rejected_m > 0), None
+    confidence = np.zeros(some.shape, np.float32)
     if visible:
-        if rays is not None:
-            layers = without_seen_through(layers, cloud, view, rays, reason)
-        evidence = features(layers)
-        confidence = np.zeros(layers.filled_m.shape, np.float32)
-        confidence[layers.filled_m > 0] = confidence_of(evidence)
-        layers = replace(layers, confidence=confidence)
+        evidence = features(layers, cloud.since_key_ns, camera)
+        confidence[some] = confidence_of(evidence)
+    elif some.any():
+        confidence[some] = cloud.confidence[layers.point[nearest_measured(layers)]][some]
+    confidence[some] = np.maximum(confidence[some], _LEAST_CONFIDENCE)
     _set_reasons(layers, reason)
     if visible and filled:
         layers = measure_spots(layers, points)
-    return _finished(layers, cloud, exposure, reason, evidence)
+    return _finished(layers, cloud, exposure, reason, confidence, evidence)
 
 
 def _layers_of(
@@ -94,17 +106,18 @@ def _layers_of(
         made[known] = values[winner]
         return made.reshape(*shape, *values.shape[1:])
 
-    least = np.where(known, _LEAST_CONFIDENCE, np.float32(0))
     depth_m = np.where(inside, pixels.depth_m, np.float32(0)).reshape(shape)
     near = points if points.far.all() else points.select(~points.far)
     return Layers(
         depth_m=depth_m,
         rim_m=np.where(inside, np.float32(0), pixels.depth_m).reshape(shape),
         filled_m=depth_m,
-        confidence=np.maximum(pixels.confidence, least).reshape(shape),
         point=image(points.index.astype(np.int32), -1),
         tilt=image(points.slope.astype(np.float32)),
         spacing_px=_spacing_px(near, shape),
+        votes=np.ones(shape, np.float32),
+        edge=pixels.edge.reshape(shape),
+        rejected_m=np.zeros(shape, np.float32),
         lab=lab,
     )
 
@@ -142,19 +155,31 @@ def _finished(
     cloud: Cloud,
     exposure: Exposure,
     reason: NDArray[np.uint8],
+    confidence: Float32,
     evidence: Float32 | None,
 ) -> DepthMap:
     """Return the layers as a depth map, with the sweep that measured each pixel."""
     measured, shown = layers.depth_m > 0, layers.filled_m > 0
-    frame = np.full(measured.shape, -1, np.int32)
-    frame[measured] = cloud.frame[layers.point[measured]]
+
+    def frames(of: Bool) -> NDArray[np.int32]:
+        frame = np.full(of.shape, -1, np.int32)
+        frame[of] = cloud.frame[layers.point[of]]
+        return frame
+
+    none = np.float32(0)
+    rejected = Rejected(
+        layers.rejected_m,
+        np.where(shown, none, confidence),
+        frames((layers.rejected_m > 0) & (layers.rim_m > 0)),
+    )
     return DepthMap(
         camera=exposure.camera.name,
         depth_m=layers.depth_m,
         filled_m=layers.filled_m,
-        confidence=np.where(shown, np.maximum(layers.confidence, _LEAST_CONFIDENCE), 0),
-        frame=frame,
+        confidence=np.where(shown, confidence, none),
+        frame=frames(measured),
         reason=reason,
         measure=exposure.measure,
         evidence=evidence,
+        rejected=rejected if evidence is not None else None,
     )

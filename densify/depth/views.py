@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from densify.config import Config, ProjectSettings
 from densify.depth.boundary_pixels import lab
-from densify.depth.confidence import reliability
+from densify.depth.confidence import reliability, tolerance, with_max_outliers
 from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.far import far_cloud
 from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
@@ -181,6 +181,26 @@ class Views:
             shows = (surface_m > 0) & (view.exposure.depth_m(view.points_cam) <= reach_m)
             rgb[view.rows[shows]] = image[v[shows], u[shows]]
         return replace(seen.cloud, rgb=rgb)
+
+    def confident(self, seen: SeenCloud, cloud: Cloud, depth: Mapping[str, DepthMap]) -> Cloud:
+        """Return the cloud with the greatest confidence of the pixels that agree with each point.
+
+        A pixel agrees if the point is no outlier there. Points that no map confirms have 0.
+
+        Args:
+            seen: The points in the images.
+            cloud: The same points.
+            depth: Maps made of them, by name.
+        """
+        confidence = np.zeros(len(cloud), np.float32)
+        for name, view in seen.in_view.items():
+            maps, (u, v) = depth[name], np.rint(view.uv).astype(np.int64).T
+            surface_m = maps.filled_m[v, u]
+            off_m = abs(view.exposure.depth_m(view.points_cam) - surface_m)
+            agrees = off_m <= surface_m * tolerance(surface_m, view.exposure.camera)
+            of_pixel = np.where(agrees & (surface_m > 0), maps.confidence[v, u], 0)
+            confidence[view.rows] = np.maximum(confidence[view.rows], of_pixel)
+        return replace(cloud, confidence=confidence)
 
     def truth(self, truth: Truth) -> dict[str, tuple[Float32, Bool]]:
         """Return the true depth (H,W) and moving pixels (H,W) of each map that shows an image."""
@@ -354,6 +374,7 @@ class HeldOut:
         scores: dict[str, Any] = {}
         for name, (depth, truth_m, moving) in self.maps(seen, visible).items():
             camera = self.views.exposures[name].camera
+            depth = with_max_outliers(depth, self.views.settings.max_outliers)
             scores[name] = {
                 **depth_metrics.depth_scores(depth, truth_m, moving, camera),
                 "curve": depth_metrics.precision_density(depth, truth_m, camera),

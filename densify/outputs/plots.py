@@ -16,6 +16,7 @@ from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import Picture, encode_png
 from densify.outputs.front_view import front_first
 from densify.outputs.key_outputs import Context
+from densify.scores.depth_metrics import precision_density
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -135,23 +136,36 @@ def write_plot(path: Path, figure: Figure) -> None:
 
 
 def write_curve(result: Result, context: Context, folder: Path) -> None:
-    """Write ``curve.png`` of all cameras, if a method has scores with the key sweep held out."""
+    """Write ``curve.png`` of all cameras, if a method has scores with the key sweep held out.
+
+    If there is ground truth, the result is drawn against it too.
+    """
     curves: dict[str, dict[str, Curve]] = {}
     for method, of_method in {**result.baselines, result.method: result}.items():
         for camera, scores in (of_method.metrics.get("held_out") or {}).items():
-            curves.setdefault(camera, {})[method] = scores["curve"]
+            curves.setdefault(f"{camera}, key held out", {})[method] = scores["curve"]
+    for name, truth_m in result.truth_m.items() if curves else ():
+        camera = result.views[name].camera
+        of_name: dict[str, Curve] = {
+            result.method: precision_density(result.depth[name], truth_m, camera)
+        }
+        curves[f"{name}, ground truth"] = of_name
     if curves:
         write_plot(folder / "curve.png", draw_curves(curves))
 
 
 def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
-    """Draw the share of outliers over the density. ``curves`` is camera -> method -> points."""
+    """Draw the share of outliers over the density, and what the confidence expects of the last.
+
+    ``curves`` is title -> method -> `precision_density`.
+    """
     from matplotlib.figure import Figure
 
     columns, rows = min(2, len(curves)), -(-len(curves) // 2)
     figure = Figure(figsize=(8.6 * columns, 4.8 * rows), dpi=_DPI, layout="constrained")
     for place, (camera, methods) in enumerate(curves.items(), 1):
         axes = figure.add_subplot(rows, columns, place)
+        last = [*methods][-1]
         for number, (method, curve) in enumerate(methods.items()):
             for kind, width in (("measured", 1.0), ("filled", 2.5)):  # thin and thick lines
                 known = [p for p in curve if p[f"outliers_{kind}"] is not None]
@@ -162,7 +176,10 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
                     label += f": {density[0]:.1f} % of pixels, {outliers[0]:.2f} % outliers"
                 line = axes.plot(density, outliers, "o-", color=f"C{number}", label=label)[0]
                 line.set(linewidth=width, markersize=1 + 2 * width)
-        axes.set(title=f"{camera}, key held out", xlabel="pixels with a depth, %")
+                if kind == "filled" and known and method == last:
+                    expected = [100 * p[f"expected_{kind}"] for p in known]
+                    axes.plot(density, expected, "k--", label="expected by confidence")
+        axes.set(title=camera, xlabel="pixels with a depth, %")
         axes.set_ylabel("outliers, %")
         axes.set_yscale("symlog", linthresh=100 * _FEWEST_OUTLIERS)
         axes.yaxis.set_major_formatter("{x:g}")

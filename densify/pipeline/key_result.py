@@ -11,7 +11,12 @@ from numpy.typing import NDArray
 
 from densify.config import Config
 from densify.config.errors import InputError
-from densify.depth.confidence import expected_outliers, reliability, without_times
+from densify.depth.confidence import (
+    expected_outliers,
+    reliability,
+    with_max_outliers,
+    without_times,
+)
 from densify.depth.views import HeldOut, SeenCloud, Views, with_ages
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Bool, Cloud, DepthMap, Float32, Result, Stretch
@@ -108,13 +113,18 @@ def result_of_method(
         if output.movers != "keep":
             static = cloud.select(~cloud.moving & ~cloud.far)
             seen = views.see(static).joined(far)
-        depth = _add_ages(scene, method, views.depth(seen, visible, filled))
+        depth = views.depth(seen, visible, filled)
         if visible:
             depth = _without_times(scene, depth)
+        most = scene.settings.project.max_outliers
+        depth = {n: with_max_outliers(maps, most) for n, maps in depth.items()}
+        depth = _add_ages(scene, method, depth)
     cloud = seen.cloud
     if scene.images:
         with watch.stage("colour"):
             cloud = views.coloured(seen, depth, scene.images)
+    if visible:
+        cloud = views.confident(seen, cloud, depth)
     with watch.stage("score"):
         metrics = _metrics(scene, cloud, depth, visible) | {"held_out": held_out}
     return Result(

@@ -21,6 +21,8 @@ from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32
 KITTI_BASELINE_M = 0.54
 OUTLIER_PX = 3.0
 OUTLIER_FRACTION = 0.05
+DECADES = 5.0
+"""Confidence 1 means one outlier in 10^5 pixels; each 0.2 less means ten times as many."""
 _DELTA = 1.25
 _RANGES_M = (0, 10, 20, 30, 50, 80)
 _EDGE_PX = 3
@@ -93,7 +95,8 @@ def precision_density(
     """Return density and share of outliers for each least confidence 0, 0.05, … 0.95.
 
     For ``measured`` and ``filled`` depth, ``density_*`` is the share of pixels that keep a depth,
-    ``outliers_*`` that of outliers among those with a true depth (H,W), metres, 0 none.
+    ``outliers_*`` that of outliers among those with a true depth (H,W), metres, 0 none, and
+    ``expected_*`` the share that the confidence of kept pixels promises.
     """
     curve = []
     for least in _LEAST_CONFIDENCES:
@@ -104,6 +107,8 @@ def precision_density(
             errors = depth_errors(predicted_m, truth_m, focal_px=camera.focal_px)
             point[f"density_{name}"] = image_density(predicted_m)
             point[f"outliers_{name}"] = errors.outliers
+            of_kept = maps.confidence[predicted_m > 0]
+            point[f"expected_{name}"] = _mean(outlier_probability(of_kept))
         curve.append(point)
     return curve
 
@@ -190,6 +195,22 @@ def scores_by_motion(
         part: asdict(depth_errors(depth_m, truth_depth_m, mask, focal_px=camera.focal_px))
         for part, mask in masks.items()
     }
+
+
+def outlier_probability(confidence: Float | Float32) -> Float:
+    """Return the probability that a pixel is an outlier by KITTI's rule.
+
+    It is ``10 ** (-5 * confidence)``. Of a confidence PNG with pixel values v above 0, the
+    confidence is ``(v - 1) / 254``.
+
+    Args:
+        confidence: Confidence of 0 to 1, of any shape.
+
+    Returns:
+        Probabilities of the same shape.
+    """
+    probability: Float = 10.0 ** (-DECADES * np.asarray(confidence, np.float64))
+    return probability
 
 
 def is_outlier_depth(

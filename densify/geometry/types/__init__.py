@@ -17,6 +17,7 @@ from densify.geometry.types.depth import (
     Mover,
     Patches,
     Reason,
+    Rejected,
     StandingWorld,
 )
 from densify.geometry.types.recordings import (

@@ -30,7 +30,8 @@ class Cloud:
         moving: (M,) True if the point belongs to a moving object.
         instance: (M,) number of the moving object, -1 for none.
         velocity_m_s: (M,3) at the key's time, key frame, ego-motion removed; 0 if static.
-        confidence: (M,) relative score of 0 to 1.
+        confidence: (M,) of 0 to 1, of pixels that confirm the point; 0 where no map does. For
+            methods without visibility 1 / (1 + seconds from the key sweep).
         intensity: (M,) from 0 to 1.
         rgb: (M,3), black for points that no camera observed.
         far: (M,) True if the source sweep is beyond the window (``accumulate.far_m``).
@@ -222,6 +223,18 @@ class CameraView:
     number: int | None  # number of the image; None if the map shows no image
 
 
+class Rejected(NamedTuple):
+    """Pixels without a depth in the map, because a rule rejected their depth.
+
+    depth_m: (H,W) float32 rejected depth in metres, 0 elsewhere. confidence: (H,W) float32 of it.
+    frame: (H,W) int32 frame number of the sweep that measured it, -1 elsewhere.
+    """
+
+    depth_m: Float32
+    confidence: Float32
+    frame: NDArray[np.int32]
+
+
 @dataclass(frozen=True)
 class DepthMap:
     """Dense depth of one camera.
@@ -238,8 +251,10 @@ class DepthMap:
             computes it.
         measure: ``z`` for depth along the optical axis, ``range`` for distance from the lens.
         warnings: Sentences about requested steps that could not be done.
-        evidence: (P,8) `densify.depth.confidence.features` of the pixels with a depth, before laser
-            spots are added to the measured pixels; None if the confidence is not calibrated.
+        evidence: (P,10) `densify.depth.confidence.features` of the P pixels with a depth, in
+            the map or in ``rejected``; None if the confidence is not calibrated.
+        rejected: Pixels that rules rejected. None if the confidence is not calibrated, and after
+            `densify.depth.confidence.with_max_outliers` has used them.
     """
 
     camera: str
@@ -252,6 +267,7 @@ class DepthMap:
     measure: str = "z"
     warnings: tuple[str, ...] = ()
     evidence: Float32 | None = None
+    rejected: Rejected | None = None
 
     def to_points(self, view: CameraView, filled: bool = True) -> Float:
         """Return the map's pixels as points (K,3) in the key frame, metres, row by row.

@@ -285,7 +285,7 @@ class CloudPane {
       1: { title: "height over the lidar", scale: new Scale({ low, high, palette: "viridis", unit: "m", ticks: [low, 0, Math.round(high / 2), high].filter((t, i, all) => all.indexOf(t) === i) }) },
       2: { title: "sweep that measured the point; lighter is nearer to the key", marks: timeMarks(this.mostS) },
       3: { title: "moving objects; gray stands", marks: page.movers.slice(0, 16).map((m, i) => [String(m.instance), DISTINCT[i % DISTINCT.length]]) },
-      4: { title: "confidence of the point, a relative score", scale: confidenceScale() },
+      4: { title: "confidence of the pixels that confirm the point", scale: confidenceScale() },
       5: { title: "moved beyond registration; gray is not moved", scale: new Scale({ low: 0, high: Number(this.mostMoved.toFixed(1)), palette: "viridis", unit: "m", ticks: ticks(this.mostMoved) }) },
     }[kind];
     drawLegend($("legend-cloud"), legend);
