@@ -91,11 +91,13 @@ def test_the_weights_of_confidence_are_found_again(monkeypatch) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     import fit_confidence as example
 
-    known = np.array([-4.0, 1.5, 0.4, 1.0, 0.8, 0.5, 0.7, 0.6])
+    known = np.array([-4.0, 1.5, 0.4, 1.0, 0.8, 0.5, 0.7, 0.6, 0.3, 0.9])
 
     def drawn(seed: int) -> example.Evidence:
         rng = np.random.default_rng(seed)
-        features = np.column_stack([np.ones(40_000), rng.uniform(0, 1.5, (40_000, 7))])
+        rejected = rng.random(40_000) < 0.2
+        usual = rng.uniform(0, 1.5, (40_000, 8))
+        features = np.column_stack([np.ones(40_000), usual, rejected])
         outlier = rng.random(len(features)) < 1 / (1 + np.exp(-features @ known))
         return example.Evidence(str(seed), str(seed % 3), features, outlier, outlier, outlier)
 

@@ -33,7 +33,7 @@ from densify.scores.depth_metrics import (
 )
 
 WEIGHTS: Mapping[str, float] = {
-    "every pixel": -8.52,
+    "every pixel": -8.50,
     "filled pixel": 0.37,
     "votes of the image against the depth": 0.44,
     "rejected boundary pixels within 2 spacings": 0.76,
@@ -74,7 +74,8 @@ def features(layers: Layers, since_key_ns: Int, camera: Camera) -> Float32:
     if layers.solid is not None:
         edge[layers.solid] = ALL_ROUND
     step = _step(depth_m, layers.filled_m, _size(1, gap_px)) / tolerance(depth_m, camera)
-    cover = _mean(shown, _size(2, gap_px))
+    around_px = _size(2, gap_px)
+    cover = _mean(shown, around_px) / _mean(np.ones_like(shown), around_px)  # within the image
     columns = [
         np.ones(shown.shape),
         ~measured,
