@@ -187,9 +187,9 @@ def test_the_clock_of_a_camera_is_measured(exact: Sample) -> None:
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_turned_camera_is_told_with_the_line_that_mends_it(good: Sample, axis: int) -> None:
-    camera = good.sequence.cameras["fast"]
-    views, _ = cameras.camera_views(good, camera, {})
+def test_a_turned_camera_is_told_with_the_line_that_mends_it(exact: Sample, axis: int) -> None:
+    camera = exact.sequence.cameras["fast"]
+    views, _ = cameras.camera_views(exact, camera, {})
     for turn_deg in (1.5, -1.5):
         wrong = turned(camera, turn_deg * np.eye(4)[axis])
         told = cameras.check_calibration(wrong, views)[0]
@@ -203,10 +203,10 @@ def test_a_turned_camera_is_told_with_the_line_that_mends_it(good: Sample, axis:
 
 @pytest.mark.parametrize(("axis", "turn_deg"), [(1, 1.0), (1, -1.0), (0, -0.75)])
 def test_a_turn_is_not_taken_for_a_late_clock(
-    good: Sample, street: Faulty, axis: int, turn_deg: float
+    exact: Sample, street: Faulty, axis: int, turn_deg: float
 ) -> None:
     for camera in street.cameras.values():
-        views, _ = cameras.camera_views(good, camera, {})
+        views, _ = cameras.camera_views(exact, camera, {})
         wrong = turned(camera, turn_deg * np.eye(4)[axis])
         calibration, clock = cameras.check_calibration(wrong, views)
         assert calibration.verdict >= Verdict.SUSPICIOUS

@@ -80,7 +80,8 @@ def test_cores_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(7)))
     before = dict(os.environ)
     told = [outcome for _, outcome in call_all(worker_calls.threads, [[0], [1]], 2)]
-    assert set(told) == {("3", 3, False)}
+    assert told[0] == ("3", 3, False)  # one worker may call both, and has loaded numba then
+    assert {outcome[:2] for outcome in told} == {("3", 3)}
     assert dict(os.environ) == before
     assert executor.share_of_cores(8)["OMP_NUM_THREADS"] == "1"
 

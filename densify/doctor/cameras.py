@@ -153,7 +153,7 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
             text = (
                 f"{len(among)} explanations fit {num} images about equally: {'; or '.join(among)}"
             )
-        is_as_given = len(among) > 1 and num_changed(fit.offset) == 0
+        is_as_given = num_changed(fit.offset) == 0 and fit.score > fit.usual
         verdict = UNKNOWN if is_as_given or num < 2 * _LEAST_IMAGES else SUSPICIOUS
         remedy = (
             "check T_cam_lidar, K and the clocks, and that the images are the camera's; sweeps at "
