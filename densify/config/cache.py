@@ -75,8 +75,8 @@ class Cache:
         entries: list[tuple[int, Path, int]] = []
         for path in self._folder.iterdir() if self._folder.is_dir() else ():
             with suppress(OSError):  # another process deletes too
-                found = path.stat()
-                entries.append((found.st_mtime_ns, path, found.st_size))
+                status = path.stat()
+                entries.append((status.st_mtime_ns, path, status.st_size))
         left = sum(num_bytes for *_, num_bytes in entries)
         for number, (_, path, num_bytes) in enumerate(sorted(entries)):
             if left > self._limit_bytes or len(entries) - number > _MOST_ENTRIES:
@@ -166,8 +166,8 @@ def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
             return {"mapping": [[tree(key), tree(item)] for key, item in value.items()]}
         if is_dataclass(value) or hasattr(value, "_fields"):
             names = getattr(value, "_fields", None) or [f.name for f in fields(value)]
-            parts = [tree(getattr(value, name)) for name in names]
-            return {f"{kind.__module__}:{kind.__qualname__}": parts}
+            members = [tree(getattr(value, name)) for name in names]
+            return {f"{kind.__module__}:{kind.__qualname__}": members}
         if isinstance(value, tuple):
             return {"tuple": [*map(tree, value)]}
         return [*map(tree, value)] if isinstance(value, list) else value
@@ -178,21 +178,21 @@ def _packed(value: Any) -> tuple[bytes, dict[str, np.ndarray]]:
 def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """Return the value that `_packed` converted, with classes of imported modules alone."""
     if isinstance(tree, list):
-        return [_unpacked(part, arrays) for part in tree]
+        return [_unpacked(element, arrays) for element in tree]
     if not isinstance(tree, dict):
         return tree
     ((kind, content),) = tree.items()
     if kind in ("array", "scalar"):
         return arrays[content] if kind == "array" else arrays[content][()]
-    parts = _unpacked(content, arrays)
+    elements = _unpacked(content, arrays)
     if kind in ("tuple", "mapping"):
-        return tuple(parts) if kind == "tuple" else dict(parts)
+        return tuple(elements) if kind == "tuple" else dict(elements)
     module, _, name = kind.partition(":")
-    made = getattr(sys.modules[module], name)
-    if issubclass(made, tuple):
-        return tuple.__new__(made, parts)
-    value = object.__new__(made)
-    value.__dict__.update(zip((f.name for f in fields(made)), parts, strict=True))
+    cls = getattr(sys.modules[module], name)
+    if issubclass(cls, tuple):
+        return tuple.__new__(cls, elements)
+    value = object.__new__(cls)
+    value.__dict__.update(zip((f.name for f in fields(cls)), elements, strict=True))
     return value
 
 
@@ -214,8 +214,8 @@ def own_folder(name: str) -> Path:
 def others_can_write(folder: Path) -> bool:
     """Return True if users other than this user and root can write to an existing folder."""
     try:
-        found = folder.stat()
+        status = folder.stat()
     except OSError:
         return False
-    mine = found.st_uid in (0, os.getuid())
-    return not mine or bool(found.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
+    is_owner_trusted = status.st_uid in (0, os.getuid())
+    return not is_owner_trusted or bool(status.st_mode & (stat.S_IWGRP | stat.S_IWOTH))

@@ -14,7 +14,7 @@ _MOST_CHARACTERS = 1000
 
 def brief(message: str) -> str:
     """Return the message on one line, with long quoted values and long words shortened."""
-    message = _LONG_VALUE.sub(lambda found: _cut(found[0], 200), _BREAK.sub(" ", message))
+    message = _LONG_VALUE.sub(lambda match: _cut(match[0], 200), _BREAK.sub(" ", message))
     return _cut(message, _MOST_CHARACTERS) if len(message) > _MOST_CHARACTERS else message
 
 
@@ -35,8 +35,8 @@ def did_you_mean(got: str, known: Iterable[str]) -> str:
 
 
 class _ShortError(Exception):
-    def __init__(self, message: str, *others: object) -> None:
-        super().__init__(brief(message), *others)
+    def __init__(self, message: str, *args: object) -> None:
+        super().__init__(brief(message), *args)
 
 
 class InputError(_ShortError):

@@ -146,18 +146,18 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
         _note_lines(value, full, lines)
 
 
-def needed(module: str, extra: str, what: str) -> Any:
-    """Import and return an optional module; the error says that ``what`` needs the ``extra``."""
+def needed(module: str, extra: str, needed_by: str) -> Any:
+    """Import and return an optional module; the error says that ``needed_by`` need ``extra``."""
     package = module.partition(".")[0]
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
         raise InputError(
-            f"{what} need the package {package} ({error}); {how_to_install(extra)}"
+            f"{needed_by} need the package {package} ({error}); {how_to_install(extra)}"
         ) from None
     except ImportError as error:
         raise InputError(
-            f"{what} need the package {package}, which is installed and cannot be loaded here "
+            f"{needed_by} need the package {package}, which is installed and cannot be loaded here "
             f"({error}); install the system's library that it names"
         ) from None
 

@@ -94,22 +94,24 @@ class Table:
         return {point.name: point for point in points if point.name not in built_in}
 
     def _load(self, point: EntryPoint) -> Plugin:
-        what = f"{self.kind} {point.name} of the package {point.dist.name if point.dist else '?'}"
+        label = f"{self.kind} {point.name} of the package {point.dist.name if point.dist else '?'}"
         try:
             module = point.load()
         except Exception as error:  # an import raises anything
             raise InputError(
-                f"{what}: cannot be imported from {point.value} ({type(error).__name__}: {error}); "
-                f"mend or uninstall the package"
+                f"{label}: cannot be imported from {point.value} ({type(error).__name__}: {error})"
+                f"; mend or uninstall the package"
             ) from error
         if not all(callable(getattr(module, member, None)) for member in self.members):
             raise InputError(
-                f"{what}: {point.value} is no module with {', '.join(self.members)}; mend or "
+                f"{label}: {point.value} is no module with {', '.join(self.members)}; mend or "
                 f"uninstall the package"
             )
-        own = {f.name: f.name.upper() for f in fields(Plugin)} | {"recognises": "recognises"}
-        said = {name: getattr(module, told) for name, told in own.items() if hasattr(module, told)}
-        return Plugin(**{**said, "name": point.name, "module": module.__name__})
+        attrs = {f.name: f.name.upper() for f in fields(Plugin)} | {"recognises": "recognises"}
+        values = {
+            key: getattr(module, attr) for key, attr in attrs.items() if hasattr(module, attr)
+        }
+        return Plugin(**{**values, "name": point.name, "module": module.__name__})
 
 
 ENGINES = Table(
@@ -171,8 +173,8 @@ _BESIDE = re.compile(r"\..*|(timestamps?|times|stamps|poses?|trajectory)\.\w+", 
 
 def _holds_sweeps(path: Path) -> bool:
     """Return True for sweep files at most two folders deep, or for tables of numbers alone."""
-    near = (found for pattern in ("*", "*/*", "*/*/*") for found in path.glob(pattern))
-    if (path / "densify.yaml").is_file() or any(_SWEEP.fullmatch(found.name) for found in near):
+    entries = (entry for pattern in ("*", "*/*", "*/*/*") for entry in path.glob(pattern))
+    if (path / "densify.yaml").is_file() or any(_SWEEP.fullmatch(entry.name) for entry in entries):
         return True
     names = [entry.name for entry in path.glob("*") if entry.is_file()]
     names = [name for name in names if not _BESIDE.fullmatch(name)]

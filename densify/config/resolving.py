@@ -89,8 +89,8 @@ def apply_changes(
         for key, value in _mapping(keys, f"{where}: section {name}", "keys"):
             if key not in values[name]:
                 hint = _expected(str(key), values[name], f"key of {name}")
-                others = [other for other, known in values.items() if key in known]
-                hint = f"did you mean {others[0]}.{key}?" if others else hint
+                owners = [section for section, known in values.items() if key in known]
+                hint = f"did you mean {owners[0]}.{key}?" if owners else hint
                 raise InputError(f"{where}: unknown key {name}.{key}; {hint}")
             values[name][key] = checked(sections[name], key, value, f"{where}: ")
 

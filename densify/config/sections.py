@@ -96,8 +96,8 @@ class FlowSettings(Section):
     def around(self, points_per_s: float) -> tuple[float, float]:
         """Return how far around the window motion is searched, and those sweeps' spacing, s."""
         # Sparse sweeps show little of a moving object: every one is searched (spacing 0), farther.
-        few = points_per_s < _FEW_POINTS_PER_S
-        needed_s, step_s = (_AROUND_FEW_S, 0.0) if few else (_AROUND_S, _AROUND_S)
+        is_sparse = points_per_s < _FEW_POINTS_PER_S
+        needed_s, step_s = (_AROUND_FEW_S, 0.0) if is_sparse else (_AROUND_S, _AROUND_S)
         return needed_s if self.look_around_s is None else self.look_around_s, step_s
 
 

@@ -36,22 +36,22 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
     kept = [np.flatnonzero(~(drop_lost & flow.lost)) for flow in fields]
     cloud, first = _empty_cloud(sum(map(len, kept))), 0
     for registered, flow, rows in zip(stretch.sweeps, fields, kept, strict=True):
-        part = slice(first, first + len(rows))
-        first, sweep = part.stop, registered.sweep
+        span = slice(first, first + len(rows))
+        first, sweep = span.stop, registered.sweep
         T_key_lidar = stretch.T_target_source(key, registered.frame)
-        cloud.rigid_points[part] = poses.transform(T_key_lidar, sweep.points).take(rows, axis=0)
-        cloud.points[part] = cloud.rigid_points[part]
+        cloud.rigid_points[span] = poses.transform(T_key_lidar, sweep.points).take(rows, axis=0)
+        cloud.points[span] = cloud.rigid_points[span]
         since_key_ns = sweep.stamp_ns - stretch[key].sweep.stamp_ns
-        cloud.frame[part], cloud.since_key_ns[part] = registered.frame, since_key_ns
-        cloud.intensity[part] = sweep.intensity[rows]
-        cloud.row[part], cloud.lidar[part] = sweep.row[rows], sweep.lidar[rows]
-        cloud.moving[part], cloud.instance[part] = flow.moving[rows], flow.instance[rows]
+        cloud.frame[span], cloud.since_key_ns[span] = registered.frame, since_key_ns
+        cloud.intensity[span] = sweep.intensity[rows]
+        cloud.row[span], cloud.lidar[span] = sweep.row[rows], sweep.lidar[rows]
+        cloud.moving[span], cloud.instance[span] = flow.moving[rows], flow.instance[rows]
 
-        moves = np.flatnonzero((flow.moving & ~flow.lost)[rows])
-        place, rows = part.start + moves, rows[moves]
-        cloud.points[place] += poses.rotate(T_key_lidar, flow.total[rows])
+        moving = np.flatnonzero((flow.moving & ~flow.lost)[rows])
+        cloud_rows, rows = span.start + moving, rows[moving]
+        cloud.points[cloud_rows] += poses.rotate(T_key_lidar, flow.total[rows])
         if flow.velocity_m_s is not None:
-            cloud.velocity_m_s[place] = poses.rotate(T_key_lidar, flow.velocity_m_s[rows])
+            cloud.velocity_m_s[cloud_rows] = poses.rotate(T_key_lidar, flow.velocity_m_s[rows])
     cloud.confidence[:] = confidence_of(cloud.since_key_ns)
     return cloud
 
@@ -83,7 +83,7 @@ def _empty_cloud(num: int) -> Cloud:
 class _ObjectPoints(NamedTuple):
     """The N points of an object in one sweep, key sweep's lidar frame."""
 
-    there: Float  # (N,3) positions in metres at the reference time of this sweep
+    at_sweep: Float  # (N,3) positions in metres at the reference time of this sweep
     at_key: Float  # (N,3) positions in metres at the reference time of the key sweep
     velocity_m_s: Float  # (3,) median velocity of the points
 
@@ -100,71 +100,73 @@ def object_tracks(
     the rear axle, where a vehicle that turns moves where it points. The arguments are as in
     `accumulate`.
     """
-    seen: dict[int, dict[int, _ObjectPoints]] = {}
+    objects: dict[int, dict[int, _ObjectPoints]] = {}
     for registered, flow in zip(stretch.sweeps, fields, strict=True):
-        follows = flow.moving & ~flow.lost & (flow.instance >= 0)
-        if not follows.any():
+        followed = flow.moving & ~flow.lost & (flow.instance >= 0)
+        if not followed.any():
             continue
         T_key_lidar = stretch.T_target_source(key, registered.frame)
-        instance = flow.instance[follows]
-        points = registered.sweep.points[follows]
+        instance = flow.instance[followed]
+        points = registered.sweep.points[followed]
         if flow.to_reference is not None:
-            points = points + flow.to_reference[follows]
-        there = poses.transform(T_key_lidar, points)
-        at_key = there + poses.rotate(T_key_lidar, flow.displacement[follows])
+            points = points + flow.to_reference[followed]
+        at_sweep = poses.transform(T_key_lidar, points)
+        at_key = at_sweep + poses.rotate(T_key_lidar, flow.displacement[followed])
         velocity_m_s = np.zeros(points.shape)
         if flow.velocity_m_s is not None:
-            velocity_m_s = poses.rotate(T_key_lidar, flow.velocity_m_s[follows])
+            velocity_m_s = poses.rotate(T_key_lidar, flow.velocity_m_s[followed])
         for k in np.unique(instance).tolist():
-            own = instance == k
-            middle_m_s = np.median(velocity_m_s[own], axis=0)
-            seen.setdefault(k, {})[registered.frame] = _ObjectPoints(
-                there[own], at_key[own], middle_m_s
+            in_object = instance == k
+            median_m_s = np.median(velocity_m_s[in_object], axis=0)
+            objects.setdefault(k, {})[registered.frame] = _ObjectPoints(
+                at_sweep[in_object], at_key[in_object], median_m_s
             )
     stamps_ns = {s.frame: s.sweep.stamp_ns for s in stretch.sweeps}
     return tuple(
-        _track(k, seen[k], key, stamps_ns)
-        for k in sorted(seen)
-        if max(len(s.there) for s in seen[k].values()) >= _LEAST_SEEN
+        _track(k, objects[k], key, stamps_ns)
+        for k in sorted(objects)
+        if max(len(s.at_sweep) for s in objects[k].values()) >= _LEAST_SEEN
     )
 
 
 def _track(
-    instance: int, seen: dict[int, _ObjectPoints], key: int, stamps_ns: dict[int, int]
+    instance: int, by_frame: dict[int, _ObjectPoints], key: int, stamps_ns: dict[int, int]
 ) -> ObjectTrack:
     """Return the track of an object from its points and the sweeps' reference times by frame."""
-    at_key = np.concatenate([s.at_key for s in seen.values()])
-    T_there_key = {
-        frame: poses.fit_rigid(s.at_key, s.there)
-        for frame, s in seen.items()
-        if len(s.there) >= _LEAST_SEEN
+    at_key = np.concatenate([s.at_key for s in by_frame.values()])
+    # Motion of the object from the key to each sweep, in the key sweep's lidar frame.
+    T_sweep_key = {
+        frame: poses.fit_rigid(s.at_key, s.at_sweep)
+        for frame, s in by_frame.items()
+        if len(s.at_sweep) >= _LEAST_SEEN
     }
-    T_there_key[key] = np.eye(4)
-    frames = sorted(T_there_key)
-    velocity_m_s = np.median([s.velocity_m_s for s in seen.values()], axis=0)
+    T_sweep_key[key] = np.eye(4)
+    frames = sorted(T_sweep_key)
+    velocity_m_s = np.median([s.velocity_m_s for s in by_frame.values()], axis=0)
     middle = np.median(at_key, axis=0)
-    ends = [poses.transform(T_there_key[f], middle[None])[0] for f in (frames[0], frames[-1])]
+    ends = [poses.transform(T_sweep_key[f], middle[None])[0] for f in (frames[0], frames[-1])]
     duration_s = (stamps_ns[frames[-1]] - stamps_ns[frames[0]]) * 1e-9
-    way = velocity_m_s * duration_s if duration_s else velocity_m_s
-    way = max(way, ends[1] - ends[0], key=lambda way: float(np.hypot(*way[:2])))
-    first, last = (poses.log(T_there_key[f])[2] for f in (frames[0], frames[-1]))
+    direction = velocity_m_s * duration_s if duration_s else velocity_m_s
+    direction = max(direction, ends[1] - ends[0], key=lambda xyz: float(np.hypot(*xyz[:2])))
+    yaw_first, yaw_last = (poses.log(T_sweep_key[f])[2] for f in (frames[0], frames[-1]))
     for _ in range(2):
-        heading = np.arctan2(way[1], way[0])
+        heading = np.arctan2(direction[1], direction[0])
         T_key_object = poses.exp(np.array([0, 0, heading, 0, 0, 0]))
-        body = poses.rotate(poses.inverse(T_key_object), at_key)
-        low, high = np.percentile(body, [_BEYOND_PERCENT, 100 - _BEYOND_PERCENT], axis=0)
+        in_axes = poses.rotate(poses.inverse(T_key_object), at_key)
+        low, high = np.percentile(in_axes, [_BEYOND_PERCENT, 100 - _BEYOND_PERCENT], axis=0)
         if high[0] - low[0] < LONG_M:
             break
         axle = (low + high) / 2 - [_AXLE * (high[0] - low[0]), 0, 0]
         x, y, _ = T_key_object[:3, :3] @ axle - middle
         middle = middle + [x, y, 0]
-        way = way + (last - first) * np.array([-y, x, 0])
+        direction = direction + (yaw_last - yaw_first) * np.array([-y, x, 0])
     T_key_object[:3, 3] = T_key_object[:3, :3] @ ((low + high) / 2)
-    T = np.stack([T_there_key[frame] @ T_key_object for frame in frames])
+    T = np.stack([T_sweep_key[frame] @ T_key_object for frame in frames])
     stamp_ns = np.array([stamps_ns[frame] for frame in frames], np.int64)
     speeds_m_s = velocity_m_s[None]
     if len(frames) > 1:
         speeds_m_s = np.gradient(T[:, :3, 3], (stamp_ns - stamps_ns[key]) * 1e-9, axis=0)
+    num_points = [len(by_frame[f].at_sweep) if f in by_frame else 0 for f in frames]
     return ObjectTrack(
         instance=instance,
         size_m=high - low,
@@ -172,6 +174,6 @@ def _track(
         stamp_ns=stamp_ns,
         T_key_object=T,
         velocity_m_s=speeds_m_s,
-        num_points=np.array([len(seen[f].there) if f in seen else 0 for f in frames], np.int64),
+        num_points=np.array(num_points, np.int64),
         seen_size_m=high - low,
     )

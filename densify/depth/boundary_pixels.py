@@ -79,15 +79,15 @@ def least_votes(
     The least share of the maps counts. All have the same depths where they vote. The other
     arguments are as in `vote`.
     """
-    least = np.ones(len(pixel), np.float32)
+    least_share = np.ones(len(pixel), np.float32)
     steps = None
     for map_m in known_m:
         known = voters(map_m, layers.tilt)
         other_voters = True if steps is None else (known.steps != steps).any(axis=0).flat[pixel]
-        rows, steps = np.flatnonzero(other_voters & (least > 0)), known.steps
+        rows, steps = np.flatnonzero(other_voters & (least_share > 0)), known.steps
         share = vote(layers, known, pixel[rows], depth_m[rows], surely)
-        least[rows] = np.minimum(least[rows], share)
-    return least
+        least_share[rows] = np.minimum(least_share[rows], share)
+    return least_share
 
 
 class Voters(NamedTuple):
@@ -131,23 +131,23 @@ def vote(layers: Layers, voters: Voters, pixel: Int, depth_m: Float32, surely: b
 @inlined
 def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
     """Return the number of steps in direction d from row v, column u to the next known pixel."""
-    here = np.int64(steps[d, v, u])
+    num_steps = np.int64(steps[d, v, u])
     height, width = steps.shape[1:]
-    for k in range(1, 3 if here == 0 else 1):
+    for k in range(1, 3 if num_steps == 0 else 1):
         du, dv = offset(d, k)
         if not (0 <= u + du < width and 0 <= v + dv < height):
             return NONE
-        here = k + np.int64(steps[d, v + dv, u + du])
-        if here == k:
-            return here
-    return min(here, NONE)
+        num_steps = k + np.int64(steps[d, v + dv, u + du])
+        if num_steps == k:
+            return num_steps
+    return min(num_steps, NONE)
 
 
 @inlined
 def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
     """Fill in the 16 votes on the pixel in row v, column u; return the numbers for and against."""
     # depth in metres, gap in px; steps: to the voter in each direction, 0 without a vote
-    same = HIDDEN_M + HIDDEN_FRACTION * depth
+    agree_m = HIDDEN_M + HIDDEN_FRACTION * depth
     num_for, num_against = 0, 0
     for d in range(len(steps)):
         k = _steps_to(voters.steps, d, v, u)
@@ -156,8 +156,8 @@ def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-
         if k == NONE or max(abs(du), abs(dv)) > VOTERS_REACH * gap:
             continue
         steps[d] = k
-        here = extended(voters.inverse, voters.tilt, v + dv, u + du, du, dv)
-        agrees[d] = abs(1 / here - depth) <= same
+        predicted = extended(voters.inverse, voters.tilt, v + dv, u + du, du, dv)
+        agrees[d] = abs(1 / predicted - depth) <= agree_m
         num_for += agrees[d]
         num_against += not agrees[d]
     return num_for, num_against
@@ -197,7 +197,7 @@ def _vote(first, last, pixel, inverse, voters, lab, gap_px, surely, share):  # t
             share[i] = num_for > 0
             continue
         aside = np.int64(np.rint(_ASIDE * gap)) if surely else 0
-        least = 1.0
+        least_share = 1.0
         for side in range(5 if aside else 1):
             down = aside * ((side == 3) - (side == 4))
             right = aside * ((side == 1) - (side == 2))
@@ -206,8 +206,8 @@ def _vote(first, last, pixel, inverse, voters, lab, gap_px, surely, share):  # t
                 k = steps[d]
                 if k == 0:
                     continue
-                one = _alike(lab, v + down, u + right, d, k, gap) / (1 + k / (_DECAY * gap))
-                votes += one
-                votes_for += one * agrees[d]
-            least = min(least, votes_for / votes)
-        share[i] = least
+                weight = _alike(lab, v + down, u + right, d, k, gap) / (1 + k / (_DECAY * gap))
+                votes += weight
+                votes_for += weight * agrees[d]
+            least_share = min(least_share, votes_for / votes)
+        share[i] = least_share

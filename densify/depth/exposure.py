@@ -60,21 +60,21 @@ def key_shots(
     begin_ns, end_ns = _own_time_ns(sequence, key)
     shots = {}
     for camera in cameras:
-        near = {
+        images_ns = {
             number: exposed_ns
             for number, exposed_ns in sequence.image_stamps_ns(camera.name).items()
             if begin_ns < exposed_ns <= end_ns
         }
         if settings.per == "image":
-            for number, exposed_ns in near.items():
+            for number, exposed_ns in images_ns.items():
                 shots[f"{camera.name}/{number:06d}"] = Shot(camera, number, exposed_ns)
-        elif near:
-            number = min(near, key=lambda n: (abs(near[n] - stamp_ns), near[n]))
-            moment_ns = near[number] if settings.at == "camera" else stamp_ns
-            shots[camera.name] = Shot(camera, number, moment_ns)
+        elif images_ns:
+            number = min(images_ns, key=lambda n: (abs(images_ns[n] - stamp_ns), images_ns[n]))
+            shown_ns = images_ns[number] if settings.at == "camera" else stamp_ns
+            shots[camera.name] = Shot(camera, number, shown_ns)
         else:
             shots[camera.name] = Shot(camera, None, stamp_ns)
-        if settings.per == "image" and not near:
+        if settings.per == "image" and not images_ns:
             _log.warning(
                 "key %d: %s has no image of %s within %.0f ms of the sweep: no depth map",
                 key,
@@ -96,9 +96,9 @@ def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str,
 def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
     """Return start and end, in ns, of the time nearer to the key sweep than to another sweep."""
     frames = list(sequence.frames)
-    at = frames.index(key)
+    row = frames.index(key)
     stamps_ns = {}
-    for frame in frames[max(0, at - 1) : at + 2]:
+    for frame in frames[max(0, row - 1) : row + 2]:
         try:
             stamps_ns[frame] = sequence.stamp_ns(frame)
         except InputError:  # the image of another key
@@ -106,11 +106,11 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
                 raise
     if len(stamps_ns) < 2:
         return np.iinfo(np.int64).min, np.iinfo(np.int64).max
-    every_ns, middle_ns = [*stamps_ns.values()], stamps_ns[key]
-    most_ns = int(_JITTER * np.diff(every_ns).min())
-    before_ns = max([middle_ns - most_ns, *(s for s in every_ns if s < middle_ns)])
-    after_ns = min([middle_ns + most_ns, *(s for s in every_ns if s > middle_ns)])
-    return (before_ns + middle_ns) // 2, (middle_ns + after_ns) // 2
+    every_ns, key_ns = [*stamps_ns.values()], stamps_ns[key]
+    most_period_ns = int(_JITTER * np.diff(every_ns).min())
+    before_ns = max([key_ns - most_period_ns, *(s for s in every_ns if s < key_ns)])
+    after_ns = min([key_ns + most_period_ns, *(s for s in every_ns if s > key_ns)])
+    return (before_ns + key_ns) // 2, (key_ns + after_ns) // 2
 
 
 class InView(NamedTuple):
@@ -121,13 +121,13 @@ class InView(NamedTuple):
     points_cam: Float  # (K,3) positions as in `Sight`
     uv: Float  # (K,2) pixel coordinates as in `Sight`
 
-    def joined(self, other: InView, num: int) -> InView:
+    def joined(self, appended: InView, num: int) -> InView:
         """Return the points of this cloud (``num`` points) with those of another one appended."""
         return InView(
             self.exposure,
-            np.concatenate([self.rows, num + other.rows]),
-            np.concatenate([self.points_cam, other.points_cam]),
-            np.concatenate([self.uv, other.uv]),
+            np.concatenate([self.rows, num + appended.rows]),
+            np.concatenate([self.points_cam, appended.points_cam]),
+            np.concatenate([self.uv, appended.uv]),
         )
 
 
@@ -152,7 +152,7 @@ class Exposure:
     number: int | None = None  # number of the image, None if the map shows no image
     measure: str = "z"  # kind of depth, camera ``z`` or ``range``
     # Exposures of the "previous" and "next" image, if the window covers them
-    others: Mapping[str, Exposure] = field(default_factory=dict)
+    neighbours: Mapping[str, Exposure] = field(default_factory=dict)
 
     @staticmethod
     def of(
@@ -161,14 +161,14 @@ class Exposure:
         """Return the camera of a depth map at the map's time, relative to the key sweep.
 
         The camera pose is the recorded pose of the image. Without one it is extrapolated from the
-        key sweep with the vehicle's twist. The setting ``output.optical_flow`` adds the ``others``.
+        key sweep with the vehicle's twist. ``output.optical_flow`` adds the ``neighbours``.
         """
-        others: dict[str, Exposure] = {}
+        neighbours: dict[str, Exposure] = {}
         if settings.output.optical_flow and shot.number is not None:
             stamps_ns = sequence.image_stamps_ns(shot.camera.name)
             numbers = list(stamps_ns)
-            at = numbers.index(shot.number)
-            for name, row in (("previous", at - 1), ("next", at + 1)):
+            index = numbers.index(shot.number)
+            for name, row in (("previous", index - 1), ("next", index + 1)):
                 if 0 <= row < len(numbers):
                     exposed_ns = stamps_ns[numbers[row]]
                     sweeps_ns = [s.sweep.stamp_ns for s in stretch.sweeps]
@@ -179,9 +179,9 @@ class Exposure:
                         continue
                     if settings.project.at == "sweep":
                         exposed_ns = stretch[frame].sweep.stamp_ns
-                    other = Shot(shot.camera, numbers[row], exposed_ns)
-                    others[name] = _exposure(sequence, stretch, key, frame, other, settings)
-        return _exposure(sequence, stretch, key, key, shot, settings, others)
+                    neighbour = Shot(shot.camera, numbers[row], exposed_ns)
+                    neighbours[name] = _exposure(sequence, stretch, key, frame, neighbour, settings)
+        return _exposure(sequence, stretch, key, key, shot, settings, neighbours)
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
         """Project points (N,3) to the image; metres, key sweep's lidar frame at its reference time.
@@ -193,7 +193,7 @@ class Exposure:
         late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)
         uv, inside = image_points(self.camera, points_cam)
-        there = points_cam
+        exposed_cam = points_cam
         last = np.array([self.camera.width_px - 1, self.camera.height_px - 1])
         time_s = np.array([self.camera.column_time_s, self.camera.row_time_s])
         for _ in range(_NUM_ROW_STEPS if self.camera.is_rolling else 0):
@@ -202,20 +202,20 @@ class Exposure:
             velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
             turn = np.hstack([-row_s * self.twist[:3], np.zeros((len(points), 3))])
             ahead = points_cam + row_s * (velocity_cam - self.twist[3:])
-            there = poses.transform_each(turn, ahead)
-            uv, inside = image_points(self.camera, there)
-        return Sight(there, uv, inside & (self.depth_m(there) > NEAREST_M))
+            exposed_cam = poses.transform_each(turn, ahead)
+            uv, inside = image_points(self.camera, exposed_cam)
+        return Sight(exposed_cam, uv, inside & (self.depth_m(exposed_cam) > NEAREST_M))
 
     def sees(self, cloud: Cloud) -> InView:
         """Return the points in the image of a cloud at the key sweep's reference time."""
-        parts = []
+        chunks = []
         for first in range(0, max(1, len(cloud)), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
-            sight = self.see(cloud.points[part], cloud.velocity_m_s[part])
+            chunk = slice(first, first + AT_ONCE)
+            sight = self.see(cloud.points[chunk], cloud.velocity_m_s[chunk])
             inside = np.flatnonzero(sight.inside)
             columns = (column.take(inside, axis=0) for column in (sight.points_cam, sight.uv))
-            parts.append((first + inside, *columns))
-        return InView(self, *(np.concatenate(column) for column in zip(*parts, strict=True)))
+            chunks.append((first + inside, *columns))
+        return InView(self, *(np.concatenate(column) for column in zip(*chunks, strict=True)))
 
     def depth_m(self, points_cam: Float) -> Float:
         """Return the (N,) depth of points (N,3), camera frame: z or range, by ``measure``."""
@@ -229,7 +229,7 @@ def _exposure(
     frame: int,
     shot: Shot,
     settings: Config,
-    others: Mapping[str, Exposure] | None = None,
+    neighbours: Mapping[str, Exposure] | None = None,
 ) -> Exposure:
     """Return the exposure of a shot (as `Exposure.of`), extrapolated from sweep ``frame``."""
     camera, registered = shot.camera, stretch[frame]
@@ -248,5 +248,5 @@ def _exposure(
         twist=poses.carried(camera.T_cam_lidar, twist),
         number=shot.number,
         measure=camera.measure if measure == "auto" else measure,
-        others=others or {},
+        neighbours=neighbours or {},
     )

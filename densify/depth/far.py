@@ -58,57 +58,62 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
     last testing sweep is taken, if 2 m away or more, or the testing sweep on the other side. The
     sweeps are deskewed, and ``travel_m`` (S,) is the ascending position of each along the road.
     """
-    asked = [0] if sweeps else list[int]()
+    testers = [0] if sweeps else list[int]()
     for i, at_m in enumerate(travel_m.tolist()):
-        if at_m - travel_m[asked[-1]] >= _WITNESSES_M or i == len(sweeps) - 1 > 0:
-            asked.append(i)
+        if at_m - travel_m[testers[-1]] >= _WITNESSES_M or i == len(sweeps) - 1 > 0:
+            testers.append(i)
     with ThreadPoolExecutor(num_threads()) as pool:
-        images = dict(zip(asked, pool.map(lambda i: RangeImage.of(sweeps[i]), asked), strict=True))
+        images = dict(
+            zip(testers, pool.map(lambda i: RangeImage.of(sweeps[i]), testers), strict=True)
+        )
 
     def gone(i: int) -> Bool:
         """Return (N,) True for the points of sweep i that were seen through."""
-        one, witnesses = sweeps[i], _witnesses(i, asked, travel_m)
-        points, free = one.sweep.points, np.zeros(len(one.sweep), bool)
-        whose = np.zeros(len(points), np.int64)
-        T = [poses.inverse(sweeps[w].T_world_lidar) @ one.T_world_lidar for w in witnesses]
+        tested, witnesses = sweeps[i], _witnesses(i, testers, travel_m)
+        points, free = tested.sweep.points, np.zeros(len(tested.sweep), bool)
+        witness_of = np.zeros(len(points), np.int64)
+        # From the tested sweep's lidar frame to the frames of the witnesses
+        T_witness = [
+            poses.inverse(sweeps[w].T_world_lidar) @ tested.T_world_lidar for w in witnesses
+        ]
         if len(witnesses) == 2:  # points ahead belong to the later witness
-            whose[points @ poses.inverse(T[1])[:3, 3] > 0] = 1
+            witness_of[points @ poses.inverse(T_witness[1])[:3, 3] > 0] = 1
         for number, witness in enumerate(witnesses):
-            rows = np.flatnonzero(whose == number)
-            there = poses.transform(T[number], points.take(rows, axis=0))
-            free[rows] = images[witness].sees_through(there, *FREE_MARGIN, _FEW_FILLED)
+            rows = np.flatnonzero(witness_of == number)
+            points_witness = poses.transform(T_witness[number], points.take(rows, axis=0))
+            free[rows] = images[witness].sees_through(points_witness, *FREE_MARGIN, _FEW_FILLED)
         return free
 
     with ThreadPoolExecutor(num_threads()) as pool:
         return list(pool.map(gone, range(len(sweeps))))
 
 
-def _witnesses(i: int, asked: Sequence[int], travel_m: Float) -> list[int]:
-    """Return the indices, among ``asked``, of the sweeps before and after sweep i that test it."""
-    apart_m = np.array([travel_m[j] - travel_m[i] for j in asked])
+def _witnesses(i: int, testers: Sequence[int], travel_m: Float) -> list[int]:
+    """Return the indices, of ``testers``, of the sweeps before and after sweep i that test it."""
+    apart_m = np.array([travel_m[j] - travel_m[i] for j in testers])
     sides = []
     for off_m in (-apart_m, apart_m):
         far_enough = np.flatnonzero(off_m >= _WITNESS_M)
         if len(far_enough):
-            sides.append(asked[far_enough[np.argmin(off_m[far_enough])]])
+            sides.append(testers[far_enough[np.argmin(off_m[far_enough])]])
         elif off_m.max() >= _LEAST_WITNESS_M:
-            sides.append(asked[int(np.argmax(off_m))])
+            sides.append(testers[int(np.argmax(off_m))])
     return sides
 
 
 def standing(sensors: Sensors, registered: RegisteredSweep, gone: Bool) -> StandingWorld:
     """Return a sweep's points that are not ``gone`` (N,), world frame, with their patches."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
-    one = np.zeros(len(sweep), np.int32)
-    every = np.ones(len(one), bool)
+    source = np.zeros(len(sweep), np.int32)
+    wanted = np.ones(len(source), bool)
     normal, spacing_m = tangents(
-        sweep.points, sweep.lidar, one, every, sensors, [sensors.origins_m]
+        sweep.points, sweep.lidar, source, wanted, sensors, [sensors.origins_m]
     )
     return StandingWorld(
         points=poses.transform(T_world_lidar, sweep.points).astype(np.float32),
         normal=poses.rotate(T_world_lidar, normal.astype(np.float64)).astype(np.float32),
         spacing_m=np.minimum(spacing_m, np.float32(_MOST_SPACING_M)),
-        source=one,
+        source=source,
         row=sweep.row,
         lidar=sweep.lidar,
         intensity=sweep.intensity,
@@ -117,14 +122,14 @@ def standing(sensors: Sensors, registered: RegisteredSweep, gone: Bool) -> Stand
     ).select(~gone)
 
 
-def joined(parts: Sequence[StandingWorld]) -> StandingWorld:
-    """Join parts of one static world, ordered by frame number."""
-    parts = [_NOTHING, *sorted(parts, key=lambda part: part.frames)]
-    counts = np.cumsum([0, *(len(part.frames) for part in parts)])
-    sources = [p.source + np.int32(first) for p, first in zip(parts, counts, strict=False)]
+def joined(worlds: Sequence[StandingWorld]) -> StandingWorld:
+    """Join the parts of one static world, ordered by frame number."""
+    worlds = [_NOTHING, *sorted(worlds, key=lambda world: world.frames)]
+    firsts = np.cumsum([0, *(len(world.frames) for world in worlds)])
+    sources = [world.source + np.int32(first) for world, first in zip(worlds, firsts, strict=False)]
     names = {field.name for field in fields(StandingWorld)} - {"source", "frames", "left_out"}
-    columns: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
-    frames = tuple(frame for part in parts for frame in part.frames)
+    columns: dict[str, Any] = {n: np.concatenate([getattr(w, n) for w in worlds]) for n in names}
+    frames = tuple(frame for world in worlds for frame in world.frames)
     return StandingWorld(**columns, source=np.concatenate(sources), frames=frames)
 
 
@@ -161,8 +166,8 @@ def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float)
 
 
 def far_cloud(
-    found: StandingWorld,
-    T_key_found: Float,
+    world: StandingWorld,
+    T_key_world: Float,
     stretch: Stretch,
     key: int,
     exposures: Mapping[str, Exposure],
@@ -171,39 +176,39 @@ def far_cloud(
     """Return the points beyond the window that a camera observes, and their patches.
 
     Both are in the key sweep's lidar frame. One point per pixel and step of depth is kept.
-    ``T_key_found`` (4,4) maps the world frame of ``found`` to that frame. ``standing_only`` leaves
+    ``T_key_world`` (4,4) maps the world frame of ``world`` to that frame. ``standing_only`` leaves
     out points that the first or the last sweep of the window saw through.
     """
-    beyond = ~np.isin(found.frames, stretch.frames)
-    rows = np.flatnonzero(beyond[found.source])
-    needed = np.zeros(len(found), bool)
+    beyond = ~np.isin(world.frames, stretch.frames)
+    rows = np.flatnonzero(beyond[world.source])
+    needed = np.zeros(len(world), bool)
     for exposure in exposures.values():
-        needed[_seen(found.points, rows, T_key_found, exposure)] = True
+        needed[_seen(world.points, rows, T_key_world, exposure)] = True
     rows = np.flatnonzero(needed)
-    points = poses.transform(T_key_found, found.points.take(rows, axis=0).astype(np.float64))
+    points = poses.transform(T_key_world, world.points.take(rows, axis=0).astype(np.float64))
     if standing_only:
         ends = sorted({stretch.frames[0], stretch.frames[-1]} - {key})
-        stands = ~_gone(points, stretch, key, ends)
-        rows, points = rows[stands], points[stands]
-    found = found.select(rows)
-    num, since_key_ns = len(found), found.stamp_ns - stretch[key].sweep.stamp_ns
+        is_static = ~_gone(points, stretch, key, ends)
+        rows, points = rows[is_static], points[is_static]
+    world = world.select(rows)
+    num, since_key_ns = len(world), world.stamp_ns - stretch[key].sweep.stamp_ns
     cloud = Cloud(
         points=points,
         rigid_points=points,
-        frame=np.array(found.frames, np.int32)[found.source],
-        since_key_ns=since_key_ns[found.source],
-        row=found.row,
-        lidar=found.lidar,
+        frame=np.array(world.frames, np.int32)[world.source],
+        since_key_ns=since_key_ns[world.source],
+        row=world.row,
+        lidar=world.lidar,
         moving=np.zeros(num, bool),
         instance=np.full(num, -1, np.int32),
         velocity_m_s=np.zeros((num, 3), np.float32),
-        confidence=confidence_of(since_key_ns)[found.source],
-        intensity=found.intensity,
+        confidence=confidence_of(since_key_ns)[world.source],
+        intensity=world.intensity,
         rgb=np.zeros((num, 3), np.uint8),
         far=np.ones(num, bool),
     )
-    normal = poses.rotate(T_key_found, found.normal.astype(np.float64)).astype(np.float32)
-    return cloud, Patches(normal, found.spacing_m)
+    normal = poses.rotate(T_key_world, world.normal.astype(np.float64)).astype(np.float32)
+    return cloud, Patches(normal, world.spacing_m)
 
 
 def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) -> Int:
@@ -211,16 +216,18 @@ def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) ->
     T_cam_world = exposure.T_cam_key @ T_key_world
     kept, cells = [rows[:0]], [np.zeros((0, 3), np.float32)]
     for first in range(0, len(rows), AT_ONCE):
-        part = rows[first : first + AT_ONCE]
-        near = part[may_see(exposure.camera, T_cam_world, points.take(part, axis=0), _SLACK_M)]
-        there = poses.transform(T_key_world, points.take(near, axis=0).astype(np.float64))
-        sight = exposure.see(there, np.zeros(there.shape, np.float32))
+        chunk = rows[first : first + AT_ONCE]
+        viewable = chunk[
+            may_see(exposure.camera, T_cam_world, points.take(chunk, axis=0), _SLACK_M)
+        ]
+        points_key = poses.transform(T_key_world, points.take(viewable, axis=0).astype(np.float64))
+        sight = exposure.see(points_key, np.zeros(points_key.shape, np.float32))
         inside = np.flatnonzero(sight.inside)
         depth_m = exposure.depth_m(sight.points_cam.take(inside, axis=0))
         # A camera needs one point in every pixel and step of depth.
-        place = np.column_stack([sight.uv.take(inside, axis=0), np.log(depth_m) / HIDDEN_FRACTION])
-        kept.append(near[inside])
-        cells.append(np.rint(place.astype(np.float32)))
+        cell = np.column_stack([sight.uv.take(inside, axis=0), np.log(depth_m) / HIDDEN_FRACTION])
+        kept.append(viewable[inside])
+        cells.append(np.rint(cell.astype(np.float32)))
     rows = np.concatenate(kept)
     # A pixel is supported only by several sweeps, so neighbouring pixels take different sweeps.
     mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
@@ -231,7 +238,7 @@ def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -
     """Return (M,) True for points (M,3), key frame, that a sweep of ``witnesses`` saw through."""
     free = np.zeros(len(points), bool)
     for frame in witnesses:
-        there = poses.transform(stretch.T_target_source(frame, key), points)
+        points_sweep = poses.transform(stretch.T_target_source(frame, key), points)
         image = RangeImage.of(stretch[frame])
-        free |= image.sees_through(there, *FREE_MARGIN)
+        free |= image.sees_through(points_sweep, *FREE_MARGIN)
     return free

@@ -125,20 +125,20 @@ def _surrounded(num, top, bottom, left, right, row, column):  # type: ignore[no-
 @inlined
 def _gather(known, top, bottom, left, right, row, column, inside):  # type: ignore[no-untyped-def]
     """Put a window's pixels into ``inside``; return number, greatest and least inverse depth."""
-    num, near, far = 0, 0.0, np.inf
+    num, w_near, w_far = 0, 0.0, np.inf
     for first in range(top, bottom, _ROWS):
         last = min(first + _ROWS, bottom)
         if not _any(known.num, first, last, left, right):
             continue
         for r in range(first, last):
             for k in range(known.before[r, left], known.before[r, right]):
-                there = known.inverse[k]
-                near, far = max(near, there), min(far, there)
-                inside.inverse[num] = there
+                w = known.inverse[k]
+                w_near, w_far = max(w_near, w), min(w_far, w)
+                inside.inverse[num] = w
                 inside.right[num] = known.column[k] - column
                 inside.down[num] = r - row
                 num += 1
-    return num, near, far
+    return num, w_near, w_far
 
 
 @inlined
@@ -146,7 +146,7 @@ def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
     """Fit a plane; return its inverse depth in the middle, both slopes, range of deviations."""
     n = u = v = uu = uv = vv = w = uw = vw = 0.0
     for i in range(num):
-        there, du, dv = inside.inverse[i], inside.right[i], inside.down[i]
+        inverse, du, dv = inside.inverse[i], inside.right[i], inside.down[i]
         # It falls to 0 just beyond the reach (px).
         weight = (1 - abs(dv) / (reach_v + 1)) * (1 - abs(du) / (reach_u + 1))
         n += weight
@@ -155,14 +155,14 @@ def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
         uu += weight * du * du
         uv += weight * du * dv
         vv += weight * dv * dv
-        w += weight * there
-        uw += weight * du * there
-        vw += weight * dv * there
+        w += weight * inverse
+        uw += weight * du * inverse
+        vw += weight * dv * inverse
     centre, slope_u, slope_v = plane(n, u, v, uu, uv, vv, w, uw, vw, _RIDGE_PX2)
     low, high = np.inf, -np.inf
     for i in range(num):
-        there = centre + inside.down[i] * slope_v
-        off = inside.inverse[i] - there - inside.right[i] * slope_u
+        inverse = centre + inside.down[i] * slope_v
+        off = inside.inverse[i] - inverse - inside.right[i] * slope_u
         low, high = min(low, off), max(high, off)
     return centre, slope_u, slope_v, high - low
 
@@ -171,8 +171,8 @@ def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
 def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ignore[no-untyped-def]
     """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`."""
     height, width = filled_m.shape
-    most = (2 * _MOST_PX + 1) ** 2
-    inside = _Inside(np.empty(most), np.empty(most), np.empty(most))
+    capacity = (2 * _MOST_PX + 1) ** 2
+    inside = _Inside(np.empty(capacity), np.empty(capacity), np.empty(capacity))
     for p in range(first, last):
         row, column = p // width, p % width
         if filled_m[row, column] > 0:
@@ -190,9 +190,9 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ign
             left, right = max(column - reach_u, 0), min(column + reach_u + 1, width)
             if not _surrounded(known.num, top, bottom, left, right, row, column):
                 continue
-            num, near, far = _gather(known, top, bottom, left, right, row, column, inside)
-            allowed = max(HIDDEN_M, HIDDEN_FRACTION / near)
-            if num < _MIN_PLANE_PX and 1 / far - 1 / near > allowed:
+            num, w_near, w_far = _gather(known, top, bottom, left, right, row, column, inside)
+            allowed = max(HIDDEN_M, HIDDEN_FRACTION / w_near)
+            if num < _MIN_PLANE_PX and 1 / w_far - 1 / w_near > allowed:
                 continue
             centre, slope_u, slope_v, spread = _fit(inside, num, reach_u, reach_v)
             if num >= _MIN_PLANE_PX and spread / (centre * centre) > allowed:
@@ -214,10 +214,10 @@ def fill_stars(layers: Layers) -> Layers:
     known = layers.filled_m > 0
     inverse = np.divide(1, layers.filled_m, out=np.zeros_like(layers.filled_m), where=known)
     pixel = np.flatnonzero(~known)
-    found_m, steps = np.zeros(len(pixel), np.float32), first_known(known)
-    _star.over_rows(len(pixel), pixel, steps, inverse, layers.tilt, layers.spacing_px, found_m)
+    predicted_m, steps = np.zeros(len(pixel), np.float32), first_known(known)
+    _star.over_rows(len(pixel), pixel, steps, inverse, layers.tilt, layers.spacing_px, predicted_m)
     filled_m = layers.filled_m.copy()
-    filled_m.flat[pixel] = found_m
+    filled_m.flat[pixel] = predicted_m
     return _voted(replace(layers, filled_m=filled_m), layers.filled_m, _LEAST_STAR_SHARE)
 
 
@@ -232,14 +232,14 @@ def _widest_gap(met):  # type: ignore[no-untyped-def]
 
 
 @Kernel
-def _star(first, last, pixel, steps, inverse, tilt, spacing_px, found_m):  # type: ignore[no-untyped-def]
+def _star(first, last, pixel, steps, inverse, tilt, spacing_px, predicted_m):  # type: ignore[no-untyped-def]
     """Predict the depth of empty pixels from the first known pixels around them, 0 for none."""
     width = inverse.shape[1]
     met = np.empty(len(DIRECTIONS), np.bool_)
     for p in range(first, last):
         row, column = pixel[p] // width, pixel[p] % width
         reach_px = max(spacing_px[row, column, 0], spacing_px[row, column, 1])
-        num, near, far = 0, 0.0, np.inf
+        num, w_near, w_far = 0, 0.0, np.inf
         sum_w, weight = 0.0, 0.0
         for d in range(len(DIRECTIONS)):
             k = np.int64(steps[d, row, column])
@@ -247,12 +247,12 @@ def _star(first, last, pixel, steps, inverse, tilt, spacing_px, found_m):  # typ
             met[d] = k != NONE and du * du + dv * dv <= reach_px * reach_px
             if met[d]:
                 w = extended(inverse, tilt, row + dv, column + du, du, dv)
-                near, far = max(near, w), min(far, w)
+                w_near, w_far = max(w_near, w), min(w_far, w)
                 sum_w += w / k
                 weight += 1 / k
                 num += 1
         if num < _STAR_MET or _widest_gap(met) > _STAR_GAP:
             continue
         w = sum_w / weight
-        if near - far <= _STAR_SPREAD * w:
-            found_m[p] = 1 / w
+        if w_near - w_far <= _STAR_SPREAD * w:
+            predicted_m[p] = 1 / w

@@ -48,10 +48,10 @@ class PointsInImage:
 
     def at(self, rows: Int) -> Int:
         """Return the indices, among these K points, of the points at ``rows`` of the cloud."""
-        place = np.zeros(int(self.index.max(initial=-1)) + 1, np.int64)
-        place[self.index] = np.arange(len(self.index))
-        found: Int = place[rows]
-        return found
+        index_of = np.zeros(int(self.index.max(initial=-1)) + 1, np.int64)
+        index_of[self.index] = np.arange(len(self.index))
+        indices: Int = index_of[rows]
+        return indices
 
     @property
     def inverse(self) -> Float:
@@ -116,26 +116,26 @@ def _any_lens(
         else:
             slope = -along / np.linalg.norm(points_cam, axis=1, keepdims=True)
     # Rays of a scanner are spaced in azimuth and in elevation, about the key's upward axis.
-    level = np.cross(exposure.T_cam_key[:3, 2], points_cam)
-    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
-    rise = np.cross(points_cam, level)
-    rise /= np.linalg.norm(rise, axis=1, keepdims=True)
-    sides = [np.einsum("ijk,ik->ij", J, axis) for axis in (level, rise)]
-    spacing_px = np.hypot(sides[0] * spacing_m[:, :1], sides[1] * spacing_m[:, 1:])
+    azimuth_axis = np.cross(exposure.T_cam_key[:3, 2], points_cam)
+    azimuth_axis /= np.maximum(np.linalg.norm(azimuth_axis, axis=1, keepdims=True), 1e-9)
+    elevation_axis = np.cross(points_cam, azimuth_axis)
+    elevation_axis /= np.linalg.norm(elevation_axis, axis=1, keepdims=True)
+    px_per_m = [np.einsum("ijk,ik->ij", J, axis) for axis in (azimuth_axis, elevation_axis)]
+    spacing_px = np.hypot(px_per_m[0] * spacing_m[:, :1], px_per_m[1] * spacing_m[:, 1:])
     return focal_px, slope, spacing_px
 
 
 def _ages_ns(since_key_ns: Int, frame: np.ndarray, far: Bool) -> Int:
     """Return the (K,) times between the points' sweeps and the key sweep."""
-    ages_ns, near = np.abs(since_key_ns), np.flatnonzero(~far)
-    first = int(frame[near].min(initial=np.iinfo(np.int32).max))
-    of_sweep = np.zeros(max(0, int(frame[near].max(initial=-1)) + 1 - first), np.int64)
-    of_sweep[frame[near] - first] = ages_ns[near]
-    for younger, older in pairwise(np.argsort(of_sweep, kind="stable")):
+    ages_ns, in_window = np.abs(since_key_ns), np.flatnonzero(~far)
+    first = int(frame[in_window].min(initial=np.iinfo(np.int32).max))
+    sweep_ages_ns = np.zeros(max(0, int(frame[in_window].max(initial=-1)) + 1 - first), np.int64)
+    sweep_ages_ns[frame[in_window] - first] = ages_ns[in_window]
+    for younger, older in pairwise(np.argsort(sweep_ages_ns, kind="stable")):
         # Else clock jitter would decide between the sweeps before and after the key sweep.
-        if of_sweep[older] - of_sweep[younger] < _SAME_AGE_NS:
-            of_sweep[older] = of_sweep[younger]
-    ages_ns[near] = of_sweep[frame[near] - first]
+        if sweep_ages_ns[older] - sweep_ages_ns[younger] < _SAME_AGE_NS:
+            sweep_ages_ns[older] = sweep_ages_ns[younger]
+    ages_ns[in_window] = sweep_ages_ns[frame[in_window] - first]
     return ages_ns
 
 
@@ -177,8 +177,8 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
             covered = canvas[v, left : right + 1]
             for k in range(len(covered)):
                 tilt = tilt_v + slope[i, 0] * (left + k - uv[i, 0])
-                there = w + min(max(tilt, -0.5 * w), 0.0)
-                covered[k] = max(covered[k], np.float32(there))
+                on_patch = w + min(max(tilt, -0.5 * w), 0.0)
+                covered[k] = max(covered[k], np.float32(on_patch))
 
 
 def sorted_by_pixel(points: PointsInImage, rank: Int, camera: Camera) -> tuple[Int, Int]:

@@ -82,30 +82,30 @@ def visible_pixels(
     Points beyond the window come second. They measure pixels that the window leaves empty, away
     from depth discontinuities.
     """
-    near = np.flatnonzero(~points.far)
-    pixels, why = _settled(points.select(~points.far), camera)
-    reason[points.index[near]] = why
-    if len(near) == len(points.index):
+    in_window = np.flatnonzero(~points.far)
+    pixels, reasons = _settled(points.select(~points.far), camera)
+    reason[points.index[in_window]] = reasons
+    if len(in_window) == len(points.index):
         return pixels
-    if len(near):
-        winner = np.where(pixels.winner < 0, -1, near[pixels.winner])
+    if len(in_window):
+        winner = np.where(pixels.winner < 0, -1, in_window[pixels.winner])
         pixels = pixels._replace(winner=winner)
-    beyond, why = _settled(points, camera, taken=pixels.inside)
-    reason[points.index[points.far]] = why[points.far]
+    beyond, reasons = _settled(points, camera, measured=pixels.inside)
+    reason[points.index[points.far]] = reasons[points.far]
     better = beyond.inside
-    both = zip(pixels, beyond, strict=True)
-    return MeasuredPixels(*(np.where(better, b, n) for n, b in both))  # type: ignore[call-overload]
+    pairs = zip(pixels, beyond, strict=True)
+    return MeasuredPixels(*(np.where(better, far_value, value) for value, far_value in pairs))  # type: ignore[call-overload]
 
 
 def _settled(
-    points: PointsInImage, camera: Camera, taken: Bool | None = None
+    points: PointsInImage, camera: Camera, measured: Bool | None = None
 ) -> tuple[MeasuredPixels, NDArray[np.uint8]]:
     """Return the pixels that points measure, and the (K,) `Reason` of every point."""
     hidden = distance_behind(points, camera) > 1
     reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
-    pixel, winner, found = _found(points, hidden, camera, taken)
-    depth_m, num_sweeps, supported, edge = found
-    if taken is None:
+    pixel, winner, settled = _fit_surfaces(points, hidden, camera, measured)
+    depth_m, num_sweeps, supported, edge = settled
+    if measured is None:
         supported = supported > 0
         inside = edge >= 1
     else:
@@ -131,14 +131,14 @@ class _Visible(NamedTuple):
     age_ns: Int  # (K,) time from the key sweep
 
 
-def _found(
-    points: PointsInImage, hidden: Bool, camera: Camera, taken: Bool | None
+def _fit_surfaces(
+    points: PointsInImage, hidden: Bool, camera: Camera, measured: Bool | None
 ) -> tuple[Int, Int, Float32]:
     """Return pixels (P,) with visible points, the best point of each, and (4,P) of `_settle`."""
     last = int(points.age_ns.max(initial=0)) + 1
     start, order = sorted_by_pixel(points, np.where(hidden, last, points.age_ns), camera)
-    found = np.zeros((4, len(start) - 1), np.float32)
-    done = np.zeros(len(start) - 1, bool) if taken is None else taken  # left out
+    settled = np.zeros((4, len(start) - 1), np.float32)
+    done = np.zeros(len(start) - 1, bool) if measured is None else measured  # left out
     inverse = points.inverse
     edge_px = FOOTPRINT * points.spacing_px[:, 0] + _SLACK_M * points.focal_px[:, 0] * inverse
     visible = _Visible(
@@ -153,9 +153,9 @@ def _found(
         points.age_ns[order],
     )
     shape = (camera.height_px, camera.width_px)
-    _settle.over_rows(len(done), visible, shape, done, found)
-    pixel = np.flatnonzero(found[0])
-    return pixel, order[start[pixel]], found[:, pixel]
+    _settle.over_rows(len(done), visible, shape, done, settled)
+    pixel = np.flatnonzero(settled[0])
+    return pixel, order[start[pixel]], settled[:, pixel]
 
 
 @inlined
@@ -188,7 +188,8 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
     """Compare the points around pixel (v0, u0) with the tangent plane of point i."""
     # The plane has inverse depth centre (1/m) in the pixel, and visible points within agree (1/m)
     # of it agree. Points farther behind it within outer (px) show a discontinuity. Filled in are
-    # moments m (9,) of the fit and the extent of the surface, reach (8,).
+    # the sums m (9,) of the fit, the first nine arguments of `plane` with the deviation from the
+    # tangent plane as inverse depth, and the extent of the surface, reach (8,).
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
     su, sv, w0 = points.slope[i, 0], points.slope[i, 1], inverse[i]
@@ -230,14 +231,14 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
 
 
 @Kernel
-def _settle(first, last, points, shape, taken, found):  # type: ignore[no-untyped-def]
+def _settle(first, last, points, shape, done, settled):  # type: ignore[no-untyped-def]
     """Find the depth of each pixel from the surrounding points that agree with its first point."""
-    # found (4,P): depth (m), sweeps that agree, 1 if no sweep nearer to the key disagrees, extent
+    # settled (4,P): depth (m), sweeps that agree, 1 if no sweep nearer to the key disagrees, extent
     # of the surface in radii of discontinuities
     m, reach = np.empty(9), np.empty(8)
     for p in range(first, last):
         i = points.start[p]
-        if taken[p] or i == points.start[p + 1] or points.hidden[i]:
+        if done[p] or i == points.start[p + 1] or points.hidden[i]:
             continue
         v0, u0 = p // shape[1], p % shape[1]
         w0, uv, slope = points.inverse[i], points.uv[i], points.slope[i]
@@ -249,11 +250,11 @@ def _settle(first, last, points, shape, taken, found):  # type: ignore[no-untype
             points, shape, i, u0, v0, centre, agree, inner + _EDGE_WINDOW_PX, m, reach
         )
         off, _, _ = plane(m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], _RIDGE_PX2)
-        found[0, p] = 1 / limited(centre + min(max(off, -agree), agree), w0)
-        found[1, p], found[2, p] = _count(seen), supported
-        found[3, p] = ALL_ROUND
+        settled[0, p] = 1 / limited(centre + min(max(off, -agree), agree), w0)
+        settled[1, p], settled[2, p] = _count(seen), supported
+        settled[3, p] = ALL_ROUND
         if behind and inner > 0:
-            least = reach[0]
-            for far in reach[1:]:
-                least = min(least, far)
-            found[3, p] = least / inner
+            least_extent = reach[0]
+            for extent in reach[1:]:
+                least_extent = min(least_extent, extent)
+            settled[3, p] = least_extent / inner

@@ -64,19 +64,19 @@ def moving_bodies(
     """
     moving = np.flatnonzero(cloud.moving & (cloud.instance >= 0))
     instance = cloud.instance[moving]
-    own = {k: moving[instance == k] for k in np.unique(instance).tolist()}
-    hulls = {k: _corners(cloud.points[rows]) for k, rows in own.items()}
-    velocity_m_s = {k: np.median(cloud.velocity_m_s[rows], axis=0) for k, rows in own.items()}
+    rows_of = {k: moving[instance == k] for k in np.unique(instance).tolist()}
+    hulls = {k: _corners(cloud.points[rows]) for k, rows in rows_of.items()}
+    velocity_m_s = {k: np.median(cloud.velocity_m_s[rows], axis=0) for k, rows in rows_of.items()}
 
     def is_shown(k: int) -> bool:
         """Return True if a corner of the object's hull is in an image."""
         each_m_s = _each(velocity_m_s[k], hulls[k])
         return any(exposure.see(hulls[k], each_m_s).inside.any() for exposure in exposures)
 
-    own = {k: rows for k, rows in own.items() if is_shown(k)}
+    rows_of = {k: rows for k, rows in rows_of.items() if is_shown(k)}
     return {
-        k: MovingBody(hulls[k], velocity_m_s[k], *_met(cloud, k, hulls[k], found))
-        for k, found in rays_toward(cloud, rays, own, hulls).items()
+        k: MovingBody(hulls[k], velocity_m_s[k], *_met(cloud, k, hulls[k], toward))
+        for k, toward in rays_toward(cloud, rays, rows_of, hulls).items()
     }
 
 
@@ -84,14 +84,14 @@ def without_sweep(
     bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
 ) -> dict[int, MovingBody]:
     """Return the bodies without sweep ``frame``. cloud: points of all other sweeps."""
-    told = {}
+    reduced_bodies = {}
     for k, body in bodies.items():
         corners = _corners(cloud.points[cloud.moving & (cloud.instance == k)])
         kept = body.frame != frame
         if len(corners):
             rays = (column[kept] for column in (body.entries, body.ends, body.frame))
-            told[k] = MovingBody(corners, body.velocity_m_s, *rays)
-    return told
+            reduced_bodies[k] = MovingBody(corners, body.velocity_m_s, *rays)
+    return reduced_bodies
 
 
 def _corners(points: Float) -> Float:
@@ -108,12 +108,12 @@ def _met(
     cloud: Cloud, instance: int, corners: Float, rays: ObjectRays
 ) -> tuple[Float, Bool, NDArray[np.integer]]:
     """Return entries, ends and frame of the rays that meet a hull (V,3), as in `MovingBody`."""
-    rays = rays.select(passes_near(corners, rays.start, rays.way))
-    enter, leave = crossing(half_spaces(corners), rays.start, rays.way)
+    rays = rays.select(passes_near(corners, rays.start, rays.to_return))
+    enter, leave = crossing(half_spaces(corners), rays.start, rays.to_return)
     meets = (enter > 0) & (enter < np.minimum(leave, 1))
-    (rows, start, way), enter = rays.select(meets), enter[meets]
+    (rows, start, to_return), enter = rays.select(meets), enter[meets]
     ends = cloud.moving[rows] & (cloud.instance[rows] == instance)
-    return start + enter[:, None] * way, ends, cloud.frame[rows]
+    return start + enter[:, None] * to_return, ends, cloud.frame[rows]
 
 
 def close_bodies(
@@ -132,8 +132,8 @@ def close_bodies(
         front = _Front.of(body, exposure, margin_px)
         if front is not None:
             rows = np.flatnonzero(cloud.moving & (cloud.instance == instance))
-            part = layers.part(front.box)
-            solid[front.box] |= _close(part, cloud, exposure, rows, body, front)
+            box_layers = layers.part(front.box)
+            solid[front.box] |= _close(box_layers, cloud, exposure, rows, body, front)
     return replace(layers, solid=solid if layers.solid is None else layers.solid | solid)
 
 
@@ -196,19 +196,19 @@ class _Front(NamedTuple):
         row, column = row - self.box[0].start, column - self.box[1].start
         height, width = self.inverse.shape
         shown = sight.inside & (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        which = np.flatnonzero(shown)
-        depth_m = exposure.depth_m(sight.points_cam[which])
-        return _Pixels(which, (row[which], column[which]), depth_m)
+        point = np.flatnonzero(shown)
+        depth_m = exposure.depth_m(sight.points_cam[point])
+        return _Pixels(point, (row[point], column[point]), depth_m)
 
     def closed(self, body: MovingBody, exposure: Exposure, spacing_px: Float32) -> Float:
         """Return the (h,w) share, 0 to 1, of the rays entering at a pixel that end on the body."""
         blur_px = np.maximum(FOOTPRINT * np.median(spacing_px, axis=(0, 1)), 1.0)
-        at = self.pixels(exposure, body.entries, _each(body.velocity_m_s, body.entries))
-        front_m = 1 / np.maximum(self.inverse[at.place], 1e-6)
-        faces = at.depth_m < front_m + HIDDEN_M + HIDDEN_FRACTION * front_m
+        entered = self.pixels(exposure, body.entries, _each(body.velocity_m_s, body.entries))
+        front_m = 1 / np.maximum(self.inverse[entered.pixel], 1e-6)
+        faces = entered.depth_m < front_m + HIDDEN_M + HIDDEN_FRACTION * front_m
         counts = np.zeros((2, *self.inverse.shape))
-        ends = body.ends[at.which].astype(np.int64)
-        np.add.at(counts, (ends, *at.place), faces)
+        ends = body.ends[entered.point].astype(np.int64)
+        np.add.at(counts, (ends, *entered.pixel), faces)
         passed, ended = (cv2.GaussianBlur(n, (0, 0), blur_px[0], sigmaY=blur_px[1]) for n in counts)
         ended = ended + _PRIOR / (2 * np.pi * blur_px.prod())
         share: Float = np.where(self.inverse > 0, ended / (ended + passed), 0)
@@ -218,8 +218,8 @@ class _Front(NamedTuple):
 class _Pixels(NamedTuple):
     """Points in a box of the image: index, row and column in the box, and depth of each point."""
 
-    which: Int
-    place: tuple[Int, Int]
+    point: Int
+    pixel: tuple[Int, Int]
     depth_m: Float
 
 
@@ -232,15 +232,16 @@ def _close(
     surface_m = (1 / surface).astype(np.float32)
     agree_m = _AGREES * (AGREE_M + AGREE_FRACTION * surface_m)
     share = front.closed(body, exposure, layers.spacing_px)
-    shows, sure = _shown(layers, cloud, surface, agree_m, share)
+    shows, measurable = _shown(layers, cloud, surface, agree_m, share)
     layers.filled_m[shows] = surface_m[shows]
 
-    at = front.pixels(exposure, cloud.points[rows], cloud.velocity_m_s[rows])
-    agrees = sure[at.place] & (abs(at.depth_m - surface_m[at.place]) <= agree_m[at.place])
-    place, rows = tuple(axis[agrees] for axis in at.place), rows[at.which[agrees]]
+    returns = front.pixels(exposure, cloud.points[rows], cloud.velocity_m_s[rows])
+    off_m = abs(returns.depth_m - surface_m[returns.pixel])
+    agrees = measurable[returns.pixel] & (off_m <= agree_m[returns.pixel])
+    pixel, rows = tuple(axis[agrees] for axis in returns.pixel), rows[returns.point[agrees]]
     oldest_first = np.argsort(-abs(cloud.since_key_ns[rows]), kind="stable")
     measured = np.full(surface.shape, -1)
-    measured[tuple(axis[oldest_first] for axis in place)] = rows[oldest_first]
+    measured[tuple(axis[oldest_first] for axis in pixel)] = rows[oldest_first]
     hit = measured >= 0
     layers.depth_m[shows] = np.where(hit, surface_m, 0)[shows]
     layers.point[hit] = measured[hit]
@@ -251,10 +252,10 @@ def _surface(layers: Layers, rows: Int, front: _Front) -> Float:
     """Return the (h,w) inverse depth (1/m) of a body's surface; arguments as in `_close`."""
     inside = front.inverse > 0
     known_m = np.maximum(layers.depth_m, layers.rim_m)
-    own = inside & (known_m > 0) & np.isin(layers.point, rows)
-    own &= known_m * front.inverse < 1 + _DEEP_M * front.inverse
-    offset = 1 / np.where(own, known_m, 1) - front.inverse
-    surface: Float = np.maximum(front.inverse + _smooth(offset, own, inside), 1e-3)
+    on_body = inside & (known_m > 0) & np.isin(layers.point, rows)
+    on_body &= known_m * front.inverse < 1 + _DEEP_M * front.inverse
+    offset = 1 / np.where(on_body, known_m, 1) - front.inverse
+    surface: Float = np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)
     return surface
 
 
@@ -264,21 +265,21 @@ def _shown(
     """Return (h,w) the pixels that show a body, and (h,w) the pixels where its returns count."""
     inside, now_m, surface_m = share > 0, layers.filled_m, (1 / surface).astype(np.float32)
     whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
-    before = (now_m > 0) & (now_m < surface_m - HIDDEN_M - HIDDEN_FRACTION * surface_m)
+    in_front = (now_m > 0) & (now_m < surface_m - HIDDEN_M - HIDDEN_FRACTION * surface_m)
     closed = share >= (_LEAST_OF_WHOLE if whole else _LEAST_OF_OPEN)
-    core = _well_inside(closed, float(np.median(layers.gap_px[inside]))) & ~before
+    core = _well_inside(closed, float(np.median(layers.gap_px[inside]))) & ~in_front
     moves = (layers.depth_m > 0) & cloud.moving[layers.point]
-    outline = inside & ~before & ~core & ~(moves & (layers.depth_m <= surface_m + agree_m))
+    outline = inside & ~in_front & ~core & ~(moves & (layers.depth_m <= surface_m + agree_m))
     if not whole:
         outline &= share >= _LEAST_OF_WHOLE
-    for values in (layers.depth_m, layers.filled_m, layers.rejected_m):
-        values[outline] = 0  # what is seen past a moving object is not given back
+    for layer_m in (layers.depth_m, layers.filled_m, layers.rejected_m):
+        layer_m[outline] = 0  # what is seen past a moving object is not given back
     layers.filled_m[core], layers.votes[core] = surface_m[core], 1
     layers.tilt[core] = np.stack(list(np.gradient(surface))[::-1], axis=-1)[core]
-    shows, votes = core.copy(), _VOTES_OF_WHOLE if whole else LEAST_SHARE
+    shows, share_needed = core.copy(), _VOTES_OF_WHOLE if whole else LEAST_SHARE
     pixel, depth_m = np.flatnonzero(outline), surface_m[outline]
     votes_for = least_votes(layers, [layers.filled_m], pixel, depth_m, surely=not whole)
-    layers.votes[outline], shows[outline] = votes_for, votes_for >= ROUNDED * votes
+    layers.votes[outline], shows[outline] = votes_for, votes_for >= ROUNDED * share_needed
     return shows, shows if whole else core
 
 
@@ -294,18 +295,18 @@ def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
     """Return the (h,w) smooth offset (1/m) inside a body's outline, near the known offset."""
     number = np.cumsum(inside).reshape(inside.shape) - 1
     across, down = inside[:, :-1] & inside[:, 1:], inside[:-1] & inside[1:]
-    one = np.concatenate([number[:, :-1][across], number[:-1][down]])
-    other = np.concatenate([number[:, 1:][across], number[1:][down]])
+    first = np.concatenate([number[:, :-1][across], number[:-1][down]])
+    second = np.concatenate([number[:, 1:][across], number[1:][down]])
     num = int(inside.sum())
-    joins = sparse.coo_matrix((np.full(len(one), _STIFF), (one, other)), (num, num)).tocsr()
+    joins = sparse.coo_matrix((np.full(len(first), _STIFF), (first, second)), (num, num)).tocsr()
     joins = joins + joins.T
     # The offset o minimises Σ known (o - offset)² + _STIFF Σ |∇o|² + _HELD Σ o².
     weight = known[inside].astype(np.float64)
     diagonal = np.asarray(joins.sum(axis=1)).ravel() + weight + _HELD
-    found = np.zeros(inside.shape)
+    smooth_offset = np.zeros(inside.shape)
     system = (sparse.diags(diagonal) - joins).tocsr()
-    found[inside] = cg(system, weight * offset[inside], rtol=_ROUNDING)[0]
-    return found
+    smooth_offset[inside] = cg(system, weight * offset[inside], rtol=_ROUNDING)[0]
+    return smooth_offset
 
 
 def _each(velocity_m_s: Float32, points: Float) -> Float32:

@@ -48,19 +48,19 @@ def _march(steps):  # type: ignore[no-untyped-def]
         u1, v1, u2, v2 = DIRECTIONS[d].ravel()
         for i in range(2, height - 2):
             row = height - 1 - i if v2 > 0 else i  # rows two steps on are done before
-            here = steps[d, row, 2 : width - 2]
+            line = steps[d, row, 2 : width - 2]
             if v2 == 0:
-                for j in range(len(here)):
-                    column = len(here) - 1 - j if u2 > 0 else j
+                for j in range(len(line)):
+                    column = len(line) - 1 - j if u2 > 0 else j
                     before = steps[d, row, 2 + column + u1]
-                    here[column] = 0 if here[column] == 0 else min(before, 254) + 1
+                    line[column] = 0 if line[column] == 0 else min(before, 254) + 1
                 continue
             first = steps[d, row + v1, 2 + u1 : width - 2 + u1]
             second = steps[d, row + v2, 2 + u2 : width - 2 + u2]
-            for j in range(len(here)):
+            for j in range(len(line)):
                 beyond = min(second[j], np.uint8(253)) + np.uint8(2)
                 beyond = np.uint8(1) if first[j] == 0 else np.uint8(beyond)
-                here[j] = np.uint8(0) if here[j] == 0 else beyond
+                line[j] = np.uint8(0) if line[j] == 0 else beyond
 
 
 @inlined
@@ -78,14 +78,14 @@ def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
     Pixel (v, u) is du columns and dv rows away. ``inverse`` (H,W) is in 1/m, ``tilt`` (H,W,2) is
     its slope to the right and down in 1/m per px.
     """
-    there = inverse[v, u]
-    return limited(there - tilt[v, u, 0] * du - tilt[v, u, 1] * dv, there)
+    known = inverse[v, u]
+    return limited(known - tilt[v, u, 0] * du - tilt[v, u, 1] * dv, known)
 
 
 @inlined
-def limited(here, there):  # type: ignore[no-untyped-def]
-    """Return inverse depth ``here``, extended from ``there``, which it exceeds at most 1.4-fold."""
-    return min(max(here, there / _MOST), _MOST * there)
+def limited(inverse, start):  # type: ignore[no-untyped-def]
+    """Return inverse depth ``inverse``, kept between 1 / 1.4 and 1.4 times ``start``."""
+    return min(max(inverse, start / _MOST), _MOST * start)
 
 
 @inlined

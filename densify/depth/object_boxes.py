@@ -41,15 +41,15 @@ def complete_boxes(
     """
     tracks = [_on_ground(track, rays, ground) for track in tracks]
     reach = {track.instance: _reach(track, rays.key) for track in tracks}
-    own = {k: np.flatnonzero(cloud.moving & (cloud.instance == k)) for k in reach}
-    toward = rays_toward(cloud, rays, own, reach)
+    rows_of = {k: np.flatnonzero(cloud.moving & (cloud.instance == k)) for k in reach}
+    toward = rays_toward(cloud, rays, rows_of, reach)
     completed = []
     for track in tracks:
         k = track.instance
         T_object_key = poses.inverse(track.T_key_object[track.frames.index(rays.key)])
         start = poses.transform(T_object_key, toward[k].start)
-        way = poses.rotate(T_object_key, toward[k].way)
-        completed.append(_completed(track, start, way))
+        to_return = poses.rotate(T_object_key, toward[k].to_return)
+        completed.append(_completed(track, start, to_return))
     return tuple(completed)
 
 
@@ -87,16 +87,16 @@ def corners_of(size_m: Float) -> Float:
     return corners
 
 
-def _completed(track: ObjectTrack, start: Float, way: Float) -> ObjectTrack:
+def _completed(track: ObjectTrack, start: Float, to_return: Float) -> ObjectTrack:
     """Return a track with its completed box, from rays (K,3) in the object's frame at the key."""
     seen, missing_m = list[str](), _missing_m(track.size_m)
     reach_m = track.size_m / 2 + missing_m + _BESIDE_M
-    enter, leave = crossing(_box_spaces(-reach_m, reach_m), start, way)
-    near = (enter < leave) & (leave > 0) & (enter < 1)
-    start, way = start[near], way[near]
+    enter, leave = crossing(_box_spaces(-reach_m, reach_m), start, to_return)
+    meets = (enter < leave) & (leave > 0) & (enter < 1)
+    start, to_return = start[meets], to_return[meets]
     size_m = track.size_m  # the rays are in the frame of this box
     for axis, names in enumerate(_SIDES):
-        free_m = [_free_m(size_m, missing_m, axis, sign, start, way) for sign in (-1, 1)]
+        free_m = [_free_m(size_m, missing_m, axis, sign, start, to_return) for sign in (-1, 1)]
         seen += [name for name, m in zip(names, free_m, strict=True) if m <= _BESIDE_M]
         room_m = [0.0 if m <= _BESIDE_M else m for m in free_m]
         if missing_m[axis] > 0 and sum(room_m):
@@ -108,7 +108,7 @@ def _completed(track: ObjectTrack, start: Float, way: Float) -> ObjectTrack:
 
 
 def _free_m(
-    size_m: Float, missing_m: Float, axis: int, sign: int, start: Float, way: Float
+    size_m: Float, missing_m: Float, axis: int, sign: int, start: Float, to_return: Float
 ) -> float:
     """Return the metres from a side of a box to the nearest free space outside; inf for none."""
     half = np.stack([-size_m / 2, size_m / 2])
@@ -118,10 +118,10 @@ def _free_m(
     reach_m = missing_m[axis] + _BESIDE_M
     edge_m = sign * size_m[axis] / 2
     low[axis], high[axis] = sorted([edge_m, edge_m + sign * reach_m])
-    enter, leave = crossing(_box_spaces(low, high), start, way)
+    enter, leave = crossing(_box_spaces(low, high), start, to_return)
     enter, leave = np.maximum(enter, 0), np.minimum(leave, 1)
     crosses = enter < leave
-    along = [start[crosses, axis] + t[crosses] * way[crosses, axis] for t in (enter, leave)]
+    along = [start[crosses, axis] + t[crosses] * to_return[crosses, axis] for t in (enter, leave)]
     away_m = np.sort(np.min(sign * np.stack(along), axis=0) - abs(edge_m))
     return float(away_m[_NUM_RAYS - 1]) if len(away_m) >= _NUM_RAYS else np.inf
 

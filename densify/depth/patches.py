@@ -67,42 +67,42 @@ def tangents(
     if not len(points):
         return Patches(normal, spacing_m)
     num_scanners = len(origins[0])
-    place = (sweep * num_scanners + lidar).astype(np.int32)
-    seen = np.empty((3, len(points)), np.float32)
-    _look.over_rows(len(points), points, np.concatenate(origins), place, seen)
-    size = np.bincount(place, minlength=num_scanners * len(origins))
-    members = np.split(np.argsort(place, kind="stable"), np.cumsum(size)[:-1])
+    scanner = (sweep * num_scanners + lidar).astype(np.int32)
+    spherical = np.empty((3, len(points)), np.float32)
+    _look.over_rows(len(points), points, np.concatenate(origins), scanner, spherical)
+    size = np.bincount(scanner, minlength=num_scanners * len(origins))
+    members = np.split(np.argsort(scanner, kind="stable"), np.cumsum(size)[:-1])
     for number, model in sensors.models.items():
         grid = model.grid
         cells = np.empty((grid.num_rows, grid.num_columns), np.int32)
         find = _tangents_anywhere if model.unordered else _tangents_on_rings
-        for mine in members[number::num_scanners]:
-            _nearest_in_cells(seen, mine, grid, cells)
-            mine = mine[wanted[mine]]
-            find.over_rows(len(mine), mine, seen, model.table, grid, cells, normal, spacing_m)
+        for rows in members[number::num_scanners]:
+            _nearest_in_cells(spherical, rows, grid, cells)
+            rows = rows[wanted[rows]]
+            find.over_rows(len(rows), rows, spherical, model.table, grid, cells, normal, spacing_m)
     return Patches(normal, spacing_m)
 
 
 @Kernel
-def _look(first, last, points, origins, place, seen):  # type: ignore[no-untyped-def]
-    """Fill ``seen`` (3,N) with azimuth, elevation (rad) and range (m) of points (N,3)."""
+def _look(first, last, points, origins, scanner, spherical):  # type: ignore[no-untyped-def]
+    """Fill ``spherical`` (3,N) with azimuth, elevation (rad) and range (m) of points (N,3)."""
     for i in range(first, last):
-        x = points[i, 0] - origins[place[i], 0]
-        y = points[i, 1] - origins[place[i], 1]
-        z = points[i, 2] - origins[place[i], 2]
-        level = np.sqrt(x * x + y * y)
-        seen[0, i] = np.arctan2(y, x)
-        seen[1, i] = np.arctan2(z, level)
-        seen[2, i] = np.sqrt(level * level + z * z)
+        x = points[i, 0] - origins[scanner[i], 0]
+        y = points[i, 1] - origins[scanner[i], 1]
+        z = points[i, 2] - origins[scanner[i], 2]
+        horizontal_m = np.sqrt(x * x + y * y)
+        spherical[0, i] = np.arctan2(y, x)
+        spherical[1, i] = np.arctan2(z, horizontal_m)
+        spherical[2, i] = np.sqrt(horizontal_m * horizontal_m + z * z)
 
 
 @inlined
 def _cell(azimuth, elevation, grid):  # type: ignore[no-untyped-def]
     """Return row and column of a direction in a `densify.free_space.sensor.RayGrid`."""
-    place = (elevation - grid.low_rad) / grid.bin_rad
-    k = min(max(int(place), 0), len(grid.row_of) - 2)
-    at = grid.row_of[k] + (place - k) * (grid.row_of[k + 1] - grid.row_of[k])
-    row = min(max(int(at), 0), grid.num_rows - 1)
+    at_bin = (elevation - grid.low_rad) / grid.bin_rad
+    k = min(max(int(at_bin), 0), len(grid.row_of) - 2)
+    at_row = grid.row_of[k] + (at_bin - k) * (grid.row_of[k + 1] - grid.row_of[k])
+    row = min(max(int(at_row), 0), grid.num_rows - 1)
     column = int((azimuth + np.pi) * (grid.num_columns / (2 * np.pi)))
     return row, min(max(column, 0), grid.num_columns - 1)
 
@@ -117,23 +117,23 @@ def _spacing(azimuth, elevation, table):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _before(seen, i, j):  # type: ignore[no-untyped-def]
+def _before(spherical, i, j):  # type: ignore[no-untyped-def]
     """Return True if point i is nearer than point j; between equal ranges the direction decides."""
-    if seen[2, i] != seen[2, j]:
-        return seen[2, i] < seen[2, j]
-    if seen[0, i] != seen[0, j]:
-        return seen[0, i] < seen[0, j]
-    return seen[1, i] < seen[1, j]
+    if spherical[2, i] != spherical[2, j]:
+        return spherical[2, i] < spherical[2, j]
+    if spherical[0, i] != spherical[0, j]:
+        return spherical[0, i] < spherical[0, j]
+    return spherical[1, i] < spherical[1, j]
 
 
 @Kernel
-def _nearest_in_cells(seen, members, grid, cells):  # type: ignore[no-untyped-def]
+def _nearest_in_cells(spherical, members, grid, cells):  # type: ignore[no-untyped-def]
     """Fill ``cells`` (R,C) with the index of the nearest of the members in each cell, -1 none."""
     cells[:] = -1
     for i in members:
-        row, column = _cell(seen[0, i], seen[1, i], grid)
-        there = cells[row, column]
-        if there < 0 or _before(seen, i, there):
+        row, column = _cell(spherical[0, i], spherical[1, i], grid)
+        nearest = cells[row, column]
+        if nearest < 0 or _before(spherical, i, nearest):
             cells[row, column] = i
 
 
@@ -143,56 +143,56 @@ def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
     for k in range(len(rows)):
         r = row + rows[k]
         if 0 <= r < cells.shape[0]:
-            there = cells[r, (column + columns[k]) % cells.shape[1]]
-            if there >= 0:
-                return there
+            point = cells[r, (column + columns[k]) % cells.shape[1]]
+            if point >= 0:
+                return point
     return -1
 
 
 @inlined
-def _slope(one, other, step, range_m):  # type: ignore[no-untyped-def]
+def _slope(slope_a, slope_b, step, range_m):  # type: ignore[no-untyped-def]
     """Return the slope of inverse range per radian from its slopes on both sides (NaN: unknown)."""
     metres = step * range_m * range_m  # of range per step, by a unit of slope
     # On one surface the mean, else the lesser slope, or 0 if that is a step in depth; step in rad
-    if abs(one - other) * metres <= _BEND_M + _BEND * abs(one + other) * metres:
-        return 0.5 * (one + other)
-    if not abs(one) <= abs(other):  # NaN too
-        one = other
-    return one if abs(one) * range_m <= _STEEP else 0.0
+    if abs(slope_a - slope_b) * metres <= _BEND_M + _BEND * abs(slope_a + slope_b) * metres:
+        return 0.5 * (slope_a + slope_b)
+    if not abs(slope_a) <= abs(slope_b):  # NaN too
+        slope_a = slope_b
+    return slope_a if abs(slope_a) * range_m <= _STEEP else 0.0
 
 
 @inlined
-def _change(seen, i, there, axis, across, slope_across):  # type: ignore[no-untyped-def]
+def _change(spherical, i, j, axis, across, slope_across):  # type: ignore[no-untyped-def]
     """Return the change of inverse range per radian along axis 0 (azimuth) or 1, NaN unknown."""
-    if there < 0:
+    if j < 0:
         return np.nan
-    apart = seen[axis, there] - seen[axis, i]
+    apart = spherical[axis, j] - spherical[axis, i]
     if axis == 0:
         apart -= 2 * np.pi * np.rint(apart / (2 * np.pi))
     if abs(apart) < 1e-5:
         return np.nan
     # The change by the other angle is removed.
-    beside = seen[across, there] - seen[across, i]
-    return (1 / seen[2, there] - 1 / seen[2, i] - slope_across * beside) / apart
+    beside = spherical[across, j] - spherical[across, i]
+    return (1 / spherical[2, j] - 1 / spherical[2, i] - slope_across * beside) / apart
 
 
 @inlined
-def _put(i, seen, table, level, rise, normal, spacing):  # type: ignore[no-untyped-def]
+def _put(i, spherical, table, slope_u, slope_v, normal, spacing):  # type: ignore[no-untyped-def]
     """Fill in normal and spacing of point i from its slopes of inverse range per radian."""
-    azimuth, elevation, range_m = seen[0, i], seen[1, i], seen[2, i]
+    azimuth, elevation, range_m = spherical[0, i], spherical[1, i], spherical[2, i]
     across, along = _spacing(azimuth, elevation, table)
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
-    # level: slope along the azimuth, rise: along the elevation
-    aside = level / max(ce, 1e-3)
-    normal[i, 0] = ce * ca / range_m - aside * sa - rise * se * ca
-    normal[i, 1] = ce * sa / range_m + aside * ca - rise * se * sa
-    normal[i, 2] = se / range_m + rise * ce
+    # slope_u: along the azimuth, slope_v: along the elevation
+    aside = slope_u / max(ce, 1e-3)
+    normal[i, 0] = ce * ca / range_m - aside * sa - slope_v * se * ca
+    normal[i, 1] = ce * sa / range_m + aside * ca - slope_v * se * sa
+    normal[i, 2] = se / range_m + slope_v * ce
     spacing[i, 0] = range_m * across
     spacing[i, 1] = range_m * along
 
 
 @Kernel
-def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
+def _tangents_on_rings(first, last, members, spherical, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
     """Fill normal (N,3) and spacing (N,2) of members from neighbours on the ring, above, below."""
     right, left = np.array([-2, -1, -3]), np.array([2, 1, 3])
     same = np.array([0, 0, 0])
@@ -200,31 +200,32 @@ def _tangents_on_rings(first, last, members, seen, table, grid, cells, normal, s
     straight = np.array([0, 1, -1, 0])
     for k in range(first, last):
         i = members[k]
-        across, along = _spacing(seen[0, i], seen[1, i], table)
-        step = across / max(np.cos(seen[1, i]), 1e-3)
-        row, column = _cell(seen[0, i], seen[1, i], grid)
-        one = _change(seen, i, _first(cells, row, column, same, right), 0, 1, 0.0)
-        other = _change(seen, i, _first(cells, row, column, same, left), 0, 1, 0.0)
-        level = _slope(one, other, 2 * step, seen[2, i])
-        level = 0.0 if np.isnan(level) else level
+        across, along = _spacing(spherical[0, i], spherical[1, i], table)
+        step = across / max(np.cos(spherical[1, i]), 1e-3)
+        row, column = _cell(spherical[0, i], spherical[1, i], grid)
+        slope_a = _change(spherical, i, _first(cells, row, column, same, right), 0, 1, 0.0)
+        slope_b = _change(spherical, i, _first(cells, row, column, same, left), 0, 1, 0.0)
+        slope_u = _slope(slope_a, slope_b, 2 * step, spherical[2, i])
+        slope_u = 0.0 if np.isnan(slope_u) else slope_u
         above = _first(cells, row, column, up, straight)
         below = _first(cells, row, column, down, straight)
-        one, other = _change(seen, i, above, 1, 0, level), _change(seen, i, below, 1, 0, level)
-        rise = _slope(one, other, along, seen[2, i])
-        _put(i, seen, table, level, 0.0 if np.isnan(rise) else rise, normal, spacing)
+        slope_a = _change(spherical, i, above, 1, 0, slope_u)
+        slope_b = _change(spherical, i, below, 1, 0, slope_u)
+        slope_v = _slope(slope_a, slope_b, along, spherical[2, i])
+        _put(i, spherical, table, slope_u, 0.0 if np.isnan(slope_v) else slope_v, normal, spacing)
 
 
 @Kernel
-def _tangents_anywhere(first, last, members, seen, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
+def _tangents_anywhere(first, last, members, spherical, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
     """Fill normal and spacing as `_tangents_on_rings`, for a scanner without rings."""
     num_rows, num_columns = cells.shape
     for k in range(first, last):
         i = members[k]
-        range_m, flatten = seen[2, i], np.cos(seen[1, i])
-        row, column = _cell(seen[0, i], seen[1, i], grid)
-        spacing_rad = _spacing(seen[0, i], seen[1, i], table)[1]
+        range_m, flatten = spherical[2, i], np.cos(spherical[1, i])
+        row, column = _cell(spherical[0, i], spherical[1, i], grid)
+        spacing_rad = _spacing(spherical[0, i], spherical[1, i], table)[1]
         reach = min(1 + int(_AROUND * spacing_rad / grid.bin_rad), _MOST_CELLS)
-        level, rise = 0.0, 0.0
+        slope_u, slope_v = 0.0, 0.0
         for turn in range(2):  # a plane to the points around, then to those close to it
             uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0
             num, num_kept = 0, 0
@@ -233,19 +234,19 @@ def _tangents_anywhere(first, last, members, seen, table, grid, cells, normal, s
                     j = cells[r, c % num_columns]
                     if j < 0:
                         continue
-                    u = seen[0, j] - seen[0, i]
+                    u = spherical[0, j] - spherical[0, i]
                     u = (u - 2 * np.pi * np.rint(u / (2 * np.pi))) * flatten
-                    v, w = seen[1, j] - seen[1, i], 1 / seen[2, j] - 1 / range_m
+                    v, w = spherical[1, j] - spherical[1, i], 1 / spherical[2, j] - 1 / range_m
                     if u == 0 and v == 0 and w == 0:
                         continue  # the point itself, or its equal
                     num += 1
-                    off_m = abs(w - level * u - rise * v) * range_m * range_m
+                    off_m = abs(w - slope_u * u - slope_v * v) * range_m * range_m
                     if turn and off_m > _BEND_M + _BEND * abs(w) * range_m * range_m:
                         continue
                     num_kept += 1
                     uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
             ridge = _RIDGE * (uu + vv) + 1e-12
-            level, rise = slopes(uu + ridge, uv, vv + ridge, uw, vw)
+            slope_u, slope_v = slopes(uu + ridge, uv, vv + ridge, uw, vw)
             if 2 * num_kept < num:  # no plane: the patch faces the scanner
-                level, rise = 0.0, 0.0
-        _put(i, seen, table, level * flatten, rise, normal, spacing)
+                slope_u, slope_v = 0.0, 0.0
+        _put(i, spherical, table, slope_u * flatten, slope_v, normal, spacing)

@@ -118,8 +118,8 @@ def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
         return A @ x - target
 
     start = np.linalg.lstsq(A, target, rcond=None)[0]
-    found = optimize.least_squares(residual, start, loss="soft_l1", f_scale=_USUAL)
-    scale, shift = (float(x) for x in found.x)
+    solution = optimize.least_squares(residual, start, loss="soft_l1", f_scale=_USUAL)
+    scale, shift = (float(x) for x in solution.x)
     return (scale, shift - scale * np.log(unit)) if form == "log" else (scale / unit, shift)
 
 
@@ -128,8 +128,8 @@ def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
     value = value.astype(np.float64)
     if fit.kind == "log":
         return fit.scale * np.log(np.maximum(value, np.finfo(np.float64).tiny)) + fit.shift
-    of = np.log(np.maximum(fit.scale * value + fit.shift, np.exp(-_EMPTY)))
-    return -of if fit.kind == "inverse" else of
+    logarithm = np.log(np.maximum(fit.scale * value + fit.shift, np.exp(-_EMPTY)))
+    return -logarithm if fit.kind == "inverse" else logarithm
 
 
 def _at_far_limit(value: Float32, known: Bool, fit: PriorFit) -> Bool:
@@ -144,7 +144,7 @@ class _Cells(NamedTuple):
 
     size: int
     guide: Float  # (R,C) logarithm of depth at the central pixel of each cell
-    of: Int  # (H,W) number of each pixel's cell, row by row
+    number: Int  # (H,W) number of each pixel's cell, row by row
 
     @staticmethod
     def over(guide: Float32) -> _Cells:
@@ -155,40 +155,41 @@ class _Cells(NamedTuple):
             np.minimum(np.arange(0, length, size) + size // 2, length - 1)
             for length in (height, width)
         )
-        of = np.arange(height)[:, None] // size * len(columns) + np.arange(width) // size
-        return _Cells(size, guide[np.ix_(rows, columns)].astype(np.float64), of)
+        number = np.arange(height)[:, None] // size * len(columns) + np.arange(width) // size
+        return _Cells(size, guide[np.ix_(rows, columns)].astype(np.float64), number)
 
     def membrane(self) -> sparse.csr_array:
         """Return the (RC,RC) matrix of the squared differences between neighbouring cells."""
-        number = np.arange(self.guide.size).reshape(self.guide.shape)
-        first = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
-        second = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
+        cell = np.arange(self.guide.size).reshape(self.guide.shape)
+        first = np.concatenate([cell[:, :-1].ravel(), cell[:-1].ravel()])
+        second = np.concatenate([cell[:, 1:].ravel(), cell[1:].ravel()])
         step = (self.guide.ravel()[first] - self.guide.ravel()[second]) / _USUAL
         tied = _SMOOTHNESS * np.exp(-(step**2))  # less, the more the guides of both cells differ
-        half = sparse.coo_array((tied, (first, second)), shape=(number.size, number.size))
-        both = (half + half.T).tocsr()
-        return sparse.diags_array(both.sum(axis=1)) - both
+        half = sparse.coo_array((tied, (first, second)), shape=(cell.size, cell.size))
+        weights = (half + half.T).tocsr()
+        return sparse.diags_array(weights.sum(axis=1)) - weights
 
     def at_pixels(self, values: Float, guide: Float32) -> Float:
         """Return (K,H,W) values (K,RC) of cells, interpolated between four cells."""
         grid = values.reshape(-1, *self.guide.shape)
         down, right = ((np.arange(length) - self.size // 2) / self.size for length in guide.shape)
-        total, result = np.zeros(guide.shape), np.zeros((len(grid), *guide.shape))
+        weight_sum, value_sum = np.zeros(guide.shape), np.zeros((len(grid), *guide.shape))
         for row, row_weight in _both_ways(down, self.guide.shape[0]):
             for column, column_weight in _both_ways(right, self.guide.shape[1]):
-                place = np.ix_(row, column)
+                corner = np.ix_(row, column)
                 # Cells on another surface, by their guide, hardly count.
-                alike = np.exp(-(((guide - self.guide[place]) / _USUAL) ** 2)) + np.finfo(float).eps
+                off = (guide - self.guide[corner]) / _USUAL
+                alike = np.exp(-(off**2)) + np.finfo(float).eps
                 weight = alike * np.outer(row_weight, column_weight)
-                total += weight
-                result += weight * grid[:, row[:, None], column]
-        return result / total
+                weight_sum += weight
+                value_sum += weight * grid[:, row[:, None], column]
+        return value_sum / weight_sum
 
 
-def _both_ways(place: Float, num: int) -> list[tuple[Int, Float]]:
+def _both_ways(position: Float, num: int) -> list[tuple[Int, Float]]:
     """Return the cells before and after fractional positions, each with its weights."""
-    before = np.clip(np.floor(place), 0, num - 1).astype(np.int64)
-    share = np.clip(place - before, 0, 1)
+    before = np.clip(np.floor(position), 0, num - 1).astype(np.int64)
+    share = np.clip(position - before, 0, 1)
     return [(before, 1 - share), (np.minimum(before + 1, num - 1), share)]
 
 
@@ -199,9 +200,9 @@ def _correction(
     # guide: the prior's log_depth smoothed, steepness: its range around a pixel
     cells = _Cells.over(guide)
     area, num = cells.size**2, cells.guide.size
-    near = usable & (filled_m > 0) & (np.abs(guide - cells.guide.ravel()[cells.of]) < _USUAL)
-    cell = cells.of[near]
-    lacking = np.log(filled_m[near].astype(np.float64)) - log_depth[near]
+    known = usable & (filled_m > 0) & (np.abs(guide - cells.guide.ravel()[cells.number]) < _USUAL)
+    cell = cells.number[known]
+    deviation = np.log(filled_m[known].astype(np.float64)) - log_depth[known]
     membrane = cells.membrane()
 
     def at_rest(trust: Float, values: Float, elsewhere: float) -> Float:
@@ -209,8 +210,8 @@ def _correction(
         tied = np.bincount(cell, trust, num) / area + _TOWARDS_NONE
         pulled = np.bincount(cell, trust * values, num) / area + _TOWARDS_NONE * elsewhere
         system = (membrane + sparse.diags_array(tied)).tocsc()
-        rest: Float = linalg.spsolve(system, pulled, permc_spec="MMD_AT_PLUS_A")
-        return rest
+        settled: Float = linalg.spsolve(system, pulled, permc_spec="MMD_AT_PLUS_A")
+        return settled
 
     def trusted(off: Float | Float32) -> Float:
         """Return the (N,) weight of known pixels at these deviations."""
@@ -218,11 +219,11 @@ def _correction(
         return weight
 
     # A steep prior may be blurred. Differences there have little weight.
-    flat = trusted(steepness[near])
-    mean = float(np.average(np.abs(lacking), weights=flat)) if len(flat) else 0.0
-    trust = flat * trusted(lacking - at_rest(flat, lacking, 0.0)[cell])
-    correction = at_rest(trust, lacking, 0.0)
+    flat = trusted(steepness[known])
+    mean = float(np.average(np.abs(deviation), weights=flat)) if len(flat) else 0.0
+    trust = flat * trusted(deviation - at_rest(flat, deviation, 0.0)[cell])
+    correction = at_rest(trust, deviation, 0.0)
     # The mean error of known pixels nearby on the same surface; far from them, of the image.
-    spread = at_rest(trust, np.abs(lacking - correction[cell]), mean)
+    spread = at_rest(trust, np.abs(deviation - correction[cell]), mean)
     at_pixels = cells.at_pixels(np.stack([correction, spread]), guide)
     return at_pixels[0], at_pixels[1]

@@ -78,14 +78,14 @@ def project(
     if visible and rays is not None:
         layers = without_seen_through(layers, cloud, view, rays, reason)
     layers = replace(layers, rejected_m=np.where(layers.filled_m > 0, 0, layers.rejected_m))
-    some, evidence = (layers.filled_m > 0) | (layers.rejected_m > 0), None
-    confidence = np.zeros(some.shape, np.float32)
+    has_depth, evidence = (layers.filled_m > 0) | (layers.rejected_m > 0), None
+    confidence = np.zeros(has_depth.shape, np.float32)
     if visible:
         evidence = features(layers, cloud.since_key_ns, camera)
-        confidence[some] = confidence_of(evidence)
-    elif some.any():
-        confidence[some] = cloud.confidence[layers.point[nearest_measured(layers)]][some]
-    confidence[some] = np.maximum(confidence[some], _LEAST_CONFIDENCE)
+        confidence[has_depth] = confidence_of(evidence)
+    elif has_depth.any():
+        confidence[has_depth] = cloud.confidence[layers.point[nearest_measured(layers)]][has_depth]
+    confidence[has_depth] = np.maximum(confidence[has_depth], _LEAST_CONFIDENCE)
     _set_reasons(layers, reason)
     if visible and filled:
         layers = measure_spots(layers, points)
@@ -102,19 +102,19 @@ def _layers_of(
 
     def image(values: np.ndarray, none: float = 0) -> np.ndarray:
         """Return (H,W,…) values of the points that give pixels their depth."""
-        made = np.full((known.size, *values.shape[1:]), none, values.dtype)
-        made[known] = values[winner]
-        return made.reshape(*shape, *values.shape[1:])
+        by_pixel = np.full((known.size, *values.shape[1:]), none, values.dtype)
+        by_pixel[known] = values[winner]
+        return by_pixel.reshape(*shape, *values.shape[1:])
 
     depth_m = np.where(inside, pixels.depth_m, np.float32(0)).reshape(shape)
-    near = points if points.far.all() else points.select(~points.far)
+    in_window = points if points.far.all() else points.select(~points.far)
     return Layers(
         depth_m=depth_m,
         rim_m=np.where(inside, np.float32(0), pixels.depth_m).reshape(shape),
         filled_m=depth_m,
         point=image(points.index.astype(np.int32), -1),
         tilt=image(points.slope.astype(np.float32)),
-        spacing_px=_spacing_px(near, shape),
+        spacing_px=_spacing_px(in_window, shape),
         votes=np.ones(shape, np.float32),
         edge=pixels.edge.reshape(shape),
         rejected_m=np.zeros(shape, np.float32),
@@ -161,9 +161,9 @@ def _finished(
     """Return the layers as a depth map, with the sweep that measured each pixel."""
     measured, shown = layers.depth_m > 0, layers.filled_m > 0
 
-    def frames(of: Bool) -> NDArray[np.int32]:
-        frame = np.full(of.shape, -1, np.int32)
-        frame[of] = cloud.frame[layers.point[of]]
+    def frames(mask: Bool) -> NDArray[np.int32]:
+        frame = np.full(mask.shape, -1, np.int32)
+        frame[mask] = cloud.frame[layers.point[mask]]
         return frame
 
     none = np.float32(0)

@@ -36,19 +36,19 @@ class Rays:
         """Return the (M,3) origins of the rays of a cloud's M points, at their firing times."""
         starts = np.empty((len(cloud), 3))
         for frame in np.unique(cloud.frame).tolist():
-            mine, registered = np.flatnonzero(cloud.frame == frame), self.stretch[frame]
+            rows, registered = np.flatnonzero(cloud.frame == frame), self.stretch[frame]
             sweep = registered.sweep
             origin = np.stack([sweep.origin_m(n) for n in range(int(sweep.lidar.max()) + 1)])
-            start = origin[cloud.lidar[mine]]
+            start = origin[cloud.lidar[rows]]
             if sweep.offset_ns is not None:
                 order = np.argsort(sweep.row, kind="stable")
-                found = order[np.searchsorted(sweep.row, cloud.row[mine], sorter=order)]
-                offset_s = sweep.offset_ns[found, None] * 1e-9
+                sweep_rows = order[np.searchsorted(sweep.row, cloud.row[rows], sorter=order)]
+                offset_s = sweep.offset_ns[sweep_rows, None] * 1e-9
                 twist: Float = np.where(
                     offset_s < 0, registered.twist_before, registered.twist_after
                 )
                 start = poses.transform_each(offset_s * twist, start)
-            starts[mine] = poses.transform(self.stretch.T_target_source(self.key, frame), start)
+            starts[rows] = poses.transform(self.stretch.T_target_source(self.key, frame), start)
         return starts
 
     def moved_m(self, frame: int) -> float:
@@ -103,8 +103,8 @@ def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
     size = 2 * round(2.5 * blur_px) + 1
     pixels = counts.reshape(shape).astype(np.float32)
-    made = cv2.GaussianBlur(pixels, (size, size), blur_px, borderType=cv2.BORDER_REFLECT)
-    return made.astype(np.float32, copy=False)
+    blurred = cv2.GaussianBlur(pixels, (size, size), blur_px, borderType=cv2.BORDER_REFLECT)
+    return blurred.astype(np.float32, copy=False)
 
 
 def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Exposure) -> Float:
@@ -118,32 +118,32 @@ def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Expo
     end = poses.transform(exposure.T_cam_key, to_key)
     end_m, still = exposure.depth_m(end), np.zeros(to_key.shape, np.float32)
     sight = exposure.see(to_key, still)
-    uv, good = sight.uv, sight.inside
+    uv, valid = sight.uv, sight.inside
     depth_m = np.full(len(to_key), np.inf)
     for _ in range(_NUM_STEPS):
-        column, row = np.rint(np.where(good[:, None], uv, 0)).astype(np.int64).T
+        column, row = np.rint(np.where(valid[:, None], uv, 0)).astype(np.int64).T
         there_m = surface_m[row, column].astype(np.float64)
         with np.errstate(invalid="ignore"):
             same = abs(there_m - depth_m) <= AGREE_M + AGREE_FRACTION * depth_m
         depth_m = there_m
         share = _share(start, end, depth_m, exposure.measure)
-        good &= (depth_m > 0) & (share > 0) & (share < 1)
-        share = np.where(good, share, 1.0)[:, None]
+        valid &= (depth_m > 0) & (share > 0) & (share < 1)
+        share = np.where(valid, share, 1.0)[:, None]
         sight = exposure.see(from_key + share * (to_key - from_key), still)
-        uv, good = sight.uv, good & sight.inside
+        uv, valid = sight.uv, valid & sight.inside
     allowed_m = HIDDEN_M + HIDDEN_FRACTION * depth_m
-    crosses: Float = uv[good & same & (end_m - depth_m > allowed_m)]
+    crosses: Float = uv[valid & same & (end_m - depth_m > allowed_m)]
     return crosses
 
 
 def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
     """Return the (P,) share of the path at this depth, camera frame, NaN if it is not reached."""
-    way = end - start
+    path = end - start
     with np.errstate(divide="ignore", invalid="ignore"):
         if measure == "z":
-            share: Float = (depth_m - start[:, 2]) / way[:, 2]
+            share: Float = (depth_m - start[:, 2]) / path[:, 2]
             return share
-        square, along = (way**2).sum(axis=1), (start * way).sum(axis=1)
-        within = along**2 - square * ((start**2).sum(axis=1) - depth_m**2)
-        share = (np.sqrt(within) - along) / square
+        length_squared, along = (path**2).sum(axis=1), (start * path).sum(axis=1)
+        discriminant = along**2 - length_squared * ((start**2).sum(axis=1) - depth_m**2)
+        share = (np.sqrt(discriminant) - along) / length_squared
         return share

@@ -28,25 +28,25 @@ def measure_spots(layers: Layers, points: PointsInImage) -> Layers:
     point = points.at(layers.point.flat[measured])
     radius_px = np.minimum(FOOTPRINT * points.spacing_px[point, 0], _MOST_PX)
     filled_m = np.where(layers.depth_m == 0, layers.filled_m, np.float32(0))
-    found = np.full(shape, -1)
+    source_pixel = np.full(shape, -1)
     nearest, uv = np.full(shape, np.inf), points.uv[point]
-    _cover(measured, uv, radius_px, layers.depth_m, layers.tilt, filled_m, found, nearest)
-    covered = np.flatnonzero(found >= 0)
+    _cover(measured, uv, radius_px, layers.depth_m, layers.tilt, filled_m, source_pixel, nearest)
+    covered = np.flatnonzero(source_pixel >= 0)
     depth_m, of_point = layers.depth_m.copy(), layers.point.copy()
     depth_m.flat[covered] = layers.filled_m.flat[covered]
-    of_point.flat[covered] = layers.point.flat[found.flat[covered]]
+    of_point.flat[covered] = layers.point.flat[source_pixel.flat[covered]]
     return replace(layers, depth_m=depth_m, point=of_point)
 
 
 @Kernel
-def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, found, nearest):  # type: ignore[no-untyped-def]
+def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, source_pixel, nearest):  # type: ignore[no-untyped-def]
     """Find for each filled pixel the measured pixel, nearest in the image, whose spot covers it."""
-    # filled_m: 0 where no pixel may be covered; found (H,W): index of the measured pixel, nearest
-    # (H,W): squared distance to its spot, inf at first
+    # filled_m: 0 where no pixel may be covered; source_pixel (H,W): index of the measured pixel, -1
+    # at first; nearest (H,W): squared distance to its spot, inf at first
     height, width = filled_m.shape
     for i in range(len(pixel)):
         v, u = pixel[i] // width, pixel[i] % width
-        here = depth_m[v, u]
+        return_m = depth_m[v, u]
         reach = int(radius_px[i] + 0.5)  # the centre of a spot is in its pixel
         for row in range(max(v - reach, 0), min(v + reach + 1, height)):
             for column in range(max(u - reach, 0), min(u + reach + 1, width)):
@@ -56,7 +56,7 @@ def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, found, nearest):  # ty
                 away = (column - uv[i, 0]) ** 2 + (row - uv[i, 1]) ** 2
                 if away > radius_px[i] * radius_px[i] or away >= nearest[row, column]:
                     continue
-                inverse = 1 / here + (column - u) * tilt[v, u, 0] + (row - v) * tilt[v, u, 1]
-                if abs(z * inverse - 1) <= (AGREE_M + AGREE_FRACTION * here) * abs(inverse):
+                inverse = 1 / return_m + (column - u) * tilt[v, u, 0] + (row - v) * tilt[v, u, 1]
+                if abs(z * inverse - 1) <= (AGREE_M + AGREE_FRACTION * return_m) * abs(inverse):
                     nearest[row, column] = away
-                    found[row, column] = pixel[i]
+                    source_pixel[row, column] = pixel[i]

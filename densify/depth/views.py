@@ -137,11 +137,11 @@ class Views:
         return moving_bodies(cloud, self.rays, self.exposures.values())
 
     def far(
-        self, found: StandingWorld, T_key_found: Float, stretch: Stretch, standing_only: bool
+        self, world: StandingWorld, T_key_world: Float, stretch: Stretch, standing_only: bool
     ) -> SeenCloud:
         """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`."""
         cloud, surface = far_cloud(
-            found, T_key_found, stretch, self.key, self.exposures, standing_only
+            world, T_key_world, stretch, self.key, self.exposures, standing_only
         )
         return SeenCloud(cloud, surface, self.in_view(cloud))
 
@@ -157,8 +157,8 @@ class Views:
         maps = {}
         for name, view in seen.in_view.items():
             shown = self.lab.get(name), self.rays, seen.bodies
-            made = project(seen.cloud, view, settings, seen.patches, filled, *shown)
-            maps[name] = replace(made, warnings=(_OFF,)) if name in self.off else made
+            depth_map = project(seen.cloud, view, settings, seen.patches, filled, *shown)
+            maps[name] = replace(depth_map, warnings=(_OFF,)) if name in self.off else depth_map
         return maps
 
     def coloured(
@@ -225,8 +225,8 @@ class Views:
         """Return the (H,W,2) `optical_flow` to the "previous" and "next" image, by map name."""
         return {
             name: {
-                which: optical_flow(cloud, depth[name], exposure, other)
-                for which, other in exposure.others.items()
+                image: optical_flow(cloud, depth[name], exposure, neighbour)
+                for image, neighbour in exposure.neighbours.items()
             }
             for name, exposure in self.exposures.items()
         }
@@ -259,14 +259,14 @@ class Views:
         """Return every moving object alone by instance number, points without an object as -1."""
         movers = {}
         for instance in np.unique(cloud.instance[cloud.moving]).tolist():
-            part = self.see(cloud.select(cloud.moving & (cloud.instance == instance)))
-            part = part._replace(bodies={k: b for k, b in bodies.items() if k == instance})
-            depth = self.depth(part, visible)
-            movers[instance] = Mover(self.coloured(part, depth, images), depth)
+            seen = self.see(cloud.select(cloud.moving & (cloud.instance == instance)))
+            seen = seen._replace(bodies={k: b for k, b in bodies.items() if k == instance})
+            depth = self.depth(seen, visible)
+            movers[instance] = Mover(self.coloured(seen, depth, images), depth)
         return movers
 
 
-def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, other: Exposure) -> Float32:
+def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, target: Exposure) -> Float32:
     """Return the (H,W,2) flow in pixels, right and down, between two exposures; NaN if unknown.
 
     The flow includes ego-motion, and moving objects continue at their velocity. Pixels that only a
@@ -277,7 +277,7 @@ def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, other: Expos
     uv = exposure.see(points, velocity_m_s).uv
     column, row = np.rint(uv).astype(np.int64).T
     flow = np.full((*depth.depth_m.shape, 2), np.nan, np.float32)
-    flow[row, column] = other.see(points, velocity_m_s).uv - uv
+    flow[row, column] = target.see(points, velocity_m_s).uv - uv
     hit = np.zeros(depth.depth_m.shape, bool)
     hit[row, column] = True
     covered = (depth.depth_m > 0) & ~hit
@@ -296,9 +296,9 @@ def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: f
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
     age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
     measured = depth.depth_m > 0
-    frames, which = np.unique(depth.frame[measured], return_inverse=True)
+    frames, frame_index = np.unique(depth.frame[measured], return_inverse=True)
     ages = np.full(measured.shape, np.nan, np.float32)
-    ages[measured] = np.array([age_s[int(f)] for f in frames])[which]
+    ages[measured] = np.array([age_s[int(f)] for f in frames])[frame_index]
     filled = (depth.filled_m > 0) & ~measured
     if len(frames) and filled.any():
         row, column = ndimage.distance_transform_edt(
@@ -322,29 +322,29 @@ class HeldOut:
     def of(views: Views, cloud: Cloud) -> HeldOut:
         """Return the ground truth of a key sweep; ``cloud`` has its moving points' velocities."""
         settings = replace(views.settings, rims="strict", visibility=True)
-        own = cloud.select(cloud.frame == views.key)
+        key_cloud = cloud.select(cloud.frame == views.key)
 
-        def alone(part: SeenCloud) -> dict[str, DepthMap]:
+        def alone(returns: SeenCloud) -> dict[str, DepthMap]:
             """Return the maps of returns of the key sweep."""
             return {
-                name: project(part.cloud, view, settings, part.patches, filled=False)
-                for name, view in part.in_view.items()
+                name: project(returns.cloud, view, settings, returns.patches, filled=False)
+                for name, view in returns.in_view.items()
             }
 
-        seen = views.see(own)
+        seen = views.see(key_cloud)
         key_alone = alone(seen)
         moving = {
             name: (maps.depth_m > 0) & (maps.depth_m == key_alone[name].depth_m)
-            for name, maps in alone(views.see(own.select(own.moving))).items()
+            for name, maps in alone(views.see(key_cloud.select(key_cloud.moving))).items()
         }
-        gap_rad = seen.patches.spacing_m[:, 1] / np.linalg.norm(own.points, axis=1)
+        gap_rad = seen.patches.spacing_m[:, 1] / np.linalg.norm(key_cloud.points, axis=1)
         known = gap_rad[np.isfinite(gap_rad) & (gap_rad > 0)]
         return HeldOut(views, key_alone, moving, float(np.median(known)) if len(known) else 0.0)
 
     def without_key(self, seen: SeenCloud) -> SeenCloud:
         """Return the cloud without the key sweep and its evidence on bodies."""
-        others = seen.cloud.frame != self.views.key
-        surface, cloud = seen.patches.select(others), seen.cloud.select(others)
+        keep = seen.cloud.frame != self.views.key
+        surface, cloud = seen.patches.select(keep), seen.cloud.select(keep)
         bodies = without_sweep(seen.bodies, cloud, self.views.key)
         return SeenCloud(cloud, surface, self.views.in_view(cloud), bodies)
 
@@ -354,15 +354,15 @@ class HeldOut:
         Returns from far inside a moving body are no ground truth: they passed its windows, but the
         map shows the glass. The result is empty if no points remain.
         """
-        others = self.without_key(seen)
-        if not len(others.cloud):
+        without_key = self.without_key(seen)
+        if not len(without_key.cloud):
             return {}
-        made = {}
-        for name, depth in self.views.depth(others, visible).items():
+        maps = {}
+        for name, depth in self.views.depth(without_key, visible).items():
             moving, truth_m = self.moving[name], self.key_alone[name].depth_m
             inside = moving & far_inside(seen.bodies.values(), self.views.exposures[name], truth_m)
-            made[name] = depth, np.where(inside, np.float32(0), truth_m), moving & ~inside
-        return made
+            maps[name] = depth, np.where(inside, np.float32(0), truth_m), moving & ~inside
+        return maps
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Return the scores of each map made without the key sweep, None if no points remain.
@@ -391,5 +391,5 @@ class HeldOut:
         unjudged = away_px > self.gap_rad * self.views.exposures[name].camera.focal_px
         filled = maps.filled_m > 0
         moving = outlines(bodies.values(), self.views.exposures[name])
-        parts = {"all": filled, "moving": filled & moving, "static": filled & ~moving}
-        return {n: float(unjudged[p].mean()) if p.any() else None for n, p in parts.items()}
+        masks = {"all": filled, "moving": filled & moving, "static": filled & ~moving}
+        return {n: float(unjudged[p].mean()) if p.any() else None for n, p in masks.items()}

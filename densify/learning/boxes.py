@@ -33,7 +33,7 @@ class BoxMargins:
 
 
 def flow_of_boxes(
-    here: RegisteredSweep,
+    source: RegisteredSweep,
     after: RegisteredSweep,
     boxes: Boxes,
     next_boxes: Boxes,
@@ -42,29 +42,30 @@ def flow_of_boxes(
     """Return the flow of the N points of one sweep to the next, and which flows are certain.
 
     Args:
+        source: Sweep of the N points.
         after: Next sweep in the same world. Only its pose and time are used.
         boxes, next_boxes: Boxes of the two sweeps. Boxes of one object share the track name.
 
     Returns:
-        The flow with ego-motion removed, in the lidar frame of ``here``; ``instance`` is the index
+        The flow with ego-motion removed, in the lidar frame of ``source``; ``instance`` is the row
             of the point's box, -1 for no box. Then (N,) True where the flow is certain. It is False
             for points in two boxes, just outside a box, at the bottom of a moving box, in a box
             that the next sweep lacks, or in image areas without annotation.
     """
     margins = margins or BoxMargins()
-    points = here.sweep.points
+    points = source.sweep.points
     field = FlowField.zero(len(points))
-    num_inside, near = np.zeros(len(points), np.int64), np.zeros(len(points), bool)
+    num_inside, is_near_box = np.zeros(len(points), np.int64), np.zeros(len(points), bool)
     sure = _looked_at(boxes.view, points)
-    duration_s = (after.sweep.stamp_ns - here.sweep.stamp_ns) * 1e-9
-    T_here_next = poses.inverse(here.T_world_lidar) @ after.T_world_lidar
-    T_there = T_here_next @ _at_reference(next_boxes, after)
+    duration_s = (after.sweep.stamp_ns - source.sweep.stamp_ns) * 1e-9
+    T_source_next = poses.inverse(source.T_world_lidar) @ after.T_world_lidar
+    T_source_next_boxes = T_source_next @ _at_reference(next_boxes, after)
     row_of = {track: row for row, track in enumerate(next_boxes.track) if track}
-    for k, (rows, T_here_box) in enumerate(_about(boxes, here, margins)):
+    for k, (rows, T_source_box) in enumerate(_about(boxes, source, margins)):
         track = boxes.track[k]
-        in_box = poses.transform(poses.inverse(T_here_box), points[rows])
+        in_box = poses.transform(poses.inverse(T_source_box), points[rows])
         outside_m = (np.abs(in_box) - boxes.size_m[k] / 2).max(axis=1)
-        near[rows] |= outside_m <= margins.grown_m + margins.unsure_m
+        is_near_box[rows] |= outside_m <= margins.grown_m + margins.unsure_m
         inside = outside_m <= margins.grown_m
         rows, in_box = rows[inside], in_box[inside]
         num_inside[rows] += 1
@@ -72,33 +73,35 @@ def flow_of_boxes(
         if track not in row_of:
             sure[rows] = False
             continue
-        T_here_there = T_there[row_of[track]]
-        shift_m = np.linalg.norm(T_here_there[:3, 3] - T_here_box[:3, 3])
+        T_source_next_box = T_source_next_boxes[row_of[track]]
+        shift_m = np.linalg.norm(T_source_next_box[:3, 3] - T_source_box[:3, 3])
         if shift_m < MOVES_M_S * duration_s:
             continue
-        field.displacement[rows] = poses.transform(T_here_there, in_box) - points[rows]
+        field.displacement[rows] = poses.transform(T_source_next_box, in_box) - points[rows]
         field.moving[rows] = True
         sure[rows[in_box[:, 2] < margins.foot_m - boxes.size_m[k, 2] / 2]] = False
     twice = num_inside > 1
-    sure &= ~twice & ~(near & (num_inside == 0))
+    sure &= ~twice & ~(is_near_box & (num_inside == 0))
     field.displacement[twice] = 0.0
     field.moving[twice] = False
     return field, sure
 
 
-def _about(boxes: Boxes, here: RegisteredSweep, margins: BoxMargins) -> Iterator[tuple[Int, Float]]:
+def _about(
+    boxes: Boxes, registered: RegisteredSweep, margins: BoxMargins
+) -> Iterator[tuple[Int, Float]]:
     """Yield, for each box, the indices of the points around it and its (4,4) pose, lidar frame."""
-    points = here.sweep.points
+    points = registered.sweep.points
     reach_m = np.linalg.norm(boxes.size_m / 2 + margins.grown_m + margins.unsure_m, axis=1)
     x, y = np.ascontiguousarray(points[:, 0]), np.ascontiguousarray(points[:, 1])
-    for k, T_here_box in enumerate(_at_reference(boxes, here)):
+    for k, T_lidar_box in enumerate(_at_reference(boxes, registered)):
         rows: Int = np.flatnonzero(
-            (np.abs(x - T_here_box[0, 3]) <= reach_m[k])
-            & (np.abs(y - T_here_box[1, 3]) <= reach_m[k])
+            (np.abs(x - T_lidar_box[0, 3]) <= reach_m[k])
+            & (np.abs(y - T_lidar_box[1, 3]) <= reach_m[k])
         )
         if boxes.lidar is not None and boxes.lidar[k] >= 0:  # drawn for one scanner
-            rows = rows[here.sweep.lidar[rows] == boxes.lidar[k]]
-        yield rows, T_here_box
+            rows = rows[registered.sweep.lidar[rows] == boxes.lidar[k]]
+        yield rows, T_lidar_box
 
 
 def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:

@@ -108,14 +108,14 @@ def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str)
     sweeps = []
     for i, registered in enumerate(stretch.sweeps):
         above, frame = AboveGround.of(registered, heights), frames[i]
-        around = frames[max(i - 1, 0)], frames[min(i + 1, len(frames) - 1)]
+        neighbors = frames[max(i - 1, 0)], frames[min(i + 1, len(frames) - 1)]
         flow = moving = None
         if teacher == "truth" and sequence.truth is not None:
             row = registered.sweep.row[above.row]
-            found = [sequence.truth.displacement(frame, other)[row] for other in around]
-            flow, moving = np.stack(found), sequence.truth.sweep(frame).moving[row]
+            flows = [sequence.truth.displacement(frame, neighbor)[row] for neighbor in neighbors]
+            flow, moving = np.stack(flows), sequence.truth.sweep(frame).moving[row]
         elif motion is not None:
-            row, fields = above.row, [motion.flow(frame, other) for other in around]
+            row, fields = above.row, [motion.flow(frame, neighbor) for neighbor in neighbors]
             flow = np.stack([field.displacement[row] for field in fields])
             moving = fields[0].moving[row] & ~fields[0].lost[row]
         if flow is not None:

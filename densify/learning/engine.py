@@ -30,34 +30,34 @@ def check_argument(argument: str) -> None:
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
     """Return the motion of a scene by a model file (`densify.flow.engines.EngineModule`)."""
     model, sweeps = read_model(Path(argument)), scene.stretch.sweeps
-    rows = zip(sweeps, scene.candidates, strict=True)
-    standing = [AboveGround.of(sweep, scene.ground, found.row) for sweep, found in rows]
-    flows = flows_of(model, standing, [s.T_world_lidar[:3, 3] for s in sweeps])
+    pairs = zip(sweeps, scene.candidates, strict=True)
+    above = [AboveGround.of(sweep, scene.ground, candidates.row) for sweep, candidates in pairs]
+    flows = flows_of(model, above, [s.T_world_lidar[:3, 3] for s in sweeps])
     stamps_s = [s.sweep.stamp_ns * 1e-9 for s in sweeps]
-    found, velocities = [], []
+    all_grouped, velocities = [], []
     for i, candidates in enumerate(scene.candidates):
-        duration_s = stamps_s[_neighbor(i, len(standing))] - stamps_s[i] if len(standing) > 1 else 1
+        duration_s = stamps_s[_neighbor(i, len(above))] - stamps_s[i] if len(above) > 1 else 1
         velocity_m_s = flows[i] / duration_s
         velocity_m_s[:, 2] = 0.0
-        grouped, common_m_s = _grouped(scene, i, candidates, standing[i], velocity_m_s)
-        found.append(grouped)
+        grouped, common_m_s = _grouped(scene, i, candidates, above[i], velocity_m_s)
+        all_grouped.append(grouped)
         velocities.append(common_m_s)
-    return motion_of(scene, tuple(found), velocities)
+    return motion_of(scene, tuple(all_grouped), velocities)
 
 
-def flows_of(model: Model, standing: list[AboveGround], origins: list[Float]) -> list[Float]:
+def flows_of(model: Model, above: list[AboveGround], origins: list[Float]) -> list[Float]:
     """Return for each sweep the flow (n,3) to the next sweep, metres, world, ego-motion removed.
 
     The last sweep has its flow to the previous sweep. ``origins`` are (3,) scanner positions.
     """
     flows = []
-    for i, own in enumerate(standing):
-        if len(standing) < 2 or not len(own.row):
-            flows.append(np.zeros((len(own.row), 3)))
+    for i, source in enumerate(above):
+        if len(above) < 2 or not len(source.row):
+            flows.append(np.zeros((len(source.row), 3)))
             continue
-        numbers = order_for(i, _neighbor(i, len(standing)), len(standing), NUM_SWEEPS)
+        numbers = order_for(i, _neighbor(i, len(above)), len(above), NUM_SWEEPS)
         flows.append(
-            model.flow([None if n is None else standing[n].cloud(origins[i]) for n in numbers])
+            model.flow([None if n is None else above[n].cloud(origins[i]) for n in numbers])
         )
     return flows
 
@@ -67,7 +67,7 @@ def _neighbor(i: int, count: int) -> int:
 
 
 def _grouped(
-    scene: Scene, i: int, candidates: Candidates, standing: AboveGround, velocity_m_s: Float
+    scene: Scene, i: int, candidates: Candidates, above: AboveGround, velocity_m_s: Float
 ) -> tuple[Candidates, Float]:
     """Return the candidates of sweep i for tracking, and their (n,3) velocities, m/s, world."""
     # Clusters that move according to the network may start a track, at their median velocity.
@@ -76,12 +76,12 @@ def _grouped(
     registered = scene.stretch.sweeps[i]
     row = candidates.row
     gap_m = scene.space.sensors.gap_m(registered.sweep.points[row], registered.sweep.lidar[row])
-    close = closer_rings(standing.points - registered.T_world_lidar[:3, 3], gap_m)
-    num, cluster = cluster_around(close, moves)
+    squeezed = closer_rings(above.points - registered.T_world_lidar[:3, 3], gap_m)
+    num, cluster = cluster_around(squeezed, moves)
     common_m_s = np.zeros_like(velocity_m_s)
     for k in range(num):
-        mine = cluster == k
-        common_m_s[mine] = np.median(velocity_m_s[mine & moves], axis=0)
+        members = cluster == k
+        common_m_s[members] = np.median(velocity_m_s[members & moves], axis=0)
     only_evidence = (cluster < 0) & (candidates.cluster >= 0)
     label = np.where(only_evidence, num + candidates.cluster, cluster)
     seed = candidates.seed & (cluster >= 0)

@@ -61,11 +61,11 @@ def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: in
     following = [f for f in stretch.frames if f > frame]
     if not following:
         return None
-    own, others = boxes(frame), boxes(following[0])
-    if own is None or others is None:
+    source_boxes, target_boxes = boxes(frame), boxes(following[0])
+    if source_boxes is None or target_boxes is None:
         return None
     registered, after = stretch[frame], stretch[following[0]]
-    field, sure = flow_of_boxes(registered, after, own, others)
+    field, sure = flow_of_boxes(registered, after, source_boxes, target_boxes)
     T_next_here = stretch.T_target_source(following[0], frame)
     return Label(registered, after, field, sure, T_next_here)
 

@@ -119,29 +119,29 @@ class Voxels(nn.Module):
 
         It excludes ego-motion, is in the world axes of the input, and is 0 beyond the grid.
         """
-        given = [*sweeps[:NUM_SWEEPS], *[None] * (NUM_SWEEPS - len(sweeps))]
-        source = given[0]
+        clouds = [*sweeps[:NUM_SWEEPS], *[None] * (NUM_SWEEPS - len(sweeps))]
+        source = clouds[0]
         if source is None:
             raise ValueError("expected a source sweep")
-        pillars = [None if cloud is None else _Pillars.of(cloud) for cloud in given]
-        first = pillars[0]
-        grids, encoded = [], source.points.new_zeros(0, _WIDTH)
-        for number, found in enumerate(pillars):
-            if found is None or not len(found.cell):
+        pillars = [None if cloud is None else _Pillars.of(cloud) for cloud in clouds]
+        source_pillars = pillars[0]
+        grids, codes = [], source.points.new_zeros(0, _WIDTH)
+        for number, sweep_pillars in enumerate(pillars):
+            if sweep_pillars is None or not len(sweep_pillars.cell):
                 grids.append(source.points.new_zeros(NUM_CELLS**2, _WIDTH + 1))
                 continue
-            features = self.encode(found.features)
+            features = self.encode(sweep_pillars.features)
             if number == 0:
-                encoded = features
-            grids.append(found.as_grid(features))
+                codes = features
+            grids.append(sweep_pillars.as_grid(features))
         flow = torch.zeros_like(source.points)
-        if first is None or not len(first.row):
+        if source_pillars is None or not len(source_pillars.row):
             return flow
         image = torch.cat(grids, dim=1).view(1, NUM_CELLS, NUM_CELLS, -1).permute(0, 3, 1, 2)
         # The position of a point in its cell says more than the mean of the cell.
-        at_points = _at(self._unet(image), first)
-        decoded = self.decode(torch.cat([at_points, encoded, first.features[:, :3]], dim=1))
-        return flow.index_copy(0, first.row, decoded)
+        at_points = _at(self._unet(image), source_pillars)
+        decoded = self.decode(torch.cat([at_points, codes, source_pillars.features[:, :3]], dim=1))
+        return flow.index_copy(0, source_pillars.row, decoded)
 
     def _unet(self, image: Tensor) -> Tensor:
         """Return the (1,32,128,128) codes of an image (1,C,256,256)."""
@@ -197,14 +197,14 @@ class _Pillars:
 
     @staticmethod
     def of(cloud: NetworkCloud) -> _Pillars:
-        at = (cloud.points[:, :2] + REACH_M) / CELL_M
-        row = torch.nonzero(((at >= 0) & (at < NUM_CELLS)).all(dim=1))[:, 0]
-        cell = at[row].floor().long()
+        xy = (cloud.points[:, :2] + REACH_M) / CELL_M  # in cells
+        row = torch.nonzero(((xy >= 0) & (xy < NUM_CELLS)).all(dim=1))[:, 0]
+        cell = xy[row].floor().long()
         number, order = torch.sort(cell[:, 1] * NUM_CELLS + cell[:, 0], stable=True)
         row = row[order]
-        at, height_m = at[row], cloud.height_m[row].clamp(max=_LARGEST_HEIGHT_M)
+        xy, height_m = xy[row], cloud.height_m[row].clamp(max=_LARGEST_HEIGHT_M)
         features = torch.cat(
-            [at - at.floor() - 0.5, height_m[:, None] / 2 - 0.5, cloud.points[row] / 100.0], dim=1
+            [xy - xy.floor() - 0.5, height_m[:, None] / 2 - 0.5, cloud.points[row] / 100.0], dim=1
         )
         return _Pillars(row, number, features)
 
@@ -221,11 +221,11 @@ class _Pillars:
 def _at(image: Tensor, pillars: _Pillars) -> Tensor:
     """Return the (m,C) values of an image (1,C,128,128), interpolated at each point."""
     cell = torch.stack([pillars.cell % NUM_CELLS, pillars.cell // NUM_CELLS], dim=1)
-    at = (cell + pillars.features[:, :2] + 0.5) * (2.0 / NUM_CELLS) - 1.0
-    found = functional.grid_sample(
-        image, at[None, None], padding_mode="border", align_corners=False
+    grid_xy = (cell + pillars.features[:, :2] + 0.5) * (2.0 / NUM_CELLS) - 1.0  # -1 to 1
+    sampled = functional.grid_sample(
+        image, grid_xy[None, None], padding_mode="border", align_corners=False
     )
-    return found[0, :, 0].T
+    return sampled[0, :, 0].T
 
 
 FORMAT, VERSION = "densify model", 1
@@ -244,8 +244,8 @@ class Model:
     def flow(self, sweeps: Sweeps) -> Float:
         """Return `Voxels.forward` as an array, with the same bytes on any number of cores."""
         with on_one_thread(), torch.inference_mode():
-            found: Float = self.network(sweeps).double().numpy()
-        return found
+            displacement_m: Float = self.network(sweeps).double().numpy()
+        return displacement_m
 
 
 def write_model(path: Path, model: Model) -> None:
@@ -267,13 +267,13 @@ def read_model(path: Path) -> Model:
     arrays = read_arrays(path)
     try:
         header = dict(parse_json(bytes(arrays.pop(_HEADER).astype(np.uint8)), path))
-        found = header["format"], header["version"], header["network"]
-        made = dict(header["made"])
+        identity = header["format"], header["version"], header["network"]
+        training = dict(header["made"])
     except (KeyError, ValueError, TypeError, InputError):
         raise InputError(f"{path}: no model that densify train flow wrote") from None
-    if found != (FORMAT, VERSION, NETWORK):
+    if identity != (FORMAT, VERSION, NETWORK):
         raise InputError(
-            f"{path}: got {found}, expected {(FORMAT, VERSION, NETWORK)}; train it again"
+            f"{path}: got {identity}, expected {(FORMAT, VERSION, NETWORK)}; train it again"
         )
     network = build()
     weights = {name.removeprefix(_WEIGHTS): array for name, array in arrays.items()}
@@ -283,4 +283,4 @@ def read_model(path: Path) -> Model:
         network.load_state_dict({name: torch.from_numpy(a) for name, a in weights.items()})
     except (RuntimeError, TypeError) as error:
         raise InputError(f"{path}: damaged: {error}; train it again") from error
-    return Model(network.train(False), made)
+    return Model(network.train(False), training)

@@ -53,8 +53,8 @@ def on_device(value: Any, device: torch.device) -> Any:
     if isinstance(value, Tensor):
         return value.to(device)
     if isinstance(value, tuple):
-        parts = [on_device(part, device) for part in value]
-        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+        moved = [on_device(element, device) for element in value]
+        return type(value)(*moved) if hasattr(value, "_fields") else tuple(moved)
     return value
 
 
@@ -64,19 +64,19 @@ def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
         mixed = [make(group * _NUM_MIXED + n) for n in range(_NUM_MIXED)]
         rng = np.random.default_rng([make.seed, group, 1])
         pairs = [pair for c, clip in enumerate(mixed) for pair in _pairs(c, clip, rng)]
-        for place in rng.permutation(len(pairs)):
-            own = np.random.default_rng([make.seed, group, 2, int(place)])
-            c, source, target = pairs[place]
-            yield sample_of(mixed[c], source, target, num_wanted, own)
+        for row in rng.permutation(len(pairs)):
+            pair_rng = np.random.default_rng([make.seed, group, 2, int(row)])
+            c, source, target = pairs[row]
+            yield sample_of(mixed[c], source, target, num_wanted, pair_rng)
 
 
 def _pairs(c: int, clip: Clip, rng: np.random.Generator) -> list[tuple[int, int, int]]:
     """Return 48 triples (c, source, target) of a clip, in random rounds of all its pairs."""
-    number = range(len(clip))
-    found = [(c, i, j) for i in number for j in (i - 1, i + 1) if j in number]
-    num_rounds = -(-_PAIRS_OF_CLIP // len(found))
-    order = [place for _ in range(num_rounds) for place in rng.permutation(len(found))]
-    return [found[place] for place in order[:_PAIRS_OF_CLIP]]
+    indices = range(len(clip))
+    pairs = [(c, i, j) for i in indices for j in (i - 1, i + 1) if j in indices]
+    num_rounds = -(-_PAIRS_OF_CLIP // len(pairs))
+    order = [row for _ in range(num_rounds) for row in rng.permutation(len(pairs))]
+    return [pairs[row] for row in order[:_PAIRS_OF_CLIP]]
 
 
 def sample_of(
@@ -87,25 +87,25 @@ def sample_of(
     rng: np.random.Generator | None = None,
 ) -> Sample:
     """Return the sample of two neighbouring sweeps (indices), random where ``rng`` is given."""
-    here, there = clip[source], clip[target]
-    change = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
-    scale = np.float32(np.linalg.norm(change[2]))
+    source_sweep, target_sweep = clip[source], clip[target]
+    augmentation = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
+    scale = np.float32(np.linalg.norm(augmentation[2]))
 
     def cloud(number: int) -> NetworkCloud:
         sweep = clip[number]
-        points = torch.from_numpy((sweep.points - here.origin_m) @ change.T)
+        points = torch.from_numpy((sweep.points - source_sweep.origin_m) @ augmentation.T)
         return NetworkCloud(points, torch.from_numpy(sweep.height_m * scale))
 
     numbers = order_for(source, target, len(clip), num_wanted)
     sweeps = tuple(None if n is None else cloud(n) for n in numbers)
     points = cloud(source).points, cloud(target).points
-    in_reach = [(each[:, :2].abs() < REACH_M).all(dim=1) for each in points]
-    drawn = [_draw(within.numpy(), rng) for within in in_reach]
+    in_reach = [(xyz[:, :2].abs() < REACH_M).all(dim=1) for xyz in points]
+    drawn = [_draw(is_within.numpy(), rng) for is_within in in_reach]
     flow = moving = None
-    if here.flow is not None:
-        flow = torch.from_numpy(here.flow[int(target > source)] @ change.T)
-        moving = torch.from_numpy(here.moving)
-    duration_s = abs(there.time_s - here.time_s)
+    if source_sweep.flow is not None:
+        flow = torch.from_numpy(source_sweep.flow[int(target > source)] @ augmentation.T)
+        moving = torch.from_numpy(source_sweep.moving)
+    duration_s = abs(target_sweep.time_s - source_sweep.time_s)
     return Sample(sweeps, drawn[0], points[1][drawn[1]], in_reach[0], duration_s, flow, moving)
 
 
@@ -139,8 +139,8 @@ def objective_loss(predict: Predict, sample: Sample) -> Tensor:
     source: Tensor = sample.sweeps[0].points[sample.drawn]  # type: ignore[union-attr]
     graph = knn_graph(source.detach().cpu().double().numpy(), NUM_NEIGHBORS)
     flow = predict(sample.sweeps)[sample.drawn]
-    found = energy(flow, source, sample.drawn_target, laplacian(graph), ALPHA)
-    return found.total / len(source)
+    loss = energy(flow, source, sample.drawn_target, laplacian(graph), ALPHA)
+    return loss.total / len(source)
 
 
 def supervised_loss(predict: Predict, sample: Sample) -> Tensor:

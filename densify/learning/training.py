@@ -66,8 +66,8 @@ def train(training: Training, out: Path, progress: Progress | None = None) -> fl
             if progress is not None:
                 mean = float(np.mean(losses[-_NUM_AVERAGED:]))
                 progress(f"train, loss {mean:.3g}", len(losses), training.steps)
-    made = {name: getattr(training, name) for name in ("teacher", "seed", "steps")}
-    write_model(out, Model(network, {"data": list(training.data), **made}))
+    provenance = {name: getattr(training, name) for name in ("teacher", "seed", "steps")}
+    write_model(out, Model(network, {"data": list(training.data), **provenance}))
     return float(np.mean(losses[-_NUM_AVERAGED:]))
 
 

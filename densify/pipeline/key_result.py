@@ -116,8 +116,8 @@ def result_of_method(
         depth = views.depth(seen, visible, filled)
         if visible:
             depth = _without_times(scene, depth)
-        most = scene.settings.project.max_outliers
-        depth = {n: with_max_outliers(maps, most) for n, maps in depth.items()}
+        max_outliers = scene.settings.project.max_outliers
+        depth = {n: with_max_outliers(maps, max_outliers) for n, maps in depth.items()}
         depth = _add_ages(scene, method, depth)
     cloud = seen.cloud
     if scene.images:

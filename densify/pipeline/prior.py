@@ -58,16 +58,16 @@ def complete_with_prior(
 
 def _read(files: PriorFiles, shots: Mapping[str, Shot], key: int) -> dict[str, Prior]:
     """Return map name -> prior, read by image number, or by key if the map shows no image."""
-    found, lacking = {}, []
+    priors, lacking = {}, []
     for name, shot in shots.items():
         number = key if shot.number is None else shot.number
         prior = files.prior(shot.camera, number)
         if prior is not None:
-            found[name] = prior
+            priors[name] = prior
         else:
             lacking.append(f"{shot.camera.name} {number} ({files.said_of(shot.camera.name)})")
-    if lacking and not found:
+    if lacking and not priors:
         raise InputError(f"--prior {files.place}: key {key}: no depth image {', '.join(lacking)}")
     if lacking:
         _log.warning("key %d: no depth_full: no prior %s", key, ", ".join(lacking))
-    return found
+    return priors

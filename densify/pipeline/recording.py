@@ -124,8 +124,8 @@ class Recording:
         # The sweeps around a window count as lead-in, too.
         self._num_lead_in = max(_TELL_SPEED, timeline.num_in(LEAD_IN_S - around_s))
         self._run = run
-        most = max((len(block) for block in self.cut.blocks), default=0)
-        num_raw = most + self._num_lead_in
+        longest_block = max((len(block) for block in self.cut.blocks), default=0)
+        num_raw = longest_block + self._num_lead_in
         self._sweeps = Sweeps(
             sequence, timeline, settings.register, num_raw, cache, run, self._watch
         )
@@ -133,7 +133,7 @@ class Recording:
         self.registration = lru_cache(maxsize=2)(self._registration)
         self._pieces = lru_cache(maxsize=2)(self._find_pieces)
         # Keyed by the index of the block and of the piece, because a Piece cannot be hashed.
-        self._deskewed = lru_cache(maxsize=most)(self._deskew)
+        self._deskewed = lru_cache(maxsize=longest_block)(self._deskew)
         self._stretch = lru_cache(maxsize=1)(self._make_stretch)
         self._searched = lru_cache(maxsize=2)(self._find_searched)
         self._ground = lru_cache(maxsize=2)(self._find_ground)
@@ -267,11 +267,11 @@ class Recording:
         if not self.settings.accumulate.far_m:  # not requested
             return None
         piece = self._piece(key)
-        found = self._far(piece.number, piece.row)
-        if not len(found.frames):
+        surfaces = self._far(piece.number, piece.row)
+        if not len(surfaces.frames):
             return None
         return Beyond(
-            found, poses.inverse(piece.poses.T_world_lidar[piece.poses.frames.index(key)])
+            surfaces, poses.inverse(piece.poses.T_world_lidar[piece.poses.frames.index(key)])
         )
 
     def _piece(self, key: int) -> Piece:
@@ -312,19 +312,19 @@ class Recording:
         return self._kept("registration", frames, make)
 
     def _check_frame(
-        self, sweeps: Sequence[Sweep], found: Trajectory, recorded: Trajectory | None
+        self, sweeps: Sequence[Sweep], trajectory: Trajectory, recorded: Trajectory | None
     ) -> None:
         """Raise InputError if sweeps are not in the scanner's frame but in the frame of a map."""
-        ends, told = (sweeps[0], sweeps[-1]), ""
+        ends, symptom = (sweeps[0], sweeps[-1]), ""
         if recorded is not None:
             if are_placed(sweeps, recorded.T_world_lidar):
-                told = "the rays begin at the sweeps' poses"
-        elif is_still(found.T_world_lidar) and (way_m := way_in_map(*ends)):
-            told = f"odometry finds no motion, but the rays of both begin {way_m:.1f} m apart"
-        if told:
+                symptom = "the rays begin at the sweeps' poses"
+        elif is_still(trajectory.T_world_lidar) and (way_m := way_in_map(*ends)):
+            symptom = f"odometry finds no motion, but the rays of both begin {way_m:.1f} m apart"
+        if symptom:
             raise InputError(
                 f"{self.sequence.name}: sweeps {format_frames([s.frame for s in ends])} are in the "
-                f"frame of a map: {told}; expected each in its scanner's own frame: "
+                f"frame of a map: {symptom}; expected each in its scanner's own frame: "
                 f"{MAP_FRAME_REMEDY}"
             )
 
@@ -341,8 +341,8 @@ class Recording:
         for piece in self.registration(number).pieces:
             frames = tuple(f for f in piece.frames if f in block)
             if frames:
-                part = piece.part([f for f in piece.frames if f in wanted], origin=frames[0])
-                pieces.append(Piece(number, len(pieces), part, frames))
+                trajectory = piece.part([f for f in piece.frames if f in wanted], origin=frames[0])
+                pieces.append(Piece(number, len(pieces), trajectory, frames))
         return pieces
 
     def _deskew(self, number: int, frame: int) -> RegisteredSweep:
@@ -359,11 +359,11 @@ class Recording:
     def _find_searched(self, number: int, row: int) -> tuple[int, ...]:
         """Return the frames of a piece where motion is searched: windows, and every n-th around."""
         frames, inside = self._pieces(number)[row].frames, self._in_windows(number)
-        at = np.flatnonzero([frame in inside for frame in frames])
-        if self._step_around == 1 or not len(at):
+        inside_rows = np.flatnonzero([frame in inside for frame in frames])
+        if self._step_around == 1 or not len(inside_rows):
             return frames
-        away = np.abs(np.arange(len(frames))[:, None] - at).min(axis=1)
-        return tuple(f for f, n in zip(frames, away, strict=True) if n % self._step_around == 0)
+        num_away = np.abs(np.arange(len(frames))[:, None] - inside_rows).min(axis=1)
+        return tuple(f for f, n in zip(frames, num_away, strict=True) if n % self._step_around == 0)
 
     def _find_ground(self, number: int, row: int) -> HeightMap:
         """Return the height map of the ground of a piece."""
@@ -393,13 +393,13 @@ class Recording:
         road = Road(self.timeline, self._sweeps, cameras, settings, far_m)
         # Sweeps of the block outside the windows belong to the far range.
         inside, frames = self._in_windows(number), self._pieces(number)[row].frames
-        near = tuple(f for f in frames if f in inside) or frames
+        in_windows = tuple(f for f in frames if f in inside) or frames
 
         def make() -> StandingWorld:
-            keys = [k for k in self.cut.keys_of(number) if k in near]
-            stretch = self._stretch(number, near)
+            keys = [k for k in self.cut.keys_of(number) if k in in_windows]
+            stretch = self._stretch(number, in_windows)
             with self._watch.stage("far"):
-                return road.find_standing(stretch, keys, with_near=len(keys) > 1)
+                return road.find_standing(stretch, keys, with_window=len(keys) > 1)
 
         # Processes of one run share the result. A digest would read every sweep of the road.
         shared = self._cache if self._run is not None else None

@@ -65,72 +65,74 @@ class Road:
     # where no camera looks.
     far_m: float
 
-    def find_standing(self, near: Stretch, keys: Sequence[int], with_near: bool) -> StandingWorld:
-        """Return the static surfaces along the road, in the world of ``near``.
+    def find_standing(
+        self, window: Stretch, keys: Sequence[int], with_window: bool
+    ) -> StandingWorld:
+        """Return the static surfaces along the road, in the world of ``window``.
 
-        ``near`` are deskewed sweeps of the window that include the keys. ``with_near`` includes
+        ``window`` are deskewed sweeps of the window that include the keys. ``with_window`` includes
         their points in the result.
         """
-        sensors, views = Sensors.of(near.sweeps), self._views(near, keys)
+        sensors, views = Sensors.of(window.sweeps), self._views(window, keys)
         is_recorded, surfaces = self.settings.source == "dataset", dict[int, Surface]()
         with ThreadPoolExecutor(num_threads()) as pool:
             if not is_recorded:
-                found = pool.map(Surface.of_sweep, (s.sweep for s in near.sweeps))
-                surfaces = dict(zip(near.frames, found, strict=True))
-            behind, ahead = pool.map(partial(self._beyond, near, surfaces, views), (-1, 1))
-        inside = _within(near, surfaces, views)
+                sweep_surfaces = pool.map(Surface.of_sweep, (s.sweep for s in window.sweeps))
+                surfaces = dict(zip(window.frames, sweep_surfaces, strict=True))
+            behind, ahead = pool.map(partial(self._beyond, window, surfaces, views), (-1, 1))
+        inside = _within(window, surfaces, views)
         passed, left_out = [*behind[::-1], *inside, *ahead], frozenset[int]()
         if not is_recorded and len(passed) > 1:
-            passed, left_out = _relaxed(passed, near)
+            passed, left_out = _relaxed(passed, window)
         used = [
-            p for p in passed if (with_near or not p.known) and p.registered.frame not in left_out
+            p for p in passed if (with_window or not p.known) and p.registered.frame not in left_out
         ]
         travel_m = np.array([p.travel_m for p in used])
         with ThreadPoolExecutor(num_threads()) as pool:
             deskewed = list(pool.map(_deskewed, used))
             gone = far.departed(deskewed, travel_m)
             standing = partial(far.standing, sensors)
-            parts = list(pool.map(standing, deskewed, gone))
-        return replace(far.joined(parts), left_out=tuple(sorted(left_out)))
+            worlds = list(pool.map(standing, deskewed, gone))
+        return replace(far.joined(worlds), left_out=tuple(sorted(left_out)))
 
     def _beyond(
         self,
-        near: Stretch,
+        window: Stretch,
         surfaces: Mapping[int, Surface],
         views: Sequence[_View],
         side: int,
     ) -> list[_Passed]:
         """Return the sweeps before (side -1) or after (side 1) the window, nearest first."""
-        last = near.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
-        begin_m = 0.0 if side < 0 else _travel_m(near)[-1]
-        found, last_m, travel_m = list[_Passed](), 0.0, 0.0
-        seen_m = self.far_m if self._is_seen(near, views, side) else _UNSEEN_SHARE * self.far_m
+        last = window.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
+        begin_m = 0.0 if side < 0 else _travel_m(window)[-1]
+        passed, last_m, travel_m = list[_Passed](), 0.0, 0.0
+        seen_m = self.far_m if self._is_seen(window, views, side) else _UNSEEN_SHARE * self.far_m
         road = replace(self, far_m=seen_m)
-        for one, surface in road._sweeps_beyond(near, surfaces, side):
-            travel_m += float(np.linalg.norm(one.T_world_lidar[:3, 3] - last))
-            last = one.T_world_lidar[:3, 3]
+        for registered, surface in road._sweeps_beyond(window, surfaces, side):
+            travel_m += float(np.linalg.norm(registered.T_world_lidar[:3, 3] - last))
+            last = registered.T_world_lidar[:3, 3]
             if travel_m - last_m < _LEAST_STEP_M:
                 continue
             last_m = travel_m
             at_m = begin_m + side * travel_m
-            found.append(_Passed(_in_view(one, views), surface, at_m, known=False))
-        return found
+            passed.append(_Passed(_in_view(registered, views), surface, at_m, known=False))
+        return passed
 
-    def _is_seen(self, near: Stretch, views: Sequence[_View], side: int) -> bool:
+    def _is_seen(self, window: Stretch, views: Sequence[_View], side: int) -> bool:
         """Return True if a camera may see the road's end before (side -1) or after the window."""
-        first, last = (near.sweeps[row].T_world_lidar[:3, 3] for row in (0, -1))
+        first, last = (window.sweeps[row].T_world_lidar[:3, 3] for row in (0, -1))
         length_m = float(np.linalg.norm(last - first))
         if length_m < _LEAST_STEP_M:  # the vehicle stands
             return True
-        way = side * self.far_m * (last - first) / length_m
-        end = ((last if side > 0 else first) + way)[None].astype(np.float32)
+        to_end = side * self.far_m * (last - first) / length_m
+        end = ((last if side > 0 else first) + to_end)[None].astype(np.float32)
         return any(far.may_see(*view, end, _SLACK_M).any() for view in views)
 
-    def _views(self, near: Stretch, keys: Sequence[int]) -> list[_View]:
+    def _views(self, window: Stretch, keys: Sequence[int]) -> list[_View]:
         """Return the views of all cameras at the keys. Keys less than 3 m apart share a view."""
         chosen: list[Float] = []
         for key in keys:
-            T_world_lidar = near[key].T_world_lidar
+            T_world_lidar = window[key].T_world_lidar
             apart = [np.linalg.norm(T[:3, 3] - T_world_lidar[:3, 3]) for T in chosen[-1:]]
             if not apart or apart[0] > _SAME_VIEW_M:
                 chosen.append(T_world_lidar)
@@ -141,21 +143,21 @@ class Road:
         ]
 
     def _sweeps_beyond(
-        self, near: Stretch, surfaces: Mapping[int, Surface], side: int
+        self, window: Stretch, surfaces: Mapping[int, Surface], side: int
     ) -> Iterator[tuple[RegisteredSweep, Surface | None]]:
         """Yield each raw sweep with its pose, and its surface, nearest first."""
-        known = near.sweeps[::side]
+        known = window.sweeps[::side]
         beside = self.timeline.before if side < 0 else self.timeline.after
-        frames = beside(known[-1].frame, self._most_sweeps(near))[::side]
+        frames = beside(known[-1].frame, self._most_sweeps(window))[::side]
         if self.settings.source == "dataset":
             return self._recorded(known[-1], frames)
         stamp_ns = np.array([self.timeline.stamp_of(f) for f in frames], np.int64)
         of_known, read = [surfaces[s.frame] for s in known], self.sweeps.read
         return follow_road(known, of_known, frames, stamp_ns, read, self.far_m, _STEP_M)
 
-    def _most_sweeps(self, near: Stretch) -> int:
+    def _most_sweeps(self, window: Stretch) -> int:
         """Return the number of sweeps that cover ``far_m`` at half the speed of the window."""
-        first, last = near.sweeps[0], near.sweeps[-1]
+        first, last = window.sweeps[0], window.sweeps[-1]
         most_s, step_ns = _MOST_S, last.sweep.stamp_ns - first.sweep.stamp_ns
         if step_ns > 0:
             step = last.T_world_lidar[:3, 3] - first.T_world_lidar[:3, 3]
@@ -197,41 +199,41 @@ def _deskewed(p: _Passed) -> RegisteredSweep:
     return deskew_sweep(sweep.sweep, sweep.T_world_lidar, sweep.twist_before, sweep.twist_after)
 
 
-def _travel_m(near: Stretch) -> Float:
+def _travel_m(window: Stretch) -> Float:
     """Return the (n,) distance in metres from the first sweep to each of the window's n sweeps."""
-    positions = np.stack([s.T_world_lidar[:3, 3] for s in near.sweeps])
+    positions = np.stack([s.T_world_lidar[:3, 3] for s in window.sweeps])
     return np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
 
 
 def _within(
-    near: Stretch, surfaces: Mapping[int, Surface], views: Sequence[_View]
+    window: Stretch, surfaces: Mapping[int, Surface], views: Sequence[_View]
 ) -> list[_Passed]:
     """Return the window's sweeps, thinned to at least 1 m between sweeps."""
-    found, last_m = list[_Passed](), -np.inf
-    for s, at_m in zip(near.sweeps, _travel_m(near).tolist(), strict=True):
+    passed, last_m = list[_Passed](), -np.inf
+    for s, at_m in zip(window.sweeps, _travel_m(window).tolist(), strict=True):
         if at_m - last_m >= _LEAST_STEP_M:
             last_m = at_m
-            found.append(_Passed(_in_view(s, views), surfaces.get(s.frame), at_m, known=True))
-    return found
+            passed.append(_Passed(_in_view(s, views), surfaces.get(s.frame), at_m, known=True))
+    return passed
 
 
-def _relaxed(passed: Sequence[_Passed], near: Stretch) -> tuple[list[_Passed], frozenset[int]]:
+def _relaxed(passed: Sequence[_Passed], window: Stretch) -> tuple[list[_Passed], frozenset[int]]:
     """Correct the poses by `relax_poses`; return also the frames of sweeps that stay unreliable."""
     frames = tuple(p.registered.frame for p in passed)
-    found = relax_poses(
+    relaxed = relax_poses(
         [p.surface for p in passed if p.surface is not None],
         np.stack([p.registered.T_world_lidar for p in passed]),
         np.array([p.known for p in passed]),
-        num_in_submap(float(np.median([len(s.sweep) for s in near.sweeps]))),
+        num_in_submap(float(np.median([len(s.sweep) for s in window.sweeps]))),
     )
     stamp_ns = np.array([p.registered.sweep.stamp_ns for p in passed], np.int64)
-    trajectory, moved = Trajectory(frames, stamp_ns, found.T_world_lidar), []
+    trajectory, moved = Trajectory(frames, stamp_ns, relaxed.T_world_lidar), []
     for i, p in enumerate(passed):
         if not p.known:  # poses of the window stay
-            T_world_lidar, sweep = found.T_world_lidar[i], p.registered.sweep
+            T_world_lidar, sweep = relaxed.T_world_lidar[i], p.registered.sweep
             p = p._replace(registered=RegisteredSweep(sweep, T_world_lidar, *twists(trajectory, i)))
         moved.append(p)
-    return moved, frozenset(f for f, holds in zip(frames, found.holds, strict=True) if not holds)
+    return moved, frozenset(f for f, holds in zip(frames, relaxed.holds, strict=True) if not holds)
 
 
 def _in_view(registered: RegisteredSweep, views: Sequence[_View]) -> RegisteredSweep:

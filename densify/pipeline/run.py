@@ -80,8 +80,8 @@ def run(
         The result. With ``output.score`` it also has the simpler methods as ``baselines``, and
             scores of maps made without the key sweep.
     """
-    made = run_keys(sequence, [key], window, method, cameras, config, progress, prior=prior)
-    ((_, result),) = made
+    results = run_keys(sequence, [key], window, method, cameras, config, progress, prior=prior)
+    ((_, result),) = results
     if isinstance(result, Exception):
         raise result
     return result
@@ -209,17 +209,19 @@ def densify(
         )
         filled = [settings.is_scored or name == methods[-1] for name in methods]
         make = partial(result_of_method, scene, moments)
-        made = list(pool.map(make, methods, filled))
+        bare_results = list(pool.map(make, methods, filled))
 
     if priors is not None:
         from densify.pipeline.prior import complete_with_prior
 
         with watch.stage("prior"):
             kind = settings.prior.kind
-            made[-1] = complete_with_prior(made[-1], priors, shots, scene.truth, kind)
+            bare_results[-1] = complete_with_prior(
+                bare_results[-1], priors, shots, scene.truth, kind
+            )
     results: dict[str, Result] = {}
     costs = watch.costs()
-    for result in made:
+    for result in bare_results:
         results[result.method] = replace(
             result,
             costs=costs,

@@ -54,8 +54,8 @@ def add_warnings(
         *_of_motion(recording, key),
         *_of_images(sequence, shots),
     ]
-    told = {n: dict.fromkeys([*shared, *of_result(r, stretch)]) for n, r in results.items()}
-    return {name: replace(result, warnings=tuple(told[name])) for name, result in results.items()}
+    warnings = {n: dict.fromkeys([*shared, *of_result(r, stretch)]) for n, r in results.items()}
+    return {n: replace(result, warnings=tuple(warnings[n])) for n, result in results.items()}
 
 
 def _of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
@@ -161,8 +161,8 @@ def _of_recorded(recording: Recording, key: int) -> Iterator[str]:
     """Yield a warning if odometry does not confirm the recording's poses around the key."""
     timeline = recording.timeline
     row, num = timeline.row[key], max(len(recording.window(key).frames) // 2, _LEAST_SIDE)
-    near = timeline.frames[max(row - num, 0) : row + num + 1]
-    (around,) = (frames for frames in timeline.runs(near) if key in frames)
+    neighbours = timeline.frames[max(row - num, 0) : row + num + 1]
+    (around,) = (frames for frames in timeline.runs(neighbours) if key in frames)
     settings = replace(recording.settings.register, source="kiss-icp")
     try:
         sweeps = [recording.raw(frame) for frame in around]
@@ -174,11 +174,11 @@ def _of_recorded(recording: Recording, key: int) -> Iterator[str]:
     error = RecordedError.of(motions[:1], motions[1:])
     if error.cost > 1:
         duration_s = (sweeps[-1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
-        told, remedy = main_error(motions[:1], motions[1:], duration_s)
+        mistake, remedy = main_error(motions[:1], motions[1:], duration_s)
         yield (
             f"the recording's poses are off by {error.m:.2f} m and {error.deg:.1f} deg from "
-            f"odometry over {error.way_m:.1f} m around sweep {key}{told}; {remedy}leave them out "
-            f"with --set register.source=kiss-icp"
+            f"odometry over {error.way_m:.1f} m around sweep {key}{mistake}; {remedy}leave them "
+            f"out with --set register.source=kiss-icp"
         )
 
 

@@ -40,14 +40,14 @@ class Spec(NamedTuple):
         text = str(text)
         if text == "street" or text.startswith(("street:", "street?")):
             return Spec("street", text)
-        name, colon, place = text.partition(":")
+        name, colon, location = text.partition(":")
         reader = name if colon and name in READERS.names() else None
-        place = text if reader is None else place
+        location = text if reader is None else location
         # A # in the path of an existing file is part of the path. Without READER: it also is if no
         # file is named by the text before it.
-        path, mark, scene = place.rpartition("#")
-        if not mark or _exists(place) or (reader is None and not _exists(path)):
-            return Spec(reader, place)
+        path, mark, scene = location.rpartition("#")
+        if not mark or _exists(location) or (reader is None and not _exists(path)):
+            return Spec(reader, location)
         return Spec(reader, path, scene)
 
     @property
@@ -64,8 +64,8 @@ class Spec(NamedTuple):
         return f"{reader}{self.path.absolute()}{scene}"
 
 
-def _exists(place: str) -> bool:
-    return os.path.exists(Path(place).expanduser())
+def _exists(location: str) -> bool:
+    return os.path.exists(Path(location).expanduser())
 
 
 def open_sequence(spec: str | Path = "street") -> LidarSequence:
@@ -120,18 +120,18 @@ def _what_is_there(path: Path) -> str:
     """Describe the contents of a path without a recording, as a clause for error messages."""
     if path.is_file():
         return f"it is a {path.suffix or 'file without a suffix'} file"
-    found = Counter(entry.suffix.lower() or "other" for entry in path.iterdir() if entry.is_file())
-    parts = [f"{num} {suffix} file{'s' * (num > 1)}" for suffix, num in found.most_common(3)]
+    counts = Counter(entry.suffix.lower() or "other" for entry in path.iterdir() if entry.is_file())
+    contents = [f"{num} {suffix} file{'s' * (num > 1)}" for suffix, num in counts.most_common(3)]
     num_folders = sum(entry.is_dir() for entry in path.iterdir())
-    parts += [f"{num_folders} folder{'s' * (num_folders > 1)}"] * bool(num_folders)
-    text = f"it holds {', '.join(parts)}, no lidar sweeps" if parts else "it is empty"
+    contents += [f"{num_folders} folder{'s' * (num_folders > 1)}"] * bool(num_folders)
+    text = f"it holds {', '.join(contents)}, no lidar sweeps" if contents else "it is empty"
     drive = drive_around(path)
     return text if drive is None else f"{text}, and is inside a KITTI drive: give {drive}"
 
 
 def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:
     """Return the first recording in a folder, at most two levels down; None without one."""
-    places = [*path.glob("*"), *path.glob("*/*")][:_MOST_PLACES] if path.is_dir() else []
-    places = [place for place in sorted(places) if place.exists()]  # links may lead nowhere
-    found = (place for reader in readers for place in places if reader.recognises(place))
-    return next(found, None)
+    entries = [*path.glob("*"), *path.glob("*/*")][:_MOST_PLACES] if path.is_dir() else []
+    entries = [entry for entry in sorted(entries) if entry.exists()]  # links may lead nowhere
+    recordings = (entry for reader in readers for entry in entries if reader.recognises(entry))
+    return next(recordings, None)

@@ -43,9 +43,9 @@ def open_recording(path: Path, scene: str | None) -> Argoverse2:
     """Open a log: its folder, or that of its split or the data set with its name as ``scene``."""
     if scene is None and (path / _POSES).is_file():
         return Argoverse2(path)
-    places = (path, path / "train", path / "val", path / "test")
-    found = [file.parent for place in places for file in place.glob(f"*/{_POSES}")]
-    logs = {log.name: log for log in found}
+    folders = (path, path / "train", path / "val", path / "test")
+    log_folders = [file.parent for folder in folders for file in folder.glob(f"*/{_POSES}")]
+    logs = {log.name: log for log in log_folders}
     none = f"no Argoverse 2 log; expected {_POSES} and sensors/lidar in it, or in folders within it"
     return Argoverse2(logs[checks.chosen_scene("argoverse2", path, scene, sorted(logs), none)])
 

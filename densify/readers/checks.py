@@ -26,15 +26,15 @@ def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
     if not folder.is_dir():
         return {}
     files = [p for p in folder.iterdir() if p.stem.isdecimal() and p.suffix.lower() in suffixes]
-    found: dict[int, Path] = {}
+    path_of_number: dict[int, Path] = {}
     for path in sorted(files, key=lambda p: (suffixes.index(p.suffix.lower()), p.name)):
-        before = found.setdefault(int(path.stem), path)
+        before = path_of_number.setdefault(int(path.stem), path)
         if before.stem != path.stem:
             raise InputError(
                 f"{path}: has the number {int(path.stem)}, as {before.name} has; expected one file "
                 f"of each number; move one of them away"
             )
-    return dict(sorted(found.items()))
+    return dict(sorted(path_of_number.items()))
 
 
 def file_within(root: Path, name: str, where: Path | str) -> Path:
@@ -52,11 +52,11 @@ def drive_around(path: Path) -> Path | None:
     return next((p for p in path.absolute().parents[:2] if (p / "velodyne_points").is_dir()), None)
 
 
-def of_frame(entries: Mapping[int, T], frame: int, what: str, where: Path) -> T:
-    """Return the entry of a frame, such as a file or stamp; errors name ``what`` and ``where``."""
+def of_frame(entries: Mapping[int, T], frame: int, kind: str, where: Path) -> T:
+    """Return the entry of a frame, such as a file or stamp; errors name ``kind`` and ``where``."""
     if frame not in entries:
         raise InputError(
-            f"{where}: no {what} of frame {frame}; frames that exist: {format_frames(entries)}"
+            f"{where}: no {kind} of frame {frame}; frames that exist: {format_frames(entries)}"
         )
     return entries[frame]
 
@@ -222,7 +222,7 @@ def boxes(
     if not np.isfinite(T_lidar_box).all():
         raise InputError(f"{where}: a box is nowhere: got NaN or infinity, expected a place")
     names = np.array(track, np.str_)
-    found, times = np.unique(names[names != ""], return_counts=True)
-    if (times > 1).any():
-        raise InputError(f"{where}: the box {found[times > 1][0]} is there twice, expected once")
+    unique, counts = np.unique(names[names != ""], return_counts=True)
+    if (counts > 1).any():
+        raise InputError(f"{where}: the box {unique[counts > 1][0]} is there twice, expected once")
     return Boxes(names, T_lidar_box, size_m.reshape(-1, 3), lidar=lidar)

@@ -47,8 +47,8 @@ def read_arrays(
     data = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            there = {m.filename[:-4]: m for m in archive.infolist() if m.filename[-4:] == ".npy"}
-            wanted = {n: m for n, m in there.items() if names is None or n in names}
+            members = {m.filename[:-4]: m for m in archive.infolist() if m.filename[-4:] == ".npy"}
+            wanted = {n: m for n, m in members.items() if names is None or n in names}
             check_size(sum(member.file_size for member in wanted.values()), path, most_bytes)
             return {name: _array(archive.read(member)) for name, member in wanted.items()}
     except InputError:

@@ -76,19 +76,19 @@ def pair_depth_files(
     ``groundtruth`` maps exclude other maps. ``filled`` pairs densify's filled maps instead of its
     maps of measured pixels.
     """
-    found = _product(_found(predicted, "PREDICTED"), predicted, filled)
+    estimated = _product(_found(predicted, "PREDICTED"), predicted, filled)
     true = _found(truth, "TRUTH")
     true = [f for f in true if f.product in _TRUTH_PRODUCTS] or _product(true, truth, filled=False)
-    alone = predicted.is_file() and truth.is_file()
-    if mask is not None and not (mask.is_file() if alone else mask.is_dir()):
-        kind = "PNG file, as PREDICTED and TRUTH are" if alone else "folder of masks"
+    are_files = predicted.is_file() and truth.is_file()
+    if mask is not None and not (mask.is_file() if are_files else mask.is_dir()):
+        kind = "PNG file, as PREDICTED and TRUTH are" if are_files else "folder of masks"
         raise InputError(f"--mask {mask}: expected a {kind}")
-    if alone:
+    if are_files:
         return DepthPairs((DepthPair(predicted, truth, mask),))
-    matched = _match(found, true, predicted, truth)
+    matched = _match(estimated, true, predicted, truth)
     if not matched:
         raise InputError(
-            f"no pair of {found[0].path} and {len(found) - 1} more with {true[0].path} and "
+            f"no pair of {estimated[0].path} and {len(estimated) - 1} more with {true[0].path} and "
             f"{len(true) - 1} more; expected the same drive, camera and frame, or equal names"
         )
     masks: Mapping[Path, Path] = {}
@@ -98,27 +98,27 @@ def pair_depth_files(
     used = set(matched.values())
     return DepthPairs(
         tuple(DepthPair(matched[path], path, masks.get(path)) for path in sorted(matched)),
-        without_truth=tuple(file.path for file in found if file.path not in used),
+        without_truth=tuple(file.path for file in estimated if file.path not in used),
         without_prediction=tuple(file.path for file in true if file.path not in matched),
         without_mask=tuple(sorted(matched.keys() - masks.keys())) if mask is not None else (),
     )
 
 
-def _found(place: Path, what: str) -> list[_File]:
+def _found(path: Path, argument: str) -> list[_File]:
     """Return the PNG files at a path, in order; plain names only if no file has a known layout."""
-    if place.is_file():
-        return [_parsed(place)]
-    paths = sorted(place.rglob("*.png"))
+    if path.is_file():
+        return [_parsed(path)]
+    images = sorted(path.rglob("*.png"))
     # Hidden files are unfinished results.
-    paths = [p for p in paths if "/." not in f"/{p.relative_to(place).as_posix()}"]
+    images = [p for p in images if "/." not in f"/{p.relative_to(path).as_posix()}"]
     # Exported maps are copies of the maps beside them.
-    exported = {p.parent for p in place.rglob("export.yaml")} - {place}
-    paths = [p for p in paths if not exported.intersection(p.parents)]
-    if not paths:
+    exported = {p.parent for p in path.rglob("export.yaml")} - {path}
+    images = [p for p in images if not exported.intersection(p.parents)]
+    if not images:
         raise InputError(
-            f"{what} {place}: no such file or folder with PNG files, expected depth maps"
+            f"{argument} {path}: no such file or folder with PNG files, expected depth maps"
         )
-    files = [_parsed(path) for path in paths]
+    files = [_parsed(image) for image in images]
     return [file for file in files if file.product is not None] or files
 
 
@@ -126,49 +126,49 @@ def _parsed(path: Path) -> _File:
     text = path.absolute().as_posix()
     for layout in _LAYOUTS:
         if match := re.search(layout, text):
-            parts = match.groupdict()
-            drive = _last(_DRIVE, text[: match.end("product")]) or parts.get("folder")
-            frame = str(int(parts["frame"]))
-            return _File(path, frame, drive, parts["camera"], parts["product"])
+            groups = match.groupdict()
+            drive = _last(_DRIVE, text[: match.end("product")]) or groups.get("folder")
+            frame = str(int(groups["frame"]))
+            return _File(path, frame, drive, groups["camera"], groups["product"])
     frame = str(int(path.stem)) if path.stem.isdecimal() else path.stem
     folder = path.absolute().parent.as_posix()
     return _File(path, frame, _last(_DRIVE, folder), _last(_CAMERA, folder))
 
 
 def _last(pattern: re.Pattern[str], text: str) -> str | None:
-    found = [match[1] for match in pattern.finditer(text)]
-    return found[-1] if found else None
+    names = [match[1] for match in pattern.finditer(text)]
+    return names[-1] if names else None
 
 
-def _product(files: Sequence[_File], place: Path, filled: bool) -> list[_File]:
+def _product(files: Sequence[_File], path: Path, filled: bool) -> list[_File]:
     """Return densify's filled or measured maps; all files if another method made them."""
     wanted = [file for file in files if file.product in (_FILLED if filled else _MEASURED)]
     if filled and not wanted:
         raise InputError(
-            f"--filled: {place}: holds no {' or '.join(_FILLED)} maps; leave --filled out"
+            f"--filled: {path}: holds no {' or '.join(_FILLED)} maps; leave --filled out"
         )
-    ours = any(file.product in _OURS for file in files)
-    return wanted if wanted and (ours or filled) else list(files)
+    has_densify_maps = any(file.product in _OURS for file in files)
+    return wanted if wanted and (has_densify_maps or filled) else list(files)
 
 
 def _match(
-    left: Sequence[_File], right: Sequence[_File], left_place: Path, right_place: Path
+    left: Sequence[_File], right: Sequence[_File], left_path: Path, right_path: Path
 ) -> dict[Path, Path]:
     """Return right -> left path where frames agree, and drive and camera too if all name them."""
     everything = (*left, *right)
-    told = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in everything)]
-    here = _keyed(left, ["frame", *told], left_place)
-    there = _keyed(right, ["frame", *told], right_place)
-    return {path: here[key] for key, path in there.items() if key in here}
+    shared = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in everything)]
+    left_by_key = _keyed(left, ["frame", *shared], left_path)
+    right_by_key = _keyed(right, ["frame", *shared], right_path)
+    return {path: left_by_key[key] for key, path in right_by_key.items() if key in left_by_key}
 
 
-def _keyed(files: Sequence[_File], names: Sequence[str], place: Path) -> dict[str, Path]:
+def _keyed(files: Sequence[_File], names: Sequence[str], path: Path) -> dict[str, Path]:
     keyed: dict[str, Path] = {}
     for file in files:
         key = " ".join(f"{name} {getattr(file, name)}" for name in names)
         if key in keyed:
             raise InputError(
-                f"{place}: {keyed[key].relative_to(place)} and {file.path.relative_to(place)} are "
+                f"{path}: {keyed[key].relative_to(path)} and {file.path.relative_to(path)} are "
                 f"both {key}, by what the names on both sides say; give one drive, camera and "
                 f"product at a time"
             )

@@ -47,8 +47,8 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
         *((f"frame {frame}", f"cannot be used: {unreadable[frame]}") for frame in named),
     ]
     if len(unreadable) > len(named):
-        others = format_frames(unreadable.keys() - named)
-        lines.append(("frames", f"cannot be used either: {others}"))
+        unlisted = format_frames(unreadable.keys() - named)
+        lines.append(("frames", f"cannot be used either: {unlisted}"))
     return lines
 
 

@@ -42,8 +42,8 @@ def open_recording(path: Path, scene: str | None) -> Dgp:
 
 def find_scene(folder: Path) -> Path | None:
     """Return the file ``scene_<hash>.json`` that describes a folder's scene, None if missing."""
-    found = [p for p in folder.glob("scene_*.json") if not p.name.startswith("scene_dataset")]
-    return min(found, default=None)
+    scene_files = [p for p in folder.glob("scene_*.json") if not p.name.startswith("scene_dataset")]
+    return min(scene_files, default=None)
 
 
 class _Datum(NamedTuple):
@@ -85,8 +85,8 @@ class Dgp(FileSequence):
         # 1.55 m above the ground: the mean position of the cameras is used.
         self._origins_m = None
         if np.array_equal(T_ego_lidar, np.eye(4)) and cameras:
-            places = [poses.inverse(camera.T_cam_lidar)[:3, 3] for camera in cameras.values()]
-            self._origins_m = np.mean(places, axis=0)[None]
+            origins_m = [poses.inverse(camera.T_cam_lidar)[:3, 3] for camera in cameras.values()]
+            self._origins_m = np.mean(origins_m, axis=0)[None]
         super().__init__(
             path.resolve().name,
             path,
@@ -121,7 +121,7 @@ _Numbered = dict[str, dict[int, _Datum]]
 def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
     """Return sweeps and images, by sensor and number, and the path of the calibration file."""
     content = read_json(file)
-    found: dict[str, _Numbered] = {"point_cloud": {}, "image": {}}
+    numbered_of_kind: dict[str, _Numbered] = {"point_cloud": {}, "image": {}}
     with described_in(file, "a DGP scene with samples and their data"):
         data = {entry["key"]: entry for entry in content["data"]}
         keys = {key for sample in content["samples"] for key in sample["datum_keys"]}
@@ -129,16 +129,16 @@ def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
         for entry in sorted((data[key] for key in keys), key=lambda e: e["id"]["timestamp"]):
             kind, name = next(iter(entry["datum"])), entry["id"]["name"]
             number = numbered[name] = numbered.get(name, -1) + 1
-            if kind in found:
+            if kind in numbered_of_kind:
                 datum = _datum(file, kind, entry)
                 if isfile(datum.path):
-                    found[kind].setdefault(name, {})[number] = datum
+                    numbered_of_kind[kind].setdefault(name, {})[number] = datum
         key = content["samples"][0]["calibration_key"]
-    if not found["point_cloud"]:
+    if not numbered_of_kind["point_cloud"]:
         raise InputError(f"{file}: none of its sweeps is there; expected point_cloud/LIDAR/*.npz")
-    images = dict(sorted(found["image"].items()))
+    images = dict(sorted(numbered_of_kind["image"].items()))
     calibration = checks.file_within(file.parent, f"calibration/{key}.json", file)
-    return found["point_cloud"], images, calibration
+    return numbered_of_kind["point_cloud"], images, calibration
 
 
 def _datum(file: Path, kind: str, entry: Mapping[str, Any]) -> _Datum:
@@ -159,18 +159,18 @@ def _stamp_ns(text: str) -> int:
     return microseconds * (100 if date.year >= _BOGUS_YEAR else 1000)
 
 
-def _read_pose(given: Mapping[str, Any], where: str) -> Float:
-    turn, place = given["rotation"], given["translation"]
-    quaternion = [turn[key] for key in ("qw", "qx", "qy", "qz")]
-    return checks.quaternion_pose(quaternion, [place[key] for key in "xyz"], where)
+def _read_pose(pose: Mapping[str, Any], where: str) -> Float:
+    rotation, translation = pose["rotation"], pose["translation"]
+    quaternion = [rotation[key] for key in ("qw", "qx", "qy", "qz")]
+    return checks.quaternion_pose(quaternion, [translation[key] for key in "xyz"], where)
 
 
 def _read_calibration(file: Path) -> dict[str, tuple[Float, list[float]]]:
     """Return each sensor's (4,4) pose in the vehicle frame and fx fy cx cy (px), by its name."""
-    given, found = read_json(file), {}
+    content, calibration = read_json(file), {}
     with described_in(file, "names, and extrinsics and intrinsics of each"):
-        sensors = zip(given["names"], given["extrinsics"], given["intrinsics"], strict=True)
+        sensors = zip(content["names"], content["extrinsics"], content["intrinsics"], strict=True)
         for name, extrinsic, lens in sensors:
             T = _read_pose(extrinsic, f"{file}: extrinsics of {name}")
-            found[name] = T, [float(lens[key]) for key in ("fx", "fy", "cx", "cy")]
-    return found
+            calibration[name] = T, [float(lens[key]) for key in ("fx", "fy", "cx", "cy")]
+    return calibration

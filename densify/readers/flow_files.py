@@ -60,16 +60,17 @@ def check_argument(argument: str) -> None:
         raise InputError(f"flow.engine npz:{argument}: no such folder; expected flow files in it")
 
 
-def read_step(folder: Path, stretch: Stretch, here: int, there: int) -> FlowField:
+def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowField:
     """Read the flow of a sweep's points to another sweep, ego-motion removed, in its lidar frame.
 
-    ``here`` (source) and ``there`` (target) are indices in ``stretch.sweeps``. Points that are
-    missing in the flow file are static.
+    ``source`` and ``target`` are indices in ``stretch.sweeps``. Points that are missing
+    in the flow file are static.
     """
-    frame, target = stretch.frames[here], stretch.frames[there]
-    sweep, T_here_there = stretch.sweeps[here].sweep, stretch.T_target_source(frame, target)
-    path = folder / f"{frame:06d}_{target:06d}.npz"
-    columns = sweep_columns(path, sweep.row, sweep.points, T_here_there)
+    source_frame, target_frame = stretch.frames[source], stretch.frames[target]
+    sweep = stretch.sweeps[source].sweep
+    T_source_target = stretch.T_target_source(source_frame, target_frame)
+    path = folder / f"{source_frame:06d}_{target_frame:06d}.npz"
+    columns = sweep_columns(path, sweep.row, sweep.points, T_source_target)
     residual, moving = columns["residual_flow"], columns["moving"].astype(bool)
     residual[~moving] = 0.0
     instance, lost = columns["object"].astype(np.int32), np.zeros(len(moving), bool)
@@ -77,14 +78,14 @@ def read_step(folder: Path, stretch: Stretch, here: int, there: int) -> FlowFiel
 
 
 def sweep_columns(
-    path: Path, row: NDArray[np.int64], points: NDArray[np.float64], T_here_there: NDArray[Any]
+    path: Path, row: NDArray[np.int64], points: NDArray[np.float64], T_source_target: NDArray[Any]
 ) -> dict[str, NDArray[Any]]:
     """Read a flow file's arrays, as the module describes them, for N points in the sweep's order.
 
     Missing residual_flow, moving, object and valid are added. A point that is missing in the file
     has flow 0 and object -1, and is not valid. ``row`` (N,) is the row of each point in the sweep's
-    file. ``points`` is (N,3) metres in the source's lidar frame, in which ``T_here_there`` (4,4) is
-    the pose of the target's lidar frame.
+    file. ``points`` is (N,3) metres in the source's lidar frame, in which ``T_source_target`` (4,4)
+    is the pose of the target's lidar frame.
     """
     arrays = load_flow_file(path)
     num_points = len(next(iter(arrays.values())))
@@ -94,25 +95,25 @@ def sweep_columns(
             f"{path}: holds {num_points} points, expected one for each row of the sweep's file "
             f"(more than {row.max()}); add their 'row' where some are left out"
         )
-    place = np.full(int(row.max(initial=0)) + 1, -1, np.int64)
-    ours = np.flatnonzero(rows < len(place))
-    place[rows[ours]] = ours
-    known = place[row] >= 0
-    at = place[row][known]
-    found = {}
+    entry_of_row = np.full(int(row.max(initial=0)) + 1, -1, np.int64)
+    entries = np.flatnonzero(rows < len(entry_of_row))
+    entry_of_row[rows[entries]] = entries
+    known = entry_of_row[row] >= 0
+    entry = entry_of_row[row][known]
+    columns = {}
     for name in arrays:
         values = np.zeros((len(row), *arrays[name].shape[1:]))
-        values[known] = arrays[name][at]
-        found[name] = values
+        values[known] = arrays[name][entry]
+        columns[name] = values
     if "residual_flow" not in arrays:
-        back = poses.transform(T_here_there, points + found["total_flow"])
-        residual = back - points - found.get("to_reference", 0.0)
-        found["residual_flow"] = np.where(known[:, None], residual, 0.0)
+        arrived = poses.transform(T_source_target, points + columns["total_flow"])
+        residual = arrived - points - columns.get("to_reference", 0.0)
+        columns["residual_flow"] = np.where(known[:, None], residual, 0.0)
     if "moving" not in arrays:
-        found["moving"] = np.linalg.norm(found["residual_flow"], axis=1) >= MOVES_M
-    found["object"] = np.where(known, found.get("object", -1), -1)
-    found["valid"] = known & found.get("valid", known).astype(bool)
-    return found
+        columns["moving"] = np.linalg.norm(columns["residual_flow"], axis=1) >= MOVES_M
+    columns["object"] = np.where(known, columns.get("object", -1), -1)
+    columns["valid"] = known & columns.get("valid", known).astype(bool)
+    return columns
 
 
 def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
@@ -135,11 +136,11 @@ def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
             )
         if not np.isfinite(array).all():
             raise InputError(f"{path}: array {name}: got NaN or infinite, expected finite numbers")
-        most = np.abs(array, dtype=np.float64).max(initial=0) if name in _WIDE else 0.0
-        if most > FARTHEST_M:
+        longest_m = np.abs(array, dtype=np.float64).max(initial=0) if name in _WIDE else 0.0
+        if longest_m > FARTHEST_M:
             raise InputError(
-                f"{path}: array {name}: got a step of {most:g} m, expected metres, {FARTHEST_M:g} "
-                f"at most"
+                f"{path}: array {name}: got a step of {longest_m:g} m, expected metres, "
+                f"{FARTHEST_M:g} at most"
             )
     if (arrays.get("row", np.zeros(1)) < 0).any():
         raise InputError(f"{path}: array row: got a negative one, expected row numbers from 0 up")
@@ -198,29 +199,29 @@ class LabelledFlow:
     valid: Bool  # (N,) bool, the ground-truth flow of the point is known
 
 
-def labelled_flow(place: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
+def labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
     """Read the ground-truth flow of a sweep (a frame number) to the next sweep of the stretch.
 
-    ``place`` holds ``FRAME_NEXT.npz`` or, itself or in its folder ``name``, Argoverse 2 labels.
+    ``folder`` holds ``FRAME_NEXT.npz`` or, itself or in its folder ``name``, Argoverse 2 labels.
     """
-    if not place.is_dir():
-        raise InputError(f"--truth {place}: no such folder; expected true flow in it")
+    if not folder.is_dir():
+        raise InputError(f"--truth {folder}: no such folder; expected true flow in it")
     target = stretch.frames[stretch.frames.index(frame) + 1]
-    path = place / f"{frame:06d}_{target:06d}.npz"
-    if path.is_file() or any(place.glob("*_*.npz")):
+    path = folder / f"{frame:06d}_{target:06d}.npz"
+    if path.is_file() or any(folder.glob("*_*.npz")):
         sweep, T = stretch[frame].sweep, stretch.T_target_source(frame, target)
-        found = sweep_columns(path, sweep.row, sweep.points, T)
-        classes = np.where(found["object"] >= 0, _OBJECT, 0).astype(np.uint8)
-        return LabelledFlow(found["residual_flow"], classes, found["valid"])
-    here = place / name if (place / name).is_dir() else place
-    files = {int(p.stem): p for p in here.glob("*.feather") if p.stem.isdecimal()}
+        columns = sweep_columns(path, sweep.row, sweep.points, T)
+        classes = np.where(columns["object"] >= 0, _OBJECT, 0).astype(np.uint8)
+        return LabelledFlow(columns["residual_flow"], classes, columns["valid"])
+    label_folder = folder / name if (folder / name).is_dir() else folder
+    files = {int(p.stem): p for p in label_folder.glob("*.feather") if p.stem.isdecimal()}
     if not files:
         raise InputError(
-            f"--truth {place}: holds no labels of {name}; expected FRAME_NEXT.npz, or "
+            f"--truth {folder}: holds no labels of {name}; expected FRAME_NEXT.npz, or "
             f"STAMP.feather there or in a folder {name}"
         )
     stamp_ns = stretch[frame].sweep.stamp_ns
-    path = files.get(stamp_ns, files.get(frame, here / f"{stamp_ns}.feather"))
+    path = files.get(stamp_ns, files.get(frame, label_folder / f"{stamp_ns}.feather"))
     return _read_feather(path, stretch[frame].sweep.row)
 
 

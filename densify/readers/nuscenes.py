@@ -75,7 +75,7 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
     """Return the records of a JSON table whose field ``key`` is in ``wanted``, by their tokens."""
     pattern = re.compile(rb'"%s"\s*:\s*"([^"]*)"' % key.encode())
     names = frozenset(name.encode() for name in wanted)
-    found = []
+    records = []
     try:
         with (
             open_file(_existing(path)) as file,
@@ -85,15 +85,15 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
             if begin[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
                 raise ValueError("it does not begin with [ or end with ]")
             for match in _RECORD.finditer(data):
-                of = pattern.search(match[0])
-                if of and of[1] in names:
-                    found.append(parse_json(match[0], path))  # tables have millions of records
+                token = pattern.search(match[0])
+                if token and token[1] in names:
+                    records.append(parse_json(match[0], path))  # tables have millions of records
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: not a whole JSON table: {reason(error)}; fetch it again"
         ) from error
     with described_in(path, _EXPECTED):
-        return {str(record["token"]): record for record in found}
+        return {str(record["token"]): record for record in records}
 
 
 def _existing(path: Path) -> Path:
@@ -124,11 +124,11 @@ class Annotations:
         if not path.is_file():
             return None
         samples = find_records(tables / "sample.json", "scene_token", {scene})
-        found: dict[str, dict[str, KeyBox]] = defaultdict(dict)
+        boxes_of: dict[str, dict[str, KeyBox]] = defaultdict(dict)
         with described_in(path, _EXPECTED):
             stamps_ns = {token: stamp_ns(record) for token, record in samples.items()}
             for token, record in find_records(path, "sample_token", samples).items():
-                where, boxes = f"{path}: record {token}", found[record["sample_token"]]
+                where, boxes = f"{path}: record {token}", boxes_of[record["sample_token"]]
                 if record["instance_token"] in boxes:
                     raise InputError(
                         f"{where}: a second box of the instance {record['instance_token']} in the "
@@ -138,7 +138,9 @@ class Annotations:
                 boxes[record["instance_token"]] = KeyBox(pose_of(record, where), size_m)
         order = sorted(stamps_ns, key=stamps_ns.__getitem__)
         key_ns = np.array([stamps_ns[token] for token in order], np.int64)
-        return Annotations(str(path), key_ns, tuple(found[t] for t in order)) if found else None
+        return (
+            Annotations(str(path), key_ns, tuple(boxes_of[t] for t in order)) if boxes_of else None
+        )
 
     def at(self, stamp_ns: int, T_lidar_world: Float) -> Boxes | None:
         """Return the boxes at a time in the lidar frame; None outside the time of the key frames.
@@ -149,13 +151,13 @@ class Annotations:
             return None
         after = int(np.searchsorted(self.key_ns, stamp_ns))
         before = after if self.key_ns[after] == stamp_ns else after - 1
-        here, there = self.boxes[before], self.boxes[after]
-        track = [name if name in here and name in there else "" for name in {**here, **there}]
-        found = [self._box(name, before, after, stamp_ns) for name in {**here, **there}]
+        earlier, later = self.boxes[before], self.boxes[after]
+        track = [name if name in earlier and name in later else "" for name in {**earlier, **later}]
+        key_boxes = [self._box(name, before, after, stamp_ns) for name in {**earlier, **later}]
         return checks.boxes(
             track,
-            T_lidar_world @ np.reshape([box.T_world_box for box in found], (-1, 4, 4)),
-            np.reshape([box.size_m for box in found], (-1, 3)),
+            T_lidar_world @ np.reshape([box.T_world_box for box in key_boxes], (-1, 4, 4)),
+            np.reshape([box.size_m for box in key_boxes], (-1, 3)),
             f"{self.where}: at {stamp_ns} ns",
         )
 
@@ -167,18 +169,18 @@ class Annotations:
         for first, last in ((before, after), (after, after + 1), (before - 1, before)):
             inside = 0 <= first < last < len(boxes)
             if inside and instance in boxes[first] and instance in boxes[last]:
-                here, there = boxes[first][instance], boxes[last][instance]
+                first_box, last_box = boxes[first][instance], boxes[last][instance]
                 span_ns = self.key_ns[last] - self.key_ns[first]
                 share = float((stamp_ns - self.key_ns[first]) / span_ns)
-                T = interpolate(here.T_world_box, there.T_world_box, share)
-                return KeyBox(T, (there if share > 0.5 else here).size_m)
+                T = interpolate(first_box.T_world_box, last_box.T_world_box, share)
+                return KeyBox(T, (last_box if share > 0.5 else first_box).size_m)
         return {**boxes[before], **boxes[after]}[instance]
 
 
 def open_recording(path: Path, scene: str | None) -> NuScenes:
     """Open a scene, such as ``scene-0061``, by the folder of the JSON tables or by its parent."""
     folders = [path] if (path / "sample_data.json").is_file() else []
-    folders = folders or sorted(found.parent for found in path.glob("v*/sample_data.json"))
+    folders = folders or sorted(file.parent for file in path.glob("v*/sample_data.json"))
     if not folders:
         raise InputError(
             f"{path}: no nuScenes tables; expected a folder such as v1.0-mini with scene.json and "
@@ -232,20 +234,20 @@ def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[st
     """Return the sensors of a modality by channel, from sample data records in order of time."""
     path, table = tables / "calibrated_sensor.json", tables / "sample_data.json"
     calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
-    found: dict[str, list[Record]] = defaultdict(list)
+    groups: dict[str, list[Record]] = defaultdict(list)
     for record in records:
         sensor = sensors[calibrated[record["calibrated_sensor_token"]]["sensor_token"]]
         if sensor["modality"] == modality:
-            found[sensor["channel"]].append(record)
+            groups[sensor["channel"]].append(record)
     channels = {}
-    for name, of in sorted(found.items()):
-        tokens = [record["calibrated_sensor_token"] for record in of]
+    for name, group in sorted(groups.items()):
+        tokens = [record["calibrated_sensor_token"] for record in group]
         T = {t: pose_of(calibrated[t], f"{path}: record {t}") for t in dict.fromkeys(tokens)}
         channels[name] = Channel(
-            [stamp_ns(record) for record in of],
-            [checks.file_within(tables.parent, record["filename"], table) for record in of],
+            [stamp_ns(record) for record in group],
+            [checks.file_within(tables.parent, record["filename"], table) for record in group],
             [T[token] for token in tokens],
-            (int(of[0].get("width") or 0), int(of[0].get("height") or 0)),
+            (int(group[0].get("width") or 0), int(group[0].get("height") or 0)),
             calibrated[tokens[0]].get("camera_intrinsic"),
         )
     return channels
@@ -260,8 +262,8 @@ class NuScenes(FileSequence):
             records, self._ego = _read_path(tables, token, name)
             lidars, self._channels = (_channels(tables, records, k) for k in ("lidar", "camera"))
         if len(lidars) != 1:
-            there = ", ".join(lidars) or "none"
-            raise InputError(f"{root}: got the lidars {there} of {name}, expected one")
+            lidar_names = ", ".join(lidars) or "none"
+            raise InputError(f"{root}: got the lidars {lidar_names} of {name}, expected one")
         (lidar,) = lidars.values()
         self._T_ego_lidar, self._stamps_ns = lidar.T_ego_sensor[0], lidar.stamps_ns
         T_world_lidar = self._ego.T_world_ego @ self._T_ego_lidar

@@ -32,9 +32,9 @@ def open_recording(path: Path, scene: str | None) -> Ouster:
         raise InputError(f"{path}: no such file; expected an Ouster capture (.pcap)")
     metadata = find_metadata(path) if scene is None else path.with_name(scene)
     if metadata is None or not metadata.is_file():
-        there = ", ".join(sorted(p.name for p in path.parent.glob("*.json"))) or "none"
+        names = ", ".join(sorted(p.name for p in path.parent.glob("*.json"))) or "none"
         raise InputError(
-            f"{path}: which metadata? beside it: {there}; put the sensor's .json there, name it by "
+            f"{path}: which metadata? beside it: {names}; put the sensor's .json there, name it by "
             f"ouster:{path}#NAME.json if there are several"
         )
     return Ouster(path, metadata)
@@ -46,11 +46,11 @@ def find_metadata(path: Path) -> Path | None:
     The file with the longest name that begins the name of the capture is chosen, or else the only
     ``.json`` file.
     """
-    found = sorted(path.parent.glob("*.json"))
-    named = [p for p in found if path.stem.startswith(p.stem)]
+    json_files = sorted(path.parent.glob("*.json"))
+    named = [p for p in json_files if path.stem.startswith(p.stem)]
     if named:
         return max(named, key=lambda p: len(p.stem))
-    return found[0] if len(found) == 1 else None
+    return json_files[0] if len(json_files) == 1 else None
 
 
 class Ouster(FileSequence):
@@ -131,6 +131,6 @@ def lost_and_doubled(turn: Int, column: Int) -> tuple[int, int]:
     """
     step = np.diff(turn, prepend=turn[:1])
     turn = np.cumsum((step + _HALF_WRAP) % (2 * _HALF_WRAP) - _HALF_WRAP)
-    sent, place = np.unique(column, return_inverse=True)
-    number = np.unique(turn * len(sent) + place)
+    sent_columns, rank = np.unique(column, return_inverse=True)
+    number = np.unique(turn * len(sent_columns) + rank)
     return int(np.ptp(number)) + 1 - len(number), len(turn) - len(number)

@@ -70,8 +70,8 @@ class PandaSet(FileSequence):
 
     def __init__(self, path: Path) -> None:
         lidar = path / "lidar"
-        found = {file.name.removesuffix(".pkl.gz"): file for file in sorted(lidar.glob("*.pkl.gz"))}
-        sweeps = {int(name): file for name, file in found.items() if name.isdecimal()}
+        named = {file.name.removesuffix(".pkl.gz"): file for file in sorted(lidar.glob("*.pkl.gz"))}
+        sweeps = {int(name): file for name, file in named.items() if name.isdecimal()}
         if not sweeps:
             raise InputError(
                 f"{path}: no sweeps; expected a PandaSet sequence with files such as "
@@ -112,8 +112,8 @@ class PandaSet(FileSequence):
         after = np.searchsorted(self._track.stamp_ns, stamp_ns)
         if not 0 < after < len(self._track.stamp_ns):
             return np.inf
-        here, there = self._track.T_world_ego[after - 1 : after + 1, :3, 3]
-        return float(np.linalg.norm(there - here))
+        position_before_m, position_after_m = self._track.T_world_ego[after - 1 : after + 1, :3, 3]
+        return float(np.linalg.norm(position_after_m - position_before_m))
 
     def _returns(self, frame: int) -> Returns:
         path, stamp_ns = self._files[frame], self.stamp_ns(frame)
@@ -151,6 +151,7 @@ class PandaSet(FileSequence):
         with described_in(path, "the cuboids of PandaSet"):
             texts = [str(text) for text in columns["uuid"]]
             numbers = (*_CENTRE, *_LENGTH_WIDTH_HEIGHT, "yaw", "cuboids.sensor_id")
+            # Columns: 0 to 2 centre, 3 to 5 size, 6 yaw, 7 scanner
             table = np.column_stack([np.asarray(columns[name], np.float64) for name in numbers])
         T_world_box = checks.upright_poses(table[:, :3], table[:, 6] + np.pi / 2)
         T_lidar_box = poses.inverse(self._pose(frame)) @ T_world_box
@@ -169,8 +170,8 @@ def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
     path, T = folder / "poses.json", []
     with described_in(path, "a list of heading w x y z and position x y z"):
         for number, entry in enumerate(read_json(path)):
-            turn, place = entry["heading"], entry["position"]
-            values = [turn[k] for k in "wxyz"], [place[k] for k in "xyz"]
+            heading, position = entry["heading"], entry["position"]
+            values = [heading[k] for k in "wxyz"], [position[k] for k in "xyz"]
             T.append(checks.quaternion_pose(*values, f"{path}: entry {number}"))
     num = min(len(stamps_ns), len(T))
     if last >= num:
@@ -183,7 +184,7 @@ def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
 
 def _camera(folder: Path, image: Path, T_cam_lidar: Float) -> Camera:
     path = folder / "intrinsics.json"
-    given = read_json(path)
+    intrinsics = read_json(path)
     with described_in(path, "fx fy cx cy in pixels"):
-        fx_fy_cx_cy = [float(given[name]) for name in ("fx", "fy", "cx", "cy")]
+        fx_fy_cx_cy = [float(intrinsics[name]) for name in ("fx", "fy", "cx", "cy")]
     return checks.pinhole(folder.name, image_size_px(image), fx_fy_cx_cy, T_cam_lidar, str(path))

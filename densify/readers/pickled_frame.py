@@ -88,9 +88,9 @@ def _columns(frame: Any) -> dict[str, NDArray[Any]]:
     names = managed["axes"][0].args[1]["data"].state[-1]
     columns = {}
     for block in managed["blocks"]:
-        values, places = _array(block["values"]), block["mgr_locs"]
-        is_slice = isinstance(places, _RECORDS["builtins.slice"])
-        for row, column in enumerate(range(*places.args) if is_slice else _array(places).tolist()):
+        values, locs = _array(block["values"]), block["mgr_locs"]
+        is_slice = isinstance(locs, _RECORDS["builtins.slice"])
+        for row, column in enumerate(range(*locs.args) if is_slice else _array(locs).tolist()):
             columns[str(names[column])] = values[row]
     return columns
 

@@ -62,11 +62,11 @@ def find_fields(names: Collection[str]) -> Fields:
     """Find the field of each quantity by name, in any case; the order of `_NAMES` decides."""
     # CloudCompare puts scalar_ before the names of fields.
     lower = {name.lower().removeprefix("scalar_"): name for name in reversed(list(names))}
-    found = {
-        part: next((lower[name] for name in known.split() if name in lower), "")
-        for part, known in _NAMES.items()
+    field_of_quantity = {
+        quantity: next((lower[name] for name in aliases.split() if name in lower), "")
+        for quantity, aliases in _NAMES.items()
     }
-    return Fields(**found)
+    return Fields(**field_of_quantity)
 
 
 @dataclass(frozen=True)
@@ -89,26 +89,26 @@ class PointTimes:
 
         Returns (N,) int64 times, 0 where invalid, and an (N,) mask of the valid times.
         """
-        right = self._right(values, stamp_ns)
+        is_valid = self._right(values, stamp_ns)
         offset_ns = np.zeros(len(values), np.int64)
-        if right.any():
-            near = widened(values[right])
-            zero, zero_ns = self._zero(near)
-            since_ns = np.rint((near - near.dtype.type(zero)) * UNIT_NS[self.unit])
+        if is_valid.any():
+            times = widened(values[is_valid])
+            zero, zero_ns = self._zero(times)
+            since_ns = np.rint((times - times.dtype.type(zero)) * UNIT_NS[self.unit])
             is_of_stamp = self.absolute and not self.other_clock and not self.reference
-            offset_ns[right] = since_ns.astype(np.int64) + is_of_stamp * (zero_ns - stamp_ns)
-        return offset_ns, right
+            offset_ns[is_valid] = since_ns.astype(np.int64) + is_of_stamp * (zero_ns - stamp_ns)
+        return offset_ns, is_valid
 
     def own_stamp_ns(self, values: NDArray[Any]) -> int | None:
         """Return a stamp (ns) for a sweep whose (N,) point times are absolute.
 
         The stamp is the earliest time or the time of `reference`; None if no time is valid.
         """
-        right = self._right(values, None)
-        if not right.any():
+        is_valid = self._right(values, None)
+        if not is_valid.any():
             return None
-        near = widened(values[right])
-        return self._zero(near)[1] if self.reference else self._in_ns(near.min())
+        times = widened(values[is_valid])
+        return self._zero(times)[1] if self.reference else self._in_ns(times.min())
 
     def _right(self, values: NDArray[Any], stamp_ns: int | None) -> Bool:
         """Return an (N,) mask of the valid times, within `reach_ns` of the middle of the sweep."""
@@ -116,17 +116,17 @@ class PointTimes:
         middle_ns = self.middle_ns + ((stamp_ns or 0) if self.absolute else 0.0)
         if (self.other_clock or stamp_ns is None) and np.isfinite(times_ns).any():
             middle_ns, _ = _extent(times_ns)
-        right: Bool = np.abs(times_ns - middle_ns) <= self.reach_ns
-        return right
+        is_valid: Bool = np.abs(times_ns - middle_ns) <= self.reach_ns
+        return is_valid
 
-    def _zero(self, near: NDArray[Any]) -> tuple[Any, int]:
+    def _zero(self, times: NDArray[Any]) -> tuple[Any, int]:
         """Return the time to subtract from valid times (M,), in the field's unit and in ns."""
-        low, high = near.min(), near.max()
+        low, high = times.min(), times.max()
         if self.reference or self.other_clock:
             share = {"": 0, "start": 0, "middle": 0.5, "end": 1}[self.reference]
-            zero = low + near.dtype.type(share * (high - low))
+            zero = low + times.dtype.type(share * (high - low))
         else:
-            zero = near.dtype.type(np.floor(low) if self.absolute else 0)
+            zero = times.dtype.type(np.floor(low) if self.absolute else 0)
         return zero, self._in_ns(zero)
 
     def _in_ns(self, time: Any) -> int:
@@ -155,8 +155,8 @@ def _extent(times: NDArray[Any]) -> tuple[float, float]:
     width = times[half:] - times[: len(times) - half]
     first = int(np.argmin(width))
     middle, reach = times[first] + width[first] / 2, 2 * width[first]
-    most = times[np.abs(times - middle) <= reach]
-    return float(most[0] + most[-1]) / 2, float(most[-1] - most[0]) / 2
+    inliers = times[np.abs(times - middle) <= reach]
+    return float(inliers[0] + inliers[-1]) / 2, float(inliers[-1] - inliers[0]) / 2
 
 
 def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K, Columns]:
@@ -164,7 +164,7 @@ def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K,
 
     Unreadable sweeps are left out, unless no other has points. ``read`` returns a sweep's columns.
     """
-    found, errors = dict[K, Columns](), list[InputError]()
+    columns_of_sweep, errors = dict[K, Columns](), list[InputError]()
     for sweep in sweeps[:: max(1, len(sweeps) // _NUM_SAMPLED)][:_NUM_SAMPLED]:
         try:
             columns = read(sweep)
@@ -172,10 +172,10 @@ def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K,
             errors.append(error)
             continue
         if len(next(iter(columns.values()), ())):
-            found[sweep] = columns
-    if errors and not found:
+            columns_of_sweep[sweep] = columns
+    if errors and not columns_of_sweep:
         raise errors[0]
-    return found
+    return columns_of_sweep
 
 
 def find_times(
@@ -196,12 +196,12 @@ def find_times(
     Returns:
         The meaning of the times and its description; or None and the reason of the failure.
     """
-    told = [_unit_of(values, field, period_ns, unit) for values in sweeps]
-    units = Counter(found for found, _ in told)
-    unit = max(units, key=lambda found: (units[found], found != ""))
+    unit_guesses = [_unit_of(values, field, period_ns, unit) for values in sweeps]
+    units = Counter(guess for guess, _ in unit_guesses)
+    unit = max(units, key=lambda guess: (units[guess], guess != ""))
     if not unit:
-        return None, next(words for found, words in told if not found)
-    rows = [row for row, (found, _) in enumerate(told) if found == unit]
+        return None, next(reason for guess, reason in unit_guesses if not guess)
+    rows = [row for row, (guess, _) in enumerate(unit_guesses) if guess == unit]
     unit_ns = UNIT_NS[unit]
     extents = np.array([_extent(sweeps[row].astype(np.float64) * unit_ns) for row in rows])
     middle_ns, reach_ns = extents.T
@@ -214,7 +214,7 @@ def find_times(
         usual_ns = float(np.median(middle_ns))
     elif absolute:  # the stamps are made of these times
         usual_ns = {"middle": 0, "end": -1}.get(reference, 1) * float(np.median(reach_ns))
-    found = PointTimes(
+    point_times = PointTimes(
         field,
         unit,
         absolute,
@@ -223,7 +223,7 @@ def find_times(
         reach_ns=round(float(np.median(reach_ns))) + period_ns,
         reference=reference,
     )
-    return found, str(found)
+    return point_times, str(point_times)
 
 
 def _unit_of(values: NDArray[Any], field: str, period_ns: int, unit: str) -> tuple[str, str]:
@@ -239,8 +239,8 @@ def _unit_of(values: NDArray[Any], field: str, period_ns: int, unit: str) -> tup
             f"{middle + reach:.10g}"
         )
     if not reach:
-        most = "most" if span else "all"
-        return "", f"{field} is the same for {most} points, so it does not tell their times"
+        quantifier = "most" if span else "all"
+        return "", f"{field} is the same for {quantifier} points, so it does not tell their times"
     share = {u: 2 * reach * ns / period_ns for u, ns in UNIT_NS.items()}
     fit = [unit] if unit else [u for u in share if _SHORTEST_SHARE < share[u] < _LONGEST_SHARE]
     if not fit:
@@ -294,14 +294,14 @@ class PointLayout:
                 f"folder name them in densify.yaml: sweeps: {{columns: [x, y, z, ...]}}"
             )
         alike = [row for row, columns in enumerate(sweeps) if columns.keys() == sweeps[0].keys()]
-        found, words = None, "none: no column of that kind"
+        point_times, words = None, "none: no column of that kind"
         if fields.time:
             values = [sweeps[row][fields.time] for row in alike]
             stamps_ns = None if stamps_ns is None else [stamps_ns[row] for row in alike]
-            found, words = find_times(values, fields.time, period_ns, stamps_ns, **times)
+            point_times, words = find_times(values, fields.time, period_ns, stamps_ns, **times)
         if fields.intensity and not intensity_scale:
             intensity_scale = max(full_scale(sweeps[row][fields.intensity]) for row in alike)
-        return PointLayout(fields, found, words, intensity_scale or 1.0)
+        return PointLayout(fields, point_times, words, intensity_scale or 1.0)
 
     def returns(self, columns: Columns, where: Path | str, stamp_ns: int) -> tuple[Returns, Bool]:
         """Return all N rows of a sweep, and a mask (N,) of the valid rows.
@@ -327,7 +327,7 @@ class PointLayout:
             values = columns[self.times.field][valid]
             if len(values) and (values != values[0]).any():  # else this sweep has no times
                 offset_ns = np.zeros(len(points), np.int64)
-                offset_ns[valid], right = self.times.offset_ns(values, stamp_ns)
-                valid[valid], num_untimed = right, int((~right).sum())
+                offset_ns[valid], is_in_sweep = self.times.offset_ns(values, stamp_ns)
+                valid[valid], num_untimed = is_in_sweep, int((~is_in_sweep).sum())
         points[~valid] = 0
         return Returns(points, intensity, offset_ns, num_untimed=num_untimed), valid

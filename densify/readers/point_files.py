@@ -158,25 +158,25 @@ def _are_scanned(points: NDArray[Any]) -> bool:
     """Return True if consecutive (N,3) points are close to each other, as in a scan."""
     # Rows read with a wrong number of columns mix x with y: then points lie far apart.
     with np.errstate(invalid="ignore"):  # wrongly read bytes may be signalling NaN
-        near = np.nan_to_num(points.astype(np.float64), posinf=0, neginf=0)
-    step, size = np.abs(np.diff(near, axis=0)).sum(axis=1), np.abs(near).sum(axis=1)
+        finite = np.nan_to_num(points.astype(np.float64), posinf=0, neginf=0)
+    step, size = np.abs(np.diff(finite, axis=0)).sum(axis=1), np.abs(finite).sum(axis=1)
     share = step / (size[1:] + size[:-1] + 1e-9)
-    return len(near) < _FEWEST_ROWS or 0 < np.median(share) < _ALIKE
+    return len(finite) < _FEWEST_ROWS or 0 < np.median(share) < _ALIKE
 
 
 def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:
     if path.suffix.lower() == ".npy":
         return PointTable(_matrix(read_array(path), names, path))
-    found = read_arrays(path)
-    if "points" in found:
-        return PointTable(_matrix(found.pop("points"), names, path), beside=found)
-    if not {"x", "y", "z"} <= found.keys():
-        raise ValueError(f"holds the arrays {', '.join(found)}, expected points, or x, y and z")
-    num_points = found["x"].shape
-    if len(num_points) != 1 or any(found[axis].shape != num_points for axis in "yz"):
+    arrays = read_arrays(path)
+    if "points" in arrays:
+        return PointTable(_matrix(arrays.pop("points"), names, path), beside=arrays)
+    if not {"x", "y", "z"} <= arrays.keys():
+        raise ValueError(f"holds the arrays {', '.join(arrays)}, expected points, or x, y and z")
+    num_points = arrays["x"].shape
+    if len(num_points) != 1 or any(arrays[axis].shape != num_points for axis in "yz"):
         raise ValueError("the arrays x, y and z have other shapes than (N,)")
-    fit = {n: a for n, a in found.items() if a.shape == num_points and a.dtype.kind in "fiu"}
-    return PointTable(fit, beside={n: a for n, a in found.items() if n not in fit})
+    fit = {n: a for n, a in arrays.items() if a.shape == num_points and a.dtype.kind in "fiu"}
+    return PointTable(fit, beside={n: a for n, a in arrays.items() if n not in fit})
 
 
 def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
@@ -302,9 +302,9 @@ def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
 
 def _read_las(path: Path, names: Sequence[str] | None) -> PointTable:
     cloud = read_las(path)
-    places = {axis: np.asarray(getattr(cloud, axis)) for axis in "xyz"}
-    others = [n for n in cloud.point_format.dimension_names if n not in ("X", "Y", "Z")]
-    return PointTable(places | {name: np.asarray(cloud[name]) for name in others})
+    coordinates = {axis: np.asarray(getattr(cloud, axis)) for axis in "xyz"}
+    attributes = [n for n in cloud.point_format.dimension_names if n not in ("X", "Y", "Z")]
+    return PointTable(coordinates | {name: np.asarray(cloud[name]) for name in attributes})
 
 
 _READERS: Mapping[str, Callable[[Path, Sequence[str] | None], PointTable]] = {

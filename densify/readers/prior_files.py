@@ -42,29 +42,29 @@ class PriorFiles:
     sky: Mapping[str, Mapping[int, Path]]  # files of sky masks, by camera name and image number
 
     @staticmethod
-    def open(place: Path, cameras: Sequence[str]) -> PriorFiles:
+    def open(path: Path, cameras: Sequence[str]) -> PriorFiles:
         """Find the priors of the given cameras in a folder, or take a single file."""
-        where, example = f"--prior {place}", "0000000120.npy, .exr or .png"
-        if not place.exists():
+        where, example = f"--prior {path}", "0000000120.npy, .exr or .png"
+        if not path.exists():
             raise InputError(f"{where}: no such folder or file; expected DIR/CAMERA/{example}")
-        values = {camera: _in(place / camera) for camera in cameras}
-        sky = {camera: _in(place / "sky" / camera) for camera in cameras}
-        if not any(values.values()) and (flat := _in(place)):
+        values = {camera: _in(path / camera) for camera in cameras}
+        sky = {camera: _in(path / "sky" / camera) for camera in cameras}
+        if not any(values.values()) and (flat := _in(path)):
             if len(cameras) > 1:
                 raise InputError(
                     f"{where}: holds depth images of one camera, and there are "
                     f"{', '.join(cameras)}; choose one with --camera, or put them into "
-                    f"{place / 'CAMERA'}"
+                    f"{path / 'CAMERA'}"
                 )
-            values, sky = {cameras[0]: flat}, {cameras[0]: _in(place / "sky")}
+            values, sky = {cameras[0]: flat}, {cameras[0]: _in(path / "sky")}
         if not any(values.values()):
-            inside = place / (cameras[0] if cameras else "CAMERA")
+            inside = path / (cameras[0] if cameras else "CAMERA")
             raise InputError(
                 f"{where}: holds no depth images named by frame; expected {inside}/{example}"
-                if place.is_dir()
+                if path.is_dir()
                 else f"{where}: names no frame; expected {example}"
             )
-        return PriorFiles(place, values, sky)
+        return PriorFiles(path, values, sky)
 
     def said_of(self, camera: str) -> str:
         """Return a clause for messages that lists the numbers of a camera's images with a prior."""
@@ -88,21 +88,21 @@ def _in(folder: Path) -> dict[int, Path]:
     """Return the prior files of a folder or its ``data`` subfolder by image number."""
     groups = [sorted(f.iterdir()) for f in (folder, folder / "data") if f.is_dir()]
     for paths in [[folder]] if folder.is_file() else groups:
-        found: dict[int, Path] = {}
+        path_of_number: dict[int, Path] = {}
         # The most precise file of a number wins: a PNG may be only a preview of the .npy.
         for suffix in _SUFFIXES:
             for path in paths:
                 stem = _STEM.fullmatch(path.stem)
                 if stem is not None and path.suffix.lower() == suffix:
-                    known = found.get(int(stem[1]))
+                    known = path_of_number.get(int(stem[1]))
                     if known is not None and known.suffix.lower() == suffix:
                         raise InputError(
                             f"--prior: {known} and {path.name} are both of image {int(stem[1])}; "
                             f"leave one there"
                         )
-                    found[int(stem[1])] = path
-        if found:
-            return dict(sorted(found.items()))
+                    path_of_number[int(stem[1])] = path
+        if path_of_number:
+            return dict(sorted(path_of_number.items()))
     return {}
 
 

@@ -180,9 +180,9 @@ def _viewpoint(path: Path) -> Float:
     with open_file(path) as file:
         header = file.read(_PCD_HEADER).split(b"\nDATA")[0].decode("ascii", "replace")
     lines = (line.split(maxsplit=1) for line in header.splitlines())
-    found = [line[1] for line in lines if len(line) == 2 and line[0] == "VIEWPOINT"]
+    viewpoints = [line[1] for line in lines if len(line) == 2 and line[0] == "VIEWPOINT"]
     where = f"{path}: VIEWPOINT"
-    values = checks.parse_numbers(found[0] if found else _NO_VIEWPOINT, where, 7)
+    values = checks.parse_numbers(viewpoints[0] if viewpoints else _NO_VIEWPOINT, where, 7)
     return checks.quaternion_pose(values[3:], values[:3], where)
 
 

@@ -103,48 +103,50 @@ class RosBag(FileSequence):
         """Return the chosen topics and assumptions as pairs of a label and a text."""
         lines = []
         for lidar in self._lidars:
-            found = lidar.layout
-            used = [f"{part} = {name}" for part, name in vars(found.fields).items() if name]
+            layout = lidar.layout
+            used = [
+                f"{quantity} = {name}" for quantity, name in vars(layout.fields).items() if name
+            ]
             undone = f", out of the world of {self._topics.poses}" if lidar.placed else ""
             lines.append(("lidar", f"{lidar.topic} in {lidar.frame}{undone}: {', '.join(used)}"))
-            scale = f"intensity divided by {found.intensity_scale:g}"
-            lines.append(("times", f"{found.time_words}; {scale}"))
+            scale = f"intensity divided by {layout.intensity_scale:g}"
+            lines.append(("times", f"{layout.time_words}; {scale}"))
         lines += [("images", f"{topic} ({name})") for name, topic in self._image_topics.items()]
         lines += [("no camera", text) for text in self._left_out]
         return [*lines, ("poses from", self._track_and_words[1])]
 
     def _returns(self, frame: int) -> Returns:
-        at, found = self._sweeps[frame], list[tuple[int, Returns]]()
+        sweep, numbered = self._sweeps[frame], list[tuple[int, Returns]]()
         for number, lidar in enumerate(self._lidars):
-            near = min(lidar.entries, key=lambda e: abs(e.stamp_ns - at.stamp_ns))
-            near = near if number else at
-            if abs(near.stamp_ns - at.stamp_ns) <= self._lidars[0].period_ns // 2:
-                found.append((number, self._returns_of(lidar, near, at.stamp_ns)))
-        parts = [part for _, part in found]
-        timed = all(part.offset_ns is not None for part in parts)
+            nearest = min(lidar.entries, key=lambda e: abs(e.stamp_ns - sweep.stamp_ns))
+            nearest = nearest if number else sweep
+            if abs(nearest.stamp_ns - sweep.stamp_ns) <= self._lidars[0].period_ns // 2:
+                numbered.append((number, self._returns_of(lidar, nearest, sweep.stamp_ns)))
+        clouds = [cloud for _, cloud in numbered]
+        timed = all(cloud.offset_ns is not None for cloud in clouds)
         origins = np.stack([lidar.T_first_lidar[:3, 3] for lidar in self._lidars])
         return Returns(
-            np.concatenate([part.points for part in parts]),
-            np.concatenate([_intensity(part) for part in parts]),
-            np.concatenate([part.offset_ns for part in parts]) if timed else None,  # type: ignore
-            np.concatenate([np.full(len(part.points), n, np.uint8) for n, part in found]),
+            np.concatenate([cloud.points for cloud in clouds]),
+            np.concatenate([_intensity(cloud) for cloud in clouds]),
+            np.concatenate([cloud.offset_ns for cloud in clouds]) if timed else None,  # type: ignore
+            np.concatenate([np.full(len(cloud.points), n, np.uint8) for n, cloud in numbered]),
             origins if len(self._lidars) > 1 else None,
-            num_untimed=sum(part.num_untimed for part in parts),
+            num_untimed=sum(cloud.num_untimed for cloud in clouds),
         )
 
     def _returns_of(self, lidar: Lidar, entry: Entry, stamp_ns: int) -> Returns:
         """Return a message's points in the first lidar's frame, with times since ``stamp_ns``."""
         where = f"{self._bag.path}: {lidar.topic} at {entry.stamp_ns} ns"
         columns = cloud_columns(self._bag.message(lidar.topic, entry), where)
-        found, valid = lidar.layout.returns(columns, where, entry.stamp_ns)
+        returns, valid = lidar.layout.returns(columns, where, entry.stamp_ns)
         if lidar.placed:
-            found = self._taken_back(found, entry.stamp_ns)
-        points = np.zeros_like(found.points)
-        points[valid] = poses.transform(lidar.T_first_lidar, found.points[valid])
-        offset_ns = found.offset_ns
+            returns = self._taken_back(returns, entry.stamp_ns)
+        points = np.zeros_like(returns.points)
+        points[valid] = poses.transform(lidar.T_first_lidar, returns.points[valid])
+        offset_ns = returns.offset_ns
         if offset_ns is not None:
             offset_ns = offset_ns + (entry.stamp_ns - stamp_ns)
-        return replace(found, points=points, offset_ns=offset_ns)
+        return replace(returns, points=points, offset_ns=offset_ns)
 
     def _taken_back(self, placed: Returns, stamp_ns: int) -> Returns:
         """Return points of the world of odometry as fired, in the frame that odometry places."""
@@ -174,11 +176,11 @@ class RosBag(FileSequence):
             height, width = image_rgb(message, where).shape[:2]
         else:
             height, width = message.height, message.width
-        told = next(self._bag.messages(info))
-        by = max(told.binning_x, told.binning_y)
-        if by > 1 and (width, height) == (told.width, told.height):
+        camera_info = next(self._bag.messages(info))
+        binning = max(camera_info.binning_x, camera_info.binning_y)
+        if binning > 1 and (width, height) == (camera_info.width, camera_info.height):
             raise InputError(
-                f"{where}: {info} says binning {by}, but the images have all of its {width} x "
+                f"{where}: {info} says binning {binning}, but the images have all of its {width} x "
                 f"{height} px: they are binned already; record it with binning_x and binning_y 0, "
                 f"or leave the camera out of #images="
             )
@@ -210,9 +212,9 @@ class RosBag(FileSequence):
                     raise
                 return None, str(error)
             return track, f"{chosen}, {len(track.stamp_ns)} of them"
-        found = self._transforms.track_of(lidar)
-        if found is not None:
-            return found[1], f"/tf, {found[0]} to {lidar}"
+        parent_and_track = self._transforms.track_of(lidar)
+        if parent_and_track is not None:
+            return parent_and_track[1], f"/tf, {parent_and_track[0]} to {lidar}"
         if named:
             raise InputError(f"{self._bag.path}: /tf: nothing tells where {lidar} was")
         names = ", ".join(topic.name for topic in self._bag.of_type(*POSES))
@@ -222,14 +224,14 @@ class RosBag(FileSequence):
     def _lidar(self, topic: str) -> Lidar:
         """Find frame, mounting and point fields of a lidar from some of its messages."""
         where, entries = f"{self._bag.path}: {topic}", self._index[topic]
-        found = sample_columns(
+        columns_of_entry = sample_columns(
             entries, lambda entry: cloud_columns(self._bag.message(topic, entry), where)
         )
-        if not found:
+        if not columns_of_entry:
             raise InputError(f"{where}: the messages looked at hold no points")
-        frame = plain(self._bag.message(topic, next(iter(found))).header.frame_id)
-        body = self._placed_in(frame)
-        frame = body or frame
+        frame = plain(self._bag.message(topic, next(iter(columns_of_entry))).header.frame_id)
+        placed_frame = self._placed_in(frame)
+        frame = placed_frame or frame
         first = self._lidars[0].frame if self._lidars else frame
         T = self._transforms.between(first, frame)
         if T is None:
@@ -239,9 +241,9 @@ class RosBag(FileSequence):
             )
         steps = np.diff([e.stamp_ns for e in entries])
         period_ns = max(1, int(np.median(steps))) if len(steps) else _USUAL_PERIOD_NS
-        stamps_ns = [entry.stamp_ns for entry in found]
-        layout = PointLayout.find([*found.values()], where, period_ns, stamps_ns)
-        return Lidar(topic, frame, bool(body), entries, T, period_ns, layout)
+        stamps_ns = [entry.stamp_ns for entry in columns_of_entry]
+        layout = PointLayout.find([*columns_of_entry.values()], where, period_ns, stamps_ns)
+        return Lidar(topic, frame, bool(placed_frame), entries, T, period_ns, layout)
 
     def _placed_in(self, frame: str) -> str:
         """Return the frame that the chosen odometry places in ``frame``, "" if in another."""
@@ -254,8 +256,8 @@ class RosBag(FileSequence):
 
     def _camera(self, topic: str) -> Camera:
         """Return the camera of a topic; raise InputError without images, CameraInfo or mounting."""
-        place, places = place_of(topic), [place_of(t) for t in self._topics.images]
-        where, info = f"{self._bag.path}: {topic}", f"{place}/camera_info"
+        prefix, prefixes = place_of(topic), [place_of(t) for t in self._topics.images]
+        where, info = f"{self._bag.path}: {topic}", f"{prefix}/camera_info"
         message = next(self._bag.messages(info), None) if info in self._bag.topics else None
         if message is None:
             raise InputError(f"{where}: no {info} with its calibration; leave it out of #images=")
@@ -270,10 +272,10 @@ class RosBag(FileSequence):
                 f"{where}: nothing in /tf_static joins the camera's frame {frame} to the "
                 f"lidar's, {lidar}; record /tf_static, or leave images out: #images=none"
             )
-        name = (place if places.count(place) == 1 else topic).strip("/").replace("/", "_")
+        name = (prefix if prefixes.count(prefix) == 1 else topic).strip("/").replace("/", "_")
         rectified = "rect" in topic.removesuffix("/compressed").rpartition("/")[2]
         return camera_of(message, name or "camera", T, rectified, f"{self._bag.path}: {info}")
 
 
-def _intensity(part: Returns) -> Float32:
-    return np.zeros(len(part.points), np.float32) if part.intensity is None else part.intensity
+def _intensity(cloud: Returns) -> Float32:
+    return np.zeros(len(cloud.points), np.float32) if cloud.intensity is None else cloud.intensity

@@ -72,8 +72,8 @@ class Bag:
         self._is_ros2 = not (self._files[0].suffix == ".bag" and self._files[0].is_file())
         self._types = message_types(self._is_ros2)
         for file in self._files:
-            for part in [file] if file.is_file() else file.glob("*.*"):
-                open_file(part).close()  # raises a clear error for an unreadable file
+            for data_file in [file] if file.is_file() else file.glob("*.*"):
+                open_file(data_file).close()  # raises a clear error for an unreadable file
         package = needed(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
         self._lock = RLock()
         # Indexed messages without a header stamp, and messages recorded twice, by topic
@@ -97,30 +97,30 @@ class Bag:
         Messages without a stamp are counted. A message that was recorded twice is indexed once and
         counted.
         """
-        found: dict[str, list[Entry]] = {topic: [] for topic in topics}
-        at = dict.fromkeys(topics, (-1, 0))  # time of recording and turn of the last message
-        read: set[tuple[str, int, int]] = set()
+        entries_of_topic: dict[str, list[Entry]] = {topic: [] for topic in topics}
+        last = dict.fromkeys(topics, (-1, 0))  # time of recording and turn of the last message
+        indexed: set[tuple[str, int, int]] = set()
         for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
-            turn = at[topic][1] + 1 if at[topic][0] == log_ns else 0
-            at[topic] = log_ns, turn
+            turn = last[topic][1] + 1 if last[topic][0] == log_ns else 0
+            last[topic] = log_ns, turn
             try:
                 stamp_ns = _stamp_ns(raw, self._is_ros2)
             except struct.error:
                 raise InputError(f"{self.path}: {topic}: a message of {len(raw)} bytes") from None
             content = topic, stamp_ns or log_ns, crc32(raw)
-            self.num_twice[topic] += content in read
-            if content not in read:
-                found[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
+            self.num_twice[topic] += content in indexed
+            if content not in indexed:
+                entries_of_topic[topic].append(Entry(stamp_ns or log_ns, log_ns, turn))
                 self.num_unstamped[topic] += not stamp_ns
-            read.add(content)
-        return {topic: sorted(entries) for topic, entries in found.items()}
+            indexed.add(content)
+        return {topic: sorted(entries) for topic, entries in entries_of_topic.items()}
 
     def message(self, topic: str, entry: Entry) -> Any:
         """Decode the message of an index entry; raise InputError if it is missing or damaged."""
-        found = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
-        if len(found) <= entry.turn:
+        recorded = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
+        if len(recorded) <= entry.turn:
             raise InputError(f"{self.path}: no message of {topic} at {entry.log_ns} ns any more")
-        _, _, raw, type_ = found[entry.turn]
+        _, _, raw, type_ = recorded[entry.turn]
         return self._decoded(raw, type_, topic)
 
     def messages(self, topic: str) -> Iterator[Any]:
@@ -132,14 +132,14 @@ class Bag:
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes, str]]:
         """Yield topic, recording time (ns), raw bytes and message type, by recording time."""
-        parts = []
+        streams = []
         for reader in self._readers:
             wanted = [c for c in reader.connections if c.topic in topics]
             if wanted:  # an empty list would mean all
-                parts.append(reader.messages(wanted, start_ns, stop_ns))
+                streams.append(reader.messages(wanted, start_ns, stop_ns))
         with self._lock:
             try:
-                for connection, log_ns, raw in heapq.merge(*parts, key=lambda part: part[1]):
+                for connection, log_ns, raw in heapq.merge(*streams, key=lambda record: record[1]):
                     yield connection.topic, log_ns, raw, connection.msgtype
             except Exception as error:  # the parser may raise any type
                 raise self._unreadable(error) from error
@@ -194,13 +194,13 @@ def _mcap_profile(file: Path) -> str | None:
 
 def _topics(readers: Sequence[Any]) -> dict[str, Topic]:
     """Return the topics with messages over all files of the recording, by name."""
-    found: dict[str, Topic] = {}
+    topic_of_name: dict[str, Topic] = {}
     for connection in (c for reader in readers for c in reader.connections if c.msgcount):
         name = connection.topic
-        before = found.get(name, Topic(name, connection.msgtype, 0))
+        before = topic_of_name.get(name, Topic(name, connection.msgtype, 0))
         type_ = before.type if before.type == connection.msgtype else "of several types"
-        found[name] = Topic(name, type_, before.num_messages + connection.msgcount)
-    return dict(sorted(found.items()))
+        topic_of_name[name] = Topic(name, type_, before.num_messages + connection.msgcount)
+    return dict(sorted(topic_of_name.items()))
 
 
 def _bag_files(path: Path) -> list[Path]:
@@ -215,12 +215,12 @@ def _bag_files(path: Path) -> list[Path]:
             f"or decompress it by zstd -d {packed[0].name} and name {packed[0].stem}"
         )
     for suffix in suffixes:
-        found = sorted(path.glob(f"*{suffix}")) if path.is_dir() else []
-        if found and (suffix == ".bag" or len(found) == 1):
-            return found
-        if found:
+        files = sorted(path.glob(f"*{suffix}")) if path.is_dir() else []
+        if files and (suffix == ".bag" or len(files) == 1):
+            return files
+        if files:
             raise InputError(
-                f"{path}: {len(found)} {suffix} files without metadata.yaml; name one of them, or "
+                f"{path}: {len(files)} {suffix} files without metadata.yaml; name one of them, or "
                 f"write it with ros2 bag reindex"
             )
     raise InputError(
@@ -251,35 +251,35 @@ class Topics:
     @staticmethod
     def choose(bag: Bag, options: str | None) -> Topics:
         """Choose the topics to read, by the user's options (after ``#``) and the message types."""
-        given = dict(parse_qsl(options or "", keep_blank_values=True))
-        wrong = [key for key in given if key not in ("points", "images", "poses")]
-        if wrong or (options and not given):
+        chosen = dict(parse_qsl(options or "", keep_blank_values=True))
+        wrong = [key for key in chosen if key not in ("points", "images", "poses")]
+        if wrong or (options and not chosen):
             raise InputError(
                 f"{bag.path}#{options}: got {wrong[0] if wrong else options}, expected {_USAGE}"
             )
         images = _guessed_images([topic.name for topic in bag.of_type(*_IMAGES)])
         odometry = bag.of_type(_ODOMETRY)
-        poses = given.get("poses") or (odometry[0].name if len(odometry) == 1 else "tf")
-        if "points" not in given:
-            given["points"] = _only_cloud(bag)
-        if "images" in given:
-            named = given["images"].replace("none", "")
+        poses = chosen.get("poses") or (odometry[0].name if len(odometry) == 1 else "tf")
+        if "points" not in chosen:
+            chosen["points"] = _only_cloud(bag)
+        if "images" in chosen:
+            named = chosen["images"].replace("none", "")
             images = named.split(",") if named else []
-        _check_topics(bag, "points", given["points"].split(","), _CLOUDS)
+        _check_topics(bag, "points", chosen["points"].split(","), _CLOUDS)
         _check_topics(bag, "images", images, _IMAGES)
         _check_topics(bag, "poses", [poses] if poses not in ("none", "tf") else [], POSES)
-        points = tuple(given["points"].split(","))
-        return Topics(points, tuple(images), poses.replace("none", ""), given.keys())
+        points = tuple(chosen["points"].split(","))
+        return Topics(points, tuple(images), poses.replace("none", ""), chosen.keys())
 
 
 def _only_cloud(bag: Bag) -> str:
     """Return the only topic of point clouds; raise InputError for no or several topics."""
-    found = bag.of_type(*_CLOUDS)
-    if len(found) == 1:
-        return found[0].name
-    if found:
+    clouds = bag.of_type(*_CLOUDS)
+    if len(clouds) == 1:
+        return clouds[0].name
+    if clouds:
         raise InputError(
-            f"{bag.path}: several topics could be the sweeps: {_listed(found)}; name one "
+            f"{bag.path}: several topics could be the sweeps: {_listed(clouds)}; name one "
             f"or all lidars of the vehicle: --data 'ros:{bag.path}#points=/topic,/topic'"
         )
     raise InputError(
@@ -302,13 +302,13 @@ def place_of(topic: str) -> str:
     return topic.removesuffix("/compressed").rpartition("/")[0]
 
 
-def _check_topics(bag: Bag, what: str, names: Sequence[str], types: Sequence[str]) -> None:
+def _check_topics(bag: Bag, option: str, names: Sequence[str], types: Sequence[str]) -> None:
     for name in names:
         topic = bag.topics.get(name)
         if topic is None or topic.type not in types:
             got = "no such topic" if topic is None else f"a topic of {topic.type}"
             fit = _listed(bag.of_type(*types)) or "none"
-            raise InputError(f"{bag.path}: {what}={name}: {got}; topics that fit: {fit}")
+            raise InputError(f"{bag.path}: {option}={name}: {got}; topics that fit: {fit}")
 
 
 def _listed(topics: Sequence[Topic]) -> str:

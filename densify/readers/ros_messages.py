@@ -195,7 +195,7 @@ class Transforms:
     @staticmethod
     def read(bag: Bag) -> Transforms:
         """Read all transforms of /tf_static and /tf. A frame that never moves in /tf is fixed."""
-        found = Transforms(str(bag.path))
+        tree = Transforms(str(bag.path))
         heard: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
         for topic in bag.of_type("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
             transforms = (t for message in bag.messages(topic.name) for t in message.transforms)
@@ -204,32 +204,32 @@ class Transforms:
                 where = f"{bag.path}: {topic.name}: {parent} to {child}"
                 T = _pose(transform.transform.translation, transform.transform.rotation, where)
                 if topic.name.endswith("tf_static"):
-                    found.fixed[child] = (parent, T)
+                    tree.fixed[child] = (parent, T)
                 else:
                     heard[parent, child][stamp_of(transform.header)] = T
         for (parent, child), by_stamp in heard.items():
             T = np.stack([by_stamp[stamp] for stamp in sorted(by_stamp)])
-            if child not in found.fixed and np.abs(T - T[0]).max() < _FIXED_M:
-                found.fixed[child] = (parent, T[0])
-            elif child not in found.fixed:
+            if child not in tree.fixed and np.abs(T - T[0]).max() < _FIXED_M:
+                tree.fixed[child] = (parent, T[0])
+            elif child not in tree.fixed:
                 track = _track(f"{bag.path}: /tf: {parent} to {child}", by_stamp)
-                found.moving[child] = (parent, track)
-        return found
+                tree.moving[child] = (parent, track)
+        return tree
 
     def between(self, target: str, source: str) -> Float | None:
         """Return T_target_source (4,4) along fixed frames; None if no fixed frames join the two."""
-        ways: dict[str, list[tuple[str, Float]]] = defaultdict(list)
+        neighbors_of: dict[str, list[tuple[str, Float]]] = defaultdict(list)
         for child, (parent, T) in self.fixed.items():
-            ways[child].append((parent, T))
-            ways[parent].append((child, inverse(T)))
-        found, waiting = {source: np.eye(4)}, deque([source])
+            neighbors_of[child].append((parent, T))
+            neighbors_of[parent].append((child, inverse(T)))
+        T_frame_source, waiting = {source: np.eye(4)}, deque([source])
         while waiting:
-            at = waiting.popleft()
-            for other, T_other_at in ways[at]:
-                if other not in found:
-                    found[other] = T_other_at @ found[at]
-                    waiting.append(other)
-        return found.get(target)
+            frame = waiting.popleft()
+            for neighbor, T_neighbor_frame in neighbors_of[frame]:
+                if neighbor not in T_frame_source:
+                    T_frame_source[neighbor] = T_neighbor_frame @ T_frame_source[frame]
+                    waiting.append(neighbor)
+        return T_frame_source.get(target)
 
     def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
         """Return a frame's moving parent and path T_parent_frame in it; None if it is fixed."""
@@ -249,7 +249,7 @@ class Transforms:
 
 def recorded_track(bag: Bag, topic: str, transforms: Transforms, lidar: str) -> PoseTrack:
     """Read the path T_world_lidar of frame ``lidar`` from a topic of odometry or poses."""
-    found, where = dict[int, Float](), f"{bag.path}: {topic}"
+    by_stamp, where = dict[int, Float](), f"{bag.path}: {topic}"
     for message in bag.messages(topic):
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
         # Poses without a child frame are assumed to be poses of the lidar itself.
@@ -261,8 +261,8 @@ def recorded_track(bag: Bag, topic: str, transforms: Transforms, lidar: str) -> 
                 f"name other poses, or none: #poses=none"
             )
         T = _pose(pose.position, pose.orientation, where)
-        found[stamp_of(message.header)] = T @ T_child_lidar
-    return _track(where, found)
+        by_stamp[stamp_of(message.header)] = T @ T_child_lidar
+    return _track(where, by_stamp)
 
 
 def _track(where: str, by_stamp: dict[int, Float]) -> PoseTrack:
@@ -280,6 +280,6 @@ def stamp_of(header: Any) -> int:
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
-def _pose(place: Any, turn: Any, where: str) -> Float:
-    quaternion = (turn.w, turn.x, turn.y, turn.z)
-    return checks.quaternion_pose(quaternion, (place.x, place.y, place.z), where)
+def _pose(position: Any, rotation: Any, where: str) -> Float:
+    quaternion = (rotation.w, rotation.x, rotation.y, rotation.z)
+    return checks.quaternion_pose(quaternion, (position.x, position.y, position.z), where)

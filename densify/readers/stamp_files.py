@@ -89,8 +89,8 @@ def check_digits(stamps_ns: Collection[int], text: str, where: Path) -> None:
     """Raise InputError if times in file order are equal by rounding; ``text`` is the first one."""
     steps_ns = np.diff(np.array([*stamps_ns], np.int64))
     num_equal = int((steps_ns == 0).sum())
-    least = min(2, len(steps_ns))  # one of several may be a hiccup of the recorder
-    if num_equal >= max(least, 1) and num_equal > _MOST_EQUAL * len(steps_ns):
+    min_equal = min(2, len(steps_ns))  # one of several may be a hiccup of the recorder
+    if num_equal >= max(min_equal, 1) and num_equal > _MOST_EQUAL * len(steps_ns):
         raise InputError(
             f"{where}: {num_equal} of {len(steps_ns)} times are equal to the time before, such as "
             f"{text}: they have lost digits; write them anew with all digits, in nanoseconds or "
@@ -133,8 +133,8 @@ class TextTable(NamedTuple):
 
     def column(self, choices: Collection[str]) -> int | None:
         """Return the index of the first of the names in ``choices`` that is a column, else None."""
-        found = (self.names.index(name) for name in choices if name in self.names)
-        return next((i for i in found if i < len(self.rows[0])), None)
+        indices = (self.names.index(name) for name in choices if name in self.names)
+        return next((i for i in indices if i < len(self.rows[0])), None)
 
     def times_ns(self, column: int, unit: str) -> tuple[tuple[int, ...], str]:
         """Return the times of a column in nanoseconds, and the unit in the file ("date" for dates).
@@ -144,22 +144,22 @@ class TextTable(NamedTuple):
         times = [words[column] for words in self.rows]
         dates = "-" in times[0][1:] and ":" in times[0]
         known = unit or _epoch_unit(times[0])
-        found = []
+        times_ns = []
         for line, text in zip(self.lines, times, strict=True):
             try:
-                found.append(date_ns(text.rstrip("Z")) if dates else in_ns(text, known or "s"))
+                times_ns.append(date_ns(text.rstrip("Z")) if dates else in_ns(text, known or "s"))
             except ValueError:
                 raise InputError(
                     f"{self.path}: line {line}: got {text!r}, expected a time in {known or 's'}, "
                     f"from 1970 to 2261"
                 ) from None
-        steps = np.abs(np.diff(np.array(found, np.float64)))
+        steps = np.abs(np.diff(np.array(times_ns, np.float64)))
         if not dates and not known and len(steps) and np.median(steps) > _LONGEST_STEP_NS:
             raise InputError(
                 f"{self.path}: its times ({times[0]}, {times[1]}, ...) are too far apart for "
                 f"seconds; name their unit in densify.yaml: stamps_unit: ms, us or ns"
             )
-        return tuple(found), "date" if dates else known or "s"
+        return tuple(times_ns), "date" if dates else known or "s"
 
 
 class StampFile(NamedTuple):

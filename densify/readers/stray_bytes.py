@@ -53,19 +53,19 @@ def _without_stray(data: bytes) -> tuple[bytes, int]:
     """Return mended data, and the number of markers after stray bytes; ValueError if damaged."""
     num_markers, end = 0, data.rfind(_SCAN)
     for _ in range(_MOST_MARKERS):
-        found = _MARKER.search(data, end)
-        if found is None or data[end - len(_END) : end] == _END:
+        marker = _MARKER.search(data, end)
+        if marker is None or data[end - len(_END) : end] == _END:
             return data, num_markers
-        begin, rest = found.start(), data[found.start() :]
+        begin, tail = marker.start(), data[marker.start() :]
         # Without a byte that belongs to it, the interval before the marker is cut off.
         num = 0
         while num <= _MOST_STRAY_BYTES:
-            _, complaint = _decoded(data[: begin - num - 1] + rest)
+            _, complaint = _decoded(data[: begin - num - 1] + tail)
             if _CUT_OFF in complaint:
                 break
             num += 1
         if num:
-            data = data[: begin - num] + rest
+            data = data[: begin - num] + tail
             if num > _MOST_STRAY_BYTES or not _ends_in_ones(data, begin - num):
                 raise ValueError(f"{num} bytes before the marker at {begin} are not decoded")
             num_markers += 1
@@ -80,8 +80,8 @@ def _ends_in_ones(data: bytes, end: int) -> bool:
     if data[end - 2 : end] == b"\xff\x00" or last == 0xFF:
         return True
     filled = last | (last + 1)  # the lowest zero becomes one
-    other = data[: end - 1] + bytes([filled]) + b"\x00" * (filled == 0xFF) + data[end:]
+    changed = data[: end - 1] + bytes([filled]) + b"\x00" * (filled == 0xFF) + data[end:]
     # The lowest zero must be data, not filling.
     pixels, complaint = _decoded(data)
-    changed, other_complaint = _decoded(other)
-    return complaint != other_complaint or not np.array_equal(pixels, changed)  # type: ignore
+    changed_pixels, changed_complaint = _decoded(changed)
+    return complaint != changed_complaint or not np.array_equal(pixels, changed_pixels)  # type: ignore

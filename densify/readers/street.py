@@ -78,10 +78,10 @@ class Street:
         reader, _, preset = head.partition(":")
         if reader != "street":
             raise InputError(f"{spec!r}: expected street[:PRESET][?OPTION=VALUE&OPTION=VALUE]")
-        given = dict(parse_qsl(query, keep_blank_values=True))
-        for key in given:
+        options = dict(parse_qsl(query, keep_blank_values=True))
+        for key in options:
             _check("option", key, _OPTIONS)
-        seed, sensor, hz, tilt, cameras = (_OPTIONS | given).values()
+        seed, sensor, hz, tilt, cameras = (_OPTIONS | options).values()
         names = () if cameras == "none" else tuple(cameras.split(","))
         try:
             return Street(preset or "street", int(seed), sensor, int(hz), float(tilt), names)
@@ -208,9 +208,9 @@ class StreetTruth:
         return moving
 
 
-def _check(what: str, got: str, known: Sequence[str] | Mapping[str, Any]) -> None:
+def _check(kind: str, got: str, known: Sequence[str] | Mapping[str, Any]) -> None:
     if got not in known:
-        raise InputError(f"street: no {what} {got!r}; there are {', '.join(known)}")
+        raise InputError(f"street: no {kind} {got!r}; there are {', '.join(known)}")
 
 
 @lru_cache(1)

@@ -31,13 +31,13 @@ class WindowFrames(NamedTuple):
 
 def runs(frames: Iterable[int]) -> list[range]:
     """Group ascending frame numbers into ranges of consecutive numbers."""
-    found: list[range] = []
+    ranges: list[range] = []
     for frame in frames:
-        if found and frame == found[-1].stop:
-            found[-1] = range(found[-1].start, frame + 1)
+        if ranges and frame == ranges[-1].stop:
+            ranges[-1] = range(ranges[-1].start, frame + 1)
         else:
-            found.append(range(frame, frame + 1))
-    return found
+            ranges.append(range(frame, frame + 1))
+    return ranges
 
 
 def format_frames(frames: Iterable[int]) -> str:
@@ -178,13 +178,13 @@ class Timeline:
                 return side[:n], left_out[frame]
         if len(side) == window:
             return side, ""
-        here = self.row[key] + step * len(side)
-        row = here + step
-        if not 0 <= row < len(self.frames):
+        last_row = self.row[key] + step * len(side)
+        next_row = last_row + step
+        if not 0 <= next_row < len(self.frames):
             verb = "begins" if step < 0 else "ends"
-            return side, f"the recording {verb} at frame {self.frames[here]}"
-        gap_s = abs(int(self.stamp_ns[row] - self.stamp_ns[here])) * 1e-9
-        first, second = sorted((self.frames[here], self.frames[row]))
+            return side, f"the recording {verb} at frame {self.frames[last_row]}"
+        gap_s = abs(int(self.stamp_ns[next_row] - self.stamp_ns[last_row])) * 1e-9
+        first, second = sorted((self.frames[last_row], self.frames[next_row]))
         return side, f"{gap_s:.1f} s lie between frames {first} and {second}"
 
     def _hole_before(self, row: int) -> bool:
@@ -226,9 +226,9 @@ def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
     origins_m = sweep.scanner_origins
     x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T
     range_m = np.sqrt(x * x + y * y + z * z)
-    near = range_m < settings.min_range_m
-    inside = sweep.select(~near & (range_m <= settings.max_range_m))
-    return without_lone(replace(inside, num_near=int(near.sum())))
+    is_near = range_m < settings.min_range_m
+    inside = sweep.select(~is_near & (range_m <= settings.max_range_m))
+    return without_lone(replace(inside, num_near=int(is_near.sum())))
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:

@@ -108,7 +108,7 @@ class Velodyne(FileSequence):
 
 def _find_packets(path: Path) -> Int:
     """Return offset, capture time (ns), azimuth (0.01 deg) and clock (us) of packets, (4,P)."""
-    found = []
+    packets = []
     with open_file(path) as file:
         magic = file.read(24)[:4]
         if magic not in _PCAP:
@@ -131,19 +131,20 @@ def _find_packets(path: Path) -> Int:
                 azimuth = payload[2] + 256 * payload[3]
                 (clock_us,) = struct.unpack_from("<I", payload, _PAYLOAD - 6)
                 captured_ns = seconds * 10**9 + fraction * unit_ns
-                found.append((at - _PAYLOAD, captured_ns, azimuth, clock_us))
-    if not found:
+                packets.append((at - _PAYLOAD, captured_ns, azimuth, clock_us))
+    if not packets:
         raise InputError(
             f"{path}: no Velodyne packets (of {_PAYLOAD} bytes); is it an Ouster's? Then put its "
             f"metadata .json beside it"
         )
-    return np.array(found, np.int64).T
+    return np.array(packets, np.int64).T
 
 
 def _once(packets: Int) -> tuple[Int, int]:
     """Return packets (4,P) without those captured a second time, and the number of these."""
     _, captured_ns, azimuth, clock_us = packets
     order = np.lexsort((captured_ns, azimuth, clock_us))
+    # Rows 2 and 3: azimuth and clock
     same = (np.diff(packets[2:, order]) == 0).all(axis=0)
     twice = np.concatenate([[False], same & (np.diff(captured_ns[order]) < _TWICE_NS)])
     kept = np.sort(order[~twice])

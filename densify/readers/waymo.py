@@ -108,15 +108,15 @@ class Image(NamedTuple):
     T_world_vehicle: Float  # (4,4) pose of the vehicle in the world
 
 
-def read_lasers(parts: Components) -> dict[int, Laser]:
+def read_lasers(files: Components) -> dict[int, Laser]:
     """Return the lidars' calibrations by Waymo's number, from 1 (TOP)."""
     head = "[LiDARCalibrationComponent]"
     extrinsic, beams = f"{head}.extrinsic.transform", f"{head}.beam_inclination"
     columns = {LASER: "i", extrinsic: "l", f"{beams}.values": "l"}
-    rows = parts.read("lidar_calibration", {**columns, f"{beams}.min": "m", f"{beams}.max": "m"})
+    rows = files.read("lidar_calibration", {**columns, f"{beams}.min": "m", f"{beams}.max": "m"})
     lasers = {}
     for row, laser in enumerate(rows[LASER].tolist()):
-        where = f"{parts.file('lidar_calibration')}: lidar {laser}"
+        where = f"{files.file('lidar_calibration')}: lidar {laser}"
         values = rows[f"{beams}.values"][row]
         low, high = float(rows[f"{beams}.min"][row]), float(rows[f"{beams}.max"][row])
         beams_rad = None if values is None or not len(values) else values.astype(np.float64)
@@ -126,31 +126,33 @@ def read_lasers(parts: Components) -> dict[int, Laser]:
     return lasers
 
 
-def read_boxes(parts: Components) -> dict[int, Boxes]:
+def read_boxes(files: Components) -> dict[int, Boxes]:
     """Return boxes by ``frame_timestamp_micros``, in the vehicle's frame at ``vehicle_pose``."""
     numbers = (*BOX_CENTRE, *BOX_SIZE, BOX_HEADING)
-    rows = parts.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
+    rows = files.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
     centre_m, size_m = (
         np.stack([rows[name].astype(np.float64) for name in names], axis=1)
         for names in (BOX_CENTRE, BOX_SIZE)
     )
     T_vehicle_box = checks.upright_poses(centre_m, rows[BOX_HEADING].astype(np.float64))
-    path, found = parts.file("lidar_box"), {}
+    path, boxes = files.file("lidar_box"), {}
     for us in np.unique(rows[STAMP]).tolist():
-        mine = rows[STAMP] == us
+        in_sweep = rows[STAMP] == us
         where = f"{path}: frame_timestamp_micros {us}"
-        found[us] = checks.boxes(rows[OBJECT][mine], T_vehicle_box[mine], size_m[mine], where)
-    return found
+        boxes[us] = checks.boxes(
+            rows[OBJECT][in_sweep], T_vehicle_box[in_sweep], size_m[in_sweep], where
+        )
+    return boxes
 
 
-def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]]:
+def read_images(files: Components, starts_us: Int) -> dict[str, dict[int, Image]]:
     """Return times and poses of images by camera name and frame number; ``starts_us`` is (n,)."""
     head = "[CameraImageComponent]"
     pose, shutter = f"{head}.pose.transform", f"{head}.rolling_shutter_params"
     times = [f"{shutter}.{name}" for name in ("camera_trigger_time", "camera_readout_done_time")]
     numbers = [f"{head}.pose_timestamp", *times, f"{shutter}.shutter"]
     columns = {STAMP: "i", CAMERA: "i", pose: "l", **dict.fromkeys(numbers, "n")}
-    rows, found = parts.read("camera_image", columns), dict[str, dict[int, Image]]()
+    rows, images_of_camera = files.read("camera_image", columns), dict[str, dict[int, Image]]()
     frame_of = {int(us): number for number, us in enumerate(starts_us)}
     name_of = dict(enumerate(CAMERAS, 1))
     for row in np.argsort(rows[STAMP], kind="stable").tolist():
@@ -158,28 +160,28 @@ def read_images(parts: Components, starts_us: Int) -> dict[str, dict[int, Image]
         if frame is None:
             continue
         pose_s, trigger_s, done_s, shutter_s = (float(rows[name][row]) for name in numbers)
-        T = checks.rigid(rows[pose][row], f"{parts.file('camera_image')}: {name}, frame {frame}")
+        T = checks.rigid(rows[pose][row], f"{files.file('camera_image')}: {name}, frame {frame}")
         exposed_ns = _whole_us((trigger_s + done_s) / 2)
         image = Image(_whole_us(pose_s), exposed_ns, max(done_s - trigger_s - shutter_s, 0.0), T)
-        found.setdefault(name, {})[frame] = image
-    return {name: found[name] for name in CAMERAS if name in found}
+        images_of_camera.setdefault(name, {})[frame] = image
+    return {name: images_of_camera[name] for name in CAMERAS if name in images_of_camera}
 
 
-def read_cameras(parts: Components, images: Mapping[str, Mapping[int, Image]]) -> dict[str, Camera]:
+def read_cameras(files: Components, images: Mapping[str, Mapping[int, Image]]) -> dict[str, Camera]:
     """Return the calibrated cameras that have images, by name, with their rolling shutters."""
     head = "[CameraCalibrationComponent]"
     lens = [f"{head}.intrinsic.{n}" for n in _LENS]
     size = [f"{head}.{n}" for n in ("width", "height", "rolling_shutter_direction")]
     extrinsic = f"{head}.extrinsic.transform"
     columns = {CAMERA: "i", extrinsic: "l", **dict.fromkeys(lens, "n")}
-    rows = parts.read("camera_calibration", {**columns, **dict.fromkeys(size, "i")})
+    rows = files.read("camera_calibration", {**columns, **dict.fromkeys(size, "i")})
     cameras = {}
-    for name, taken in images.items():
-        where = f"{parts.file('camera_calibration')}: {name}"
+    for name, camera_images in images.items():
+        where = f"{files.file('camera_calibration')}: {name}"
         row = rows[CAMERA].tolist().index(CAMERAS.index(name) + 1)
         f_u, f_v, c_u, c_v, *distortion = (float(rows[n][row]) for n in lens)
         width, height, direction = (int(rows[n][row]) for n in size)
-        readout_s = float(np.median([image.readout_s for image in taken.values()]))
+        readout_s = float(np.median([image.readout_s for image in camera_images.values()]))
         T_cam_vehicle = T_OPTICAL_WAYMO @ inverse(checks.rigid(rows[extrinsic][row], where))
         cameras[name] = checks.pinhole(
             name,
@@ -212,18 +214,18 @@ class Waymo(FileSequence):
     """A Waymo segment in the vehicle's frame, stamped at the recorded pose, about mid-spin."""
 
     def __init__(self, root: Path, context: str) -> None:
-        parts = self._parts = Components(root, context)
-        self._starts_us = np.unique(parts.read("lidar", {STAMP: "i"})[STAMP])
+        files = self._parts = Components(root, context)
+        self._starts_us = np.unique(files.read("lidar", {STAMP: "i"})[STAMP])
         if not len(self._starts_us):
-            raise InputError(f"{parts.file('lidar')}: holds no frames")
+            raise InputError(f"{files.file('lidar')}: holds no frames")
         starts_ns = self._starts_us * 1000
         steps = np.diff(starts_ns)
         self._period_ns = int(np.median(steps)) if len(steps) else _NOMINAL_PERIOD_NS
-        has_images = parts.file("camera_image").is_file()
+        has_images = files.file("camera_image").is_file()
         with described_in(root, f"calibration and images of {context} in the data set's own form"):
-            self._lasers = read_lasers(parts)
-            self._images = read_images(parts, self._starts_us) if has_images else {}
-            cameras = read_cameras(parts, self._images) if has_images else {}
+            self._lasers = read_lasers(files)
+            self._images = read_images(files, self._starts_us) if has_images else {}
+            cameras = read_cameras(files, self._images) if has_images else {}
         front = self._images.get(CAMERAS[0], {})
         self._stamps_ns = [
             front[number].pose_ns if number in front else int(ns) + self._period_ns // 2
@@ -234,7 +236,10 @@ class Waymo(FileSequence):
             root,
             range(len(starts_ns)),
             cameras,
-            {name: {n: i.exposed_ns for n, i in of.items()} for name, of in self._images.items()},
+            {
+                name: {n: i.exposed_ns for n, i in shots.items()}
+                for name, shots in self._images.items()
+            },
             checks.truth_beside(root),
         )
 
@@ -284,18 +289,18 @@ class Waymo(FileSequence):
     def _range_images(self, frame: int) -> dict[tuple[int, int], Float]:
         """Return (H,W,4) by lidar and return, from 1; channels: range (m), intensity, 2 unused."""
         names = {number: f"[LiDARComponent].range_image_return{number}" for number in (1, 2)}
-        columns = {f"{name}.{part}": "l" for name in names.values() for part in ("values", "shape")}
+        columns = {f"{name}.{key}": "l" for name in names.values() for key in ("values", "shape")}
         start_us = int(self._starts_us[frame])
         rows = self._parts.read("lidar", {LASER: "i", **columns}, {STAMP: start_us})
-        found = {}
+        range_images = {}
         for row in np.argsort(rows[LASER], kind="stable"):
             for number, name in names.items():
                 values, shape = rows[f"{name}.values"][row], rows[f"{name}.shape"][row]
                 if values is not None and len(values):
                     height, width, num = shape.tolist()
                     image = values.reshape(height, width, num).astype(np.float64)
-                    found[int(rows[LASER][row]), number] = image
-        return found
+                    range_images[int(rows[LASER][row]), number] = image
+        return range_images
 
     def _offset_ns(self, frame: int, laser: int, size: tuple[int, ...]) -> Int:
         """Return firing times (H,W) in ns since the sweep's stamp, 0 for lidars other than TOP."""
@@ -318,8 +323,8 @@ class Waymo(FileSequence):
             int(us): checks.rigid(values, f"{where}: frame_timestamp_micros {us}")
             for us, values in zip(rows[STAMP], rows[name], strict=True)
         }
-        of = {number: poses[int(us)] for number, us in enumerate(self._starts_us) if us in poses}
-        return {frame: checks.of_frame(of, frame, "vehicle pose", where) for frame in self.frames}
+        T_of = {number: poses[int(us)] for number, us in enumerate(self._starts_us) if us in poses}
+        return {frame: checks.of_frame(T_of, frame, "vehicle pose", where) for frame in self.frames}
 
     @cached_property
     def _track(self) -> PoseTrack:

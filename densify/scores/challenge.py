@@ -80,8 +80,8 @@ class ChallengeScorer:
         length_m = np.linalg.norm(np.asarray(true, np.float64), axis=1)[counted]
         named = classes[counted].astype(np.intp)
         moves, objects = length_m >= MOVES_M, named > 0
-        for row, part in enumerate((objects & moves, objects & ~moves, ~objects & ~moves)):
-            self._three_way[row] += error_m[part].sum(), part.sum()
+        for row, mask in enumerate((objects & moves, objects & ~moves, ~objects & ~moves)):
+            self._three_way[row] += error_m[mask].sum(), mask.sum()
         cell = named * len(EDGES_M) + np.digitize(length_m, EDGES_M) - 1
         for row, weights in enumerate((None, error_m, length_m)):
             sums = np.bincount(cell, weights, self._buckets[0].size)
@@ -105,5 +105,5 @@ class ChallengeScorer:
         return ChallengeScores(three_way, by_class, mean, int(self._buckets[0].sum()))
 
 
-def _ratio(part: float, whole: float) -> float:
-    return float(part / whole) if whole else math.nan
+def _ratio(numerator: float, denominator: float) -> float:
+    return float(numerator / denominator) if denominator else math.nan

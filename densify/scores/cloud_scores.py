@@ -22,13 +22,13 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
     max(0.5 m, 2 % of its range). Dark paint and glass give no return and hide ghosts.
     """
     ghost, unjudged = np.zeros((2, len(cloud)), bool)
-    other = np.flatnonzero(_others(cloud, key))
+    rows = np.flatnonzero(_others(cloud, key))
     margins_m = (_GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION)
     beyond = key_image.num_beyond(
-        cloud.points[other], margins_m, _MIN_FILLED, cloud.velocity_m_s[other]
+        cloud.points[rows], margins_m, _MIN_FILLED, cloud.velocity_m_s[rows]
     )
-    ghost[other] = (beyond >= _MIN_FILLED).any(axis=0)
-    unjudged[other] = (beyond == 0).all(axis=0)
+    ghost[rows] = (beyond >= _MIN_FILLED).any(axis=0)
+    unjudged[rows] = (beyond == 0).all(axis=0)
     return ghost, unjudged
 
 
@@ -44,13 +44,13 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
     (``by_distance["3"]``) and by time from it, rounded to 10 ms (``by_seconds["0.30"]``).
     ``unjudged`` has the shares without returns of the key sweep to compare.
     """
-    other = np.flatnonzero(_others(cloud, key))
-    ghost, unjudged = (found[other] for found in ghosts(cloud, key_image, key))
-    moving = cloud.moving[other]
-    distance = np.abs(cloud.frame[other] - key)
-    hundredths = np.rint(np.abs(cloud.since_key_ns[other]) / 1e7).astype(np.int64)
+    rows = np.flatnonzero(_others(cloud, key))
+    ghost, unjudged = (mask[rows] for mask in ghosts(cloud, key_image, key))
+    moving = cloud.moving[rows]
+    distance = np.abs(cloud.frame[rows] - key)
+    hundredths = np.rint(np.abs(cloud.since_key_ns[rows]) / 1e7).astype(np.int64)
     return {
-        "num_points": len(other),
+        "num_points": len(rows),
         "all": _mean(ghost),
         "moving": _mean(ghost[moving]),
         "static": _mean(ghost[~moving]),

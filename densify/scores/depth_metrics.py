@@ -99,9 +99,9 @@ def precision_density(
     ``expected_*`` the share that the confidence of kept pixels promises.
     """
     curve = []
-    for least in _LEAST_CONFIDENCES:
-        kept = maps.confidence >= least
-        point: dict[str, float | None] = {"min_confidence": least}
+    for min_confidence in _LEAST_CONFIDENCES:
+        kept = maps.confidence >= min_confidence
+        point: dict[str, float | None] = {"min_confidence": min_confidence}
         for name, depth_m in (("measured", maps.depth_m), ("filled", maps.filled_m)):
             predicted_m = np.where(kept, depth_m, np.float32(0))
             errors = depth_errors(predicted_m, truth_m, focal_px=camera.focal_px)
@@ -128,17 +128,17 @@ def errors_by_part(
     """
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]
-    parts: dict[str, Bool | None] = {"all": None}
+    masks: dict[str, Bool | None] = {"all": None}
     for near_m, far_m in zip(_RANGES_M, (*_RANGES_M[1:], math.inf), strict=True):
         name = f"over {near_m} m" if math.isinf(far_m) else f"{near_m}-{far_m} m"
-        parts[name] = (t >= near_m) & (t < far_m)
+        masks[name] = (t >= near_m) & (t < far_m)
     edge = depth_edges(truth_m, focal_px=focal_px, baseline_m=baseline_m)[known]
-    parts |= {"edge": edge, "not edge": ~edge}
+    masks |= {"edge": edge, "not edge": ~edge}
     if moving is not None:
-        parts |= {"moving": moving[known], "static": ~moving[known]}
+        masks |= {"moving": moving[known], "static": ~moving[known]}
     return {
         name: depth_errors(z, t, mask, focal_px=focal_px, baseline_m=baseline_m)
-        for name, mask in parts.items()
+        for name, mask in masks.items()
     }
 
 
@@ -156,8 +156,8 @@ def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_
     holes_out = np.where(known, disparity_px, math.inf)
     smallest = ndimage.minimum_filter(holes_out, size, mode="constant", cval=math.inf)
     edge = np.zeros(truth_m.shape, bool)
-    here = disparity_px[known]
-    edge[known] = _is_outlier(largest[known], here) | _is_outlier(smallest[known], here)
+    known_px = disparity_px[known]
+    edge[known] = _is_outlier(largest[known], known_px) | _is_outlier(smallest[known], known_px)
     return edge
 
 
@@ -192,8 +192,8 @@ def scores_by_motion(
     """Return `depth_errors` of depths (H,W) as ``scores["all"|"moving"|"static"]``."""
     masks = {"all": None, "moving": moving_mask, "static": ~moving_mask}
     return {
-        part: asdict(depth_errors(depth_m, truth_depth_m, mask, focal_px=camera.focal_px))
-        for part, mask in masks.items()
+        group: asdict(depth_errors(depth_m, truth_depth_m, mask, focal_px=camera.focal_px))
+        for group, mask in masks.items()
     }
 
 
@@ -227,8 +227,8 @@ def is_outlier_depth(
 
 def _is_outlier(disparity_px: Float, true_px: Float) -> Bool:
     off_px = np.abs(disparity_px - true_px)
-    wrong: Bool = (off_px > OUTLIER_PX) & (off_px > OUTLIER_FRACTION * true_px)
-    return wrong
+    outlier: Bool = (off_px > OUTLIER_PX) & (off_px > OUTLIER_FRACTION * true_px)
+    return outlier
 
 
 def _mean(values: np.ndarray) -> float | None:

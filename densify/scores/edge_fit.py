@@ -41,7 +41,7 @@ class Silhouettes(NamedTuple):
 
     # (E,3) metres, lidar frame: at the range of the near surface, in the direction halfway between
     # the near and the far return
-    places: Float
+    points: Float
     is_level: Bool  # (E,) True if the far surface is above or below, False if beside
 
 
@@ -78,14 +78,14 @@ class Fit(NamedTuple):
 
 def silhouettes_of(sweep: Sweep) -> Silhouettes:
     """Return the depth discontinuities of a sweep, found per scanner, in the lidar frame."""
-    parts = []
+    by_scanner = []
     for lidar in map(int, np.unique(sweep.lidar)):
         origin_m, axes = sweep.origin_m(lidar), sweep.axes(lidar)
         points = (sweep.points[sweep.lidar == lidar] - origin_m) @ axes.T
         range_m = np.linalg.norm(points, axis=1)
         edges = depth_edges(points[(range_m > _NEAREST_M) & (range_m < _MOST_RANGE_M)])
-        parts.append(edges._replace(places=edges.places @ axes + origin_m))
-    return Silhouettes(*map(np.concatenate, zip(*parts, strict=True)))
+        by_scanner.append(edges._replace(points=edges.points @ axes + origin_m))
+    return Silhouettes(*map(np.concatenate, zip(*by_scanner, strict=True)))
 
 
 def depth_edges(points: Float) -> Silhouettes:
@@ -97,9 +97,9 @@ def depth_edges(points: Float) -> Silhouettes:
     x, y, z = points.T
     range_m = np.linalg.norm(points, axis=1)
     azimuth, elevation = np.arctan2(y, x), np.arcsin(z / range_m)
-    places, is_level = [], []
+    edge_points, is_level = [], []
     step_rad = _ROW_RAD
-    for level, along, across in ((False, azimuth, elevation), (True, elevation, azimuth)):
+    for far_is_level, along, across in ((False, azimuth, elevation), (True, elevation, azimuth)):
         line = np.floor(across / step_rad)
         order = np.lexsort((along, line))
         gap = np.diff(along[order])
@@ -110,31 +110,31 @@ def depth_edges(points: Float) -> Silhouettes:
         straight = (1 - share) / range_m[before] + share / range_m[after]
         beside = np.where(range_m[before] > range_m[after], before, after)
         deeper_m = np.maximum(_EDGE_M, _EDGE_SHARE * range_m[at])
-        on = (range_m[beside] - range_m[at] > deeper_m) & (range_m[at] < _FARTHEST_M)
-        on &= 1 - straight * range_m[at] > _EDGE_SHARE
-        at, beside = at[on], beside[on]
+        is_edge = (range_m[beside] - range_m[at] > deeper_m) & (range_m[at] < _FARTHEST_M)
+        is_edge &= 1 - straight * range_m[at] > _EDGE_SHARE
+        at, beside = at[is_edge], beside[is_edge]
         ray = points[at] / range_m[at, None] + points[beside] / range_m[beside, None]
-        places.append(ray * (range_m[at] / np.linalg.norm(ray, axis=1))[:, None])
-        is_level.append(np.full(len(at), level))
+        edge_points.append(ray * (range_m[at] / np.linalg.norm(ray, axis=1))[:, None])
+        is_level.append(np.full(len(at), far_is_level))
         if joined.any():
             step_rad = max(step_rad, float(np.median(gap[joined])))
-    return Silhouettes(np.concatenate(places), np.concatenate(is_level))
+    return Silhouettes(np.concatenate(edge_points), np.concatenate(is_level))
 
 
 def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, float]:
     """Return `View.strength` and `View.scale` of an (H,W,3) RGB image."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     scale = _FOCAL_PX / focal_px
-    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    resized = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=how)
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    resized = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=interpolation)
     smooth = cv2.GaussianBlur(resized, (0, 0), _NOISE_PX)
-    both = []
+    edges = []
     for order in ((1, 0), (0, 1)):
         change = np.abs(cv2.Sobel(smooth, cv2.CV_32F, *order))
         around = cv2.GaussianBlur(change, (0, 0), _AROUND_PX) + _MOST_STRENGTH
         change = cv2.GaussianBlur(np.minimum(change / around, _MOST_STRENGTH), (0, 0), _BLUR_PX)
-        both.append(change - change.mean())
-    return np.stack(both), smooth.shape[1] / image.shape[1]
+        edges.append(change - change.mean())
+    return np.stack(edges), smooth.shape[1] / image.shape[1]
 
 
 def turned(camera: Camera, offset: Float) -> Camera:
@@ -160,11 +160,13 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
     """
     view = View(silhouettes, *image_edges(image, camera.focal_px), np.zeros(6), 0.0)
     lines, turns = _Lines.of(camera, view, np.zeros(4)), _turns(np.zeros(1), np.zeros(1))
-    scores, given = lines.scores(turns), (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
-    best = [turns[part][np.argmax(scores[part])] for part in (given, ~given)]
+    scores, near_given = lines.scores(turns), (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
+    best = [turns[mask][np.argmax(scores[mask])] for mask in (near_given, ~near_given)]
+    # best: the best turn within 0.3 degrees, then the best beyond
     better = np.diff(lines.strengths(np.array(best)), axis=0)
     rival = scores[_is_beside(turns, best[1])].max()
-    stands_out = rival - np.median(scores) < _AS_HIGH * (scores[~given].max() - np.median(scores))
+    median = np.median(scores)
+    stands_out = rival - median < _AS_HIGH * (scores[~near_given].max() - median)
     return bool(stands_out and better.sum() > _CLEARLY * np.sqrt((better**2).sum()))
 
 
@@ -180,7 +182,7 @@ def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
     on_grid = np.sum([line.scores(grid, thin) for line in lines], axis=0)
     usual = float(np.median(on_grid)) * thin
     starts = _starts(grid, on_grid, free)
-    best, others, are_equal = _simplest(
+    best, rivals, are_equal = _simplest(
         lines, [_climbed(lines, start, free) for start in starts], usual
     )
     beside = _is_beside(grid, best)
@@ -189,7 +191,7 @@ def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
     lines = [_Lines.of(camera, view, best) for view in views]
     more = _climbed(lines, np.zeros(4), free)
     error, height = _error(lines, more, free), _sum(lines, more)
-    return Fit(best + more, error, height, rival_score, usual, others, are_equal)
+    return Fit(best + more, error, height, rival_score, usual, rivals, are_equal)
 
 
 def _starts(grid: Float, on_grid: Float, free: Bool) -> list[Float]:
@@ -224,7 +226,7 @@ def _simplest(
     order = np.lexsort((-total, num_changed(offsets), ~equal))
     kept = [int(order[0])]
     for row in order[high[order]]:
-        if all(_is_beside(offsets[row], offsets[other]) for other in kept):
+        if all(_is_beside(offsets[row], offsets[kept_row]) for kept_row in kept):
             kept.append(int(row))
     return offsets[kept[0]], offsets[kept[1:]], equal[kept[1:]]
 
@@ -237,8 +239,8 @@ def num_changed(offsets: Float) -> Any:
 def _grid(free: Bool) -> Float:
     """Return (M,4) offsets: pitches and yaws with each roll, then with each delay, if ``free``."""
     roll, delay = _steps(2), _steps(3)
-    parts = [_turns(roll, np.zeros(1))] if free[2] else []
-    return np.concatenate([*parts, *([_turns(np.zeros(1), delay)] if free[3] else [])])
+    grids = [_turns(roll, np.zeros(1))] if free[2] else []
+    return np.concatenate([*grids, *([_turns(np.zeros(1), delay)] if free[3] else [])])
 
 
 def _steps(axis: int) -> Float:
@@ -267,12 +269,12 @@ class _Lines(NamedTuple):
             seen_s = view.exposed_s + offset[3] + more[3]
             T_then_lidar = poses.inverse(poses.exp(seen_s * view.twist))
             T_cam_then = turned(turned(camera, offset), more).T_cam_lidar
-            return image_points(camera, poses.transform(T_cam_then @ T_then_lidar, places))
+            return image_points(camera, poses.transform(T_cam_then @ T_then_lidar, points))
 
-        places, is_level = view.silhouettes
+        points, is_level = view.silhouettes
         inside = project(np.zeros(4))[1]
-        places, is_level = places[inside], is_level[inside]
-        uv, slope = project(np.zeros(4))[0], np.zeros((len(places), 2, 4))
+        points, is_level = points[inside], is_level[inside]
+        uv, slope = project(np.zeros(4))[0], np.zeros((len(points), 2, 4))
         for axis, step in enumerate(0.2 * _BLURRED):
             ends = [project(sign * step * np.eye(4)[axis])[0] for sign in (1, -1)]
             slope[:, :, axis] = (ends[0] - ends[1]) / (2 * step)
@@ -294,30 +296,30 @@ class _Lines(NamedTuple):
         uv, slope = self.uv[::thin], self.slope[::thin]
         moved = np.rint(uv + np.einsum("ma,eda->med", offsets, slope)).astype(np.int32) + 1
         column, row = np.clip(moved[..., 0], 0, width - 1), np.clip(moved[..., 1], 0, height - 1)
-        place = (self.is_level[::thin] * height + row) * width + column
-        return self.strength.reshape(-1).take(place)
+        pixel = (self.is_level[::thin] * height + row) * width + column
+        return self.strength.reshape(-1).take(pixel)
 
 
 def _sum(lines: Sequence[_Lines], offset: Float) -> float:
     return float(sum(line.scores(offset[None])[0] for line in lines))
 
 
-def _is_beside(offsets: Float, other: Float) -> Any:
-    """Return (M,) True for offsets (M,4) over 1 degree of pitch or yaw, or 0.1 s, from another."""
-    return (np.abs(offsets - other)[..., [0, 1, 3]] > (1.0, 1.0, 0.1)).any(axis=-1)
+def _is_beside(offsets: Float, reference: Float) -> Any:
+    """Return (M,) True for offsets (M,4) over 1 degree (pitch, yaw) or 0.1 s from the reference."""
+    return (np.abs(offsets - reference)[..., [0, 1, 3]] > (1.0, 1.0, 0.1)).any(axis=-1)
 
 
 def _climbed(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
     """Return the offset (4,) of the local maximum of the score near a start."""
-    sides = np.concatenate([np.eye(4)[free], -np.eye(4)[free]])
+    steps = np.concatenate([np.eye(4)[free], -np.eye(4)[free]])
     best = _sum(lines, offset)
     for halving in range(_NUM_HALVINGS):
         while True:
-            around = offset + sides * _BLURRED / 2**halving
-            found = np.sum([line.scores(around) for line in lines], axis=0)
-            if found.max() <= best or np.abs(offset[0]) > 2 * _REACH[0]:
+            around = offset + steps * _BLURRED / 2**halving
+            scores = np.sum([line.scores(around) for line in lines], axis=0)
+            if scores.max() <= best or np.abs(offset[0]) > 2 * _REACH[0]:
                 break
-            offset, best = around[int(np.argmax(found))], float(found.max())
+            offset, best = around[int(np.argmax(scores))], float(scores.max())
     return offset
 
 
@@ -328,17 +330,18 @@ def _error(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
     num, pairs = len(axes), [(i, j) for i in range(len(axes)) for j in range(i)]
     corners = [s * steps[i] + t * steps[j] for i, j in pairs for s in (1, -1) for t in (1, -1)]
     offsets = offset + np.concatenate([np.zeros((1, 4)), steps, -steps, np.array(corners)])
-    found = np.stack([line.scores(offsets) for line in lines])
-    slope = 0.5 * (found[:, 1 : num + 1] - found[:, num + 1 : 2 * num + 1])
-    total = found.sum(axis=0)
-    curved = np.diag(total[1 : num + 1] + total[num + 1 : 2 * num + 1] - 2 * total[0])
+    scores = np.stack([line.scores(offsets) for line in lines])
+    slope = 0.5 * (scores[:, 1 : num + 1] - scores[:, num + 1 : 2 * num + 1])
+    total = scores.sum(axis=0)
+    curvature = np.diag(total[1 : num + 1] + total[num + 1 : 2 * num + 1] - 2 * total[0])
     for row, (i, j) in enumerate(pairs):
-        of = total[2 * num + 1 + 4 * row :][:4]
-        curved[i, j] = curved[j, i] = 0.25 * (of[0] - of[1] - of[2] + of[3])
+        # scores at the corners ++, +-, -+ and -- of the axes i and j
+        pp, pm, mp, mm = total[2 * num + 1 + 4 * row :][:4]
+        curvature[i, j] = curvature[j, i] = 0.25 * (pp - pm - mp + mm)
     error = np.zeros(4)
     error[axes] = np.inf
-    if np.linalg.eigvalsh(curved).max() < 0:
+    if np.linalg.eigvalsh(curvature).max() < 0:
         slope = slope - slope.mean(axis=0)
-        spread = np.linalg.solve(curved, slope.T)
+        spread = np.linalg.solve(curvature, slope.T)
         error[axes] = np.sqrt(np.einsum("av,av->a", spread, spread)) * _BLURRED[axes]
     return error

@@ -44,12 +44,13 @@ def main_error(
     )
     off_m, way_m = (recorded_m - odometry_m).mean(axis=0), odometry_m.mean(axis=0)
     if np.linalg.norm(off_m) < 0.5 * np.linalg.norm(recorded_m - odometry_m, axis=1).mean():
-        told = "; no usual mistake explains it (another frame than the points', another clock, or"
-        return f"{told} noise)", ""
+        mistake = "; no usual mistake explains it (another frame than the points', another clock,"
+        return f"{mistake} or noise)", ""
     longer = float(off_m @ way_m / (way_m @ way_m))
     if abs(longer) * np.linalg.norm(way_m) > 0.7 * np.linalg.norm(off_m):
-        told = f": their ways are {abs(longer) * 100:.1f} % too {'long' if longer > 0 else 'short'}"
-        return told, f"divide their translations by {1 + longer:.3f}, or "
+        sense = "long" if longer > 0 else "short"
+        mistake = f": their ways are {abs(longer) * 100:.1f} % too {sense}"
+        return mistake, f"divide their translations by {1 + longer:.3f}, or "
     axis = int(np.argmax(np.abs(off_m)))
-    way = (("forward", "back"), ("left", "right"), ("up", "down"))[axis][int(off_m[axis] < 0)]
-    return f": they go {abs(off_m[axis]) / duration_s:.2f} m/s {way} beside the sweeps", ""
+    direction = (("forward", "back"), ("left", "right"), ("up", "down"))[axis][int(off_m[axis] < 0)]
+    return f": they go {abs(off_m[axis]) / duration_s:.2f} m/s {direction} beside the sweeps", ""

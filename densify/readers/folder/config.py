@@ -212,18 +212,18 @@ class _File(NamedTuple):
     def filled(self, kind: type[C], key: str, value: Any) -> C:
         """Return a dataclass ``kind`` filled with the checked values of a YAML mapping."""
         known = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
-        found = {}
-        for name, given in self.mapping(key, value, known).items():
+        arguments = {}
+        for name, setting in self.mapping(key, value, known).items():
             convert, expected = _CHECKS.get(name, _TEXT)
             try:
-                if given is not None:
-                    found[name] = convert(given)
+                if setting is not None:
+                    arguments[name] = convert(setting)
             except (ValueError, TypeError, KeyError, OverflowError, InputError):
-                raise self.unfit(f"{key}.{name}", given, expected) from None
-        for name, one in known.items():
-            if one.default is MISSING and name not in found:
+                raise self.unfit(f"{key}.{name}", setting, expected) from None
+        for name, known_field in known.items():
+            if known_field.default is MISSING and name not in arguments:
                 raise self.unfit(f"{key}.{name}", None, _CHECKS[name][1])
-        return kind(**found)
+        return kind(**arguments)
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ class FolderConfig:
             path,
             file.filled(SweepFiles, "sweeps", values.get("sweeps")),
             file.filled(Poses, "poses", values.get("poses")),
-            {name: _camera(file, name, given) for name, given in cameras.items()},
+            {name: _camera(file, name, camera) for name, camera in cameras.items()},
         )
 
 
@@ -258,22 +258,22 @@ def _camera(file: _File, name: str, value: Any) -> tuple[Camera, CameraFiles]:
     key = f"cameras.{name}"
     if not re.fullmatch(r"[\w-][\w.-]*", name):
         raise file.unfit(key, value, "a name of letters, digits, _ - .")
-    given = file.filled(CameraFiles, key, value)
-    coefficients = given.distortion
-    if given.model == "pinhole" and not any(coefficients):
+    settings = file.filled(CameraFiles, key, value)
+    coefficients = settings.distortion
+    if settings.model == "pinhole" and not any(coefficients):
         coefficients = ()
-    if len(coefficients) not in _NUM_COEFFICIENTS[given.model]:
-        counts = ", ".join(str(n) for n in _NUM_COEFFICIENTS[given.model])
-        expected = f"{counts} coefficients for a {given.model} camera"
+    if len(coefficients) not in _NUM_COEFFICIENTS[settings.model]:
+        counts = ", ".join(str(n) for n in _NUM_COEFFICIENTS[settings.model])
+        expected = f"{counts} coefficients for a {settings.model} camera"
         raise file.unfit(f"{key}.distortion", coefficients, expected)
     camera = Camera(
         name,
-        *given.size,
-        given.K,
-        given.T_cam_lidar,
+        *settings.size,
+        settings.K,
+        settings.T_cam_lidar,
         distortion=coefficients,
-        model=given.model,
-        max_angle_deg=given.max_angle_deg,
-        row_time_s=given.row_time_s,
+        model=settings.model,
+        max_angle_deg=settings.max_angle_deg,
+        row_time_s=settings.row_time_s,
     )
-    return camera, given
+    return camera, settings

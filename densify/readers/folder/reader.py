@@ -62,26 +62,28 @@ class SweepColumns:
         """Read all rows of a sweep with reference time ``stamp_ns``, in the lidar frame."""
         path = self.series.paths[frame]
         columns = self._columns(path)
-        found, valid = self.layout.returns(columns, path, stamp_ns)
-        points = self.settings.scale_m * found.points
+        returns, valid = self.layout.returns(columns, path, stamp_ns)
+        points = self.settings.scale_m * returns.points
         if self.settings.axes is not None:
             points = points @ self.settings.axes.T
         lidar = self._lidar(path, columns, valid)
         origins = self.settings.scanner_origins
-        return replace(found, points=points, lidar=lidar, scanner_origins=origins)
+        return replace(returns, points=points, lidar=lidar, scanner_origins=origins)
 
     @cached_property
     def layout(self) -> PointLayout:
         """The meaning of the columns, found in a few sweeps."""
         frame, columns = next(iter(self._samples.items()))
-        path, known = self.series.paths[frame], self.settings
+        path, settings = self.series.paths[frame], self.settings
         named = {
-            part: name for part in ("intensity", "time", "lidar") if (name := getattr(known, part))
+            quantity: name
+            for quantity in ("intensity", "time", "lidar")
+            if (name := getattr(settings, quantity))
         }
-        for part, name in named.items():
+        for quantity, name in named.items():
             if name not in columns:
                 raise InputError(
-                    f"{self.config}: sweeps.{part}: got {name!r}, expected a column of "
+                    f"{self.config}: sweeps.{quantity}: got {name!r}, expected a column of "
                     f"{path.name}: {', '.join(columns)}"
                 )
         stamps_ns = self.series.stamps_ns
@@ -91,10 +93,10 @@ class SweepColumns:
             self.period_ns,
             None if stamps_ns is None else [stamps_ns[frame] for frame in self._samples],
             named,
-            known.intensity_scale,
-            unit=known.time_unit,
-            absolute=known.time_is == "absolute" if known.time_is else None,
-            reference=known.reference,
+            settings.intensity_scale,
+            unit=settings.time_unit,
+            absolute=settings.time_is == "absolute" if settings.time_is else None,
+            reference=settings.reference,
         )
 
     def stamp_ns(self, frame: int) -> int:
@@ -128,8 +130,8 @@ class SweepColumns:
             return self.series.told_by
         if self._own_clock is not None:
             return f"the times of the points ({self._own_clock.field})"
-        how = "the" if self.settings.rate_hz else "an assumed"
-        return f"number, at {how} {1e9 / self.period_ns:g} Hz (rate_hz)"
+        article = "the" if self.settings.rate_hz else "an assumed"
+        return f"number, at {article} {1e9 / self.period_ns:g} Hz (rate_hz)"
 
     def assumed(self) -> list[str]:
         """Return the assumptions about missing stamps, a sentence each."""
@@ -190,11 +192,11 @@ class Folder(FileSequence):
     def __init__(self, path: Path | str) -> None:
         folder = Path(path)
         self._config = FolderConfig.read(folder)
-        known, cameras = self._config.sweeps, self._config.cameras
-        files = find_sweeps(folder, known.files)
-        self._sweeps = in_time(folder, files, known.stamps, known.stamps_unit)
-        self._columns = SweepColumns(self._sweeps, known, self._config.path)
-        images = {name: _images(folder, name, given) for name, (_, given) in cameras.items()}
+        settings, cameras = self._config.sweeps, self._config.cameras
+        files = find_sweeps(folder, settings.files)
+        self._sweeps = in_time(folder, files, settings.stamps, settings.stamps_unit)
+        self._columns = SweepColumns(self._sweeps, settings, self._config.path)
+        images = {name: _images(folder, name, config) for name, (_, config) in cameras.items()}
         super().__init__(
             folder.resolve().name,
             folder,
@@ -207,13 +209,13 @@ class Folder(FileSequence):
         self._by_sweeps: dict[str, str] = {}
         for name, series in images.items():
             shift_ns = round(cameras[name][1].clock_offset_s * 1e9)
-            own = series.stamps_ns
-            if own is None:
-                own = {n: self.stamp_ns(n) for n in self.frames if n in series.paths}
+            stamps_ns = series.stamps_ns
+            if stamps_ns is None:
+                stamps_ns = {n: self.stamp_ns(n) for n in self.frames if n in series.paths}
                 self._by_sweeps |= _stamped_by_sweeps(name, series, self.frames, cameras[name][1])
-            self._exposed_ns[name] = {number: ns + shift_ns for number, ns in own.items()}
+            self._exposed_ns[name] = {number: ns + shift_ns for number, ns in stamps_ns.items()}
         self._read_poses()
-        self._is_untimed = known.compensated and self._track is None
+        self._is_untimed = settings.compensated and self._track is None
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep."""
@@ -222,20 +224,20 @@ class Folder(FileSequence):
 
     def gaps(self) -> list[str]:
         """Return missing parts of the recording and what is assumed instead, a sentence each."""
-        told, drive = self._columns.assumed(), checks.drive_around(self.where)
+        notes, drive = self._columns.assumed(), checks.drive_around(self.where)
         if drive is not None:
-            told.append(
+            notes.append(
                 f"{self.where} is a part of the KITTI drive {drive}: read alone it has no times of "
                 f"points, images and poses; give the drive"
             )
         if self._is_untimed:
-            told.append(_UNTIMED)
-        return told + [f"{name}: {text}" for name, text in self._by_sweeps.items()]
+            notes.append(_UNTIMED)
+        return notes + [f"{name}: {text}" for name, text in self._by_sweeps.items()]
 
     def findings(self) -> Sequence[tuple[str, str]]:
         """Return what the reader detected, such as columns and stamps, as (name, text) pairs."""
         layout, first = self._columns.layout, self._sweeps.paths[self.frames[0]]
-        fields = [f"{part} = {name}" for part, name in vars(layout.fields).items() if name]
+        fields = [f"{quantity} = {name}" for quantity, name in vars(layout.fields).items() if name]
         unused = ", ".join(self._columns.unused())
         lines = [
             ("files", f"{(first.parent / '*').relative_to(self.where)}{first.suffix}"),
@@ -247,7 +249,7 @@ class Folder(FileSequence):
         ]
         if self._poses is not None:
             lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
-        used = {str(Path(given.files)) for _, given in self._config.cameras.values()}
+        used = {str(Path(config.files)) for _, config in self._config.cameras.values()}
         for name, images in find_images(self.where).items():
             if name not in used:
                 text = f"{name} holds {len(images)} images without a calibration"
@@ -256,18 +258,18 @@ class Folder(FileSequence):
 
     def _returns(self, frame: int) -> Returns:
         stamp_ns = self.stamp_ns(frame)
-        found = self._columns.returns(frame, stamp_ns)
+        returns = self._columns.returns(frame, stamp_ns)
         if self._config.sweeps.frame == "poses":
             if self._track is not None:
-                return self._track.taken_back(found, stamp_ns)
-            points = taken_back(found.points, self._pose(frame))
-            return replace(found, points=points, offset_ns=None)  # compensated to the pose
-        if not self._config.sweeps.compensated or found.offset_ns is None:
-            return found
+                return self._track.taken_back(returns, stamp_ns)
+            points = taken_back(returns.points, self._pose(frame))
+            return replace(returns, points=points, offset_ns=None)  # compensated to the pose
+        if not self._config.sweeps.compensated or returns.offset_ns is None:
+            return returns
         if self._track is None:  # _is_untimed
-            return replace(found, offset_ns=None)
-        points = self._track.as_fired(found.points, stamp_ns, found.offset_ns)
-        return replace(found, points=points)
+            return replace(returns, offset_ns=None)
+        points = self._track.as_fired(returns.points, stamp_ns, returns.offset_ns)
+        return replace(returns, points=points)
 
     def _pose(self, frame: int) -> Float:
         if self._track is not None:
@@ -278,13 +280,15 @@ class Folder(FileSequence):
 
     def _read_poses(self) -> None:
         """Read the pose file into ``_track`` if its poses have stamps, else by frame number."""
-        known, frames = self._config.poses, self.frames
+        settings, frames = self._config.poses, self.frames
         self._poses: PoseFile | None = None
         self._track: PoseTrack | None = None
-        path = find_pose_file(self.where, known.file)
-        each = {f: p for f in frames if (p := self._files[f].with_suffix(".pose")).is_file()}
-        found = PoseFile.of_viewpoints([*self._files.values()]) if not path and not each else None
-        if path is None and not each and found is None:
+        path = find_pose_file(self.where, settings.file)
+        pose_files = {f: p for f in frames if (p := self._files[f].with_suffix(".pose")).is_file()}
+        file = (
+            PoseFile.of_viewpoints([*self._files.values()]) if not path and not pose_files else None
+        )
+        if path is None and not pose_files and file is None:
             if self._config.sweeps.frame == "poses":
                 raise InputError(
                     f"{self._config.path}: sweeps.frame: got poses, but there are no poses; give "
@@ -292,19 +296,19 @@ class Folder(FileSequence):
                 )
             return
         if path is not None:
-            found = PoseFile.read(path, known.stamps_unit)
-        elif found is None:
-            frames = [*each]
-            found = PoseFile.read_each([*each.values()])
-        self._poses = found
-        T = poses.inverse(found.T) if known.inverse else found.T
-        T = T if known.T_frame_lidar is None else T @ known.T_frame_lidar
-        if found.stamps_ns is not None:
-            self._track = PoseTrack(str(found.path), np.array(found.stamps_ns, np.int64), T)
+            file = PoseFile.read(path, settings.stamps_unit)
+        elif file is None:
+            frames = [*pose_files]
+            file = PoseFile.read_each([*pose_files.values()])
+        self._poses = file
+        T = poses.inverse(file.T) if settings.inverse else file.T
+        T = T if settings.T_frame_lidar is None else T @ settings.T_frame_lidar
+        if file.stamps_ns is not None:
+            self._track = PoseTrack(str(file.path), np.array(file.stamps_ns, np.int64), T)
             return
         if len(T) != len(frames) and len(T) <= frames[-1]:
             raise InputError(
-                f"{found.path}: got {len(T)} poses for {len(frames)} sweeps numbered "
+                f"{file.path}: got {len(T)} poses for {len(frames)} sweeps numbered "
                 f"{format_frames(frames)}, expected one for each, or for each number from 0"
             )
         numbers = frames if len(T) == len(frames) else range(len(T))
@@ -312,10 +316,10 @@ class Folder(FileSequence):
 
 
 def _stamped_by_sweeps(
-    name: str, images: Series, frames: Sequence[int], given: CameraFiles
+    name: str, images: Series, frames: Sequence[int], config: CameraFiles
 ) -> dict[str, str]:
     """Return a note, by camera, that images have sweeps' stamps without a request for them."""
-    if given.stamps == "sweeps":
+    if config.stamps == "sweeps":
         return {}
     text = (
         f"{len(images.paths)} images without stamps beside {len(frames)} sweeps: each is taken as "
@@ -326,9 +330,9 @@ def _stamped_by_sweeps(
     return {name: text}
 
 
-def _images(folder: Path, name: str, given: CameraFiles) -> Series:
-    paths = images_in(folder / given.files)
+def _images(folder: Path, name: str, config: CameraFiles) -> Series:
+    paths = images_in(folder / config.files)
     if not paths:
-        key = f"cameras: {{{name}: {{files: {given.files}}}}}"
-        raise InputError(f"{folder / given.files}: no images, though densify.yaml names it: {key}")
-    return in_time(folder, paths, given.stamps, given.stamps_unit, shared=False)
+        key = f"cameras: {{{name}: {{files: {config.files}}}}}"
+        raise InputError(f"{folder / config.files}: no images, though densify.yaml names it: {key}")
+    return in_time(folder, paths, config.stamps, config.stamps_unit, shared=False)

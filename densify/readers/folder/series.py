@@ -42,18 +42,18 @@ def find_sweeps(folder: Path, files: str) -> list[Path]:
     """
     if files:
         existing(folder, files, "sweeps: {files: ...}", is_folder=True)
-    found: dict[int, dict[str, list[Path]]] = {}
-    for place in [folder / files] if files else _folders(folder):
-        for path in _files(place, SUFFIXES):
-            if any(part is not None for part in named(path)[1:]):
-                groups = found.setdefault(SUFFIXES.index(path.suffix.lower()), {})
-                groups.setdefault(place.relative_to(folder).as_posix(), []).append(path)
-    if not found:
+    groups_by_suffix: dict[int, dict[str, list[Path]]] = {}
+    for subfolder in [folder / files] if files else _folders(folder):
+        for path in _files(subfolder, SUFFIXES):
+            if any(number_or_stamp is not None for number_or_stamp in named(path)[1:]):
+                groups = groups_by_suffix.setdefault(SUFFIXES.index(path.suffix.lower()), {})
+                groups.setdefault(subfolder.relative_to(folder).as_posix(), []).append(path)
+    if not groups_by_suffix:
         raise InputError(
             f"{folder / files}: no sweeps; expected numbered files such as 000120.bin "
             f"({', '.join(SUFFIXES)}) in the folder or below it"
         )
-    groups = found[min(found)]
+    groups = groups_by_suffix[min(groups_by_suffix)]
     if len(groups) > 1:
         raise InputError(
             f"{folder}: several folders hold sweeps: {', '.join(groups)}; name one in "
@@ -64,8 +64,8 @@ def find_sweeps(folder: Path, files: str) -> list[Path]:
 
 def find_images(folder: Path) -> dict[str, list[Path]]:
     """Return the image files by folder, in this folder and two levels of subfolders."""
-    found = {str(p.relative_to(folder)): images_in(p) for p in _folders(folder)}
-    return {name: images for name, images in found.items() if images}
+    images_of_folder = {str(p.relative_to(folder)): images_in(p) for p in _folders(folder)}
+    return {name: images for name, images in images_of_folder.items() if images}
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -84,8 +84,8 @@ def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path
     """Return the file or folder ``name`` that densify.yaml gives under ``key``, if it exists."""
     path = folder / name
     if not (path.is_dir() if is_folder else path.is_file()):
-        what = "folder" if is_folder else "file"
-        raise InputError(f"{path}: no such {what}, though densify.yaml names it: {key}")
+        kind = "folder" if is_folder else "file"
+        raise InputError(f"{path}: no such {kind}, though densify.yaml names it: {key}")
     return path
 
 
@@ -109,24 +109,24 @@ def in_time(
     file = None
     if stamps not in ("names", "sweeps"):
         file = _stamp_file(root, paths[0].parent, stamps, shared)
-    by_number = _numbered(names)
-    by_path = {number: name.path for number, name in by_number.items()}
+    named_of = _numbered(names)
+    path_of = {number: name.path for number, name in named_of.items()}
     if file is not None:
-        read = StampFile.read(file, unit)
-        found, told_by = _matched(read, by_path), f"{file.name} in {read.unit}"
+        stamp_file = StampFile.read(file, unit)
+        stamps_ns, told_by = _matched(stamp_file, path_of), f"{file.name} in {stamp_file.unit}"
     elif untimed or stamps == "sweeps":
-        return Series(by_path, None, "")
+        return Series(path_of, None, "")
     else:
-        found = {number: name.stamp_ns or 0 for number, name in by_number.items()}
+        stamps_ns = {number: name.stamp_ns or 0 for number, name in named_of.items()}
         told_by = "the names of the files"
-    for before, number in pairwise(found):
-        if found[number] <= found[before]:
+    for before, number in pairwise(stamps_ns):
+        if stamps_ns[number] <= stamps_ns[before]:
             raise InputError(
-                f"{file or by_path[number]}: the time of number {number} is {found[number]} ns, "
-                f"not after {found[before]} ns of the one before; expected times that ascend: "
-                f"sort the sweeps by time, and remove one that was stored twice"
+                f"{file or path_of[number]}: the time of number {number} is {stamps_ns[number]} ns"
+                f", not after {stamps_ns[before]} ns of the one before; expected times that "
+                f"ascend: sort the sweeps by time, and remove one that was stored twice"
             )
-    return Series(by_path, found, told_by)
+    return Series(path_of, stamps_ns, told_by)
 
 
 def _numbered(names: Sequence[Named]) -> dict[int, Named]:
@@ -166,18 +166,18 @@ def _matched(file: StampFile, paths: Mapping[int, Path]) -> dict[int, int]:
 def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | None:
     if name:
         return existing(folder if (folder / name).is_file() else root, name, "stamps")
-    near = [folder] + [folder.parent] * (folder != root and (shared or folder.parent != root))
-    files = (place / file for place in near for file in _STAMP_FILES)
+    searched = [folder] + [folder.parent] * (folder != root and (shared or folder.parent != root))
+    files = (directory / file for directory in searched for file in _STAMP_FILES)
     return next((file for file in files if file.is_file()), None)
 
 
 def _folders(root: Path) -> Iterator[Path]:
     """Yield the folder and its subfolders down to `_DEPTH`, by name, without links."""
-    for place, folders, _ in os.walk(root):
-        folders[:] = sorted(f for f in folders if f[0] != "." and f not in _NO_SWEEPS)
-        if len(Path(place).relative_to(root).parts) == _DEPTH:
-            folders.clear()
-        yield Path(place)
+    for folder, subfolders, _ in os.walk(root):
+        subfolders[:] = sorted(f for f in subfolders if f[0] != "." and f not in _NO_SWEEPS)
+        if len(Path(folder).relative_to(root).parts) == _DEPTH:
+            subfolders.clear()
+        yield Path(folder)
 
 
 def _files(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:

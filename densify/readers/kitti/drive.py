@@ -38,14 +38,14 @@ class Drive(FileSequence):
         files = checks.numbered_files(sweeps, ".bin")
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
-        found = {n: checks.numbered_files(p, ".png", ".jpg", ".jpeg") for n, p in images.items()}
+        numbered = {n: checks.numbered_files(p, ".png", ".jpg", ".jpeg") for n, p in images.items()}
         super().__init__(
             name,
             where,
             tuple(files),
             truth=checks.truth_beside(truth),
             files=files,
-            images={name: numbers for name, numbers in found.items() if numbers},
+            images={name: numbers for name, numbers in numbered.items() if numbers},
         )
 
     def _returns(self, frame: int) -> Returns:
@@ -137,7 +137,7 @@ class Calibration:
                 f"{path}: missing; expected KITTI's calibration there (it is a download of its own)"
             )
         matches = (_ENTRY.match(line) for line in read_text(path).splitlines())
-        return Calibration(path, {found[1]: found[2] for found in matches if found})
+        return Calibration(path, {match[1]: match[2] for match in matches if match})
 
     def numbers(self, key: str, *shape: int) -> Float:
         """Return the numbers of an entry as an array of the given shape."""
@@ -175,7 +175,7 @@ class Calibration:
         ``T_rect_lidar`` (4,4) maps the lidar frame to the frame of rectified camera 0.
         """
         P = self.numbers(key, 3, 4)
-        onto, T_cam_rect = P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), np.eye(4)
-        camera = checks.pinhole(name, size_px, onto, T_rect_lidar, f"{self.path}: {key}")
+        fx_fy_cx_cy, T_cam_rect = P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), np.eye(4)
+        camera = checks.pinhole(name, size_px, fx_fy_cx_cy, T_rect_lidar, f"{self.path}: {key}")
         T_cam_rect[:3, 3] = np.linalg.solve(camera.K, P[:, 3])
         return replace(camera, T_cam_lidar=T_cam_rect @ T_rect_lidar)

@@ -114,12 +114,12 @@ def _camera(folder: Path, name: str) -> Camera:
 
 def _fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
     """Read a fisheye camera from OpenCV's YAML, whose first line YAML libraries reject."""
-    given, _ = parse_yaml(read_text(path).replace("%YAML:1.0", "", 1), path)
+    content, _ = parse_yaml(read_text(path).replace("%YAML:1.0", "", 1), path)
     with described_in(path, "image_width, image_height, xi, k1 k2 p1 p2, gamma1 gamma2 u0 v0"):
-        lens, onto = given["distortion_parameters"], given["projection_parameters"]
-        words = [given["image_width"], given["image_height"]]
-        words += [onto[key] for key in ("gamma1", "gamma2", "u0", "v0")]
-        words += [given["mirror_parameters"]["xi"], *(lens[k] for k in ("k1", "k2", "p1", "p2"))]
+        lens, projection = content["distortion_parameters"], content["projection_parameters"]
+        words = [content["image_width"], content["image_height"]]
+        words += [projection[key] for key in ("gamma1", "gamma2", "u0", "v0")]
+        words += [content["mirror_parameters"]["xi"], *(lens[k] for k in ("k1", "k2", "p1", "p2"))]
     text = " ".join(map(str, words))
     width, height, *numbers = checks.parse_numbers(text, str(path), 11).tolist()
     return checks.pinhole(

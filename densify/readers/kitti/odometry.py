@@ -47,7 +47,7 @@ def open_recording(path: Path, scene: str | None) -> KittiOdometry:
     if (path / "velodyne").is_dir() and scene is None:
         return KittiOdometry(path)
     folder = path / "sequences" if (path / "sequences").is_dir() else path
-    names = sorted(found.parent.name for found in folder.glob("*/velodyne"))
+    names = sorted(velodyne.parent.name for velodyne in folder.glob("*/velodyne"))
     none = "no KITTI odometry; expected a folder with velodyne/, or sequences/ with such folders"
     return KittiOdometry(folder / checks.chosen_scene("kitti-odometry", path, scene, names, none))
 
@@ -77,8 +77,8 @@ class KittiOdometry(Drive):
 
     def gaps(self) -> list[str]:
         """Return a sentence about the assumed rate if times.txt is missing."""
-        told = f"{self.where} has no times.txt: sweeps are taken for 100 ms apart"
-        return [] if self._times_ns else [told]
+        note = f"{self.where} has no times.txt: sweeps are taken for 100 ms apart"
+        return [] if self._times_ns else [note]
 
     def stamp_ns(self, frame: int) -> int:
         """Return the time, since the first frame, at which the scanner faced forward in a sweep."""
@@ -104,13 +104,13 @@ class KittiOdometry(Drive):
     def _track_around(self, frame: int) -> PoseTrack | None:
         """Return the scanner's poses at a frame and its neighbours, None for fewer than two."""
         path, lines = self._pose_lines
-        near = [f for f in (frame - 1, frame, frame + 1) if f in lines]
-        if len(near) < 2:
+        frames = [f for f in (frame - 1, frame, frame + 1) if f in lines]
+        if len(frames) < 2:
             return None
         where = f"{path}: line {frame + 1} and those beside it"
-        stamps_ns = np.array([self._time_ns(f) for f in near], np.int64)
+        stamps_ns = np.array([self._time_ns(f) for f in frames], np.int64)
         return PoseTrack(
-            where, stamps_ns, np.stack([checks.rigid(self._pose(f), where) for f in near])
+            where, stamps_ns, np.stack([checks.rigid(self._pose(f), where) for f in frames])
         )
 
     def _pose(self, frame: int) -> Float:
@@ -129,9 +129,9 @@ class KittiOdometry(Drive):
 
     @cached_property
     def _pose_lines(self) -> tuple[Path | None, dict[int, str]]:
-        here = [self.where.absolute(), self.where.resolve()]  # a link, and its target
-        paths = [place / "poses.txt" for place in here]
-        paths += [place.parent.parent / "poses" / f"{place.name}.txt" for place in here]
+        folders = [self.where.absolute(), self.where.resolve()]  # a link, and its target
+        paths = [folder / "poses.txt" for folder in folders]
+        paths += [folder.parent.parent / "poses" / f"{folder.name}.txt" for folder in folders]
         for path in paths:
             if path.is_file():
                 return path, dict(enumerate(read_text(path).splitlines()))

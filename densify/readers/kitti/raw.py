@@ -73,11 +73,11 @@ class KittiRaw(Drive):
     def gaps(self) -> list[str]:
         """Return missing files and what is assumed instead, a sentence each."""
         velodyne = self.where / "velodyne_points"
-        told = [f"{velodyne} has no {', '.join(self._missing)}"] * bool(self._missing)
+        notes = [f"{velodyne} has no {', '.join(self._missing)}"] * bool(self._missing)
         if "" not in self._recorded:
-            told.append(f"{self.where}: sweeps are taken for 100 ms apart")
+            notes.append(f"{self.where}: sweeps are taken for 100 ms apart")
         left_out = [name for name in _camera_folders(self.where) if name not in self.cameras]
-        return told + [
+        return notes + [
             f"{name} is left out: calib_cam_to_cam.txt has no P_rect_{name[-2:]}"
             for name in left_out
         ]
@@ -118,11 +118,11 @@ class KittiRaw(Drive):
         if not self._oxts:
             return super()._pose(frame)
         checks.of_frame(self._oxts, frame, "oxts record", self.where)
-        near = [at for at in (frame - 1, frame, frame + 1) if at in self._oxts_stamps_ns]
-        stamps_ns = np.array([self._oxts_stamps_ns[at] for at in near], np.int64)
-        if len(near) < 2 or (np.diff(stamps_ns) <= 0).any() or "" not in self._recorded:
+        frames = [f for f in (frame - 1, frame, frame + 1) if f in self._oxts_stamps_ns]
+        stamps_ns = np.array([self._oxts_stamps_ns[f] for f in frames], np.int64)
+        if len(frames) < 2 or (np.diff(stamps_ns) <= 0).any() or "" not in self._recorded:
             return self._T_world_imu(frame) @ poses.inverse(self._T_lidar_imu)
-        T_world_imu = np.stack([self._T_world_imu(at) for at in near])
+        T_world_imu = np.stack([self._T_world_imu(f) for f in frames])
         track = PoseTrack(str(self.where / "oxts"), stamps_ns, T_world_imu)
         return track.at(self.stamp_ns(frame)) @ poses.inverse(self._T_lidar_imu)
 

@@ -93,19 +93,20 @@ class KittiTracking(Drive):
         if not path.is_file():
             return None
         numbers, is_area = read_labels(path)
-        here = numbers[:, 0] == frame
-        boxes, areas_px = numbers[here & ~is_area], numbers[here & is_area, 5:9]
-        height_m, width_m, length_m, right, down, forward, turn = boxes[:, 9:16].T
+        # Columns: 0 frame, 1 track, 5 to 8 rectangle in the image, 9 to 15 box
+        is_of_frame = numbers[:, 0] == frame
+        labels, areas_px = numbers[is_of_frame & ~is_area], numbers[is_of_frame & is_area, 5:9]
+        height_m, width_m, length_m, right, down, forward, turn = labels[:, 9:16].T
         centre_m = np.column_stack([right, forward, height_m / 2 - down])
         T_cam_box = _T_CAM_UPRIGHT @ checks.upright_poses(centre_m, -turn)
         T_lidar_box = poses.inverse(self._T_rect_lidar) @ T_cam_box
         size_m = np.column_stack([length_m, width_m, height_m])
-        tracks = [f"{track:.0f}" for track in boxes[:, 1]]
-        found = checks.boxes(tracks, T_lidar_box, size_m, f"{path}: frame {frame}")
+        tracks = [f"{track:.0f}" for track in labels[:, 1]]
+        checked = checks.boxes(tracks, T_lidar_box, size_m, f"{path}: frame {frame}")
         camera = self.cameras.get("image_02") or self._camera("image_02", _SMALLEST_IMAGE_PX)
         offset_ns = turned_ns(T_lidar_box[:, :3, 3], NOMINAL_PERIOD_NS)
         view = BoxView(camera, areas_px)
-        return Boxes(found.track, found.T_lidar_box, size_m, offset_ns, view=view)
+        return Boxes(checked.track, checked.T_lidar_box, size_m, offset_ns, view=view)
 
     @cached_property
     def _calibration(self) -> Calibration:
