@@ -39,17 +39,16 @@ def without_lone(sweep: Sweep) -> Sweep:
 
 def _places(sweep: Sweep) -> Float:
     """Return the (4,N) scanner, azimuth, elevation and log range of the returns, in cells."""
-    coordinates = np.empty((4, len(sweep)))
-    for lidar in np.unique(sweep.lidar).tolist():
-        of_lidar = sweep.lidar == lidar
-        x, y, z = (sweep.points[of_lidar] - sweep.origin_m(lidar)).T
-        range_m = np.sqrt(x * x + y * y + z * z)
-        cell_rad = _CELL_RAD * np.sqrt(_OF_POINTS / len(range_m))
-        elevation_rad = np.arcsin(np.clip(z / np.maximum(range_m, 1e-9), -1, 1))
-        depth = np.log(np.maximum(range_m, 1e-3)) / _CELL_DEPTH
-        coordinates[0, of_lidar] = lidar
-        coordinates[1:, of_lidar] = np.arctan2(y, x) / cell_rad, elevation_rad / cell_rad, depth
-    return coordinates
+    origins_m, lidar = sweep.scanner_origins, sweep.lidar
+    points = sweep.points if origins_m is None else sweep.points - origins_m[lidar]
+    x, y, z = np.ascontiguousarray(points.T)
+    range_m = np.sqrt(x * x + y * y + z * z)
+    num = np.bincount(lidar)
+    per_rad = np.sqrt(num / _OF_POINTS) / _CELL_RAD
+    elevation_rad = np.arcsin(np.clip(z / np.maximum(range_m, 1e-9), -1, 1))
+    depth = np.log(np.maximum(range_m, 1e-3)) / _CELL_DEPTH
+    scale = per_rad[lidar] if len(num) > 1 else per_rad[0]
+    return np.stack([lidar, np.arctan2(y, x) * scale, elevation_rad * scale, depth])
 
 
 def _count_in_cells(coordinates: Float) -> Int:
