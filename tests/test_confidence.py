@@ -108,6 +108,20 @@ def test_without_times_a_depth_may_be_moved_by_any_amount_up_to_the_smear():
             assert expected == pytest.approx(share * bad + 10**-3, abs=0.03)
 
 
+def test_a_single_sweep_expects_what_no_other_sweep_contradicts():
+    """The factor is between those of six recordings; rejected pixels are less certain too."""
+    maps = with_rejected(np.random.default_rng(9))
+    alone = scale.unconfirmed(maps)
+    for before, after in (
+        (maps.confidence, alone.confidence),
+        (maps.rejected.confidence, alone.rejected.confidence),
+    ):
+        more = scale.outlier_probability(after) / scale.outlier_probability(before)
+        assert ((before > 0) == (after > 0)).all()
+        assert 0.9 < more[before > 0.2].min() and more.max() < 6.0
+        assert more[before > 0.2].mean() > 2.0
+
+
 def with_rejected(rng) -> DepthMap:
     """A map of 70 % of the pixels, half of them measured, and rejected pixels elsewhere."""
     shown = rng.random(SHAPE) < 0.7

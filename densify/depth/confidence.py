@@ -12,7 +12,7 @@ recordings, each recording with equal weight, by ``examples/fit_confidence.py``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -48,6 +48,7 @@ WEIGHTS: Mapping[str, float] = {
 _LEAST_VOTES, _LEAST_SHARE, _LEAST_STEP = 0.001, 0.005, 0.03  # smaller values are not told apart
 _AGE_S, _LEAST_COVER = 0.03, 0.05
 _NUM_STEPS = 20
+_UNCONFIRMED = 2.7  # found / expected outliers of one sweep alone: 0.9 to 6, on six recordings
 
 
 def features(layers: Layers, since_key_ns: Int, camera: Camera) -> Float32:
@@ -215,11 +216,25 @@ def without_times(maps: DepthMap, smear_m: float, camera: Camera, share: float =
         share: Share of the sweeps without times.
     """
 
-    def lowered(confidence: Float32, depth_m: Float32) -> Float32:
+    def either(probability: Float, depth_m: Float32) -> Float:
         tolerated_m = depth_m * tolerance(depth_m, camera)
         smeared = share * np.clip(1 - tolerated_m / max(smear_m, 1e-9), 0, 1)
-        either = 1 - (1 - outlier_probability(confidence)) * (1 - smeared)
-        lower = np.clip(-np.log10(np.maximum(either, 10.0**-DECADES)) / DECADES, 0, 1)
+        return 1 - (1 - probability) * (1 - smeared)
+
+    return _with_probability(maps, either)
+
+
+def unconfirmed(maps: DepthMap) -> DepthMap:
+    """Return the map of one sweep alone, with the outliers that no other sweep could contradict."""
+    return _with_probability(maps, lambda probability, _: _UNCONFIRMED * probability)
+
+
+def _with_probability(maps: DepthMap, changed: Callable[[Float, Float32], Float]) -> DepthMap:
+    """Return the map with each probability P of an outlier changed to ``changed(P, depth_m)``."""
+
+    def lowered(confidence: Float32, depth_m: Float32) -> Float32:
+        probability = changed(outlier_probability(confidence), depth_m)
+        lower = np.clip(-np.log10(np.maximum(probability, 10.0**-DECADES)) / DECADES, 0, 1)
         return np.where(depth_m > 0, lower, 0).astype(np.float32)
 
     rejected, confidence = maps.rejected, lowered(maps.confidence, maps.filled_m)

@@ -14,6 +14,7 @@ from densify.config.errors import InputError
 from densify.depth.confidence import (
     expected_outliers,
     reliability,
+    unconfirmed,
     with_max_outliers,
     without_times,
 )
@@ -115,7 +116,7 @@ def result_of_method(
             seen = views.see(static).joined(far)
         depth = views.depth(seen, visible, filled)
         if visible:
-            depth = _without_times(scene, depth)
+            depth = _less_certain(scene, depth)
         max_outliers = scene.settings.project.max_outliers
         depth = {n: with_max_outliers(maps, max_outliers) for n, maps in depth.items()}
         depth = _add_ages(scene, method, depth)
@@ -185,11 +186,13 @@ def _add_ages(
     }
 
 
-def _without_times(scene: KeyScene, depth: dict[str, DepthMap]) -> dict[str, DepthMap]:
-    """Return the maps with a lower confidence if sweeps have no point times for deskewing."""
+def _less_certain(scene: KeyScene, depth: dict[str, DepthMap]) -> dict[str, DepthMap]:
+    """Return the maps with a lower confidence for a single sweep, and for sweeps without times."""
     sweeps, at = [s.sweep for s in scene.stretch.sweeps], scene.stretch[scene.key]
     untimed = np.mean([sweep.offset_ns is None for sweep in sweeps])
-    if len(sweeps) < 2 or not untimed or not scene.settings.register.deskew:
+    if len(sweeps) == 1:
+        return {name: unconfirmed(maps) for name, maps in depth.items()}
+    if not untimed or not scene.settings.register.deskew:
         return depth
     period_s = float(np.median(np.diff([sweep.stamp_ns for sweep in sweeps]))) * 1e-9
     # Sweeps already compensated for motion need no point times.
