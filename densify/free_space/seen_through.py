@@ -14,6 +14,7 @@ from densify.free_space.range_image import MIN_FILLED, RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock, num_in_batch
+from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Float, RegisteredSweep, Stretch
 
 REACH_S = 1.0
@@ -25,7 +26,7 @@ FREE_MARGIN = 0.4, 0.015  # m, share of the range: the larger tolerates errors o
 def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
     """Return the sweeps' range images, ``num_together`` in a batch, by rings where that is safe."""
     image = partial(RangeImage.of, num_together=num_together, by_ring=True)
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(num_threads()) as pool:
         return list(pool.map(image, sweeps))
 
 

@@ -18,6 +18,7 @@ from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 from densify.geometry.clock import Clock
+from densify.geometry.compiled import num_threads
 from densify.geometry.linking import close_to_seeds, link
 from densify.geometry.types import Bool, Float, Int, Stretch
 
@@ -186,7 +187,7 @@ def find_candidates(
         num_clusters, cluster = cluster_around(squeezed, seed)
         return Candidates(above, seed, cluster, num_clusters)
 
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(num_threads()) as pool:
         return tuple(pool.map(of_sweep, range(len(stretch.sweeps)) if among is None else among))
 
 

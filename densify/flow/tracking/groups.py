@@ -20,6 +20,7 @@ from densify.flow.tracking.soften import Snapshot, Softened, soften
 from densify.flow.tracking.tracks import find_tracks
 from densify.geometry import poses
 from densify.geometry.clock import Clock
+from densify.geometry.compiled import num_threads
 from densify.geometry.types import Float, FlowField, Int, Stretch
 
 _FINE_M = 0.3  # ring gap up to which a limb has returns of several rings
@@ -131,7 +132,7 @@ def motion_of(
                 sweeps.append(i)
         return Bending(tuple(sweeps), soften(snapshots))
 
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(num_threads()) as pool:
         instance = tuple(chain.from_iterable(pool.map(members, space.batches)))
         number, carrier = join_pieces(stretch, tracks, instance, space)
         moved_with: Instance = np.append(carrier, -1).astype(np.int32)
