@@ -66,7 +66,7 @@ class Table:
 
     def require(self, name: str, where: str) -> None:
         """Raise InputError, starting with ``where``, if no plug-in has this name; import none."""
-        if name not in self.names():
+        if name not in (row.name for row in self.built_in) and name not in self._added():
             usages = [row.usage for row in self.built_in] + sorted(self._added())
             raise InputError(
                 f"{where}: got {name!r}, {did_you_mean(name, self.names())}expected one of "

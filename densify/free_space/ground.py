@@ -71,7 +71,7 @@ class HeightMap:
 
     def under(self, points: Float) -> Float:
         """Return (N,) ground heights, m, at points (N,2) or (N,3); beyond the grid, at its edge."""
-        x, y = ((points[:, :2] - self.low_m) / self.cell_m - 0.5).T
+        x, y = ((points[:, i] - self.low_m[i]) / self.cell_m - 0.5 for i in (0, 1))
         ground_m: Float = ndimage.map_coordinates(self.heights_m, (x, y), order=1, mode="nearest")
         return ground_m
 
