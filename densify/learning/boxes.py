@@ -44,7 +44,8 @@ def flow_of_boxes(
     Args:
         source: Sweep of the N points.
         after: Next sweep in the same world. Only its pose and time are used.
-        boxes, next_boxes: Boxes of the two sweeps. Boxes of one object share the track name.
+        boxes: Boxes of ``source``.
+        next_boxes: Boxes of ``after``. Boxes of one object share the track name.
 
     Returns:
         The flow with ego-motion removed, in the lidar frame of ``source``; ``instance`` is the row

@@ -42,7 +42,8 @@ def energy(
     gradient is exact wherever no two neighbours tie. The energy is a sum over points, not a mean.
 
     Args:
-        flow, source: (n,3) metres, F and the points p.
+        flow: (n,3) metres, F.
+        source: (n,3) metres, points p.
         target: (m,3) metres, points q, in the frame of the source.
         laplacian: (n,n) L of `densify.flow.objective.graph.laplacian`.
     """

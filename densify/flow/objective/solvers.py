@@ -73,7 +73,8 @@ def solve(
     All is computed in float64. The same input gives the same bytes on the same CPU.
 
     Args:
-        source, target: (n,3) and (m,3) metres, in one frame.
+        source: (n,3) metres.
+        target: (m,3) metres, in the same frame.
         initial: (n,3) flow to start from, None for 0. With it, pcg uses the final alpha at once.
     """
     settings = settings or SolverSettings()

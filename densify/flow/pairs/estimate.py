@@ -49,16 +49,19 @@ def estimate_flow(
     objective. With ``flow.engine=paper`` the moving groups take it.
 
     Args:
-        source, target: (N,3) and (M,3) metres, z up, with or without the ground.
+        source: (N,3) metres, z up, with or without the ground.
+        target: (M,3) metres, as ``source``.
         config: Settings; the sections ``flow`` and ``objective`` are used.
         initial: (N,3) flow to start from. It is needed only for objects faster than the search
             covers: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
-        source_offset_ns, target_offset_ns: (N,) and (M,) times of the points, both or none. Both
-            clouds use one clock, or each counts from its own sweep's reference time; in the second
-            case the target is taken for the next revolution. Without times, the flow is too slow or
-            too fast for an object that the scanner meets earlier or later in the second sweep.
-        source_lidar, target_lidar: (N,) and (M,) numbers of the points' scanners, both or none.
-            Without times, points are compared within a scanner only.
+        source_offset_ns: (N,) times of the points. Both clouds use one clock, or each counts from
+            its own sweep's reference time; in the second case the target is taken for the next
+            revolution. Without times, the flow is too slow or too fast for an object that the
+            scanner meets earlier or later in the second sweep.
+        target_offset_ns: (M,) times of the points, both or none.
+        source_lidar: (N,) numbers of the points' scanners. Without times, points are compared
+            within a scanner only.
+        target_lidar: (M,) numbers of the points' scanners, both or none.
 
     Returns:
         Flow from the middle of the source's times to the target's middle, in the common frame. With
