@@ -69,7 +69,8 @@ class Model:
         """Add (N,3) points in the object's frame, thinning all points if there are too many."""
         points = np.concatenate([self.points, points])
         points = points[np.argsort(points[:, 0], kind="stable")]
-        self.points = points[:: len(points) // _MAX_MODEL_POINTS + 1]
+        # contiguous, or the kernels are compiled for both layouts
+        self.points = np.ascontiguousarray(points[:: len(points) // _MAX_MODEL_POINTS + 1])
         _, rows = nearest_k(tree_of(self.points), self.points, NUM_NEAR)
         self.information = surface_information(self.points, rows, _LOOSE)
 
@@ -93,7 +94,7 @@ class Model:
             predicted: (4,) state to start from.
             prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
         """
-        points = points[:: max(1, len(points) // _NUM_ALIGNED)]
+        points = np.ascontiguousarray(points[:: max(1, len(points) // _NUM_ALIGNED)])
         state, prior = predicted.copy(), prediction_std**-2
         for gate_m in GATES_M:
             H, g = np.zeros((3, 3)), np.zeros(3)
