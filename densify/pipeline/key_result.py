@@ -114,12 +114,7 @@ def result_of_method(
         if output.movers != "keep":
             static = cloud.select(~cloud.moving & ~cloud.far)
             seen = views.see(static).joined(far)
-        depth = views.depth(seen, visible, filled)
-        if visible:
-            depth = _less_certain(scene, depth)
-        max_outliers = scene.settings.project.max_outliers
-        depth = {n: with_max_outliers(maps, max_outliers) for n, maps in depth.items()}
-        depth = _add_ages(scene, method, depth)
+        depth = _add_ages(scene, method, _depth(scene, seen, visible, filled))
     cloud = seen.cloud
     if scene.images:
         with watch.stage("colour"):
@@ -184,6 +179,15 @@ def _add_ages(
         name: with_ages(maps, stamps_ns, scene.key, exposures[name].late_s)
         for name, maps in depth.items()
     }
+
+
+def _depth(scene: KeyScene, seen: SeenCloud, visible: bool, filled: bool) -> dict[str, DepthMap]:
+    """Return the depth maps of the points, with the expected outliers that are asked for."""
+    depth = scene.views.depth(seen, visible, filled)
+    if visible:
+        depth = _less_certain(scene, depth)
+    max_outliers = scene.settings.project.max_outliers
+    return {name: with_max_outliers(maps, max_outliers) for name, maps in depth.items()}
 
 
 def _less_certain(scene: KeyScene, depth: dict[str, DepthMap]) -> dict[str, DepthMap]:

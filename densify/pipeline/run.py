@@ -223,10 +223,7 @@ def densify(
     costs = watch.costs()
     for result in bare_results:
         results[result.method] = replace(
-            result,
-            costs=costs,
-            baselines=dict(results),
-            recording=sequence.name,
+            result, costs=costs, baselines=dict(results), recording=sequence.name
         )
     return add_warnings(results, recording, key, shots)
 

@@ -224,15 +224,11 @@ class CameraView:
 
 
 class Rejected(NamedTuple):
-    """Pixels without a depth in the map, because a rule rejected their depth.
+    """Pixels without a depth in the map, because a rule rejected their depth."""
 
-    depth_m: (H,W) float32 rejected depth in metres, 0 elsewhere. confidence: (H,W) float32 of it.
-    frame: (H,W) int32 frame number of the sweep that measured it, -1 elsewhere.
-    """
-
-    depth_m: Float32
-    confidence: Float32
-    frame: NDArray[np.int32]
+    depth_m: Float32  # (H,W) rejected depth in metres, 0 elsewhere
+    confidence: Float32  # (H,W) of the rejected depth
+    frame: NDArray[np.int32]  # (H,W) frame number of the sweep that measured it, -1 elsewhere
 
 
 @dataclass(frozen=True)
