@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from densify import open_sequence
-from densify.flow.pairs.estimate import estimate_flow
-from densify.flow.pairs.surface import MISSING, Surface
+from densify.flow.pair_groups import MISSING, Surface
+from densify.flow.two_clouds import estimate_flow
 from densify.geometry import poses
 from densify.readers.street import Street
 from densify.street.lidar import T_ego_lidar, at_offsets

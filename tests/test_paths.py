@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from densify.flow.surface_matching import apply, undo
-from densify.flow.tracking.objects import Track
-from densify.flow.tracking.paths import Path
+from densify.flow.tracking.objects import Path, Track
 
 STEP_S = 0.1
 NOISE_M = 0.03

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from densify.flow.tracking.pieces import join_pieces
+from densify.flow.tracking.groups import join_pieces
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 from tests.found_motion import Found

@@ -18,8 +18,12 @@ from densify.geometry import poses
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
 from densify.registration.alignment import MANY_POINTS
-from densify.registration.odometry import MAX_SPEED_M_S, above_ground, find_odometry
-from densify.registration.surfaces import register_on_surfaces
+from densify.registration.odometry import (
+    MAX_SPEED_M_S,
+    above_ground,
+    find_odometry,
+    register_on_surfaces,
+)
 
 MIN_OVERLAP = 0.55
 """Least share of a sweep's points above the ground that overlap the sweeps of the third of a second

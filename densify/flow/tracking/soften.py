@@ -17,8 +17,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
-from densify.flow.tracking.objects import LONG_M
-from densify.flow.tracking.paths import MIN_SPAN_S, MIN_STATES
+from densify.flow.tracking.objects import LONG_M, MIN_SPAN_S, MIN_STATES
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Float, Int
 

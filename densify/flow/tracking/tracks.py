@@ -20,13 +20,15 @@ from densify.flow.tracking.following import (
     FIT_M,
     MIN_POINTS,
     PREDICTION_STD,
+    DistanceField,
     Follower,
+    Group,
     find_starts,
     velocities_beside,
+    vote,
 )
 from densify.flow.tracking.likelihood import NUM_ASKED, Judge, Verdict, judge
 from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track
-from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
