@@ -2,9 +2,9 @@
 """Register sweeps point to plane on the surfaces of the last second, predicted by KISS-ICP.
 
 KISS-ICP (Vizzo et al., RA-L 2023) matches a sample of a sweep with the scan pattern of earlier
-sweeps. A rosette pattern that turns 7 degrees a sweep turns these poses with it. The surface normals
-of one second do not depend on the pattern (Chen, Medioni, "Object modelling by registration of
-multiple range images", IVC 1992).
+sweeps. A rosette pattern that turns 7 degrees a sweep turns these poses with it. The surface
+normals of one second do not depend on the pattern (Chen, Medioni, "Object modelling by registration
+of multiple range images", IVC 1992).
 """
 
 from __future__ import annotations
