@@ -18,11 +18,13 @@ from functools import cached_property
 
 import numpy as np
 
-from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
+from densify.flow.surface_matching import GATES_M, MIN_FIT, NUM_NEAR, Model, apply, undo
 from densify.flow.tracking.candidates import LINK_M, Strips, cluster_around
 from densify.flow.tracking.following import (
     FEW_POINTS,
+    FIT_M,
     MAX_SPEED_M_S,
+    MIN_POINTS,
     PREDICTION_STD,
     STEP_M,
     DistanceField,
@@ -37,8 +39,8 @@ SURFACE_M = 1.0
 """Greatest distance of a neighbour that spans the surface at a position."""
 MISSING = 3.0
 """Cost of a point without surface, and greatest cost."""
-_NUM_NEIGHBORS, _MIN_NEIGHBORS = 12, 3
-_NOISE_M = 0.1  # of a point and of a motion
+_MIN_NEIGHBORS = 3
+_NOISE_M = 0.1  # of a point, of a motion, and of level ground; a closer point is a counterpart
 _EVEN_M = 0.15  # voxel in which one point is kept, because points are denser along rings
 
 
@@ -82,7 +84,7 @@ class Surface:
 
     def cost(self, points: Float) -> Float:
         """Return (N,) costs of points (N,3), 0 to 3: half their squared Mahalanobis distances."""
-        cost, num = np.full(len(points), MISSING), min(_NUM_NEIGHBORS, self._tree.n)
+        cost, num = np.full(len(points), MISSING), min(NUM_NEAR, self._tree.n)
         if num < _MIN_NEIGHBORS:
             return cost
         ranks = np.arange(1, num + 1)
@@ -101,9 +103,7 @@ class Surface:
         return cost
 
 
-_EXPLAINED_M = 0.1  # a closer point is a counterpart
 _MAX_EXTENT_M = 20.0  # horizontal diagonal of the longest vehicle
-_MIN_POINTS, _MIN_UNEXPLAINED = 8, 5  # of a group
 _MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # greatest heights of a group's lowest and highest points
 
 
@@ -112,7 +112,7 @@ def find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
 
     A counterpart is a point of the other cloud within 0.1 m, or one of its surfaces.
     """
-    unmatched = np.flatnonzero(~is_near(tree_of(other_cloud.points), cloud.points, _EXPLAINED_M))
+    unmatched = np.flatnonzero(~is_near(tree_of(other_cloud.points), cloud.points, _NOISE_M))
     surface = Surface(other_cloud.points[other_cloud.evenly(np.arange(len(other_cloud.points)))])
     unexplained = np.zeros(len(cloud.points), bool)
     unexplained[unmatched] = surface.cost(cloud.points[unmatched]) > MISSING / 2
@@ -146,7 +146,7 @@ def road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
     groups = np.split(rows, np.flatnonzero(np.diff(group[rows])) + 1)
     users = []
     for members in groups:
-        if len(members) >= _MIN_POINTS and unexplained[members].sum() >= _MIN_UNEXPLAINED:
+        if len(members) >= MIN_POINTS and unexplained[members].sum() >= MIN_FIT:
             low_m, high_m = np.percentile(height_m[members], (5, 95))
             if low_m <= _MAX_LOW_M and high_m <= _MAX_HIGH_M:
                 users.append(members)
@@ -154,22 +154,19 @@ def road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
 
 
 _USUAL_S, _LONGEST_S = 0.1, 0.4  # assumed time between clouds if unknown; greatest time
-MIN_MOTION_M = 0.1  # a shorter motion may be an error of registration
+MIN_MOTION_M = 0.1  # a shorter motion, or difference of two, may be an error of registration
 _NUM_STARTS, _APART_M = 5, 0.5  # displacements from the vote, and their least distance
 _PER_M = 1e-3  # loss of the vote per metre: of equal displacements the shortest is taken
 _REFINE_M = (0.08, 0.04, 0.02)  # steps of the refinement
 _YAW_PER_M = 0.25  # rad: 4 m from the centre, a point moves by the same step
 _START_M = 1.0  # standard deviation of a start
-_SAME = 0.1  # greatest difference of two states that are one, m or rad
 _MIN_GAIN = 10.0  # least log-likelihood ratio in each cloud: thousands of motions are tried
 _BALANCE = 0.25  # least gain of the target points, relative to the source: both are one object
 _MAX_MISFIT = 1.7  # greatest mean cost of the moved points
-_TOGETHER_M = 0.3  # groups that differ less are parts of one object
 _THIN_M, _ALONG = 0.05, 0.3  # a wall's thickness (rms), motion across
 _BAR_M, _LEVEL, _ACROSS = 0.12, 0.5, 0.2  # a rail's width (rms), rise, motion across
 _MAX_BAR_M, _MAX_BAR_POINTS = 0.75, 60  # length (rms) and points of a far car's back
 _SLOPE_STEP_M, _SLOPE_STEPS = 2.0, 4  # of the grid that is fitted around a position
-_ROUGH_M = 0.1  # a ground rougher than this has no slope
 
 
 @dataclass(frozen=True)
@@ -213,7 +210,7 @@ class Proposal:
         """Return True if the motion of ``proposal``, at this group, is nearly the same."""
         centre = self.motion.centre[None]
         offset = self.motion.place(centre, 1.0) - proposal.motion.place(centre, 1.0)
-        return bool(np.linalg.norm(offset) < _TOGETHER_M)
+        return bool(np.linalg.norm(offset) < FIT_M)
 
     def moves(self, free: Bool | None = None) -> bool:
         """Return True if the group certainly moves.
@@ -298,7 +295,9 @@ class Search:
         judged, states = list[Proposal](), list[Float]()
         for start in starts:
             state = self._align(RigidMotion(np.append(start, 0.0), centre), members, rows)
-            if state is None or any(np.abs(state - s)[[0, 1, 3]].max() < _SAME for s in states):
+            if state is None or any(
+                np.abs(state - s)[[0, 1, 3]].max() < MIN_MOTION_M for s in states
+            ):
                 continue
             states.append(state)
             state[2] = state[:2] @ slope
@@ -372,7 +371,7 @@ def _slope_of(ground: HeightMap, position: Float) -> Float:
     height_m = ground.under(position[:2] + away)
     height_m -= height_m.mean()
     slope: Float = away.T @ height_m / (away**2).sum(axis=0)
-    is_plane = (height_m - away @ slope).std() <= _ROUGH_M  # not in clouds without ground points
+    is_plane = (height_m - away @ slope).std() <= _NOISE_M  # not in clouds without ground points
     return slope if is_plane else np.zeros(2)
 
 

@@ -24,7 +24,9 @@ from densify.registration.deskew import deskew_points
 
 _REACH_NS = 1_050_000_000
 _NUM_IN_REACH = 10  # sweeps of the last second; a larger number is thinned evenly
-_FRESH_NS = 350_000_000  # age of the latest sweep up to which a surface serves the next sweeps too
+# A pattern that does not repeat fills its field of view in this time. So long a surface serves the
+# next sweeps too.
+FRESH_NS = 350_000_000
 _NUM_START = 3  # sweeps of the first surfaces, at their expected poses
 _VOXEL_M = 0.25
 # Neighbours must include the next rings. Points of one ring give normals of noise, which lean
@@ -123,7 +125,7 @@ class _SweepRow:
         """Return a surface to align sweep i with, and its pose in the world (4,4)."""
         if self._surface is not None:
             surface, T_world_surface, nearest = self._surface
-            if abs(self.stamp_ns[i] - self.stamp_ns[nearest]) < _FRESH_NS:
+            if abs(self.stamp_ns[i] - self.stamp_ns[nearest]) < FRESH_NS:
                 return surface, T_world_surface
         T_world_surface = self._T[i].copy()
         chosen = neighbours[:: max(1, round(len(neighbours) / _NUM_IN_REACH))]

@@ -27,11 +27,11 @@ from densify.geometry.types import Bool, Float, Int
 Bytes = NDArray[np.uint8]
 
 MAX_SPEED_M_S = 38.0
-_NEAR_S = 0.1  # time to the nearer batches; the others are twice as far
+_NEAR_S, _AROUND_S = 0.1, 0.5  # times to the nearest and the farthest batches that vote
 STEP_M = 0.2  # side of a voxel
 _MOST_VOXELS = 1 << 28  # of a sweep, a byte each: 250 m x 250 m x 34 m
 FEW_POINTS, _MANY_POINTS = 60, 600
-_FINE_S, _FINE_M_S = 0.5, 0.2  # time span and velocity step of the last vote
+_FINE_M_S = 0.2  # velocity step of the last vote
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
     coarse_m_s = 2 * STEP_M / near_s
     near_fields = [fields[m] for m in _batches_around(n, near_s, clock)]
     all_fields = near_fields + [
-        fields[m] for m in _batches_around(n, max(_FINE_S / 2, near_s), clock)
+        fields[m] for m in _batches_around(n, max(_AROUND_S / 2, near_s), clock)
     ]
     rough_m_s = _best(
         group.thinned(FEW_POINTS), near_fields, _grid(int(MAX_SPEED_M_S / coarse_m_s)) * coarse_m_s
@@ -197,8 +197,7 @@ def _look_up(
 
 
 MIN_POINTS = 8  # to start a track
-_AROUND_S = 0.5  # farther than this from both ends of the recording, starts are equally good
-_NEARER_END, _NEARER_END_S = 0.7, 0.1  # closer to an end, a start is worth 0.7 per 0.1 s
+_NEARER_END = 0.7  # nearer than `_AROUND_S` to an end, a start is worth this share per 0.1 s
 FIT_M = 0.3
 """Greatest distance of a point from the object that claims it."""
 _SHARE_UNSEEN = 0.5  # least share of the object's usual number of points
@@ -207,7 +206,7 @@ PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
 _RECENT_S = 0.4  # age of the states that the rate is fitted to
 _GIVEN_S2 = 0.02  # the given velocity weighs as much as states with this sum of squared times
 _TURNS_ON = 0.9  # share of the turn rate that is predicted: turns level out
-_MISSES_ALLOWED, _MISSED_S = 1, 0.2  # a track ends when both are exceeded
+_MISSES_ALLOWED, MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
@@ -221,7 +220,7 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
     def worth(start: tuple[int, Int]) -> float:
         n, members = start
         nearer_s = max(0.0, _AROUND_S - clock.from_end_s(n))
-        return float(len(members) * _NEARER_END ** (nearer_s / _NEARER_END_S))
+        return float(len(members) * _NEARER_END ** (nearer_s / _NEAR_S))
 
     for n, c in enumerate(batches):
         size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
@@ -273,7 +272,7 @@ class Follower:
         for direction in (1, -1):
             last, n = start, start + direction
             while 0 <= n < len(self.batches) and (
-                abs(n - last) <= 1 + _MISSES_ALLOWED or self.clock.near(n, last, _MISSED_S)
+                abs(n - last) <= 1 + _MISSES_ALLOWED or self.clock.near(n, last, MISSED_S)
             ):
                 alignment = self._find(model, track, rate, n)
                 if alignment is not None:

@@ -29,8 +29,8 @@ _KNOT_S = 0.1
 _STIFFNESSES = (1e6, 10.0)
 _WORTH_SOFTENING = 0.8  # a softer path must lower the leave-one-out error to this share
 # Fewer states, or a shorter time, determine no acceleration, or no jerk.
-MIN_STATES, MIN_SPAN_S = 5, 0.35
-_JERK_STATES, _JERK_S = 8, 0.65
+MIN_STATES, _JERK_STATES = 5, 8
+MIN_SPAN_S, _JERK_S = (_KNOT_S * (num - 1.5) for num in (MIN_STATES, _JERK_STATES))
 _DEGREE = 3
 # Powers 3 to 0 of the time since a span began, by the coefficients of the four B-splines on it.
 _CUBIC = np.array([[-1, 3, -3, 1], [3, -6, 3, 0], [-3, 0, 3, 0], [1, 4, 1, 0]]) / 6
