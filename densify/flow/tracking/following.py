@@ -288,22 +288,22 @@ class Follower:
     ) -> tuple[Float, float, Int, Float] | None:
         """Align the candidates of batch n with the object so far; None if too few points fit."""
         batch, num_recent = self.batches[n], self.clock.num_in(_RECENT_S)
-        c, centre = batch.obstacles, track.centre
+        obstacles, centre = batch.obstacles, track.centre
         rough_state, rough_rate, _ = _predict(track, rate, num_recent, track.seen_at(batch.time_ns))
         expected = apply(rough_state, model.points, centre)
         slack_m = GATES_M[0] + batch.half_s * np.abs(rough_rate[:3])
-        inside = c.strips.rows_inside(expected.min(0) - slack_m, expected.max(0) + slack_m)
+        inside = obstacles.strips.rows_inside(expected.min(0) - slack_m, expected.max(0) + slack_m)
         inside = inside[batch.gather(self.free)[inside]]
-        rows, min_num_rows = inside[c.cluster[inside] >= 0], float(MIN_FIT)
+        rows, min_num_rows = inside[obstacles.cluster[inside] >= 0], float(MIN_FIT)
         if len(rows) < MIN_FIT:  # no sweep saw through the object, but it may be there
             usual_num = float(np.median([track.num_points(m) for m in track.observations]))
             rows, min_num_rows = inside, max(MIN_FIT, _SHARE_UNSEEN * usual_num)
         if len(rows) < min_num_rows:
             return None
-        seen_s = float(c.time_s[rows].mean())
+        seen_s = float(obstacles.time_s[rows].mean())
         predicted, rate, std = _predict(track, rate, num_recent, seen_s)
         predicted[2] = track.rise_m(self.ground, predicted)
-        target = _at_once(c, rows, rate, seen_s)
+        target = _at_once(obstacles, rows, rate, seen_s)
         state = model.align(target, centre, predicted, std)
         if state is None:
             return None
@@ -314,9 +314,10 @@ class Follower:
         return state, seen_s, rows[fit], target[fit]  # the (K,3) points at seen_s, world
 
 
-def _at_once(c: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
+def _at_once(obstacles: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
     """Return (N,3) obstacles ``rows`` moved to time ``time_s`` by the velocity ``rate[:3]``."""
-    return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
+    late_s = time_s - obstacles.time_s[rows]
+    return obstacles.points[rows] + late_s[:, None] * rate[:3]
 
 
 def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float, Float, Float]:

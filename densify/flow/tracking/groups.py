@@ -256,40 +256,32 @@ def _is_part(piece: _Piece, whole: MovingObject, sweeps: set[int], space: FreeSp
     # it moves alike in the object's lane, at most 0.5 m from the box, or 1.5 m if nothing was seen
     # through between.
     common = sorted(sweeps & piece.points.keys())
-    if not common:
+    if not common or _is_away(piece, whole, common[len(common) // 2]):
         return False
     middle = common[len(common) // 2]
-    if _is_away(piece, whole, middle):
-        return False
-    track, shape = whole
-    middle_s = space.clock.time_s[middle]
+    middle_s, track = space.clock.time_s[middle], whole.track
     lane = whole.lane(middle_s)
-    # whole_m, piece_m: coordinates of the points along the heading
-    whole_m = track.place(shape.points, middle_s)[:, :2] @ lane.ahead
-    touches, inside = [], []
+    # coordinates of points along the heading
+    whole_m = track.place(whole.shape.points, middle_s)[:, :2] @ lane.ahead
+    touches, is_inside = [], []
     for i in common:
         in_object = piece.within(track, [i])
         at_middle = track.place(in_object, middle_s)
         piece_m = at_middle[:, :2] @ lane.ahead
-        inside.append(
-            lane.holds(at_middle) & (piece_m >= whole_m.min()) & (piece_m <= whole_m.max())
-        )
-        close = nearest(shape.tree, in_object)[0] < piece.near_m[i]
-        touches.append((close | shape.within_outline(in_object)).any())
-    touching = bool(np.mean(touches) >= _MOSTLY)
-    if touching and np.concatenate(inside).mean() >= _MOSTLY:
+        is_beside = (piece_m >= whole_m.min()) & (piece_m <= whole_m.max())
+        is_inside.append(lane.holds(at_middle) & is_beside)
+        is_close = nearest(whole.shape.tree, in_object)[0] < piece.near_m[i]
+        touches.append((is_close | whole.shape.within_outline(in_object)).any())
+    is_touching = bool(np.mean(touches) >= _MOSTLY)
+    if is_touching and np.concatenate(is_inside).mean() >= _MOSTLY:
         return True
+    near_m = float(np.median(np.concatenate([piece.near_m[i] for i in common])))
+    tolerance_m = max(_DRIFT_M, near_m)
     at_middle = piece.track.place(piece.within(piece.track, common), middle_s)
-    beside = [i for i in common if space.clock.near(i, middle, _BESIDE_S)]
-    drift = [
-        track.carry(at_middle, middle_s, end_s) - piece.track.carry(at_middle, middle_s, end_s)
-        for end_s in space.clock.time_s[[beside[0], beside[-1]]]
-    ]
-    tolerance_m = max(_DRIFT_M, float(np.median(np.concatenate([piece.near_m[i] for i in common]))))
-    noise_m = _SIGMAS * np.hypot(track.path.residual_m, piece.track.path.residual_m)
-    if np.linalg.norm(np.concatenate(drift)[:, :2], axis=1).max() > tolerance_m + noise_m:
+    around_s = space.clock.time_s[[i for i in common if space.clock.near(i, middle, _BESIDE_S)]]
+    if not _move_alike(piece.track, track, at_middle, middle_s, around_s, tolerance_m):
         return False
-    if touching:
+    if is_touching:
         return True
     piece_m = at_middle[:, :2] @ lane.ahead
     gap_m = max(piece_m.min() - whole_m.max(), whole_m.min() - piece_m.max())
@@ -298,6 +290,24 @@ def _is_part(piece: _Piece, whole: MovingObject, sweeps: set[int], space: FreeSp
     if gap_m <= tolerance_m:
         return True
     return not _is_seen_between(track.undo(at_middle, middle_s), whole, common, space)
+
+
+def _move_alike(
+    track: Track,
+    other_track: Track,
+    points: Float,
+    at_s: float,
+    around_s: Float,
+    tolerance_m: float,
+) -> bool:
+    """Return True if two tracks carry (N,3) points from ``at_s`` to nearly the same positions."""
+    apart = [
+        other_track.carry(points, at_s, end_s) - track.carry(points, at_s, end_s)
+        for end_s in around_s[[0, -1]]
+    ]
+    noise_m = _SIGMAS * np.hypot(other_track.path.residual_m, track.path.residual_m)
+    drift_m = np.linalg.norm(np.concatenate(apart)[:, :2], axis=1).max()
+    return bool(drift_m <= tolerance_m + noise_m)
 
 
 def _is_away(piece: _Piece, whole: MovingObject, i: int) -> bool:

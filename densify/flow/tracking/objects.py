@@ -201,13 +201,14 @@ class Track:
         carried = self.place(points, at_s)
         return space.seen_through(carried, j, self.velocity_m_s(carried, at_s))
 
+    def in_object(self, obstacles: Obstacles, rows: Int) -> Float:
+        """Return the (N,3) points ``rows`` of a sweep's obstacles in the object's frame."""
+        return self.undo(obstacles.points[rows], obstacles.time_s[rows])
+
     def points_in(self, obstacles: Sequence[Obstacles], sweeps: Iterable[int]) -> Float:
         """Return the (N,3) points of the object in some sweeps (by index), object's frame."""
-        clouds = [np.zeros((0, 3))]
-        for j in sweeps:
-            c, rows = obstacles[j], self.claimed[j]
-            clouds.append(self.undo(c.points[rows], c.time_s[rows]))
-        return np.concatenate(clouds)
+        clouds = (self.in_object(obstacles[j], self.claimed[j]) for j in sweeps)
+        return np.concatenate([np.zeros((0, 3)), *clouds])
 
     def rows_in(self, batch: Batch) -> Int:
         """Return the indices, in the batch's obstacles, of the object's points."""
