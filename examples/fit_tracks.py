@@ -21,7 +21,7 @@ from densify.config import resolve
 from densify.flow.engines import Scene
 from densify.flow.tracking.candidates import Obstacles
 from densify.flow.tracking.likelihood import own_table
-from densify.flow.tracking.tracks import find_objects
+from densify.flow.tracking.tracks import find_tracks
 from densify.free_space.ground import ground
 from densify.geometry.types import Stretch
 from densify.pipeline.recording import Recording
@@ -103,7 +103,7 @@ def tried_in(stretch, heights, truth):
         means = (np.concatenate(values).mean() for values in (on, off_m, way_m))
         found.append((evidence, *means))
 
-    find_objects(obstacles, scene.space, heights, judged=judged)
+    find_tracks(obstacles, scene.space, heights, judged=judged)
     return found
 
 

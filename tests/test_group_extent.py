@@ -3,9 +3,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from densify.flow.tracking.candidates import Strips
+from densify.flow.tracking.extent import find_shape
+from densify.flow.tracking.objects import Observation, Track
+from densify.geometry.clock import Clock
 from tests.found_motion import KEY, NOISE, Found
 from tests.scenes import Arc, Box, Scene, World, car, street
 
@@ -48,6 +54,27 @@ def test_a_wall_that_somebody_walks_along_stays():
     still = marked(found, EXTRA)
     assert found.share_moving(1, 4) > 0.9
     assert len(still) > 20_000 and still.mean() < 0.04  # an arm's length of it
+
+
+def test_the_wall_behind_a_walker_is_no_part_of_the_shape():
+    """Every sweep claims 2.6 m of the wall along with the walker."""
+    body = np.random.default_rng(0).uniform((-0.2, -0.2, 0), (0.2, 0.2, 1.7), (120, 3))
+    x, z = np.meshgrid(np.arange(-3, 6, 0.1), np.arange(0, 2.4, 0.1))
+    wall = np.stack([x.ravel(), np.full(x.size, 0.6), z.ravel()], 1)
+    track, obstacles, clock = Track(np.zeros(3)), [], Clock(np.arange(9) * 100_000_000)
+    for i in range(9):
+        state = np.array([0.12 * i, 0.0, 0.0, 0.0])
+        points = np.concatenate([body + state[:3], wall])
+        beside = np.abs(wall[:, 0] - state[0]) < 1.3
+        track.observations[i] = Observation(state, 0.1 * i, i * 100_000_000, (i,))
+        track.claimed[i] = np.flatnonzero(np.append(np.ones(120, bool), beside))
+        seed, time_s = np.arange(len(points)) < 120, np.full(len(points), 0.1 * i)
+        sweep = SimpleNamespace(points=points, time_s=time_s, seed=seed, strips=Strips(points))
+        obstacles.append(sweep)
+    track.smooth()
+    space = SimpleNamespace(gap_m=lambda *_: 0.05, clock=clock)
+    shape = find_shape(track, obstacles, space)
+    assert len(shape.points) > 0.9 * 9 * 120 and shape.points[:, 1].max() < 0.3
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from densify.flow.tracking.likelihood import (
     own_table,
 )
 from densify.flow.tracking.objects import MovingObject, Observation, Shape, Track
-from densify.flow.tracking.tracks import find_objects
+from densify.flow.tracking.tracks import find_tracks
 from densify.free_space.ground import ground
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry.clock import Clock
@@ -140,7 +140,7 @@ def test_the_weights_separate_the_tracks_of_a_street_that_had_no_part_in_the_fit
         shares.append(np.concatenate(on).mean())
         log_odds.append(evidence.log_odds(own_table()))
 
-    find_objects(obstacles, space, heights, judged=judged)
+    find_tracks(obstacles, space, heights, judged=judged)
     share, moves = np.array(shares), np.array(log_odds) > 0
     assert (share > 0.9).sum() > 5 and (share < 0.1).sum() > 5
     assert not moves[share < 0.1].any() and moves[share > 0.9].mean() > 0.8

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from densify.flow.tracking.candidates import LINK_M, Obstacles, Strips, firing_times_s
 from densify.flow.tracking.following import MISSED_S
-from densify.flow.tracking.objects import LANE_M, MovingObject, Track, near_m
+from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track, near_m
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
-from densify.geometry.nearest import nearest
+from densify.geometry.linking import close_to_seeds
+from densify.geometry.nearest import is_near, nearest, tree_of
 from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 
 Instance = NDArray[np.int32]
@@ -26,6 +27,8 @@ Instance = NDArray[np.int32]
 _REACH = 1.5  # of candidates to an object, in neighbour distances (`near_m`)
 _LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M = 0.08, 0.1
 _WALKS_M_S = 2.0
+_LEAST_SEEDS, _WALKER_M = 0.1, 1.5
+_WIDER_M, _MOSTLY = 0.5, 0.5  # least share of moving points within this distance
 NUM_COLUMNS = 2.0
 """Columns of rays that may be missing along a side that recedes from the scanner."""
 _LONGEST_HOLE_M = 2.0
@@ -69,6 +72,58 @@ class SweepPoints:
     def strips(self) -> Strips:
         """Index of the points for box queries."""
         return Strips(self.points)
+
+
+def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Shape:
+    """Return the accumulated shape of a track; shapes of walkers exclude their surroundings.
+
+    Objects faster than 2 m/s keep all points. Otherwise three kinds of points are dropped. Echoes
+    merged with a wall's occur only in even or only in odd sweeps. Points of a bush are static or
+    lie among static points. Points of a wall are hardly ever seen through, like sides of slow cars:
+    this cut applies only if the rest is shorter than 1.5 m.
+    """
+    sweeps = sorted(track.claimed)
+    clouds = {j: track.in_object(obstacles[j], track.claimed[j]) for j in sweeps}
+    points = np.concatenate(list(clouds.values()))
+    if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
+        return Shape.of(points)
+    within_m = near_m(space.gap_m(track.centre, sweeps[0]))
+    sweep_number = np.repeat(np.arange(len(sweeps)), [len(p) for p in clouds.values()])
+    recurs = np.zeros(len(points), bool)
+    for is_odd in (False, True):
+        same_parity = sweep_number % 2 == is_odd
+        if not same_parity.all():
+            tree = tree_of(points[~same_parity])
+            recurs[same_parity] = is_near(tree, points[same_parity], _REACH * within_m)
+    moves = ~_is_static(track, obstacles, clouds, sweep_number, within_m)
+    recurs &= moves & close_to_seeds(points, moves, _WIDER_M, _MOSTLY)
+    seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
+    core = recurs & close_to_seeds(points, seed, _REACH * within_m, _LEAST_SEEDS)
+    if core.any() and np.linalg.norm(np.ptp(points[core, :2], axis=0)) < _WALKER_M:
+        return Shape.of(points[core])
+    return Shape.of(points[recurs] if recurs.any() else points)
+
+
+def _is_static(
+    track: Track,
+    obstacles: Sequence[Obstacles],
+    clouds: dict[int, Float],
+    sweep_number: Int,
+    reach_m: float,
+) -> Bool:
+    """Return (N,) True for points that more other sweeps confirm as static than as moved."""
+    # clouds: N points by sweep index, object's frame; sweep_number: (N,) rank of each point's sweep
+    in_object = np.concatenate(list(clouds.values()))
+    measured = np.concatenate([obstacles[j].points[track.claimed[j]] for j in clouds])
+    low, high = measured.min(0) - reach_m, measured.max(0) + reach_m
+    static, moved = np.zeros((2, len(measured)), np.int64)
+    for number, (j, cloud) in enumerate(clouds.items()):
+        in_others, c = sweep_number != number, obstacles[j]
+        returns = c.points[c.strips.rows_inside(low, high)]
+        for num, points, observed in ((static, measured, returns), (moved, in_object, cloud)):
+            if len(observed):
+                num[in_others] += is_near(tree_of(observed), points[in_others], reach_m)
+    return np.asarray(static > moved)
 
 
 def assign_points(

@@ -14,10 +14,10 @@ import numpy as np
 from densify.config import Config
 from densify.flow.engines import Scene
 from densify.flow.tracking.candidates import Candidates, Obstacles, firing_times_s
-from densify.flow.tracking.extent import Instance, assign_points, is_known_at
+from densify.flow.tracking.extent import Instance, assign_points, find_shape, is_known_at
 from densify.flow.tracking.objects import MovingObject, Shape, Track, near_m
 from densify.flow.tracking.soften import Snapshot, Softened, soften
-from densify.flow.tracking.tracks import find_objects
+from densify.flow.tracking.tracks import find_tracks
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 from densify.geometry.clock import Clock
@@ -115,8 +115,8 @@ def motion_of(
     """
     stretch, space = scene.stretch, scene.space
     obstacles = [Obstacles.of(stretch, i, of_sweep) for i, of_sweep in enumerate(candidates)]
-    objects = find_objects(obstacles, space, scene.ground, velocities_m_s)
-    tracks = [track for track, _ in objects]
+    tracks = find_tracks(obstacles, space, scene.ground, velocities_m_s)
+    objects = [MovingObject(track, find_shape(track, obstacles, space)) for track in tracks]
 
     def members(batch: Sequence[int]) -> list[Instance]:
         if any(map(scene.is_asked, batch)):

@@ -45,20 +45,20 @@ _GAPS_IN_LINE_M = (1.5, 4.0)
 _ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of a single ring or column, in steps
 
 
-def find_objects(
+def find_tracks(
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
     ground: HeightMap,
     velocities_m_s: Sequence[Float] | None = None,
     judged: Judge | None = None,
-) -> list[MovingObject]:
-    """Return all moving objects in the stretch (consecutive sweeps), with their confirmed tracks.
+) -> list[Track]:
+    """Return the confirmed tracks of all moving objects in the stretch (consecutive sweeps).
 
     ``velocities_m_s`` are, for each sweep, (C,3) of its obstacles, world frame, at which clusters
     start. None lets the neighbouring sweeps vote. ``judged`` is called with each track that was
     tried, and its evidence.
     """
-    return _Search(obstacles, space, ground, velocities_m_s, judged).objects()
+    return _Search(obstacles, space, ground, velocities_m_s, judged).tracks()
 
 
 class _Trial(NamedTuple):
@@ -105,8 +105,8 @@ class _Search:
     def _all_points(self) -> list[Bool]:
         return [np.ones(len(c.points), bool) for c in self._obstacles]
 
-    def objects(self) -> list[MovingObject]:
-        """Return the confirmed objects; those from the best starting clusters come first."""
+    def tracks(self) -> list[Track]:
+        """Return the confirmed tracks; tracks from the best starting clusters come first."""
         untried = self._all_points()
         for n, cluster in find_starts([batch.obstacles for batch in self.batches], self.clock):
             batch = self.batches[n]
@@ -124,7 +124,7 @@ class _Search:
                 untried[j][rows] = False
             if verdict.moves:
                 self._keep(track)
-        return self._objects
+        return [track for track, _ in self._objects]
 
     def _keep(self, track: Track) -> None:
         """Keep a confirmed track, with all points that its motion explains."""
