@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from densify.dataset.make import make_dataset as make_dataset
     from densify.dataset.plan import Gate as Gate
     from densify.dataset.plan import Recipe as Recipe
-    from densify.flow.pairs.estimate import estimate_flow as estimate_flow
+    from densify.flow.two_clouds import estimate_flow as estimate_flow
     from densify.geometry.types import Camera as Camera
     from densify.geometry.types import Cloud as Cloud
     from densify.geometry.types import DepthMap as DepthMap
@@ -47,7 +47,7 @@ _HOME = {
     "open_sequence": "densify.readers",
     "run": "densify.pipeline.run",
     "compare": "densify.pipeline.run",
-    "estimate_flow": "densify.flow.pairs.estimate",
+    "estimate_flow": "densify.flow.two_clouds",
     "make_dataset": "densify.dataset.make",
     "Recipe": "densify.dataset.plan",
     "outlier_probability": "densify.scores.depth_metrics",

@@ -69,16 +69,6 @@ def test_candidates_are_few_and_moving_objects_are_among_them(scene, stretch, ob
         assert mine.sum() > 100 and c.candidate[mine].mean() > 0.8
 
 
-def test_moving_objects_are_seen_through_and_walls_are_not(scene, stretch, space):
-    i, j = stretch.frames.index(KEY), stretch.frames.index(KEY + 4)
-    scan, registered = scene.scan(KEY), stretch[KEY]
-    points = poses.transform(registered.T_world_lidar, registered.sweep.points)
-    free = space.seen_through(points, j)
-    assert free[scan.instance == FAST].mean() > 0.5
-    assert free[(scan.instance < 0) & (scan.box >= 0)].mean() < 1e-3
-    assert not space.seen_through(points, i).any()
-
-
 def test_strips_find_what_a_mask_finds():
     rng = np.random.default_rng(3)
     points = rng.uniform(-5, 5, (1000, 3))

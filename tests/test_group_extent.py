@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 
 from densify.flow.tracking.candidates import Strips
-from densify.flow.tracking.extent import (
-    SweepPoints,
-    columns_apart_m,
-    find_shape,
-    leave_out_isolated,
-)
-from densify.flow.tracking.objects import MovingObject, Observation, Shape, Track
-from densify.geometry import poses
+from densify.flow.tracking.extent import find_shape
+from densify.flow.tracking.objects import Observation, Track
 from densify.geometry.clock import Clock
 from tests.found_motion import KEY, NOISE, Found
 from tests.scenes import Arc, Box, Scene, World, car, street
@@ -81,55 +75,6 @@ def test_the_wall_behind_a_walker_is_no_part_of_the_shape():
     space = SimpleNamespace(gap_m=lambda *_: 0.05, clock=clock)
     shape = find_shape(track, obstacles, space)
     assert len(shape.points) > 0.9 * 9 * 120 and shape.points[:, 1].max() < 0.3
-
-
-def test_columns_of_rays_lie_the_farther_apart_the_more_a_side_falls_away():
-    """Seen along a wall 3 m aside, from a lidar that has turned and moved."""
-    step_rad, to_right = np.deg2rad(0.2), np.array([3.0, 0.0, 1.0])
-    azimuth = np.arctan2(3.0, 50.0) + np.arange(-40, 41) * step_rad
-    meets_m = 3.0 / np.tan(azimuth)
-    models = {0: SimpleNamespace(azimuth_step_rad=step_rad)}
-    T_lidar_world = poses.exp(np.array([0, 0, 0.7, 0, 0, 0])) @ poses.exp(
-        np.append(np.zeros(3), -to_right)
-    )
-    apart_m = columns_apart_m(
-        np.array([50.0, 3.0, 0.0]) + to_right,
-        np.array([1.0, 0.0]),
-        T_lidar_world,
-        SimpleNamespace(models=models),
-    )
-    assert apart_m == pytest.approx(-np.gradient(meets_m)[40], rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("speed_m_s", "left_out"), [(1.4, [False, True, True]), (5.0, [False] * 3)]
-)
-@pytest.mark.parametrize("height_m", [0.12, 0.3])
-def test_what_lies_off_all_of_an_object_in_its_sweep_is_left_out(speed_m_s, left_out, height_m):
-    """Within, off the rest, and two echoes one above the other, on a grid of rings 0.1 m apart. Of
-    what drives only on the road: a side that passes is seen in far apart columns."""
-    y, z = np.meshgrid(np.arange(6) * 0.03, np.arange(3) * 0.1)
-    body = np.stack([np.zeros(18), y.ravel(), z.ravel()], 1)
-    extra = np.array([[0.0, 0.1, 0.13], [0.0, 0.5, 0.1], [0.0, -0.4, 0.1]])
-    points = np.concatenate([body, extra, extra[2:] + [0, 0, 0.1]])
-    num = len(points)
-    heights_m = np.where(np.arange(num) < 18, 0.5, height_m).astype(np.float32)
-    gap_m = np.full(num, 0.1)
-    row = np.arange(num)
-    seen = SweepPoints(row, points, np.zeros(num), heights_m, gap_m, 3 * gap_m)
-    track = Track(np.zeros(3))
-    for i in range(3):
-        state = np.array([0.1 * speed_m_s * i, 0.0, 0.0, 0.0])
-        track.observations[i] = Observation(state, 0.1 * i, i * 100_000_000, (i,))
-        track.claimed[i] = row
-    track.smooth()
-    instance = np.zeros(num, np.int32)
-    leave_out_isolated(
-        instance, seen, 0, [MovingObject(track, Shape.of(body))], Clock(np.arange(3) * 100_000_000)
-    )
-    assert (instance[:18] == 0).all()
-    expected = [False, True, True] if height_m == 0.12 else left_out
-    assert (instance[18:21] < 0).tolist() == expected and instance[21] == instance[20]
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import torch
 from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
-from densify.flow.objective.energy import on_one_thread
+from densify.flow.energy import on_one_thread
 from densify.learning.clips import ClipMaker
 from densify.learning.network import (
     Model,

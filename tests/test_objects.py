@@ -8,8 +8,7 @@ import pytest
 
 from densify.flow.surface_matching import apply
 from densify.flow.tracking.groups import GroupMotion
-from densify.flow.tracking.objects import MovingObject, Observation, Shape, Track
-from densify.flow.tracking.paths import Path
+from densify.flow.tracking.objects import MovingObject, Observation, Path, Shape, Track
 from densify.free_space.ground import HeightMap
 from densify.geometry import poses
 from tests.scenes import SWEEP_S, Arc, Scanner, Scene, World, street

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from densify.config.errors import InputError
-from densify.flow.pairs.estimate import estimate_flow
+from densify.flow.two_clouds import estimate_flow
 
 MOVED = np.array([0.8, 0.1, 0.0])
 EVERYTHING = {"objective": {"static_prior": False}}

@@ -6,9 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.flow.pairs.estimate import estimate_flow
-from densify.flow.pairs.motions import RigidMotion, _ambiguous, judge
-from densify.flow.pairs.surface import PairCloud
+from densify.flow.pair_groups import PairCloud, RigidMotion, _ambiguous, judge
+from densify.flow.two_clouds import estimate_flow
 from densify.geometry import poses
 from tests.scenes import Arc, Scanner, Scene, World, car, street
 

@@ -12,7 +12,7 @@ import pytest
 from densify import open_sequence
 from densify.config import RegisterSettings
 from densify.config.errors import InputError
-from densify.flow.pairs.estimate import estimate_flow
+from densify.flow.two_clouds import estimate_flow
 from densify.geometry import poses
 from densify.readers.timeline import read_sweep
 from densify.registration.deskew import deskew

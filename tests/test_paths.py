@@ -6,9 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.flow.surface_matching import apply, undo
-from densify.flow.tracking.objects import Track
-from densify.flow.tracking.paths import Path
+from densify.flow.tracking.objects import Path
 
 STEP_S = 0.1
 NOISE_M = 0.03
@@ -132,18 +130,6 @@ def test_beyond_the_ends_it_goes_on_at_constant_velocity(soft):
             np.testing.assert_allclose(there, soft(end_s) + sign * beyond_s * velocity, atol=1e-9)
             np.testing.assert_allclose(soft.rate(end_s + sign * beyond_s), velocity)
     assert soft.rate(soft.end_s + 1)[0] > 3 and abs(soft.rate(soft.begin_s - 1)[0]) < 1
-
-
-def test_points_are_placed_each_at_its_time_and_brought_back():
-    rng, t = np.random.default_rng(4), times_of(15)
-    track = Track(rng.normal(size=3))
-    track.path = fitted(t, rng.normal(size=(15, 4)).cumsum(axis=0))
-    points, asked = rng.normal(size=(300, 3)), rng.uniform(t[0] - 0.5, t[-1] + 0.5, 300)
-    for when in (asked, 0.7):
-        state = track.path(when)
-        np.testing.assert_allclose(track.place(points, when), apply(state, points, track.centre))
-        np.testing.assert_allclose(track.undo(points, when), undo(state, points, track.centre))
-        np.testing.assert_allclose(track.undo(track.place(points, when), when), points)
 
 
 def test_rounding_of_the_last_knot_leaves_the_last_state_on_the_path():

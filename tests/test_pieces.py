@@ -8,8 +8,9 @@ from copy import copy
 from functools import cache
 
 import numpy as np
+import pytest
 
-from densify.flow.tracking.pieces import join_pieces
+from densify.flow.tracking.groups import join_pieces
 from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 from tests.found_motion import Found
@@ -70,31 +71,26 @@ def apart(hole_m: float) -> Callable[[np.ndarray], np.ndarray]:
     return lambda x: np.where(x < 0.5 - hole_m / 2, 0, np.where(x > 0.5 + hole_m / 2, 1, -1))
 
 
-def test_halves_that_touch_are_one() -> None:
-    assert len(set(numbers(halves, 0, 0))) == 1
+def inside(x: np.ndarray) -> np.ndarray:
+    return ((x > 1.0) & (x < 1.5)).astype(int)
 
 
-def test_a_piece_ahead_with_nothing_seen_between_is_part_of_it() -> None:
-    assert len(set(numbers(apart(1.0), 0, 0))) == 1
-
-
-def test_a_piece_that_is_followed_badly_is_joined_and_another_motion_is_not() -> None:
-    assert len(set(numbers(halves, 0, 0.5))) == 1
-    assert len(set(numbers(halves, 0, 4.0))) == 2
-
-
-def test_a_piece_inside_is_part_of_it_whatever_its_path() -> None:
-    def inside(x: np.ndarray) -> np.ndarray:
-        return ((x > 1.0) & (x < 1.5)).astype(int)
-
-    assert len(set(numbers(inside, 0, 4.0))) == 1
+@pytest.mark.parametrize(
+    ("part_of", "too_fast_m_s", "num_objects"),
+    [
+        (halves, 0, 1),
+        (apart(1.0), 0, 1),  # nothing was seen between
+        (halves, 0.5, 1),  # followed badly
+        (halves, 4.0, 2),  # another motion
+        (inside, 4.0, 1),  # whatever its path
+    ],
+)
+def test_pieces_that_touch_and_move_alike_are_one(part_of, too_fast_m_s, num_objects) -> None:
+    assert len(set(numbers(part_of, 0, too_fast_m_s))) == num_objects
 
 
 def test_the_number_is_that_of_the_largest_piece() -> None:
-    def unequal(x: np.ndarray) -> np.ndarray:
-        return (x < 0.2).astype(int)  # most points are on the rear, piece 1
-
-    assert numbers(unequal, 0, 0).tolist() == [1, 1]
+    assert numbers(lambda x: (x < 0.2).astype(int), 0, 0).tolist() == [1, 1]
 
 
 def test_cars_in_a_queue_stay_apart() -> None:

@@ -16,8 +16,7 @@ from densify.readers.street import Street
 from densify.readers.timeline import read_sweep
 from densify.registration.alignment import subsample
 from densify.registration.deskew import deskew
-from densify.registration.odometry import find_odometry, search_twist
-from densify.registration.surfaces import register_on_surfaces
+from densify.registration.odometry import find_odometry, register_on_surfaces, search_twist
 from densify.registration.trajectory import check_plausible, find_trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
 

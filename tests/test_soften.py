@@ -251,7 +251,7 @@ def test_a_solve_minimises_what_the_docstring_says(monkeypatch):
     dense = np.eye(n) + module._ALPHAS[3] * bending._laplacian.toarray()
     rows = {hop: slice(*bending._start[k : k + 2]) for k, hop in enumerate(bending._hops)}
     velocity = np.array([1 / 0.2, 1 / 0.1])
-    velocity *= np.sqrt(2 * module._STEADY / (velocity**2).sum())
+    velocity *= np.sqrt(2 / (velocity**2).sum())
     for pair in zip(np.arange(n)[rows[1, 2]], np.arange(n)[rows[1, 0]], strict=True):
         dense[np.ix_(pair, pair)] += np.outer(velocity, velocity)
     np.testing.assert_allclose(bending._flow, np.linalg.solve(dense, -pull), atol=1e-8)

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from densify.flow.tracking import likelihood
 from densify.flow.tracking.candidates import Obstacles, find_candidates
 from densify.flow.tracking.following import find_starts
 from densify.flow.tracking.likelihood import (
@@ -110,28 +109,6 @@ def test_what_is_confirmed(evidence, moves):
     violations, before, after, *rest = evidence
     found = Evidence(Violations(*violations), Places(*before), Places(*after), *rest)
     assert (found.log_odds(own_table()) > 0) == moves
-
-
-@pytest.mark.parametrize(("along_deg", "slender"), [(0, 7.4), (90, 1.0)])
-def test_only_what_moves_along_itself_is_slender(along_deg, slender, monkeypatch):
-    offset_m = np.linspace(-1.2, 1.2, 20)
-    way = np.array([np.cos(np.deg2rad(along_deg)), np.sin(np.deg2rad(along_deg)), 0])
-    track, obstacles = Track(np.zeros(3)), []
-    for n in range(5):
-        state = np.append(2.5 * n * way, 0)
-        track.observations[n] = Observation(state, 0.1 * n, n * PERIOD_NS, (n,))
-        track.claimed[n] = np.arange(20)
-        line = np.stack([offset_m, 0 * offset_m, 0 * offset_m], 1) + state[:3]
-        obstacles.append(SimpleNamespace(points=line, time_s=np.full(20, 0.1 * n)))
-    track.smooth()
-    monkeypatch.setattr(likelihood, "count_violations", lambda *_: Violations(25, 0, 100))
-    nowhere = Places(0, 0), Places(0, 0)
-    monkeypatch.setattr(likelihood, "find_places_left", lambda *_: nowhere)
-    found = []
-    space = SimpleNamespace(gap_m=lambda *_: 0.65)
-    judge(track, obstacles, space, [], lambda _, evidence: found.append(evidence))
-    assert found[0].slender == pytest.approx(slender, abs=0.05)
-    assert found[0].travelled == pytest.approx(10 / 0.325)
 
 
 def test_two_states_confirm_nothing():

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.flow.tracking.vote import DistanceField, Group, vote
+from densify.flow.tracking.following import DistanceField, Group, vote
 from densify.geometry.clock import Clock
 from densify.geometry.types import Float
 

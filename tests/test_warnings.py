@@ -20,7 +20,7 @@ from densify.pipeline.recording import Recording
 from densify.pipeline.run import run
 from densify.pipeline.warnings import of_result
 from densify.readers.timeline import choose_cameras
-from densify.registration.compensation import find_compensated
+from densify.registration.deskew import find_compensated
 from tests.command import exit_code
 from tests.dataset_scenes import FRAMES, OPTIONS, copy_drive, records
 from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, stamp_ns, street

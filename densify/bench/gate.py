@@ -25,7 +25,7 @@ from densify.config.errors import InputError
 from densify.depth.exposure import key_shots, load_images
 from densify.depth.moving_bodies import far_inside
 from densify.depth.views import HeldOut
-from densify.flow.pairs.estimate import estimate_flow
+from densify.flow.two_clouds import estimate_flow
 from densify.geometry import poses
 from densify.geometry.types import (
     Bool,

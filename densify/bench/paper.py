@@ -25,8 +25,8 @@ import numpy as np
 
 from densify.config import Config, resolve
 from densify.config.errors import InputError
-from densify.flow.objective.solvers import SolverSettings, solve
-from densify.flow.pairs.estimate import estimate_flow
+from densify.flow.objective import SolverSettings, solve
+from densify.flow.two_clouds import estimate_flow
 from densify.geometry.types import Bool, Float, Int, Progress
 from densify.learning.clips import make_clip
 from densify.learning.network import AboveGround, Sweeps, read_model

@@ -120,8 +120,8 @@ ENGINES = Table(
     ("estimate_motion",),
     (
         Plugin("groups", "densify.flow.tracking.groups", shared=True),
-        Plugin("pairs", "densify.flow.pairs.estimate"),
-        Plugin("paper", "densify.flow.objective.engine"),
+        Plugin("pairs", "densify.flow.two_clouds"),
+        Plugin("paper", "densify.flow.objective"),
         Plugin("network", "densify.learning.engine", argument="MODEL"),
         Plugin("npz", "densify.readers.flow_files", argument="DIR"),
     ),

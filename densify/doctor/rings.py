@@ -12,7 +12,7 @@ from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, f
 from densify.doctor.sample import Sample
 from densify.geometry import poses
 from densify.geometry.types import Float
-from densify.registration.compensation import (
+from densify.registration.deskew import (
     CLEARLY,
     COMPENSATED_M,
     LEAST_SHARPNESS,

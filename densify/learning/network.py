@@ -29,7 +29,7 @@ from torch.nn import functional
 
 from densify.config.errors import InputError
 from densify.config.file_content import parse_json
-from densify.flow.objective.energy import on_one_thread
+from densify.flow.energy import on_one_thread
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.geometry import poses
 from densify.geometry.types import Float, Float32, Int, RegisteredSweep

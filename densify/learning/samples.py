@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from densify.flow.objective.energy import energy
-from densify.flow.objective.graph import knn_graph, laplacian
+from densify.flow.energy import energy
+from densify.flow.objective import knn_graph, laplacian
 from densify.geometry.types import Float32
 from densify.learning.clips import Clip, ClipMaker
 from densify.learning.network import REACH_M, NetworkCloud, Sweeps, order_for

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from densify.config.errors import ComputationError, InputError
-from densify.flow.objective.energy import on_one_thread
+from densify.flow.energy import on_one_thread
 from densify.geometry.types import Progress
 from densify.learning.clips import ClipMaker
 from densify.learning.network import NUM_SWEEPS, Model, build, write_model

@@ -23,7 +23,7 @@ from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Bool, Cloud, DepthMap, Float32, Result, Stretch
 from densify.pipeline.costs import Watch
 from densify.pipeline.recording import Beyond, Moment
-from densify.registration.compensation import find_compensated
+from densify.registration.deskew import find_compensated
 from densify.scores import depth_metrics
 from densify.scores.cloud_scores import ghost_scores
 

@@ -17,7 +17,7 @@ from densify.geometry.types import LidarSequence, Result, Stretch, Sweep
 from densify.pipeline.key_result import METHODS, looks_around
 from densify.pipeline.recording import Recording
 from densify.readers.timeline import format_frames
-from densify.registration.compensation import find_compensated
+from densify.registration.deskew import find_compensated
 from densify.registration.trajectory import find_trajectory
 from densify.scores.depth_metrics import image_density
 from densify.scores.recorded_error import RecordedError, main_error

@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Deskew sweeps: move every point to its position at the sweep's reference time."""
+"""Remove the lidar's motion within a sweep, and detect sweeps that are compensated already.
+
+Rings are cones about the spin axis only as seen from the scanner's position at each firing.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from densify.geometry import poses
-from densify.geometry.types import Float, RegisteredSweep, Stretch, Sweep, Trajectory
+from densify.geometry.types import Float, Int, RegisteredSweep, Stretch, Sweep, Trajectory
 
 
 def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
@@ -61,3 +65,125 @@ def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
         return poses.twist_between(T[i], T[j], seconds)
 
     return toward(i - 1 if i > 0 else 1), toward(i + 1 if i < last else i - 1)
+
+
+LEAST_SHARPNESS = 4.0  # of a scanner with distinct rings
+CLEARLY = 1.25  # least ratio of two sharpnesses that counts as a difference
+LEAST_SPEED_M_S = 1.5  # slower motion does not smear the rings
+COMPENSATED_M = 25.0  # range within which motion during the sweep is visible
+# The HDL-64E of KITTI has two separate blocks of lasers; its rings are sharpest from 0.2 m above.
+_HEIGHTS_M = np.linspace(-0.3, 0.3, 13)
+_NEAR_M = 3.0
+_NUM_POINTS = 20_000
+_WINDOW_CELLS, _LEAST_SHARE = 100, 0.01
+_BIN_RAD = np.deg2rad(0.02)
+
+
+class Rings(NamedTuple):
+    """The sharpness of a sweep's rings under three assumptions, see `sharpness`."""
+
+    as_stored: float  # sharpness of the points as they are
+    undone: float  # sharpness after undoing a motion compensation to ``moment``
+    done: float  # sharpness after compensating the motion
+    moment: str  # time within the sweep, in words
+
+    @property
+    def are_distinct(self) -> bool:
+        """True if the rings are sharp enough for a conclusion."""
+        return max(self.as_stored, self.undone) >= LEAST_SHARPNESS
+
+    @property
+    def are_compensated(self) -> bool:
+        """True if the motion within the sweep is compensated already."""
+        return self.are_distinct and self.undone > CLEARLY * self.as_stored
+
+
+def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
+    """Return how sharply points are concentrated in rings, as seen from an origin; 1 if not at all.
+
+    It is the chance that two returns of a window of elevation share a cell of ``bins`` times 0.02
+    degrees, relative to an even spread. The median over the windows keeps flat ground, which all
+    falls into one window, from dominating. Points (N,3) and ``origin_m`` (3,), the assumed position
+    of the scanner, are in axes with z along the spin axis.
+    """
+    x, y, z = (points - origin_m).T
+    elevation = np.arctan2(z, np.hypot(x, y))
+    cell = ((elevation + 0.5 * np.pi) / (bins * _BIN_RAD)).astype(np.int64)
+    width = max(8, _WINDOW_CELLS // bins)
+    windows = -(-int(np.pi / (bins * _BIN_RAD) + 1) // width)
+    count = np.bincount(cell, minlength=windows * width).astype(np.float64).reshape(windows, width)
+    total = count.sum(axis=1)
+    dense = total > _LEAST_SHARE * len(points)
+    if not dense.any():
+        return 1.0
+    return float(np.median((count[dense] ** 2).sum(axis=1) / total[dense] ** 2) * width)
+
+
+def rings_by_motion(
+    points: Float, offset_s: Float, twist: Float, R: Float, origins_m: Sequence[Float]
+) -> Rings:
+    """Return the sharpness of a sweep's rings, as stored and with the motion undone or compensated.
+
+    Args:
+        points: (N,3) metres, lidar frame, as stored.
+        offset_s: (N,) firing times since the stamp.
+        twist: (6,) velocity of the lidar (rad/s, m/s), lidar frame.
+        R: (3,3) rotation from the lidar axes to the scanner's axes.
+        origins_m: Positions (3,) of the scanner to try, in its axes; the sharpest counts.
+    """
+
+    def sharpest(moved: Float) -> float:
+        return max(sharpness(moved @ R.T, origin_m) for origin_m in origins_m)
+
+    def carried(since_s: Float) -> Float:
+        return poses.transform_each(since_s[:, None] * twist, points)
+
+    # The time to which the points were compensated is unknown.
+    moments_s = {
+        "its stamp": 0.0,
+        "its first point": float(offset_s.min()),
+        "its last point": float(offset_s.max()),
+    }
+    undone_to = {name: sharpest(carried(at_s - offset_s)) for name, at_s in moments_s.items()}
+    moment = max(undone_to, key=lambda name: undone_to[name])
+    return Rings(sharpest(points), undone_to[moment], sharpest(carried(offset_s)), moment)
+
+
+def sample_rows(sweep: Sweep, far_m: float) -> Int:
+    """Return the rows of at most 20,000 returns of a sweep between 3 m and ``far_m`` away."""
+    range_m = np.linalg.norm(sweep.points, axis=1)
+    rows = np.flatnonzero((range_m > _NEAR_M) & (range_m < far_m))
+    return rows[:: len(rows) // _NUM_POINTS + 1]
+
+
+def turning_s(points: Float, period_s: float) -> Float:
+    """Return (N,) firing times since the stamp, from the azimuth of points (N,3), lidar frame.
+
+    The scanner is assumed to turn clockwise in ``period_s`` and to face forward at the stamp.
+    """
+    turn: Float = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
+    return turn * period_s
+
+
+def find_compensated(sweep: Sweep, twist: Float, period_s: float) -> Rings | None:
+    """Return the rings of a raw sweep that is compensated for motion already, else None.
+
+    ``twist`` (6,) is the lidar's velocity (rad/s, m/s), lidar frame. ``period_s`` is the time of
+    one revolution, used for sweeps without point times.
+    """
+    if np.linalg.norm(twist[3:]) < LEAST_SPEED_M_S:
+        return None
+    for lidar in np.unique(sweep.lidar).tolist():
+        returns = sweep.select(sweep.lidar == lidar)
+        rows, R = sample_rows(returns, COMPENSATED_M), returns.axes(lidar)
+        if not len(rows):
+            continue
+        if returns.offset_ns is None:
+            offset_s = turning_s(returns.points[rows], period_s)
+        else:
+            offset_s = np.asarray(returns.offset_ns[rows] * 1e-9, np.float64)
+        origins_m = [R @ returns.origin_m(lidar) + [0.0, 0.0, height_m] for height_m in _HEIGHTS_M]
+        rings = rings_by_motion(returns.points[rows], offset_s, twist, R, origins_m)
+        if rings.are_compensated:
+            return rings
+    return None

@@ -18,8 +18,13 @@ from densify.geometry import poses
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
 from densify.registration.alignment import MANY_POINTS
-from densify.registration.odometry import MAX_SPEED_M_S, above_ground, find_odometry
-from densify.registration.surfaces import register_on_surfaces
+from densify.registration.odometry import (
+    FRESH_NS,
+    MAX_SPEED_M_S,
+    above_ground,
+    find_odometry,
+    register_on_surfaces,
+)
 
 MIN_OVERLAP = 0.55
 """Least share of a sweep's points above the ground that overlap the sweeps of the third of a second
@@ -30,7 +35,6 @@ _POSE_NOISE_M = 0.5
 _MAX_TURN_RATE_DEG_S = 150.0
 _OVERLAP_POINTS = 2000
 _OVERLAP_M = 0.5
-_OVERLAP_NS = 350_000_000  # time in which a pattern that does not repeat fills its field of view
 
 
 class LeftOut(NamedTuple):
@@ -160,10 +164,10 @@ def check_overlap(
     above = [above_ground(p) for p in points]
     trees = [tree_of(p) for p in above]
     for i in range(1, len(points)):
-        first = min(int(np.searchsorted(stamp_ns, stamp_ns[i] - _OVERLAP_NS)), i - 1)
+        first = min(int(np.searchsorted(stamp_ns, stamp_ns[i] - FRESH_NS)), i - 1)
         share = _share_on(above[i], trees[first:i])
-        if share < MIN_OVERLAP and stamp_ns[i] - stamp_ns[0] < _OVERLAP_NS:
-            end = int(np.searchsorted(stamp_ns, stamp_ns[i] + _OVERLAP_NS))
+        if share < MIN_OVERLAP and stamp_ns[i] - stamp_ns[0] < FRESH_NS:
+            end = int(np.searchsorted(stamp_ns, stamp_ns[i] + FRESH_NS))
             trees_around = trees[first:i] + trees[i + 1 : end]
             both_ways = _share_on(above[i], trees_around), _share_on(above[i - 1], trees[i:end])
             share = max(share, min(both_ways))

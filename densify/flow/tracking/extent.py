@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.flow.tracking.candidates import LINK_M, Obstacles, Strips, firing_times_s
+from densify.flow.tracking.following import MISSED_S
 from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track, near_m
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.seen_through import FreeSpace
@@ -18,22 +19,20 @@ from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.linking import close_to_seeds
-from densify.geometry.nearest import is_near, nearest, nearest_k, tree_of
+from densify.geometry.nearest import is_near, nearest, tree_of
 from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 
 Instance = NDArray[np.int32]
 
 _REACH = 1.5  # of candidates to an object, in neighbour distances (`near_m`)
-_LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M, _AS_LOW_AS_ROAD_M = 0.08, 0.1, 0.15
+_LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M = 0.08, 0.1
 _WALKS_M_S = 2.0
 _LEAST_SEEDS, _WALKER_M = 0.1, 1.5
 _WIDER_M, _MOSTLY = 0.5, 0.5  # least share of moving points within this distance
-_ALONE_GAPS, _NUM_BESIDE = 2.0, 2
 NUM_COLUMNS = 2.0
 """Columns of rays that may be missing along a side that recedes from the scanner."""
 _LONGEST_HOLE_M = 2.0
 _MAX_VIOLATIONS = 0.05
-_PREDICTED_S = 0.2  # an object is known so long before the first and after the last observation
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
     this cut applies only if the rest is shorter than 1.5 m.
     """
     sweeps = sorted(track.claimed)
-    clouds = {j: track.points_in(obstacles, [j]) for j in sweeps}
+    clouds = {j: track.in_object(obstacles[j], track.claimed[j]) for j in sweeps}
     points = np.concatenate(list(clouds.values()))
     if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
         return Shape.of(points)
@@ -149,7 +148,6 @@ def assign_points(
     attached = np.split(joined, np.cumsum([len(of_point) for of_point in attached])[:-1])
     instances = []
     for i, points, of_point in zip(batch, clouds, attached, strict=True):
-        leave_out_isolated(of_point, points, i, objects, space.clock)
         instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
         instance[points.row] = of_point
         instances.append(instance)
@@ -183,25 +181,6 @@ def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Cl
         instance[rows[closer]] = k
         least_m[rows[closer]] = distance_m[closer]
     return instance
-
-
-def leave_out_isolated(
-    instance: Instance, seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock
-) -> None:
-    """Set ``instance`` (N,) to -1 at isolated points that are low or belong to a slow object.
-
-    They are echoes merged with the echoes of a wall, or the road behind an edge.
-    """
-    low = seen.height_m < _AS_LOW_AS_ROAD_M
-    for k in np.unique(instance[instance >= 0]):
-        members = np.flatnonzero(instance == k)
-        doubtful = members
-        if _speed_m_s(objects[k].track, i, clock) > _WALKS_M_S:
-            doubtful = members[low[members]]
-        if len(members) <= _NUM_BESIDE or not len(doubtful):
-            continue
-        away_m, _ = nearest_k(tree_of(seen.points[members]), seen.points[doubtful], 1 + _NUM_BESIDE)
-        instance[doubtful[away_m[:, -1] > _ALONE_GAPS * seen.gap_m[doubtful]]] = -1
 
 
 def lengthen(
@@ -289,7 +268,7 @@ def _is_free_of_violations(
 def is_known_at(track: Track, i: int, clock: Clock) -> bool:
     """Return True if sweep i lies within the track's sweeps or at most 0.2 s outside."""
     first, last = min(track.claimed), max(track.claimed)
-    return first <= i <= last or any(clock.near(i, end, _PREDICTED_S) for end in (first, last))
+    return first <= i <= last or any(clock.near(i, end, MISSED_S) for end in (first, last))
 
 
 def _speed_m_s(track: Track, i: int, clock: Clock) -> float:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Track one cluster of candidates as a rigid object from batch to batch, both ways in time.
 
-Candidates are aligned with the object so far, from the pose of constant speed and turn rate.
+A track starts at the velocity that the sweeps before and after it vote for. Candidates are aligned
+with the object so far, from the pose of constant speed and turn rate.
 """
 
 from __future__ import annotations
@@ -10,18 +11,193 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
-from densify.flow.tracking.candidates import MIN_SEED_SHARE, Batch, Obstacles
+from densify.flow.tracking.candidates import LINK_M, MIN_SEED_SHARE, Batch, Obstacles
 from densify.flow.tracking.objects import BESIDE_M, MovingObject, Track
 from densify.free_space.ground import HeightMap
+from densify.geometry.arrays import bulk
 from densify.geometry.clock import Clock
-from densify.geometry.nearest import is_near, tree_of
+from densify.geometry.compiled import Kernel
+from densify.geometry.nearest import is_near, nearest, tree_of
 from densify.geometry.types import Bool, Float, Int
 
+Bytes = NDArray[np.uint8]
+
+MAX_SPEED_M_S = 38.0
+_NEAR_S, _AROUND_S = 0.1, 0.5  # times to the nearest and the farthest batches that vote
+STEP_M = 0.2  # side of a voxel
+_MOST_VOXELS = 1 << 28  # of a sweep, a byte each: 250 m x 250 m x 34 m
+FEW_POINTS, _MANY_POINTS = 60, 600
+_FINE_M_S = 0.2  # velocity step of the last vote
+
+
+@dataclass(frozen=True)
+class DistanceField:
+    """A voxel grid of the distance to the nearest candidate of a sweep."""
+
+    nearness: Bytes  # (X,Y,Z) voxels of 0.2 m: 255 at a candidate, falling to 0 at 0.6 m from it
+    low: Float  # (3,) corner of the grid, world
+    tree: cKDTree | None  # search tree of the N candidates; None without candidates
+    time_s: Float  # (N,) firing times of the candidates
+
+    @staticmethod
+    def of(points: Float, time_s: Float) -> DistanceField:
+        """Build the field of N candidates from points (N,3, world) and firing times (N,)."""
+        if not len(points):
+            return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3), None, time_s)
+        inside = points[bulk(points, STEP_M, _MOST_VOXELS)]
+        low = inside.min(0) - 2 * LINK_M
+        shape = tuple(np.ceil((inside.max(0) + 2 * LINK_M - low) / STEP_M).astype(int) + 1)
+        nearness = np.zeros(shape, np.uint8)
+        n = int(np.ceil(LINK_M / STEP_M))
+        span = np.arange(-n, n + 1)
+        offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), -1).reshape(-1, 3)
+        far = np.linalg.norm(offsets, axis=1) * STEP_M / LINK_M
+        values = (255 - np.round(255 * far[far < 1])).astype(np.uint8)
+        _spread(inside, low, STEP_M, offsets[far < 1], values, nearness)
+        return DistanceField(nearness, low, tree_of(points), time_s)
+
+    def raise_to(self, nearness: Bytes, group: Group, velocities: Float) -> None:
+        """Raise ``nearness`` (V,N) to the nearness of the moved group to this sweep's candidates.
+
+        Each of N points moves at each of the (V,3) velocities (m/s, world) to the time at which
+        this sweep would measure the group. Nearness is 0 to 255.
+        """
+        if self.tree is None:
+            return
+        _, row = nearest(self.tree, group.middle[None])  # the firing time depends on the position
+        moved = group.middle + (self.time_s[row] - group.middle_s) * velocities
+        _, row = nearest(self.tree, moved)
+        elapsed_s = self.time_s[row] - group.middle_s
+        _look_up.over_rows(
+            len(velocities),
+            group.points,
+            group.late_s,
+            velocities,
+            elapsed_s,
+            self.low,
+            1 / STEP_M,
+            self.nearness,
+            nearness,
+        )
+
+
+@dataclass(frozen=True)
+class Group:
+    """The N points of a cluster in one batch (consecutive sweeps within 0.1 s)."""
+
+    points: Float  # (N,3) world
+    late_s: Float  # (N,) firing times relative to ``middle_s``
+    middle_s: float  # mean firing time of the points
+    middle: Float  # (3,) mean of the points
+
+    @staticmethod
+    def of(points: Float, time_s: Float) -> Group:
+        """Build the group from points (N,3, world) and their firing times (N,) in seconds."""
+        middle_s = float(time_s.mean())
+        return Group(points, time_s - middle_s, middle_s, points.mean(axis=0))
+
+    def thinned(self, max_points: int) -> Group:
+        """Return the group with at most ``max_points`` points, evenly chosen."""
+        step = len(self.points) // max_points + 1
+        points, late_s = (np.ascontiguousarray(a[::step]) for a in (self.points, self.late_s))
+        return Group(points, late_s, self.middle_s, self.middle)
+
+
+def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
+    """Return the horizontal velocity (3,) of a cluster, m/s, that the neighbouring sweeps support.
+
+    At this velocity the group of batch n comes nearest to candidates of other batches. First the
+    batches about 0.1 and 0.2 s before and after are compared, in coarse steps of velocity. A flat
+    side shows its speed only at its ends, which move by less than a voxel in this short time.
+    Therefore batches up to 0.5 s away are compared too, in fine steps. ``fields`` holds, for each
+    batch, the distance fields of its sweeps.
+    """
+    near_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
+    coarse_m_s = 2 * STEP_M / near_s
+    near_fields = [fields[m] for m in _batches_around(n, near_s, clock)]
+    all_fields = near_fields + [
+        fields[m] for m in _batches_around(n, max(_AROUND_S / 2, near_s), clock)
+    ]
+    rough_m_s = _best(
+        group.thinned(FEW_POINTS), near_fields, _grid(int(MAX_SPEED_M_S / coarse_m_s)) * coarse_m_s
+    )
+    group = group.thinned(_MANY_POINTS)
+    finer_m_s = _best(group, near_fields, rough_m_s + _grid(6) * coarse_m_s / 3)
+    num = max(1, round(coarse_m_s / 3 / _FINE_M_S))
+    return _best(group, all_fields, finer_m_s + _grid(num) * coarse_m_s / 3 / num)
+
+
+def _batches_around(n: int, step_s: float, clock: Clock) -> list[int]:
+    """Return the existing batches one and two steps of ``step_s`` before and after batch n."""
+    asked = [clock.at(n, later_s) for later_s in (-2 * step_s, -step_s, step_s, 2 * step_s)]
+    return sorted({m for m in asked if m is not None})
+
+
+def _best(group: Group, around: Sequence[Sequence[DistanceField]], velocities: Float) -> Float:
+    """Return the velocity (3,) among (V,3) that brings the group nearest to candidates."""
+    cost = np.zeros(len(velocities))
+    for batch in around:
+        nearness = np.zeros((len(velocities), len(group.points)), np.uint8)
+        for field in batch:
+            field.raise_to(nearness, group, velocities)
+        cost += 1 - nearness.mean(axis=1) / 255
+    return np.asarray(velocities[np.argmin(cost + 1e-3 * np.linalg.norm(velocities, axis=1))])
+
+
+def _grid(n: int) -> Float:
+    """Return all (V,3) horizontal steps with whole x and y from -n to n."""
+    span = np.arange(-n, n + 1.0)
+    x, y = np.meshgrid(span, span, indexing="ij")
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
+
+
+@Kernel
+def _spread(
+    points: Float, low: Float, step: float, offsets: Int, values: Bytes, grid: Bytes
+) -> None:
+    """Raise the cells of ``grid`` at ``offsets`` (K,3) from points (N,3) to ``values`` (K,)."""
+    for i in range(len(points)):
+        x, y, z = (
+            int((points[i, 0] - low[0]) / step),
+            int((points[i, 1] - low[1]) / step),
+            int((points[i, 2] - low[2]) / step),
+        )
+        for k in range(len(offsets)):
+            at = x + offsets[k, 0], y + offsets[k, 1], z + offsets[k, 2]
+            grid[at] = max(grid[at], values[k])
+
+
+@Kernel
+def _look_up(
+    first: int,
+    last: int,
+    points: Float,
+    late_s: Float,
+    velocities: Float,
+    elapsed_s: Float,
+    low: Float,
+    cells_per_m: float,
+    grid: Bytes,
+    nearness: Bytes,
+) -> None:
+    """Raise ``nearness`` (V,N), in place, to the grid's at N points moved at V velocities."""
+    num_x, num_y, num_z = grid.shape
+    for v in range(first, last):
+        for i in range(len(points)):
+            moving_s = elapsed_s[v] - late_s[i]
+            x = int((points[i, 0] + velocities[v, 0] * moving_s - low[0]) * cells_per_m)
+            y = int((points[i, 1] + velocities[v, 1] * moving_s - low[1]) * cells_per_m)
+            z = int((points[i, 2] + velocities[v, 2] * moving_s - low[2]) * cells_per_m)
+            if 0 <= x < num_x and 0 <= y < num_y and 0 <= z < num_z:
+                nearness[v, i] = max(nearness[v, i], grid[x, y, z])
+
+
 MIN_POINTS = 8  # to start a track
-_AROUND_S = 0.5  # farther than this from both ends of the recording, starts are equally good
-_NEARER_END, _NEARER_END_S = 0.7, 0.1  # closer to an end, a start is worth 0.7 per 0.1 s
+_NEARER_END = 0.7  # nearer than `_AROUND_S` to an end, a start is worth this share per 0.1 s
 FIT_M = 0.3
 """Greatest distance of a point from the object that claims it."""
 _SHARE_UNSEEN = 0.5  # least share of the object's usual number of points
@@ -30,7 +206,7 @@ PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
 _RECENT_S = 0.4  # age of the states that the rate is fitted to
 _GIVEN_S2 = 0.02  # the given velocity weighs as much as states with this sum of squared times
 _TURNS_ON = 0.9  # share of the turn rate that is predicted: turns level out
-_MISSES_ALLOWED, _MISSED_S = 1, 0.2  # a track ends when both are exceeded
+_MISSES_ALLOWED, MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
@@ -44,7 +220,7 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
     def worth(start: tuple[int, Int]) -> float:
         n, members = start
         nearer_s = max(0.0, _AROUND_S - clock.from_end_s(n))
-        return float(len(members) * _NEARER_END ** (nearer_s / _NEARER_END_S))
+        return float(len(members) * _NEARER_END ** (nearer_s / _NEAR_S))
 
     for n, c in enumerate(batches):
         size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
@@ -96,7 +272,7 @@ class Follower:
         for direction in (1, -1):
             last, n = start, start + direction
             while 0 <= n < len(self.batches) and (
-                abs(n - last) <= 1 + _MISSES_ALLOWED or self.clock.near(n, last, _MISSED_S)
+                abs(n - last) <= 1 + _MISSES_ALLOWED or self.clock.near(n, last, MISSED_S)
             ):
                 alignment = self._find(model, track, rate, n)
                 if alignment is not None:
@@ -112,22 +288,22 @@ class Follower:
     ) -> tuple[Float, float, Int, Float] | None:
         """Align the candidates of batch n with the object so far; None if too few points fit."""
         batch, num_recent = self.batches[n], self.clock.num_in(_RECENT_S)
-        c, centre = batch.obstacles, track.centre
+        obstacles, centre = batch.obstacles, track.centre
         rough_state, rough_rate, _ = _predict(track, rate, num_recent, track.seen_at(batch.time_ns))
         expected = apply(rough_state, model.points, centre)
         slack_m = GATES_M[0] + batch.half_s * np.abs(rough_rate[:3])
-        inside = c.strips.rows_inside(expected.min(0) - slack_m, expected.max(0) + slack_m)
+        inside = obstacles.strips.rows_inside(expected.min(0) - slack_m, expected.max(0) + slack_m)
         inside = inside[batch.gather(self.free)[inside]]
-        rows, min_num_rows = inside[c.cluster[inside] >= 0], float(MIN_FIT)
+        rows, min_num_rows = inside[obstacles.cluster[inside] >= 0], float(MIN_FIT)
         if len(rows) < MIN_FIT:  # no sweep saw through the object, but it may be there
             usual_num = float(np.median([track.num_points(m) for m in track.observations]))
             rows, min_num_rows = inside, max(MIN_FIT, _SHARE_UNSEEN * usual_num)
         if len(rows) < min_num_rows:
             return None
-        seen_s = float(c.time_s[rows].mean())
+        seen_s = float(obstacles.time_s[rows].mean())
         predicted, rate, std = _predict(track, rate, num_recent, seen_s)
         predicted[2] = track.rise_m(self.ground, predicted)
-        target = _at_once(c, rows, rate, seen_s)
+        target = _at_once(obstacles, rows, rate, seen_s)
         state = model.align(target, centre, predicted, std)
         if state is None:
             return None
@@ -138,9 +314,10 @@ class Follower:
         return state, seen_s, rows[fit], target[fit]  # the (K,3) points at seen_s, world
 
 
-def _at_once(c: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
+def _at_once(obstacles: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
     """Return (N,3) obstacles ``rows`` moved to time ``time_s`` by the velocity ``rate[:3]``."""
-    return c.points[rows] + (time_s - c.time_s[rows])[:, None] * rate[:3]
+    late_s = time_s - obstacles.time_s[rows]
+    return obstacles.points[rows] + late_s[:, None] * rate[:3]
 
 
 def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float, Float, Float]:

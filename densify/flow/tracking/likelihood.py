@@ -217,16 +217,16 @@ def find_places_left(
 
 
 def _returns_near(
-    positions: Float, reach_m: float, c: Obstacles, objects: Sequence[MovingObject]
+    positions: Float, reach_m: float, obstacles: Obstacles, objects: Sequence[MovingObject]
 ) -> Float:
     """Return the (N,3) points within ``reach_m`` of positions (M,3), world, on no given object."""
-    rows = c.strips.rows_inside(positions.min(0) - reach_m, positions.max(0) + reach_m)
-    rows = rows[is_near(tree_of(positions), c.points[rows], reach_m)]
-    for moving_object in objects:
-        points, time_s = c.points[rows], c.time_s[rows]
-        if len(rows) and moving_object.may_be_near(points, time_s, LINK_M):
-            rows = rows[~moving_object.shape.near(moving_object.track.undo(points, time_s), LINK_M)]
-    return c.points[rows]
+    rows = obstacles.strips.rows_inside(positions.min(0) - reach_m, positions.max(0) + reach_m)
+    rows = rows[is_near(tree_of(positions), obstacles.points[rows], reach_m)]
+    for track, shape in objects:
+        points, time_s = obstacles.points[rows], obstacles.time_s[rows]
+        if len(rows) and MovingObject(track, shape).may_be_near(points, time_s, LINK_M):
+            rows = rows[~shape.near(track.undo(points, time_s), LINK_M)]
+    return obstacles.points[rows]
 
 
 @cache

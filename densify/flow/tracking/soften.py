@@ -17,8 +17,8 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
-from densify.flow.tracking.objects import LONG_M
-from densify.flow.tracking.paths import MIN_SPAN_S, MIN_STATES
+from densify.flow.tracking.following import FIT_M
+from densify.flow.tracking.objects import LONG_M, MIN_SPAN_S, MIN_STATES
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Float, Int
 
@@ -28,12 +28,10 @@ _BLURS_M = np.geomspace(0.2, 0.08, len(_ALPHAS))
 _NODE_M = 0.07  # one node per voxel, so that dense regions are not stiffer than sparse regions
 _NUM_NEIGHBORS, _LINK_M = 6, 0.5
 _NUM_BLURRED = 8
-_STEADY = 1.0  # weight of equal velocities before and after
 _ANCHOR, _ANCHOR_M = 2.0, 0.02  # weight of the rigid position, and distance at which it fades
 _MAX_PRODUCTS, _RESIDUAL_DROP = 30, 0.02
 _NUM_LOOKED_UP = 3
 _MIN_POINTS = 20
-_CAP_M = 0.3  # greatest distance that a stray point counts
 # On eight streets parts of vehicles gained up to 0.045 of the squared distance, walkers within
 # 20 m mostly 0.06 to 0.4.
 _MIN_GAIN, _MIN_SHARE_BETTER = 0.05, 0.75
@@ -146,8 +144,8 @@ def _held_out(snapshots: tuple[Snapshot, ...]) -> Float:
 
 def _squared_distance(a: Float, b: Float) -> float:
     """Return the mean squared, capped distance (m²) of nearest points, both ways."""
-    a_to_b_m = np.minimum(nearest(tree_of(b), a)[0], _CAP_M)
-    b_to_a_m = np.minimum(nearest(tree_of(a), b)[0], _CAP_M)
+    a_to_b_m = np.minimum(nearest(tree_of(b), a)[0], FIT_M)
+    b_to_a_m = np.minimum(nearest(tree_of(a), b)[0], FIT_M)
     return float((a_to_b_m**2).mean() + (b_to_a_m**2).mean()) / 2
 
 
@@ -238,7 +236,7 @@ class _Bending:
             rows = slice(self._start[k], self._start[k + 1])
             opposite[rows] = np.arange(self._start[opposite_hop], self._start[opposite_hop + 1])
             u, v = 1 / abs(times_s[b] - times_s[a]), 1 / abs(times_s[2 * a - b] - times_s[a])
-            scale = 2 * _STEADY / (u * u + v * v)  # a weight of 1 for equal times
+            scale = 2 / (u * u + v * v)  # a weight of 1 for equal times
             diagonal[rows], crossed[rows] = scale * u * u, scale * u * v
         row = np.arange(len(opposite))
         coupling = coo_array((crossed, (row, opposite)), shape=(len(row), len(row)))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -20,13 +21,15 @@ from densify.flow.tracking.following import (
     FIT_M,
     MIN_POINTS,
     PREDICTION_STD,
+    DistanceField,
     Follower,
+    Group,
     find_starts,
     velocities_beside,
+    vote,
 )
 from densify.flow.tracking.likelihood import NUM_ASKED, Judge, Verdict, judge
 from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track
-from densify.flow.tracking.vote import DistanceField, Group, vote
 from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
@@ -56,6 +59,22 @@ def find_tracks(
     tried, and its evidence.
     """
     return _Search(obstacles, space, ground, velocities_m_s, judged).tracks()
+
+
+class _Trial(NamedTuple):
+    """A track that was tried, and its verdict."""
+
+    track: Track
+    verdict: Verdict
+
+    @property
+    def leaves_much_unexplained(self) -> bool:
+        """True if a motion without violations would be clearly more likely."""
+        return self.verdict.is_clearly_below(self.verdict.at_most)
+
+    def or_better(self, other_trial: _Trial) -> _Trial:
+        """Return the other trial if it is clearly more likely, else this one."""
+        return other_trial if self.verdict.is_clearly_below(other_trial.verdict.log_odds) else self
 
 
 class _Search:
@@ -121,18 +140,16 @@ class _Search:
 
     def _velocity_of(self, members: Int, n: int) -> Float:
         """Return the likely velocity (3,), m/s, world, of ``members`` of batch n's obstacles."""
-        c = self.batches[n].obstacles
-        if self._velocities_m_s is None:
-            group = Group.of(c.points[members], c.time_s[members])
-            velocity = vote(group, n, self._fields, self.clock)
-        else:
-            velocity = np.median(self.batches[n].gather(self._velocities_m_s)[members], axis=0)
-        return velocity
+        batch = self.batches[n]
+        if self._velocities_m_s is not None:
+            return np.asarray(np.median(batch.gather(self._velocities_m_s)[members], axis=0))
+        group = Group.of(batch.obstacles.points[members], batch.obstacles.time_s[members])
+        return vote(group, n, self._fields, self.clock)
 
     def _may_move(self, members: Int, n: int, velocity: Float) -> bool:
         """Return True if other sweeps see less often through ``members`` once they are moved."""
-        c, rows = self.batches[n].obstacles, members[:: len(members) // NUM_ASKED + 1]
-        points, time_s = c.points[rows], c.time_s[rows]
+        obstacles, rows = self.batches[n].obstacles, members[:: len(members) // NUM_ASKED + 1]
+        points, time_s = obstacles.points[rows], obstacles.time_s[rows]
         velocity_m_s = np.repeat([velocity, np.zeros(3)], len(rows), axis=0)
         num_seen_through = np.zeros(2, np.int64)  # moved, static
         for m, batch in enumerate(self.batches):
@@ -145,40 +162,39 @@ class _Search:
         # without any evidence they may move
         return bool(num_seen_through[0] < num_seen_through[1] or not num_seen_through.any())
 
-    def _track_of(self, members: Int, n: int, velocities: Sequence[Float]) -> tuple[Track, Verdict]:
-        """Return the most likely track of ``members`` of batch n's obstacles, and its verdict."""
-        # best, restarted: a track and its verdict. Other velocities if violations remain.
+    def _track_of(self, members: Int, n: int, velocities: Sequence[Float]) -> _Trial:
+        """Return the most likely track of ``members`` of batch n's obstacles."""
         best = self._follow(members, n, velocities[0])
         for velocity in velocities[1:]:
-            if best[1].is_clearly_below(best[1].at_most):
-                best = _better(best, self._follow(members, n, velocity))
-        track, verdict = best
+            if best.leaves_much_unexplained:
+                best = best.or_better(self._follow(members, n, velocity))
+        if not (best.verdict.moves and best.leaves_much_unexplained):
+            return best
         # At its ends more may be in view than one side that slides along itself.
-        if verdict.moves and verdict.is_clearly_below(verdict.at_most):
-            for k in sorted({min(track.observations), max(track.observations)} - {n}):
-                rows = track.rows_in(self.batches[k])
-                if len(rows) >= MIN_POINTS:
-                    restarted = self._follow(rows, k, self._velocity_of(rows, k))
-                    if restarted[0].total_points() >= _AS_WHOLE * track.total_points():
-                        best = _better(best, restarted)
+        track = best.track
+        for end in sorted({min(track.observations), max(track.observations)} - {n}):
+            rows = track.rows_in(self.batches[end])
+            if len(rows) >= MIN_POINTS:
+                restarted = self._follow(rows, end, self._velocity_of(rows, end))
+                if restarted.track.total_points() >= _AS_WHOLE * track.total_points():
+                    best = best.or_better(restarted)
         return best
 
-    def _follow(self, members: Int, n: int, velocity: Float) -> tuple[Track, Verdict]:
+    def _follow(self, members: Int, n: int, velocity: Float) -> _Trial:
+        """Return the track of ``members`` of batch n's obstacles from a velocity (3,), m/s."""
         track = self._follower.follow(members, n, velocity)
         if len(track.observations) > 1:
             track.smooth()
-        return track, judge(track, self._obstacles, self._space, self._objects, self._judged)
+        verdict = judge(track, self._obstacles, self._space, self._objects, self._judged)
+        return _Trial(track, verdict)
 
     def _gather(self, track: Track) -> None:
         """Claim free candidates in or near the object that its motion explains, in place."""
         # Otherwise these points would start a track of their own.
         shape = self._shape_of(track)
         for j, claimed in track.claimed.items():
-            c = self._obstacles[j]
-            rim = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
-            rows = c.strips.rows_inside(rim.min(0) - LINK_M, rim.max(0) + LINK_M)
-            rows = self._unclaimed(j, rows, claimed)
-            rows = rows[shape.near(track.undo(c.points[rows], c.time_s[rows]), FIT_M)]
+            rows = self._unclaimed_around(track, shape, j, LINK_M)
+            rows = rows[shape.near(track.in_object(self._obstacles[j], rows), FIT_M)]
             track.claimed[j] = np.concatenate([claimed, self._without_violations(track, j, rows)])
 
     def _claim_in_line(self, track: Track) -> None:
@@ -188,67 +204,66 @@ class _Search:
         space, shape = self._space, self._shape_of(track)
         at_s = next(iter(track.observations.values())).seen_s
         lane = MovingObject(track, shape).lane(at_s)
-        rows_in_line, clouds = {}, [track.place(shape.points, at_s)]
-        for j, claimed in track.claimed.items():
-            c = self._obstacles[j]
-            rim = track.place(shape.rim, track.seen_at(space.clock.time_ns[j]))
-            rows = c.strips.rows_inside(rim.min(0) - LANE_M, rim.max(0) + LANE_M)
-            rows = self._unclaimed(j, rows, claimed)
-            rows = rows[_few_rays(c, rows, space.T_lidar_world[j], space.sensors)]
-            rows = rows[lane.holds(track.carry(c.points[rows], c.time_s[rows], at_s))]
+        # (N,3) points of the object, then those in line of each sweep, all at one time
+        rows_in_line, clouds = dict[int, Int](), [track.place(shape.points, at_s)]
+        for j in track.claimed:
+            obstacles, T_lidar_world = self._obstacles[j], space.T_lidar_world[j]
+            rows = self._unclaimed_around(track, shape, j, LANE_M)
+            rows = rows[_few_rays(obstacles, rows, T_lidar_world, space.sensors)]
+            rows = rows[lane.holds(track.place(track.in_object(obstacles, rows), at_s))]
             rows_in_line[j] = rows = self._without_violations(track, j, rows)
-            clouds.append(track.carry(c.points[rows], c.time_s[rows], at_s))
-        j = next(iter(track.claimed))
-        columns_m = columns_apart_m(track.centre, lane.ahead, space.T_lidar_world[j], space.sensors)
+            clouds.append(track.place(track.in_object(obstacles, rows), at_s))
+        T_lidar_world = space.T_lidar_world[next(iter(track.claimed))]
+        columns_m = columns_apart_m(track.centre, lane.ahead, T_lidar_world, space.sensors)
         gap_m = float(np.clip(NUM_COLUMNS * columns_m, *_GAPS_IN_LINE_M))
+        # Shortened along the heading, gaps up to ``gap_m`` are linked.
         points = np.concatenate(clouds)
         points[:, :2] -= (1 - LINK_M / gap_m) * (points[:, :2] @ lane.ahead)[:, None] * lane.ahead
         _, group = link(points, LINK_M)
-        linked = np.isin(group, group[: len(shape.points)])
+        is_linked = np.isin(group, group[: len(shape.points)])
         ends = np.cumsum([len(cloud) for cloud in clouds])
-        for (j, rows), kept in zip(rows_in_line.items(), np.split(linked, ends)[1:-1], strict=True):
-            track.claimed[j] = np.concatenate([track.claimed[j], rows[kept]])
+        in_sweeps = np.split(is_linked, ends)[1:-1]
+        for (j, rows), is_linked in zip(rows_in_line.items(), in_sweeps, strict=True):
+            track.claimed[j] = np.concatenate([track.claimed[j], rows[is_linked]])
 
-    def _unclaimed(self, j: int, rows: Int, claimed: Int) -> Int:
-        """Return the ``rows`` of sweep j's obstacles that are free candidates, not ``claimed``."""
-        rows = rows[self._free[j][rows] & (self._obstacles[j].cluster[rows] >= 0)]
-        return np.setdiff1d(rows, claimed, assume_unique=True)
+    def _unclaimed_around(self, track: Track, shape: Shape, j: int, around_m: float) -> Int:
+        """Return the rows of sweep j's obstacles, free candidates, in the box around the object."""
+        obstacles = self._obstacles[j]
+        rim = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
+        rows = obstacles.strips.rows_inside(rim.min(0) - around_m, rim.max(0) + around_m)
+        rows = rows[self._free[j][rows] & (obstacles.cluster[rows] >= 0)]
+        return np.setdiff1d(rows, track.claimed[j], assume_unique=True)
 
     def _without_violations(self, track: Track, j: int, rows: Int) -> Int:
         """Return those ``rows`` of sweep j that, moved with the track, are never seen through."""
-        c = self._obstacles[j]
         for i in self._space.others(j):
             if self._space.clock.near(i, j, _NEAR_S) and len(rows):
-                in_object = track.undo(c.points[rows], c.time_s[rows])
+                in_object = track.in_object(self._obstacles[j], rows)
                 rows = rows[~track.seen_through(in_object, i, self._space)]
         return rows
 
 
-def _better(best: tuple[Track, Verdict], trial: tuple[Track, Verdict]) -> tuple[Track, Verdict]:
-    """Return the found track and verdict if clearly more likely, else the known track."""
-    return trial if best[1].is_clearly_below(trial[1].log_odds) else best
-
-
-def _few_rays(c: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -> Bool:
-    """Return (N,) True for ``rows`` of ``c`` whose cluster is hit by a single ring or column."""
+def _few_rays(obstacles: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -> Bool:
+    """Return (N,) True for ``rows`` whose cluster is hit by a single ring or column."""
     if not len(rows):
         return np.zeros(0, bool)
-    clusters, of_row = np.unique(c.cluster[rows], return_inverse=True)
-    members = np.flatnonzero(np.isin(c.cluster, clusters))
-    label, in_lidar = c.cluster[members], poses.transform(T_lidar_world, c.points[members])
+    clusters, of_row = np.unique(obstacles.cluster[rows], return_inverse=True)
+    members = np.flatnonzero(np.isin(obstacles.cluster, clusters))
+    label = obstacles.cluster[members]
+    in_lidar = poses.transform(T_lidar_world, obstacles.points[members])
 
     def spread(values: Float) -> Float:
-        low, high = (f(values, label, clusters) for f in (ndimage.minimum, ndimage.maximum))
-        return np.asarray(high) - np.asarray(low)
+        lowest, highest = (f(values, label, clusters) for f in (ndimage.minimum, ndimage.maximum))
+        return np.asarray(highest) - np.asarray(lowest)
 
     range_m = np.linalg.norm(in_lidar, axis=1)
     ring_rad = ndimage.minimum(sensors.finest_gap_m(in_lidar) / range_m, label, clusters)
     column_rad = min(model.azimuth_step_rad for model in sensors.models.values())
     x, y = in_lidar[:, :2].mean(axis=0)
     azimuth_rad = np.arctan2(in_lidar[:, :2] @ [-y, x], in_lidar[:, :2] @ [x, y])
-    single = spread(np.arcsin(in_lidar[:, 2] / range_m)) < _ONE_RING * np.asarray(ring_rad)
-    single |= spread(azimuth_rad) < _ONE_COLUMN * column_rad
-    return np.asarray(single[of_row.ravel()])
+    is_single = spread(np.arcsin(in_lidar[:, 2] / range_m)) < _ONE_RING * np.asarray(ring_rad)
+    is_single |= spread(azimuth_rad) < _ONE_COLUMN * column_rad
+    return np.asarray(is_single[of_row.ravel()])
 
 
 def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> None:

@@ -1,24 +1,88 @@
 # SPDX-License-Identifier: MIT
-"""Solve the scene flow objective of Pontes, Hays, Lucey (3DV 2020) in two ways.
+"""Solve the scene flow objective of Pontes, Hays, Lucey (3DV 2020) between two clouds.
 
 ``adam`` is the published protocol. ``pcg`` alternates nearest neighbours with preconditioned
-conjugate gradients. It reaches the same or a lower energy in a fraction of the time.
+conjugate gradients. It reaches the same or a lower energy in a fraction of the time. The engine
+``paper`` solves the objective between neighbouring sweeps, above the ground.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import cKDTree
 
+from densify.config import Config, ObjectiveSettings
 from densify.config.errors import InputError
-from densify.flow.objective.graph import checked_cloud, knn_graph, laplacian
-from densify.geometry.types import Float
+from densify.flow.chained import ChainedMotion
+from densify.flow.engines import Scene
+from densify.flow.pair_groups import MIN_MOTION_M, PairCloud, RigidMotion, judge
+from densify.flow.tracking.candidates import LINK_M
+from densify.free_space.ground import ABOVE_GROUND_M
+from densify.geometry import poses
+from densify.geometry.linking import link
+from densify.geometry.types import Float, FlowField, Motion
+
+
+def checked_cloud(values: ArrayLike, name: str) -> Float:
+    """Return a copy of a cloud as (n,3) float64 metres."""
+    try:
+        points = np.array(values, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected (n,3) numbers, metres; {error}") from error
+    if points.ndim > 0 and len(points) == 0:
+        raise InputError(f"{name}: got no points, expected at least 1")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{name}: got shape {points.shape}, expected (n,3) metres")
+    invalid = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(invalid):
+        raise InputError(
+            f"{name}: {len(invalid)} of {len(points)} rows are NaN or infinite, the first is row "
+            f"{invalid[0]}; expected finite metres, drop those rows"
+        )
+    return points
+
+
+def knn_graph(points: Float, num_neighbors: int) -> csr_array:
+    """Return the weights W of the undirected k-nearest-neighbour graph of points (n,3), metres.
+
+    W is (n,n) symmetric float64, with ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is
+    among the k nearest of the other, 1 on the diagonal, 0 elsewhere. k excludes the point itself
+    and is at most n - 1. A larger k couples the flow of points farther apart.
+    """
+    if num_neighbors < 1:
+        raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
+    points = checked_cloud(points, "points")
+    num = len(points)
+    num_listed = min(num_neighbors, num - 1) + 1  # with the point itself
+    nearest = cKDTree(points).query(points, np.arange(1, num_listed + 1))
+    distance_m, column = (np.ravel(array) for array in nearest)
+    row = np.repeat(np.arange(num), num_listed)
+    edge = column != row  # with more than k duplicates the point itself may be missing
+    listed = csr_array(
+        (np.exp(-(distance_m[edge] ** 2)), (row[edge], column[edge])), shape=(num, num)
+    )
+    weights = csr_array(listed.maximum(listed.T) + eye_array(num))
+    weights.sort_indices()
+    return weights
+
+
+def laplacian(weights: csr_array) -> csr_array:
+    """Return the (n,n) graph Laplacian ``L = D^-1/2 (D - W) D^-1/2`` of the W of `knn_graph`.
+
+    L is symmetric, positive semi-definite, float64. The degree D holds the row sums of W with
+    ``W_ii = 1``, as in the paper. The null space of L is ``D^1/2 · 1``: a constant flow costs
+    energy where the density changes.
+    """
+    degree = weights.sum(axis=1)
+    scale = diags_array(1.0 / np.sqrt(degree))
+    return csr_array(scale @ (diags_array(degree) - weights) @ scale)
+
 
 SOLVERS = ("pcg", "adam")
 _LEARNING_RATE_M = 0.1  # of Adam, as published
@@ -97,7 +161,7 @@ def _adam(
     """Return the solution by Adam, the published protocol, keeping the best flow of all steps."""
     import torch
 
-    from densify.flow.objective.energy import energy, on_one_thread
+    from densify.flow.energy import energy, on_one_thread
 
     with on_one_thread():
         flow = torch.from_numpy(start).requires_grad_()
@@ -198,3 +262,69 @@ def _levels(first: float, alpha: float) -> list[float]:
         return [alpha]
     num_steps = math.ceil(math.log(first / lowest_alpha) / math.log(_LEVEL_FACTOR) - 1e-9)
     return [*np.geomspace(first, lowest_alpha, num_steps + 1)[:-1].tolist(), alpha]
+
+
+def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
+    """Return the motion by the published objective, see `EngineModule`; takes no argument."""
+
+    def step(i: int, j: int) -> FlowField:
+        return _sweep_flow(scene, i, j, settings)
+
+    return ChainedMotion(scene.stretch, step)
+
+
+def _sweep_flow(scene: Scene, i: int, j: int, settings: Config) -> FlowField:
+    """Return the flow of sweep index ``i`` to ``j``, in its lidar frame; 0 on the ground."""
+    clouds = [
+        poses.transform(s.T_world_lidar, s.sweep.points)
+        for s in (scene.stretch.sweeps[i], scene.stretch.sweeps[j])
+    ]
+    above, target_above = (scene.ground.above(c) >= ABOVE_GROUND_M for c in clouds)
+    field = FlowField.zero(len(above))
+    if above.any() and target_above.any():
+        pair = flow_between(clouds[0][above], clouds[1][target_above], settings.objective)
+        R_world_lidar = scene.stretch.sweeps[i].T_world_lidar[:3, :3]
+        field.displacement[above] = pair.displacement @ R_world_lidar
+        field.moving[above] = pair.moving
+    return field
+
+
+def flow_between(
+    source: ArrayLike,
+    target: ArrayLike,
+    settings: ObjectiveSettings,
+    initial: ArrayLike | None = None,
+) -> FlowField:
+    """Return the flow of a source cloud (N,3) to a target (M,3), by the published objective.
+
+    With ``static_prior`` only groups that certainly move have flow. See `densify.estimate_flow`.
+    """
+    objective = SolverSettings(
+        solver=settings.solver,
+        alpha=settings.alpha,
+        num_neighbors=settings.num_neighbors,
+    )
+    flow = solve(source, target, objective, initial).flow
+    if settings.static_prior:
+        return _only_proven((np.asarray(source, float), np.asarray(target, float)), flow)
+    static = FlowField.zero(len(flow))
+    return replace(static, displacement=flow, moving=np.ones(len(flow), bool))
+
+
+def _only_proven(clouds: tuple[Float, Float], flow: Float) -> FlowField:
+    """Keep the flow (N,3) of groups of points that certainly move; other points get flow 0."""
+    field = FlowField.zero(len(flow))
+    source, target = (PairCloud(c, np.full(len(c), float(i))) for i, c in enumerate(clouds))
+    moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > MIN_MOTION_M)
+    num_groups, group = link(source.points[moved], LINK_M)
+    instance = 0
+    for k in range(num_groups):
+        rows = moved[group == k]
+        state, centre = np.append(np.median(flow[rows], axis=0), 0.0), source.points[rows].mean(0)
+        # by its common translation: the free flow always comes closer to the target
+        if judge(k, rows, RigidMotion(state, centre), source, target).moves():
+            field.displacement[rows] = flow[rows]
+            field.moving[rows] = True
+            field.instance[rows] = instance
+            instance += 1
+    return field

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Estimate scene flow between any two clouds."""
