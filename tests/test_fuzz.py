@@ -35,12 +35,11 @@ from densify.readers import Spec, open_sequence
 from densify.readers.decoded_files import read_array, read_arrays, read_image
 from densify.readers.describe import describe
 from densify.readers.flow_files import load_flow_file
-from densify.readers.kitti.drive import read_stamps
-from densify.readers.kitti.tracking import read_labels
+from densify.readers.kitti_files import read_labels, read_stamps
 from densify.readers.point_files import read_table
 from densify.readers.prior_files import PriorFiles
 from densify.readers.recorded_poses import PoseFile
-from densify.readers.stamp_files import StampFile
+from densify.readers.stamped_files import StampFile
 from densify.readers.street import Street
 
 NUM_FILE_CASES = int(os.environ.get("DENSIFY_TEST_CASES", "40"))

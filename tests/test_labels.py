@@ -23,7 +23,7 @@ from densify.geometry.types import Boxes, BoxView, Camera, RegisteredSweep, Swee
 from densify.learning.boxes import BoxMargins, flow_of_boxes
 from densify.learning.labels import label_sweeps
 from densify.readers import open_sequence
-from densify.readers.kitti.drive import Calibration
+from densify.readers.kitti_files import Calibration
 from densify.readers.nuscenes import Annotations
 from densify.readers.street import Street
 from densify.readers.waymo import STAMP

@@ -18,8 +18,8 @@ from densify.geometry.poses import inverse
 from densify.outputs.simulated_street import config_text
 from densify.readers import open_sequence
 from densify.readers.describe import describe
-from densify.readers.folder.config import FolderConfig
-from densify.readers.folder.reader import Folder
+from densify.readers.folder import Folder
+from densify.readers.folder_config import FolderConfig
 from densify.readers.street import Street
 from tests.reader_checks import check_cameras, check_sweeps, check_truth
 from tests.test_point_files import write_pcd
@@ -41,8 +41,8 @@ def test_scanners_lenses_and_rolling_shutters_are_kept(tmp_path):
     read = FolderConfig.read(tmp_path)
     np.testing.assert_allclose(read.sweeps.scanner_origins, street.simulator.sensor.origins_m)
     assert read.sweeps.columns[-1] == "lidar"
-    for name, (given, _) in read.cameras.items():
-        for key, value in vars(given).items():
+    for name, files in read.cameras.items():
+        for key, value in vars(files.camera(name)).items():
             np.testing.assert_array_equal(value, getattr(street.cameras[name], key))
     origins = "scanner_origins: [[0, 0, 0], [1, 0, -0.5]]"
     config(tmp_path, f"sweeps: {{columns: [x, y, z, lidar], {origins}}}\n")
@@ -282,7 +282,7 @@ def test_the_documented_example_is_right(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "your-recording.md").read_text("utf-8")
     read = FolderConfig.read(config(tmp_path, text.split("```yaml\n")[1].split("```")[0]))
     assert read.sweeps.compensated and read.poses.T_frame_lidar[2, 3] == 1.6
-    assert next(iter(read.cameras.values()))[0].K[0, 0] == 1000
+    assert next(iter(read.cameras.values())).K[0, 0] == 1000
 
 
 # --- damage ---------------------------------------------------------------------------------------

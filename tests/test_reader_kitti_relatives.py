@@ -14,8 +14,7 @@ from densify.config.errors import InputError
 from densify.geometry import cameras
 from densify.geometry.poses import inverse
 from densify.readers import open_sequence
-from densify.readers.kitti.kitti_360 import Kitti360
-from densify.readers.kitti.odometry import KittiOdometry
+from densify.readers.kitti import Kitti360, KittiOdometry
 from tests.reader_checks import check_cameras, check_sweeps, check_truth
 from tests.recorded import CAMERA, FRAMES
 

@@ -12,7 +12,7 @@ import pytest
 from densify.config.errors import InputError
 from densify.readers import open_sequence
 from densify.readers.describe import describe
-from densify.readers.kitti.raw import KittiRaw
+from densify.readers.kitti import KittiRaw
 from tests.command import exit_code
 from tests.dataset_scenes import copy_drive
 from tests.ros_bags import PERIOD_NS, STAMP_NS, Maker, scan
