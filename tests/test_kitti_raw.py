@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.readers.describe import describe
+from densify.readers import describe
 from densify.readers.kitti import KITTI_TRIGGER_LATENCY_NS, KittiRaw
 
 # The epoch nanoseconds of this text do not survive a float64 (multiples of 256 there).

@@ -16,8 +16,7 @@ from writers.excerpt import Excerpt
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.outputs.simulated_street import config_text
-from densify.readers import open_sequence
-from densify.readers.describe import describe
+from densify.readers import describe, open_sequence
 from densify.readers.folder import Folder
 from densify.readers.folder_config import FolderConfig
 from densify.readers.street import Street

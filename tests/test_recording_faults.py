@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from densify.config.errors import InputError
-from densify.readers import open_sequence
-from densify.readers.describe import describe
+from densify.readers import describe, open_sequence
 from densify.readers.kitti import KittiRaw
 from tests.command import exit_code
 from tests.dataset_scenes import copy_drive

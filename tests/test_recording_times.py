@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from densify.config.errors import InputError
-from densify.readers import open_sequence
-from densify.readers.describe import describe
+from densify.readers import describe, open_sequence
 from densify.readers.timeline import Timeline
 from tests.ros_bags import PERIOD_NS, STAMP_NS, Maker, scan
 
