@@ -9,6 +9,8 @@ import re
 import shutil
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from tests.reader_checks import check_refused
@@ -34,6 +36,19 @@ def write(content: str | bytes):
     return lambda path: path.write_bytes(data)
 
 
+def swap_line(number: int, new: str):
+    """Replace a line, numbered from 0."""
+    return swap(rf"\A((?:.*\n){{{number}}}).*", rf"\g<1>{new}")
+
+
+PNG = cv2.imencode(".png", np.zeros((20, 39, 3), np.uint8))[1].tobytes()
+LFS = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 1900000\n"
+CALIBRATION = "../calib_cam_to_cam.txt"
+SWEEP, IMAGE, OXTS = (
+    f"{folder}/data/0000000059.{suffix}"
+    for folder, suffix in (("velodyne_points", "bin"), ("image_02", "png"), ("oxts", "txt"))
+)
+TURNS = "velodyne_points/timestamps"
 PICKLE = pickle.dumps([1, 2])
 POSES = "../../poses/00.txt"
 TO_POSE = "calibration/calib_cam_to_pose.txt"
@@ -63,6 +78,29 @@ DAMAGE = [  # format, file, what happens to it, what is said
         "length 1.414",
     ),
     ("nuscenes", "s*/LIDAR_TOP/*", cut(-7), "a multiple of"),
+    ("kitti", "velodyne_points", remove, "no KITTI recording"),
+    ("kitti", "velodyne_points/data/59.bin", write(bytes(64)), "has the number 59, as "),
+    ("kitti", SWEEP, cut(-5), "truncated: got .* bytes.*multiple of 16"),
+    ("kitti", SWEEP, write(bytes(48)), "holds no points .frame 59"),
+    ("kitti", SWEEP, write(LFS), "is a Git LFS pointer"),
+    ("kitti", CALIBRATION, remove, "cam_to_cam.txt: missing"),
+    ("kitti", "../calib_imu_to_velo.txt", remove, "imu_to_velo.txt: missing"),
+    ("kitti", CALIBRATION, write(LFS), "is a Git LFS pointer"),
+    ("kitti", CALIBRATION, swap("R_rect_00.*\n", ""), "no key R_rect_00"),
+    ("kitti", CALIBRATION, swap(r"R_rect_00: \S+", "R_rect_00:"), "got 8 values, expected 9"),
+    ("kitti", CALIBRATION, swap("R_rect_00: 1.0", "R_rect_00: one"), "R_rect_00: .*'one'"),
+    ("kitti", CALIBRATION, swap("R_rect_00: 1.0", "R_rect_00: 1.01"), "R_rect_00: .*rotation"),
+    ("kitti", CALIBRATION, swap("P_rect_02.*", "P_rect_02" + 12 * " 0"), "positive focal lengths"),
+    ("kitti", "oxts", remove, "no poses.*register.source=kiss-icp"),
+    ("kitti", OXTS, remove, "no oxts record of frame 59.* 60-61"),
+    ("kitti", OXTS, swap(r"^\S+", "91"), "latitude of 91"),
+    ("kitti", OXTS, write(LFS), "is a Git LFS pointer"),
+    ("kitti", f"{TURNS}.txt", swap_line(59, "2262-09-26 13:10:51"), "no stamp .*59.*0-58, 60-159"),
+    ("kitti", f"{TURNS}_start.txt", swap_line(59, ""), "_start.txt: no stamp of frame 59"),
+    ("kitti", f"{TURNS}.txt", write("\n1317042651.1\n"), "got '1317042651.1'.* 1970 to 2261"),
+    ("kitti", f"{TURNS}_end.txt", swap_line(59, "1990-01-01 00:00:00"), "59 ends .* before it"),
+    ("kitti", IMAGE, write(b""), r"0000000059.png.*0 bytes.*PNG or JPEG"),
+    ("kitti", IMAGE, write(PNG), "39 x 20 px; expected 1242 x 375.*image_02"),
     ("kitti-odometry", "calib.txt", remove, "missing"),
     ("kitti-odometry", "calib.txt", swap("Tr: ", "Rt: "), "no key Tr"),
     ("kitti-odometry", "calib.txt", swap("Tr: -0.0", "Tr: -9.0"), "rotation"),
