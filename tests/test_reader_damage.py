@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
+from densify.config.errors import InputError
+from densify.readers import open_sequence
 from tests.reader_checks import check_refused
 
 DRIVE = "2026_06_12_drive_0000_sync"
@@ -123,3 +125,33 @@ def test_damage_is_refused_in_a_line(copied, tmp_path, format, file, harm, says)
     place = copied(format)
     harm(min(place.glob(file), default=place / file))
     check_refused(f"{format}:{place}", says, tmp_path)
+
+
+LISTED = {  # folders of sweeps and of images, and the table that names their files
+    "nuscenes": ("samples/LIDAR_TOP", "samples/image_02", "v1.0-mini/sample_data.json"),
+    "dgp": ("point_cloud/LIDAR", "rgb/image_02", "scene_abc.json"),
+}
+
+
+@pytest.mark.parametrize("format", LISTED)
+def test_what_is_not_on_the_disk_leaves_a_gap(copied, format) -> None:
+    place, (sweeps, images, _) = copied(format), LISTED[format]
+    sorted((place / sweeps).iterdir())[1].unlink()
+    min((place / images).iterdir()).unlink()
+    sequence = open_sequence(place)
+    assert list(sequence.frames) == [0, 2]
+    assert list(sequence.image_stamps_ns("image_02")) == [1, 2]
+    with pytest.raises(InputError, match="frames that exist: 0, 2"):
+        sequence[1]
+
+
+@pytest.mark.parametrize("format", LISTED)
+def test_no_file_outside_of_the_folder_is_read(copied, format) -> None:
+    place, (sweeps, _, table) = copied(format), LISTED[format]
+    text, name = (place / table).read_text(), min((place / sweeps).iterdir()).name
+    for file in ("../secret.bin", "/etc/hostname"):
+        (place / table).write_text(text.replace(f"{sweeps}/{name}", file))
+        says = f"{table}.*names the file '{file}', outside of"
+        check_refused(f"{format}:{place}", says, place)
+    (place / table).write_text(text.replace(sweeps, f"../{place.name}/{sweeps}"))
+    open_sequence(place)
