@@ -159,19 +159,14 @@ def rigid(T: Any, where: str) -> Float:
     if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
         got = "NaN or infinity" if T.shape in ((4, 4), (3, 4)) else f"shape {T.shape}"
         raise InputError(f"{where}: got {got}, expected a (4,4) pose of finite numbers")
-    rotation(T[:3, :3], where)
-    return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
-
-
-def rotation(R: Float, where: str) -> Float:
-    """Return the (3,3) matrix unchanged; raise InputError if it is not a rotation."""
+    R = T[:3, :3]
     error = np.abs(R @ R.T - np.eye(3)).max()
     if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(R) < 0:
         raise InputError(
             f"{where}: got a matrix that is not a rotation (R Rᵀ is off by {error:.2g}, "
             f"determinant {np.linalg.det(R):.3f}), expected an orthonormal one"
         )
-    return R
+    return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
 
 
 def scanner_axes(T_lidar_scanner: Float) -> Float:

@@ -105,13 +105,13 @@ def _scene(reader: str, path: Path, scene: str | None, names: list[str]) -> str:
 class Drive(FileSequence):
     """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped when it faces forward.
 
-    Azimuth and the median period give the firing times.
+    Azimuth and the median period give the firing times. A subclass sets ``cameras`` and ``truth``.
     """
 
     def __init__(
         self, name: str, where: Path, sweeps: Path, stamps: Stamps, images: Mapping[str, Path]
     ) -> None:
-        """Find the .bin files in ``sweeps`` and the images; truth/ may be beside the sweeps."""
+        """Find the .bin files in the folder ``sweeps``, and images in a folder of each camera."""
         files = checks.numbered_files(sweeps, ".bin")
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
@@ -153,7 +153,7 @@ class KittiRaw(Drive):
         files = (drive / f"velodyne_points/timestamps{n}.txt" for n in ("", "_start", "_end"))
         stamps, self._start, self._end = (read_stamps(p, required=False) for p in files)
         recorded = (stamps, self._start, self._end)
-        self._missing = [stamps.path.name for stamps in recorded if not stamps.by_frame]
+        self._missing = [file.path.name for file in recorded if not file.by_frame]
         if self._missing == [stamps.path.name]:
             starts, ends = self._start.by_frame, self._end.by_frame
             middle = {f: (starts[f] + ends[f]) // 2 for f in starts if f in ends}
@@ -163,10 +163,10 @@ class KittiRaw(Drive):
         super().__init__(drive.resolve().name, drive, sweeps, stamps, images)
         self.cameras, self.truth = cameras, checks.truth_beside(drive)
         for name, numbers in self._image_files.items():
-            late = read_stamps(drive / name / "timestamps.txt", required=False)
-            exposed_ns = {f: ns - KITTI_TRIGGER_LATENCY_NS for f, ns in late.by_frame.items()}
-            exposed_ns = self._exposed_ns[name] | exposed_ns
-            self._exposed_ns[name] = Stamps(late.path, exposed_ns).of(numbers)
+            lagging = read_stamps(drive / name / "timestamps.txt", required=False)
+            exposed_ns = {f: ns - KITTI_TRIGGER_LATENCY_NS for f, ns in lagging.by_frame.items()}
+            exposed_ns = {**self._exposed_ns[name], **exposed_ns}
+            self._exposed_ns[name] = Stamps(lagging.path, exposed_ns).of(numbers)
         self._oxts = checks.numbered_files(drive / "oxts" / "data", ".txt")
 
     def gaps(self) -> list[str]:
@@ -210,10 +210,14 @@ class KittiRaw(Drive):
         return track.at(self.stamp_ns(frame)) @ T_imu_lidar
 
     def _T_world_imu(self, frame: int) -> Float:
-        return T_first_imu(self._record(min(self._oxts)), self._record(frame))
+        return T_first_imu(self._first_record, self._record(frame))
 
     def _record(self, frame: int) -> Float:
         return parse_oxts(read_text(self._oxts[frame]), str(self._oxts[frame]))
+
+    @cached_property
+    def _first_record(self) -> Float:
+        return self._record(min(self._oxts))
 
     @cached_property
     def _oxts_stamps(self) -> Stamps:

@@ -95,8 +95,8 @@ class PoseTrack:
         since_ns = np.array([t - stamp_ns for t in times_ns], np.float64)
         fired_ns, row = np.unique(offset_ns, return_inverse=True)  # many points share a firing time
         turns = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))(fired_ns)[row]
-        shift_m = [np.interp(fired_ns, since_ns, axis) for axis in T_ref_ego[:, :3, 3].T]
-        shift_m = np.stack(shift_m, axis=1)[row]
+        shifts_m = [np.interp(fired_ns, since_ns, axis) for axis in T_ref_ego[:, :3, 3].T]
+        shift_m = np.stack(shifts_m, axis=1)[row]
         if inverse:
             return turns.apply(points - shift_m, inverse=True)
         return turns.apply(points) + shift_m
