@@ -163,11 +163,12 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
     last = _readable(sequence, timeline.frames[::-1], unreadable)
     num_points = {sweep.frame: _num_points(sweep) for sweep in (first, last)}
     named = sorted(unreadable)[:_MOST_NAMED]
+    length_s = (last.stamp_ns - first.stamp_ns) * 1e-9
     lines = [
         ("name", sequence.name),
         ("frames", _frames(sequence)),
         ("rate", _hertz(timeline.stamp_ns) if len(timeline.frames) > 1 else "unknown, one sweep"),
-        ("stamps", f"{first.stamp_ns} to {last.stamp_ns} ns ({_seconds(first, last):.2f} s)"),
+        ("stamps", f"{first.stamp_ns} to {last.stamp_ns} ns ({length_s:.2f} s)"),
         ("points", ", ".join(f"{num} in frame {f}" for f, num in num_points.items())),
         ("point times", _point_times(first)),
         *_cameras(sequence),
@@ -202,10 +203,6 @@ def _frames(sequence: LidarSequence) -> str:
 def _hertz(stamps_ns: Sequence[int] | Int) -> str:
     period_ns = sorted(np.diff(stamps_ns).tolist())[(len(stamps_ns) - 2) // 2]
     return f"{1e9 / period_ns:.2f} Hz" if period_ns > 0 else "unknown, stamps do not advance"
-
-
-def _seconds(first: Sweep, last: Sweep) -> float:
-    return (last.stamp_ns - first.stamp_ns) / 1e9
 
 
 def _num_points(sweep: Sweep) -> str:
