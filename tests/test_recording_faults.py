@@ -16,16 +16,11 @@ from tests.command import exit_code
 from tests.dataset_scenes import copy_drive
 from tests.ros_bags import PERIOD_NS, STAMP_NS, Maker, scan
 from tests.test_reader_damage import LFS
+from tests.test_reader_folder import bare
 
 
 def numbered(folder: Path, num: int = 3, rows: np.ndarray | None = None) -> Path:
-    """A folder of numbered .bin files."""
-    folder.mkdir(parents=True, exist_ok=True)
-    if rows is None:
-        rows = np.column_stack([scan()[name] for name in ("x", "y", "z", "intensity")])
-    for i in range(num):
-        rows.astype("<f4").tofile(folder / f"{i:06d}.bin")
-    return folder
+    return bare(folder, [f"{i:06d}.bin" for i in range(num)], rows)
 
 
 # --- values ---------------------------------------------------------------------------------------
@@ -179,9 +174,8 @@ def test_a_size_that_the_first_image_has_not_is_refused_at_once(tmp_path):
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_images_that_are_binned_twice_are_refused_at_once(compressed, tmp_path):
-    maker = Maker()
+    maker, pixels = Maker(), np.zeros((6, 8, 3), np.uint8)
     maker.sweeps(3)
-    pixels = np.zeros((6, 8, 3), np.uint8)
     if compressed:
         data = cv2.imencode(".png", pixels)[1].tobytes()
         maker.compressed(data, "/front/image_raw/compressed")

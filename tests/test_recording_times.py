@@ -102,12 +102,6 @@ def test_odd_times_are_read_as_they_are_meant(kind, tmp_path):
         np.testing.assert_allclose(sequence[frame].offset_ns, expected_ns, atol=10)
 
 
-def test_zeros_are_no_times(tmp_path):
-    sequence = open_sequence(bag(tmp_path, lambda i: np.zeros(NUM, "u4"), num=3))
-    assert sequence[1].offset_ns is None
-    assert "the same for all points" in dict(sequence.findings())["times"]
-
-
 @pytest.mark.parametrize("height", [8, NUM // 8])
 def test_times_go_with_their_points_whatever_the_rows_are(height, tmp_path):
     """A scan of 8 rings, written ring by ring (each row goes all around) or firing by firing."""

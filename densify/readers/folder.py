@@ -36,6 +36,7 @@ from densify.readers.recorded_poses import PoseFile, PoseTrack, taken_back
 from densify.readers.stamped_files import NamedFile, Series, existing, files_below, in_time
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+_SEARCH_DEPTH = 2  # levels of subfolders
 _ASSUMED_HZ = 10.0
 _UNTIMED = (
     "times of points are left out: they are compensated, and no poses with stamps tell by how much"
@@ -253,7 +254,7 @@ class Folder(FileSequence):
         if self._poses is not None:
             lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
         used = {str(Path(config.files)) for config in self._config.cameras.values()}
-        for name, images in files_below(self.where, _IMAGE_SUFFIXES).items():
+        for name, images in files_below(self.where, _IMAGE_SUFFIXES, _SEARCH_DEPTH).items():
             if name not in used:
                 text = f"{name} holds {len(images)} images without a calibration"
                 lines.append(("no camera", text))
@@ -309,7 +310,7 @@ def _find_sweeps(folder: Path, files: str) -> list[Path]:
     """
     if files:
         existing(folder, files, "sweeps: {files: ...}", is_folder=True)
-    below = files_below(folder / files, SUFFIXES, *[0] * bool(files))
+    below = files_below(folder / files, SUFFIXES, 0 if files else _SEARCH_DEPTH)
     numbered = {
         name: [path for path in paths if NamedFile.of(path)[1:] != (None, None)]
         for name, paths in below.items()
@@ -331,7 +332,9 @@ def _find_sweeps(folder: Path, files: str) -> list[Path]:
 
 
 def _find_images(folder: Path, name: str, config: CameraFiles) -> Series:
-    for paths in files_below(folder / config.files, _IMAGE_SUFFIXES, 0).values():
-        return in_time(folder, paths, config.stamps, config.stamps_unit, shared=False)
-    key = f"cameras: {{{name}: {{files: {config.files}}}}}"
-    raise InputError(f"{folder / config.files}: no images, though densify.yaml names it: {key}")
+    below = files_below(folder / config.files, _IMAGE_SUFFIXES, 0)
+    if not below:
+        key = f"cameras: {{{name}: {{files: {config.files}}}}}"
+        raise InputError(f"{folder / config.files}: no images, though densify.yaml names it: {key}")
+    (paths,) = below.values()
+    return in_time(folder, paths, config.stamps, config.stamps_unit, shared=False)

@@ -37,7 +37,7 @@ class Kind(NamedTuple):
         return field(default=default, metadata={"kind": self})
 
 
-def _if(is_right: Any, value: Any) -> Any:
+def _require(is_right: Any, value: Any) -> Any:
     if not is_right:
         raise ValueError
     return value
@@ -45,23 +45,23 @@ def _if(is_right: Any, value: Any) -> Any:
 
 def _array(value: Any, *shape: int) -> Float:
     array = np.array(value, dtype=np.float64).reshape(shape)
-    return _if(np.isfinite(array).all(), array)
+    return _require(np.isfinite(array).all(), array)
 
 
 def _above_0(value: Any) -> float:
     number = float(_array(value))  # text too: YAML 1.1 reads 1e-3 as text
-    return _if(number > 0, number)
+    return _require(number > 0, number)
 
 
 def _names(value: Any) -> tuple[str, ...]:
     is_list = isinstance(value, list) and value and all(isinstance(v, str) for v in value)
-    return tuple(_if(is_list, value))
+    return tuple(_require(is_list, value))
 
 
 def _axes(value: Any) -> Float:
     """Return the (3,3) rotation that puts three stored axes, as [z, -x, -y], along x, y and z."""
     R = np.array([_AXES[name] for name in _names(value)])
-    return _if(R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3)), R)
+    return _require(R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3)), R)
 
 
 def _intrinsics(value: Any) -> Float:
@@ -71,21 +71,21 @@ def _intrinsics(value: Any) -> Float:
         numbers = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
     K = numbers.reshape(3, 3)
     has_zeros = np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])
-    return _if(min(K[0, 0], K[1, 1]) > 0 and has_zeros, K)
+    return _require(min(K[0, 0], K[1, 1]) > 0 and has_zeros, K)
 
 
 def _size_px(value: Any) -> tuple[int, int]:
     width, height = _array(value, 2).tolist()
     is_whole = min(width, height) >= 1 and not (width % 1 or height % 1)
-    return _if(is_whole, (int(width), int(height)))
+    return _require(is_whole, (int(width), int(height)))
 
 
 def _one_of(choices: Collection[str]) -> Kind:
     return Kind({name: name for name in choices}.__getitem__, f"one of {', '.join(choices)}")
 
 
-_TEXT = Kind(lambda value: _if(isinstance(value, str), value), "a text")
-_FLAG = Kind(lambda value: _if(isinstance(value, bool), value), "true or false")
+_TEXT = Kind(lambda value: _require(isinstance(value, str), value), "a text")
+_FLAG = Kind(lambda value: _require(isinstance(value, bool), value), "true or false")
 _NUMBER = Kind(lambda value: float(_array(value)), "a finite number")
 _ABOVE_0 = Kind(_above_0, "a finite number above 0")
 _UNIT = _one_of(UNIT_NS)

@@ -25,7 +25,6 @@ TIME_COLUMNS = ("timestamp", "time", "stamp", "t")
 _FILE_COLUMNS = ("filename", "file", "name", "image", "sweep", "path")
 _STAMP_FILES = [f"{n}.{s}" for n in ("timestamps", "times", "stamps") for s in ("txt", "csv")]
 _NO_SWEEPS = ("truth", "labels", "label", "poses", "calib", "calibration")
-_DEPTH = 2  # levels of subfolders that are searched
 _EPOCH_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # the years 2000 to 2099
 _LONGEST_STEP_NS = 3_900_000_000  # between sweeps or images
 _MOST_NS = 2**63
@@ -301,7 +300,7 @@ def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path
     return path
 
 
-def files_below(root: Path, suffixes: Sequence[str], depth: int = _DEPTH) -> dict[str, list[Path]]:
+def files_below(root: Path, suffixes: Sequence[str], depth: int) -> dict[str, list[Path]]:
     """Return the visible files with one of the suffixes by folder, ``depth`` levels down at most.
 
     Folders are named relative to ``root``; links to folders and broken links are left out.
