@@ -156,7 +156,7 @@ class Written(NamedTuple):
 
 _CROSSING = Street("crossing", 5, "vlp16", cameras=())
 WRITTEN = {
-    "argoverse2": Written(_CROSSING),
+    "argoverse2": Written(_CROSSING, frames=(60, 61)),
     "waymo": Written(_CROSSING),
     "pandaset": Written(Street("crossing", 5, "pandaset", cameras=()), frames=(60, 61)),
     # the first and the last sweep are key frames

@@ -33,7 +33,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +56,7 @@ from densify.readers.kitti_files import (
     read_stamps,
     turned_ns,
 )
-from densify.readers.recorded_poses import PoseTrack
+from densify.readers.recorded_poses import PoseFile, PoseTrack
 from densify.readers.stamped_files import StampFile
 
 KITTI_TRIGGER_LATENCY_NS = 10_500_000
@@ -269,8 +268,10 @@ class KittiOdometry(Drive):
 
     def __init__(self, path: Path) -> None:
         images = {p.name: p for p in sorted(path.glob("image_[0-3]"))}
-        times = _read_times(path / "times.txt")
-        super().__init__(path.resolve().name, path, path / "velodyne", times, images)
+        times = path / "times.txt"
+        times_ns = StampFile.read(times, "s").stamp_ns if times.exists() else ()
+        stamps = Stamps(times, dict(enumerate(times_ns)))
+        super().__init__(path.resolve().name, path, path / "velodyne", stamps, images)
         self.truth = checks.truth_beside(path)
         self.cameras = {
             name: self._calibration.rectified_camera(
@@ -281,61 +282,37 @@ class KittiOdometry(Drive):
 
     def _returns(self, frame: int) -> Returns:
         stored, intensity = read_points(self._files[frame])
-        track = self._track_around(frame)
-        if track is None:
+        if self._track is None:
             return Returns(stored, intensity)
         points = stored
         for _ in range(_NUM_ROUNDS):
             offset_ns = turned_ns(points, self._stamps.period_ns)
-            points = track.as_fired(stored, self.stamp_ns(frame), offset_ns)
+            points = self._track.as_fired(stored, self.stamp_ns(frame), offset_ns)
         return Returns(points, intensity, offset_ns)
 
-    def _track_around(self, frame: int) -> PoseTrack | None:
-        """Return the scanner's poses at a frame and its neighbours, None for fewer than two."""
-        path, lines = self._pose_lines
-        frames = [f for f in (frame - 1, frame, frame + 1) if f in lines]
-        if len(frames) < 2:
-            return None
-        where = f"{path}: line {frame + 1} and those beside it"
-        stamps_ns = np.array([self._stamps.at(f) for f in frames], np.int64)
-        return PoseTrack(
-            where, stamps_ns, np.stack([checks.rigid(self._pose(f), where) for f in frames])
-        )
-
     def _pose(self, frame: int) -> Float:
-        path, lines = self._pose_lines
-        if path is None:
-            return super()._pose(frame)
-        line = checks.of_frame(lines, frame, "pose", path)
-        P = checks.parse_numbers(line, f"{path}: line {frame + 1}", 12).reshape(3, 4)
-        T_cam_lidar = self._calibration.motion("Tr")
-        T_first_cam = np.vstack([P, [0.0, 0.0, 0.0, 1.0]])
-        return poses.inverse(T_cam_lidar) @ T_first_cam @ T_cam_lidar
+        return super()._pose(frame) if self._track is None else self._track.at(self.stamp_ns(frame))
 
     @cached_property
     def _calibration(self) -> Calibration:
         return Calibration.read(self.where / "calib.txt")
 
     @cached_property
-    def _pose_lines(self) -> tuple[Path | None, dict[int, str]]:
+    def _track(self) -> PoseTrack | None:
+        """The path of the scanner, None without poses."""
         folders = [self.where.absolute(), self.where.resolve()]  # a link, and its target
         paths = [folder / "poses.txt" for folder in folders]
         paths += [folder.parent.parent / "poses" / f"{folder.name}.txt" for folder in folders]
-        for path in paths:
-            if path.is_file():
-                return path, dict(enumerate(read_text(path).splitlines()))
-        return None, {}
-
-
-def _read_times(path: Path) -> Stamps:
-    """Return stamps by line; InputError if a line is no number or does not ascend."""
-    times_ns = StampFile.read(path, "s").stamp_ns if path.exists() else ()
-    for number, (before, now) in enumerate(pairwise(times_ns), 2):
-        if now <= before:
-            raise InputError(
-                f"{path}: line {number}: got {now} ns, expected more than on the line before"
-            )
-    return Stamps(path, dict(enumerate(times_ns)))
+        path = next((path for path in paths if path.is_file()), None)
+        if path is None:
+            return None
+        T_first_cam, T_cam_lidar = PoseFile.read(path).T, self._calibration.motion("Tr")
+        num = len(T_first_cam)
+        if self._stamps.by_frame:
+            num = min(num, len(self._stamps.by_frame))
+        stamps_ns = np.array([self._stamps.at(frame) for frame in range(num)], np.int64)
+        T = poses.inverse(T_cam_lidar) @ T_first_cam[:num] @ T_cam_lidar
+        return PoseTrack(str(path), stamps_ns, T)
 
 
 class KittiTracking(Drive):
