@@ -108,7 +108,7 @@ DAMAGE = [  # format, file, what happens to it, what is said
     ("kitti-odometry", "calib.txt", swap("Tr: -0.0", "Tr: -9.0"), "rotation"),
     ("kitti-odometry", "times.txt", write("1e999999999\n"), "line 1: got .* 2261"),
     ("kitti-odometry", "times.txt", swap("2.0", "1.0"), "got 3 poses, .* stamps that ascend"),
-    ("kitti-odometry", POSES, swap(" ", " nan "), "line 1: got 13 numbers, expected 12"),
+    ("kitti-odometry", POSES, swap(r"^\S+", "nan"), "line 1: got a value that is not finite"),
     ("kitti-odometry", "velodyne/000000.bin", cut(-5), "truncated"),
     ("kitti-odometry", "image_2/000000.png", write("x"), "not a complete image"),
     ("kitti-tracking", "calib/0000.txt", swap("R_rect", "R"), "no key R_rect"),
