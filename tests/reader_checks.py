@@ -103,11 +103,12 @@ def check_truth(sequence: LidarSequence, excerpt: Excerpt) -> None:
         assert not flow[still].any() or np.linalg.norm(flow[still], axis=1).max() < 0.06
 
 
-def check_refused(spec: object, says: str, place: object = "", frame: int = 0) -> None:
-    """Opening the recording and reading one sweep, pose and image of each camera ends in one line
-    that names the place."""
+def check_refused(spec: object, says: str, place: object = "", frame: int | None = None) -> None:
+    """Opening the recording and reading a sweep (the first), its pose and an image of each camera
+    ends in one line that names the place."""
     with pytest.raises(InputError, match=says) as error:
         sequence = open_sequence(str(spec))
+        frame = sequence.frames[0] if frame is None else frame
         _ = sequence[frame]
         for camera in sequence.cameras:
             for number in [*sequence.image_stamps_ns(camera)][:1]:

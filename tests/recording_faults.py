@@ -15,55 +15,52 @@ import numpy as np
 from densify.config.errors import InputError
 from densify.doctor.paths import changed
 from densify.geometry import poses
-from densify.geometry.types import Camera, Float, LidarSequence, Sweep
+from densify.geometry.types import Float, LidarSequence, Sweep
 
 _BODY_CAM = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 class Faulty:
-    """A recording with one mistake: members as in `LidarSequence`, each passed
-    through a change if one is given."""
+    """A recording with one mistake: members as in `LidarSequence`, each passed through its change.
+
+    changes: functions of a sweep, a stamp_ns (and its frame before), a pose, a camera, an image, or
+    all image_stamps_ns of a camera. unreadable: frames whose sweep cannot be read.
+    """
 
     def __init__(
         self,
         sequence: LidarSequence,
-        sweep: Callable[[Sweep], Sweep] | None = None,
-        stamp_ns: Callable[[int, int], int] | None = None,
-        pose: Callable[[Float], Float] | None = None,
-        camera: Callable[[Camera], Camera] | None = None,
-        image: Callable[[Any], Any] | None = None,
-        image_stamps_ns: Callable[[Mapping[int, int]], Mapping[int, int]] | None = None,
         frames: Sequence[int] | None = None,
         unreadable: Sequence[int] = (),
+        **changes: Callable[..., Any] | None,
     ) -> None:
-        self.name = sequence.name
-        self.truth = None
+        self.name, self.truth = sequence.name, None
         self.frames = sequence.frames if frames is None else frames
-        self.cameras = {name: camera(c) if camera else c for name, c in sequence.cameras.items()}
-        self._sequence, self._sweep, self._stamp_ns, self._pose = sequence, sweep, stamp_ns, pose
-        self._image, self._image_stamps_ns, self._unreadable = image, image_stamps_ns, unreadable
+        self._sequence, self._unreadable, self._changes = sequence, unreadable, changes
+        self.cameras = {n: self._changed("camera", c) for n, c in sequence.cameras.items()}
+
+    def _changed(self, member: str, *values: Any) -> Any:
+        """The last value is the member's own."""
+        change = self._changes.get(member)
+        return change(*values) if change else values[-1]
 
     def __getitem__(self, frame: int) -> Sweep:
         if frame in self._unreadable:
             raise InputError(f"{frame:010d}.bin: truncated; fetch the file again")
         sweep = replace(self._sequence[frame], stamp_ns=self.stamp_ns(frame))
-        return self._sweep(sweep) if self._sweep else sweep
+        return self._changed("sweep", sweep)
 
     def stamp_ns(self, frame: int) -> int:
-        stamp_ns = self._sequence.stamp_ns(frame)
-        return self._stamp_ns(frame, stamp_ns) if self._stamp_ns else stamp_ns
+        return self._changed("stamp_ns", frame, self._sequence.stamp_ns(frame))
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        stamps_ns = self._sequence.image_stamps_ns(camera)
-        return self._image_stamps_ns(stamps_ns) if self._image_stamps_ns else stamps_ns
+        return self._changed("image_stamps_ns", self._sequence.image_stamps_ns(camera))
 
     def image(self, camera: str, number: int) -> Any:
-        image = self._sequence.image(camera, number)
-        return self._image(image) if self._image else image
+        return self._changed("image", self._sequence.image(camera, number))
 
     def T_world_lidar(self, frame: int) -> Float:
-        T = self._sequence.T_world_lidar(frame)
-        return self._pose(T) if self._pose else T
+        return self._changed("pose", self._sequence.T_world_lidar(frame))
 
 
 Changes = dict[str, Any]

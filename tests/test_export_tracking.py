@@ -14,7 +14,8 @@ from densify.geometry import poses
 from densify.geometry.types import Result
 from densify.outputs import export_run, write_result
 from densify.pipeline.run import run_keys
-from densify.readers.kitti.tracking import KittiTracking, open_recording, read_labels
+from densify.readers.kitti import KittiTracking, open_recording
+from densify.readers.kitti_files import read_labels
 from tests.exported import refused, write_street, write_views
 from tests.scenes import SWEEP_S
 from tests.small_street import KEY, POSES_GIVEN, one_car

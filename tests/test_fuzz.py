@@ -31,16 +31,14 @@ from densify.config.file_content import gunzipped, read_bytes, read_json
 from densify.dataset.plan import read_plan
 from densify.geometry.types import Camera
 from densify.outputs import read_cloud
-from densify.readers import Spec, open_sequence
+from densify.readers import Spec, describe, open_sequence
 from densify.readers.decoded_files import read_array, read_arrays, read_image
-from densify.readers.describe import describe
 from densify.readers.flow_files import load_flow_file
-from densify.readers.kitti.drive import read_stamps
-from densify.readers.kitti.tracking import read_labels
+from densify.readers.kitti_files import read_labels, read_stamps
 from densify.readers.point_files import read_table
 from densify.readers.prior_files import PriorFiles
 from densify.readers.recorded_poses import PoseFile
-from densify.readers.stamp_files import StampFile
+from densify.readers.stamped_files import StampFile
 from densify.readers.street import Street
 
 NUM_FILE_CASES = int(os.environ.get("DENSIFY_TEST_CASES", "40"))

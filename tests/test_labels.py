@@ -23,10 +23,12 @@ from densify.geometry.types import Boxes, BoxView, Camera, RegisteredSweep, Swee
 from densify.learning.boxes import BoxMargins, flow_of_boxes
 from densify.learning.labels import label_sweeps
 from densify.readers import open_sequence
-from densify.readers.kitti.drive import Calibration
+from densify.readers.kitti_files import Calibration
 from densify.readers.nuscenes import Annotations
 from densify.readers.street import Street
 from densify.readers.waymo import STAMP
+from tests.command import refused
+from tests.test_reader_damage import cut, remove, swap
 
 pyarrow = pytest.importorskip("pyarrow")
 FRAMES = range(60, 63)
@@ -103,18 +105,14 @@ def test_what_is_unsure_does_not_count() -> None:
     assert field.moving.tolist() == [False, False, True, False, False]
 
 
-def test_the_road_below_what_moves_is_unsure() -> None:
-    """A box 1.5 m high: within 0.1 m of its bottom, unless it stands."""
+@pytest.mark.parametrize(("shift_m", "sure_below"), [(1, False), (0, True)])
+def test_the_road_below_what_moves_is_unsure(shift_m, sure_below) -> None:
+    """A box 1.5 m high: within 0.1 m of its bottom, unless it stands. Without a track: all."""
     points = np.array([[0.0, 0, -0.8], [0, 0, -0.7], [0, 0, -0.6]])
-    for shift_m, expected in ((1, [False, False, True]), (0, [True, True, True])):
-        _, sure = flow(points, boxes((1, 0, 0, 0)), boxes((1, shift_m, 0, 0)))
-        assert sure.tolist() == expected
-
-
-def test_a_box_that_is_not_followed_is_unsure() -> None:
-    here, there = boxes((1, 0, 0, 0)), boxes((1, 1, 0, 0))
-    nowhere = replace(here, track=np.array([""])), replace(there, track=np.array([""]))
-    field, sure = flow(np.zeros((1, 3)), *nowhere)
+    here, there = boxes((1, 0, 0, 0)), boxes((1, shift_m, 0, 0))
+    assert flow(points, here, there)[1].tolist() == [sure_below, sure_below, True]
+    untracked = (replace(box, track=np.array([""])) for box in (here, there))
+    field, sure = flow(points[2:], *untracked)
     assert not sure.any() and not field.moving.any() and not field.displacement.any()
 
 
@@ -158,7 +156,7 @@ class Written(NamedTuple):
 
 _CROSSING = Street("crossing", 5, "vlp16", cameras=())
 WRITTEN = {
-    "argoverse2": Written(_CROSSING),
+    "argoverse2": Written(_CROSSING, frames=(60, 61)),
     "waymo": Written(_CROSSING),
     "pandaset": Written(Street("crossing", 5, "pandaset", cameras=()), frames=(60, 61)),
     # the first and the last sweep are key frames
@@ -179,11 +177,6 @@ def places(tmp_path_factory) -> Callable[[str], Path]:
         return write_street(format, street, tmp_path_factory.mktemp(format), frames)
 
     return place
-
-
-@pytest.fixture
-def log(places) -> Path:
-    return places("argoverse2")
 
 
 @pytest.mark.parametrize("format", WRITTEN)
@@ -241,13 +234,48 @@ def test_a_waymo_frame_without_boxes_has_no_label(places, tmp_path: Path) -> Non
     assert [frame for frame, _ in labels] == [0]
 
 
-def refused(place: Path, tmp_path: Path, capsys) -> str:
-    """The one line."""
-    assert main(["labels", "--data", str(place), "--out", str(tmp_path / "out")]) == 2
+# Damage
+
+
+def of_first_record(change):
+    """Change the first of nuScenes' annotations; "other" stands for the second one's object."""
+
+    def harm(path):
+        first, *records = json.loads(path.read_text())
+        other = {"instance_token": records[0]["instance_token"]}
+        path.write_text(json.dumps([first | (change or other), *records]))
+
+    return harm
+
+
+def of_first_line(change):
+    """Change the words of the first of KITTI's labels."""
+    return lambda path: path.write_text(change(path.read_text().split("\n", 1)[0]))
+
+
+ANNOTATIONS, LABELS = "v1.0-mini/sample_annotation.json", "label_02/0000.txt"
+DAMAGE = [  # format, file, what happens to it, what is said
+    ("nuscenes", ANNOTATIONS, of_first_record({"size": [0, 4, 1.5]}), "a box has no size"),
+    ("nuscenes", ANNOTATIONS, of_first_record({"rotation": [1, 1, 0, 0]}), "a unit quaternion"),
+    ("nuscenes", ANNOTATIONS, of_first_record(None), "a second box of the instance"),
+    ("nuscenes", ANNOTATIONS, cut(-99), "not a whole JSON table"),
+    ("nuscenes", ANNOTATIONS, remove, "v1.0-*/sample_annotation.json (nuscenes)"),
+    ("kitti-tracking", LABELS, of_first_line(lambda t: " ".join(t.split()[:16])), "got 15 values"),
+    ("kitti-tracking", LABELS, swap(r"(\S+ ){10}\S+", "0 1 Car" + 8 * " 0"), "a box has no size"),
+    ("kitti-tracking", LABELS, of_first_line(lambda text: f"{text}\n{text}"), "is there twice"),
+    ("kitti-tracking", LABELS, remove, "label_02/0000.txt (kitti-tracking)"),
+]
+
+
+@pytest.mark.parametrize(("format", "file", "harm", "says"), DAMAGE, ids=range(len(DAMAGE)))
+def test_damaged_boxes_are_refused_in_a_line(
+    format, file, harm, says, places, tmp_path: Path, capsys
+) -> None:
+    copy = shutil.copytree(places(format), tmp_path / "training")
+    harm(copy / file)
+    said = refused(capsys, 2, "labels", "--data", copy, "--out", tmp_path / "out")
+    assert says in said and Path(file).name in said
     assert not (tmp_path / "out").exists()
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    return error
 
 
 # PandaSet
@@ -267,7 +295,20 @@ def test_what_moves_before_two_scanners_has_two_boxes(places) -> None:
 def test_pandaset_boxes_stand_as_the_devkit_has_them(places, tmp_path: Path) -> None:
     """Yaw 0 looks along the world's y, a quarter turn on against its x."""
     copy = shutil.copytree(places("pandaset"), tmp_path / "002")
-    write_cuboids(copy, [one_cuboid("a", 0.0), one_cuboid("b", np.pi / 2)])
+    cuboids = copy / "annotations/cuboids/00.pkl.gz"
+    values = dict(zip("xyz", (10.0, 20.0, 1.0), strict=True))
+    sizes_m = dict(zip("xyz", (2.0, 4.0, 1.5), strict=True))
+    put_frame(
+        cuboids,
+        {
+            "uuid": np.array(["a", "b"], object),
+            "yaw": np.array([0.0, np.pi / 2]),
+            **{f"position.{axis}": np.full(2, value) for axis, value in values.items()},
+            **{f"dimensions.{axis}": np.full(2, value) for axis, value in sizes_m.items()},
+            "stationary": np.zeros(2, bool),
+            "cuboids.sensor_id": np.full(2, -1),
+        },
+    )
     sequence = open_sequence(str(copy))
     boxes = sequence.boxes(0)
     T_world_box = sequence.T_world_lidar(0) @ boxes.T_lidar_box
@@ -275,30 +316,10 @@ def test_pandaset_boxes_stand_as_the_devkit_has_them(places, tmp_path: Path) -> 
     np.testing.assert_allclose(T_world_box[:, :3, 3], 2 * [[10, 20, 1]])
     np.testing.assert_allclose(T_world_box[:, :3, 0], [[0, 1, 0], [-1, 0, 0]], atol=1e-12)
     np.testing.assert_array_equal(boxes.size_m, 2 * [[4.0, 2.0, 1.5]])
-    (copy / CUBOIDS).unlink()
+    cuboids.unlink()
     assert sequence.boxes(0) is None and sequence.boxes(1) is not None
     with pytest.raises(InputError, match="no sweep of frame 9"):
         sequence.boxes(9)
-
-
-CUBOIDS = "annotations/cuboids/00.pkl.gz"
-
-
-def one_cuboid(name: str, yaw: float) -> dict:
-    numbers = {"position.x": 10.0, "position.y": 20.0, "position.z": 1.0}
-    numbers |= {"dimensions.x": 2.0, "dimensions.y": 4.0, "dimensions.z": 1.5}
-    return {"uuid": name, "yaw": yaw, **numbers, "stationary": False, "cuboids.sensor_id": -1}
-
-
-def write_cuboids(sequence: Path, rows: list[dict]) -> None:
-    """Of the first sweep."""
-    texts = ("uuid",)
-    columns = {}
-    for name in rows[0]:
-        values = [row[name] for row in rows]
-        is_text = name in texts or any(isinstance(value, str) for value in values)
-        columns[name] = np.array(values, object if is_text else None)
-    put_frame(sequence / CUBOIDS, columns)
 
 
 # nuScenes
@@ -350,44 +371,7 @@ def test_boxes_between_key_frames_go_straight_and_turn_evenly(tmp_path: Path) ->
     assert annotated(tmp_path, [], []) is None
 
 
-def test_damaged_nuscenes_boxes_are_refused(places, tmp_path: Path, capsys) -> None:
-    copy = shutil.copytree(places("nuscenes"), tmp_path / "street")
-    path = copy / "v1.0-mini" / "sample_annotation.json"
-    whole = path.read_bytes()
-    records = json.loads(whole)
-    for change, said in (
-        ({"size": [0, 4, 1.5]}, "a box has no size"),
-        ({"rotation": [1, 1, 0, 0]}, "expected a unit quaternion"),
-        ({"instance_token": records[1]["instance_token"]}, "a second box of the instance"),
-    ):
-        path.write_text(json.dumps([{**records[0], **change}, *records[1:]]))
-        error = refused(copy, tmp_path, capsys)
-        assert said in error and "sample_annotation.json" in error
-    path.write_bytes(whole[: len(whole) // 2])
-    assert "not a whole JSON table" in refused(copy, tmp_path, capsys)
-    path.unlink()
-    assert "v1.0-*/sample_annotation.json (nuscenes)" in refused(copy, tmp_path, capsys)
-
-
 # KITTI tracking
-
-LABELS = "label_02/0000.txt"
-
-
-def test_damaged_kitti_labels_are_refused(places, tmp_path: Path, capsys) -> None:
-    copy = shutil.copytree(places("kitti-tracking"), tmp_path / "training")
-    lines = (copy / LABELS).read_text().splitlines()
-    words = lines[0].split()
-    for wrong, said in (
-        (" ".join(words[:16]), "line 1: got 15 values, expected 16 numbers"),
-        (" ".join([*words[:10], "0", *words[11:]]), "frame 0: a box has no size"),
-        (f"{lines[0]}\n{lines[0]}", f"frame 0: the box {words[1]} is there twice"),
-    ):
-        (copy / LABELS).write_text("\n".join([wrong, *lines[1:]]))
-        error = refused(copy, tmp_path, capsys)
-        assert said in error and "0000.txt" in error
-    (copy / LABELS).unlink()
-    assert "label_02/0000.txt (kitti-tracking)" in refused(copy, tmp_path, capsys)
 
 
 def test_kitti_boxes_stand_as_the_devkit_has_them(places, tmp_path: Path) -> None:

@@ -9,8 +9,12 @@ import re
 import shutil
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from densify.config.errors import InputError
+from densify.readers import open_sequence
 from tests.reader_checks import check_refused
 
 DRIVE = "2026_06_12_drive_0000_sync"
@@ -34,6 +38,19 @@ def write(content: str | bytes):
     return lambda path: path.write_bytes(data)
 
 
+def swap_line(number: int, new: str):
+    """Replace a line, numbered from 0."""
+    return swap(rf"\A((?:.*\n){{{number}}}).*", rf"\g<1>{new}")
+
+
+PNG = cv2.imencode(".png", np.zeros((20, 39, 3), np.uint8))[1].tobytes()
+LFS = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 1900000\n"
+CALIBRATION = "../calib_cam_to_cam.txt"
+SWEEP, IMAGE, OXTS = (
+    f"{folder}/data/0000000059.{suffix}"
+    for folder, suffix in (("velodyne_points", "bin"), ("image_02", "png"), ("oxts", "txt"))
+)
+TURNS = "velodyne_points/timestamps"
 PICKLE = pickle.dumps([1, 2])
 POSES = "../../poses/00.txt"
 TO_POSE = "calibration/calib_cam_to_pose.txt"
@@ -63,12 +80,35 @@ DAMAGE = [  # format, file, what happens to it, what is said
         "length 1.414",
     ),
     ("nuscenes", "s*/LIDAR_TOP/*", cut(-7), "a multiple of"),
+    ("kitti", "velodyne_points", remove, "no KITTI recording"),
+    ("kitti", "velodyne_points/data/59.bin", write(bytes(64)), "has the number 59, as "),
+    ("kitti", SWEEP, cut(-5), "truncated: got .* bytes.*multiple of 16"),
+    ("kitti", SWEEP, write(bytes(48)), "holds no points .frame 59"),
+    ("kitti", SWEEP, write(LFS), "is a Git LFS pointer"),
+    ("kitti", CALIBRATION, remove, "cam_to_cam.txt: missing"),
+    ("kitti", "../calib_imu_to_velo.txt", remove, "imu_to_velo.txt: missing"),
+    ("kitti", CALIBRATION, write(LFS), "is a Git LFS pointer"),
+    ("kitti", CALIBRATION, swap("R_rect_00.*\n", ""), "no key R_rect_00"),
+    ("kitti", CALIBRATION, swap(r"R_rect_00: \S+", "R_rect_00:"), "got 8 values, expected 9"),
+    ("kitti", CALIBRATION, swap("R_rect_00: 1.0", "R_rect_00: one"), "R_rect_00: .*'one'"),
+    ("kitti", CALIBRATION, swap("R_rect_00: 1.0", "R_rect_00: 1.01"), "R_rect_00: .*rotation"),
+    ("kitti", CALIBRATION, swap("P_rect_02.*", "P_rect_02" + 12 * " 0"), "positive focal lengths"),
+    ("kitti", "oxts", remove, "no poses.*register.source=kiss-icp"),
+    ("kitti", OXTS, remove, "no oxts record of frame 59.* 60-61"),
+    ("kitti", OXTS, swap(r"^\S+", "91"), "latitude of 91"),
+    ("kitti", OXTS, write(LFS), "is a Git LFS pointer"),
+    ("kitti", f"{TURNS}.txt", swap_line(59, "2262-09-26 13:10:51"), "no stamp .*59.*0-58, 60-159"),
+    ("kitti", f"{TURNS}_start.txt", swap_line(59, ""), "_start.txt: no stamp of frame 59"),
+    ("kitti", f"{TURNS}.txt", write("\n1317042651.1\n"), "got '1317042651.1'.* 1970 to 2261"),
+    ("kitti", f"{TURNS}_end.txt", swap_line(59, "1990-01-01 00:00:00"), "59 ends .* before it"),
+    ("kitti", IMAGE, write(b""), r"0000000059.png.*0 bytes.*PNG or JPEG"),
+    ("kitti", IMAGE, write(PNG), "39 x 20 px; expected 1242 x 375.*image_02"),
     ("kitti-odometry", "calib.txt", remove, "missing"),
     ("kitti-odometry", "calib.txt", swap("Tr: ", "Rt: "), "no key Tr"),
     ("kitti-odometry", "calib.txt", swap("Tr: -0.0", "Tr: -9.0"), "rotation"),
     ("kitti-odometry", "times.txt", write("1e999999999\n"), "line 1: got .* 2261"),
-    ("kitti-odometry", "times.txt", swap("2.0", "1.0"), "line 3: got"),
-    ("kitti-odometry", POSES, swap(" ", " nan "), "line 1: got 13 values"),
+    ("kitti-odometry", "times.txt", swap("2.0", "1.0"), "got 3 poses, .* stamps that ascend"),
+    ("kitti-odometry", POSES, swap(r"^\S+", "nan"), "line 1: got a value that is not finite"),
     ("kitti-odometry", "velodyne/000000.bin", cut(-5), "truncated"),
     ("kitti-odometry", "image_2/000000.png", write("x"), "not a complete image"),
     ("kitti-tracking", "calib/0000.txt", swap("R_rect", "R"), "no key R_rect"),
@@ -85,3 +125,33 @@ def test_damage_is_refused_in_a_line(copied, tmp_path, format, file, harm, says)
     place = copied(format)
     harm(min(place.glob(file), default=place / file))
     check_refused(f"{format}:{place}", says, tmp_path)
+
+
+LISTED = {  # folders of sweeps and of images, and the table that names their files
+    "nuscenes": ("samples/LIDAR_TOP", "samples/image_02", "v1.0-mini/sample_data.json"),
+    "dgp": ("point_cloud/LIDAR", "rgb/image_02", "scene_abc.json"),
+}
+
+
+@pytest.mark.parametrize("format", LISTED)
+def test_what_is_not_on_the_disk_leaves_a_gap(copied, format) -> None:
+    place, (sweeps, images, _) = copied(format), LISTED[format]
+    sorted((place / sweeps).iterdir())[1].unlink()
+    min((place / images).iterdir()).unlink()
+    sequence = open_sequence(place)
+    assert list(sequence.frames) == [0, 2]
+    assert list(sequence.image_stamps_ns("image_02")) == [1, 2]
+    with pytest.raises(InputError, match="frames that exist: 0, 2"):
+        sequence[1]
+
+
+@pytest.mark.parametrize("format", LISTED)
+def test_no_file_outside_of_the_folder_is_read(copied, format) -> None:
+    place, (sweeps, _, table) = copied(format), LISTED[format]
+    text, name = (place / table).read_text(), min((place / sweeps).iterdir()).name
+    for file in ("../secret.bin", "/etc/hostname"):
+        (place / table).write_text(text.replace(f"{sweeps}/{name}", file))
+        says = f"{table}.*names the file '{file}', outside of"
+        check_refused(f"{format}:{place}", says, place)
+    (place / table).write_text(text.replace(sweeps, f"../{place.name}/{sweeps}"))
+    open_sequence(place)

@@ -10,8 +10,7 @@ import pytest
 from writers.waymo import T_EGO_LIDAR, pixels
 
 from densify.geometry.poses import inverse, transform
-from densify.readers import open_sequence
-from densify.readers.describe import describe
+from densify.readers import describe, open_sequence
 from densify.readers.waymo import Waymo
 from tests.reader_checks import check_truth
 from tests.recorded import FRAMES

@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 
 from densify.config.errors import InputError
-from densify.readers import open_sequence
-from densify.readers.describe import describe
+from densify.readers import describe, open_sequence
 from densify.readers.timeline import Timeline
 from tests.ros_bags import PERIOD_NS, STAMP_NS, Maker, scan
 
 NUM = 400
 FIRED_NS = np.arange(NUM) * (PERIOD_NS // NUM)
-Change = Callable[[np.ndarray], np.ndarray]
 
 
 def bag(folder: Path, times: Callable[[int], np.ndarray], num: int = 7, **options) -> Path:
@@ -32,16 +30,15 @@ def bag(folder: Path, times: Callable[[int], np.ndarray], num: int = 7, **option
 def pcd(folder: Path, times: Callable[[int], np.ndarray], num: int = 7) -> Path:
     """A folder of numbered .pcd files with a float64 ``timestamp``."""
     folder.mkdir(exist_ok=True)
+    rows = np.zeros(NUM, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")])
+    header = (
+        "VERSION 0.7\nFIELDS x y z timestamp\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+        f"WIDTH {NUM}\nHEIGHT 1\nPOINTS {NUM}\nDATA binary\n"
+    )
     for i in range(num):
-        kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")]
-        rows = np.zeros(NUM, kinds)
         for axis in "xyz":
             rows[axis] = scan(NUM)[axis]
         rows["timestamp"] = times(i)
-        header = (
-            "VERSION 0.7\nFIELDS x y z timestamp\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 1\n"
-            f"WIDTH {NUM}\nHEIGHT 1\nPOINTS {NUM}\nDATA binary\n"
-        )
         (folder / f"{i:06d}.pcd").write_bytes(header.encode() + rows.tobytes())
     return folder
 
@@ -57,8 +54,9 @@ def broken(sweep: int, share: float, time_s: float) -> Callable[[int], np.ndarra
     return times
 
 
-@pytest.mark.parametrize("sweep", [0, 3, 6])
-@pytest.mark.parametrize(("share", "time_s"), [(0.3, 3.6), (0.6, 3.6), (0.3, -0.5), (0.02, 4.29)])
+@pytest.mark.parametrize(
+    ("sweep", "share", "time_s"), [(0, 0.3, 3.6), (3, 0.6, 3.6), (6, 0.3, -0.5), (3, 0.02, np.nan)]
+)
 def test_points_with_times_of_another_sweep_are_left_out(sweep, share, time_s, tmp_path):
     sequence = open_sequence(bag(tmp_path, broken(sweep, share, time_s)))
     for frame in sequence.frames:
@@ -87,35 +85,21 @@ def test_offsets_that_wrapped_are_left_out_of_every_sweep(tmp_path):
     assert sweep.num_untimed == 20 and sweep.offset_ns.max() == FIRED_NS[-1] - 5_000_000
 
 
-@pytest.mark.parametrize("frame", [0, 2])
-def test_a_time_that_is_not_finite_is_its_points_problem(frame, tmp_path):
-    times = broken(frame, 0.01, np.nan)
-    found = open_sequence(bag(tmp_path, times))[frame]
-    assert (len(found), found.num_untimed) == (NUM - 4, 4)
-
-
-ODD: dict[str, tuple[Change, float]] = {  # what is written, ms of the first point after the stamp
-    "half revolutions": (lambda t: (t // 2 * 1e-9).astype("f4"), 0),
-    "end-referenced": (lambda t: (t * 1e-9 - 0.1).astype("f4"), -100),
-    "around the stamp": (lambda t: (t * 1e-9 - 0.05).astype("f4"), -50),
-    "whole ns before the end": (lambda t: (t - PERIOD_NS).astype("i4"), -100),
+ODD = {  # what is written, ms of the first point after the stamp, and of the last one
+    "half revolutions": (lambda t: (t // 2 * 1e-9).astype("f4"), 0, 50),
+    "end-referenced": (lambda t: (t * 1e-9 - 0.1).astype("f4"), -100, 0),
+    "around the stamp": (lambda t: (t * 1e-9 - 0.05).astype("f4"), -50, 50),
+    "whole ns before the end": (lambda t: (t - PERIOD_NS).astype("i4"), -100, 0),
 }
 
 
 @pytest.mark.parametrize("kind", ODD)
 def test_odd_times_are_read_as_they_are_meant(kind, tmp_path):
-    make, first_ms = ODD[kind]
+    make, first_ms, end_ms = ODD[kind]
     sequence = open_sequence(bag(tmp_path, lambda i: make(FIRED_NS), num=3))
-    share = 0.5 if kind == "half revolutions" else 1
+    expected_ns = 1e6 * (first_ms + (end_ms - first_ms) * FIRED_NS / PERIOD_NS)
     for frame in sequence.frames:
-        expected_ns = share * FIRED_NS + 1e6 * first_ms
         np.testing.assert_allclose(sequence[frame].offset_ns, expected_ns, atol=10)
-
-
-def test_zeros_are_no_times(tmp_path):
-    sequence = open_sequence(bag(tmp_path, lambda i: np.zeros(NUM, "u4"), num=3))
-    assert sequence[1].offset_ns is None
-    assert "the same for all points" in dict(sequence.findings())["times"]
 
 
 @pytest.mark.parametrize("height", [8, NUM // 8])
@@ -149,20 +133,20 @@ def test_stamps_are_those_of_the_points_where_nothing_else_tells(tmp_path):
     assert not sequence.gaps()
 
 
-def test_times_since_the_start_of_the_log_are_stamps_too(tmp_path):
-    place = pcd(tmp_path / "drive", lambda i: 0.1 * i + FIRED_NS * 1e-9)
+@pytest.mark.parametrize(
+    ("start_s", "text", "reference_ns"),
+    [(0.0, "", 0), (1.7e9, "sweeps: {reference: end}", FIRED_NS[-1])],
+)
+def test_times_since_any_epoch_are_stamps(start_s, text, reference_ns, tmp_path):
+    """Of the log too; the stamp may be the end of the points' times."""
+    place = pcd(tmp_path / "drive", lambda i: start_s + 0.1 * i + FIRED_NS * 1e-9)
+    (place / "densify.yaml").write_text(text)
     sequence = open_sequence(place)
-    assert np.diff([sequence.stamp_ns(f) for f in sequence.frames]).tolist() == [10**8] * 6
-    np.testing.assert_allclose(sequence[5].offset_ns, FIRED_NS, atol=10)
-
-
-def test_the_stamp_may_be_the_end_of_the_points_times(tmp_path):
-    place = pcd(tmp_path / "drive", lambda i: 1.7e9 + 0.1 * i + FIRED_NS * 1e-9)
-    (place / "densify.yaml").write_text("sweeps: {reference: end}")
-    sequence = open_sequence(place)
-    last_ns = FIRED_NS[-1]
-    assert abs(sequence.stamp_ns(2) - (STAMP_NS + 2 * 10**8 + last_ns)) < 600
-    np.testing.assert_allclose(sequence[2].offset_ns, FIRED_NS - last_ns, atol=600)
+    stamps_ns = np.array([sequence.stamp_ns(f) for f in sequence.frames])
+    np.testing.assert_allclose(
+        stamps_ns - int(start_s) * 10**9 - reference_ns, np.arange(7) * 10**8, atol=600
+    )
+    np.testing.assert_allclose(sequence[5].offset_ns, FIRED_NS - reference_ns, atol=600)
 
 
 def test_a_file_that_cannot_be_read_costs_its_sweep_alone(tmp_path):

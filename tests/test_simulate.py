@@ -9,7 +9,7 @@ import pytest
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.outputs.simulated_street import write_street
-from densify.readers.kitti.raw import KittiRaw
+from densify.readers.kitti import KittiRaw
 from densify.readers.street import Street
 from densify.readers.truth_files import FileTruth, write_bodies, write_points
 from densify.street.simulator import Bodies

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from densify.geometry.poses import inverse, transform
-from densify.readers.describe import describe
+from densify.readers import describe
 from densify.readers.street import Street
 from densify.street.materials import Material
 from densify.street.mesh import box

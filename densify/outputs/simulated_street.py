@@ -31,8 +31,8 @@ from densify.geometry.types import Float, Float32, Int, Progress
 from densify.outputs.atomic import staged_folder
 from densify.outputs.depth_png import encode_png
 from densify.readers import checks
-from densify.readers.folder.config import NAME
-from densify.readers.kitti.raw import KITTI_TRIGGER_LATENCY_NS
+from densify.readers.folder_config import NAME
+from densify.readers.kitti import KITTI_TRIGGER_LATENCY_NS
 from densify.readers.recorded_poses import PoseTrack
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,21 +19,31 @@ from densify.readers.timeline import format_frames
 
 T = TypeVar("T")
 
+_NUMBER = re.compile(r"(\d+)")
 _ORTHONORMAL_TOLERANCE = 1e-3  # far above the rounding of text and float32 files (7 digits)
 
 
-def numbered_files(folder: Path, *suffixes: str) -> dict[int, Path]:
-    """Return a folder's files by number, such as ``0000000120.bin``; earlier suffixes win."""
-    if not folder.is_dir():
-        return {}
-    files = [p for p in folder.iterdir() if p.stem.isdecimal() and p.suffix.lower() in suffixes]
+def numbered_files(
+    folder: Path, *suffixes: str, stem: re.Pattern[str] = _NUMBER
+) -> dict[int, Path]:
+    """Return a folder's files by number, such as ``0000000120.bin``; earlier suffixes win.
+
+    ``stem`` matches the names without suffix; its first group is the number. A single file is
+    taken as a folder of one.
+    """
+    entries = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
+    files = [
+        (suffixes.index(suffix), int(match[1]), path)
+        for path in entries
+        if (suffix := path.suffix.lower()) in suffixes and (match := stem.fullmatch(path.stem))
+    ]
     path_of_number: dict[int, Path] = {}
-    for path in sorted(files, key=lambda p: (suffixes.index(p.suffix.lower()), p.name)):
-        before = path_of_number.setdefault(int(path.stem), path)
-        if before.stem != path.stem:
+    for _, number, path in sorted(files):
+        before = path_of_number.setdefault(number, path)
+        if before.stem != path.stem and before.suffix.lower() == path.suffix.lower():
             raise InputError(
-                f"{path}: has the number {int(path.stem)}, as {before.name} has; expected one file "
-                f"of each number; move one of them away"
+                f"{path}: has the number {number}, as {before.name} has; expected one file of each "
+                f"number; move one of them away"
             )
     return dict(sorted(path_of_number.items()))
 
@@ -148,19 +159,14 @@ def rigid(T: Any, where: str) -> Float:
     if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
         got = "NaN or infinity" if T.shape in ((4, 4), (3, 4)) else f"shape {T.shape}"
         raise InputError(f"{where}: got {got}, expected a (4,4) pose of finite numbers")
-    rotation(T[:3, :3], where)
-    return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
-
-
-def rotation(R: Float, where: str) -> Float:
-    """Return the (3,3) matrix unchanged; raise InputError if it is not a rotation."""
+    R = T[:3, :3]
     error = np.abs(R @ R.T - np.eye(3)).max()
     if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(R) < 0:
         raise InputError(
             f"{where}: got a matrix that is not a rotation (R Rᵀ is off by {error:.2g}, "
             f"determinant {np.linalg.det(R):.3f}), expected an orthonormal one"
         )
-    return R
+    return np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
 
 
 def scanner_axes(T_lidar_scanner: Float) -> Float:

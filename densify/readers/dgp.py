@@ -33,17 +33,15 @@ _BOGUS_YEAR = 2200  # DDAD stores tenths of microseconds as microseconds
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
     """Open a scene by its folder, or by a folder of scenes with the scene's name."""
-    if scene is None and find_scene(path):
+    if scene is None and _scene_files(path):
         return Dgp(path)
-    names = sorted(folder.name for folder in path.glob("*/") if find_scene(folder))
+    names = sorted(folder.name for folder in path.glob("*/") if _scene_files(folder))
     none = "no DGP scene; expected a folder with scene_<hash>.json"
     return Dgp(path / checks.chosen_scene("dgp", path, scene, names, none))
 
 
-def find_scene(folder: Path) -> Path | None:
-    """Return the file ``scene_<hash>.json`` that describes a folder's scene, None if missing."""
-    scene_files = [p for p in folder.glob("scene_*.json") if not p.name.startswith("scene_dataset")]
-    return min(scene_files, default=None)
+def _scene_files(folder: Path) -> list[Path]:
+    return [p for p in folder.glob("scene_*.json") if not p.name.startswith("scene_dataset")]
 
 
 class _Datum(NamedTuple):
@@ -56,14 +54,19 @@ class _Datum(NamedTuple):
     size_px: tuple[int, int]  # width and height of an image
 
 
+class _Mount(NamedTuple):
+    """The calibration of a sensor."""
+
+    T_ego_sensor: Float  # (4,4) pose of the sensor in the vehicle's frame
+    fx_fy_cx_cy: list[float]  # pixels
+
+
 class Dgp(FileSequence):
     """A DGP scene as a `LidarSequence`, with poses of its images."""
 
     def __init__(self, path: Path) -> None:
-        file = find_scene(path)
-        if file is None:
-            raise InputError(f"{path}: no DGP scene; expected scene_<hash>.json in it")
-        sweeps, self._images, calibration = _read_scene(file)
+        """Read the scene of a folder with scene_<hash>.json."""
+        sweeps, self._images, calibration = _read_scene(min(_scene_files(path)))
         lidar = min(sweeps)
         self._sweeps = sweeps[lidar]
         self._stamps_ns = {number: sweep.stamp_ns for number, sweep in self._sweeps.items()}
@@ -73,13 +76,12 @@ class Dgp(FileSequence):
             raise InputError(
                 f"{calibration}: no calibration of {missing[0]}; got {', '.join(map(str, mounts))}"
             )
-        T_ego_lidar, cameras = mounts[lidar][0], {}
+        T_ego_lidar, cameras = mounts[lidar].T_ego_sensor, {}
         for name, data in self._images.items():
-            (T_ego_cam, lens), size_px = mounts[name], next(iter(data.values())).size_px
-            T_cam_lidar = poses.inverse(T_ego_cam) @ T_ego_lidar
-            cameras[name] = checks.pinhole(
-                name, size_px, lens, T_cam_lidar, f"{calibration}: {name}"
-            )
+            size_px, where = next(iter(data.values())).size_px, f"{calibration}: {name}"
+            T_cam_lidar = poses.inverse(mounts[name].T_ego_sensor) @ T_ego_lidar
+            lens = mounts[name].fx_fy_cx_cy
+            cameras[name] = checks.pinhole(name, size_px, lens, T_cam_lidar, where)
         # DDAD merges several solid-state scanners into the vehicle's frame, with its origin on the
         # ground, and does not publish the origin of the rays. Scan lines are smoothest as seen from
         # 1.55 m above the ground: the mean position of the cameras is used.
@@ -165,12 +167,12 @@ def _read_pose(pose: Mapping[str, Any], where: str) -> Float:
     return checks.quaternion_pose(quaternion, [translation[key] for key in "xyz"], where)
 
 
-def _read_calibration(file: Path) -> dict[str, tuple[Float, list[float]]]:
-    """Return each sensor's (4,4) pose in the vehicle frame and fx fy cx cy (px), by its name."""
-    content, calibration = read_json(file), {}
+def _read_calibration(file: Path) -> dict[str, _Mount]:
+    """Return the calibration of each sensor by its name."""
+    content, mounts = read_json(file), {}
     with described_in(file, "names, and extrinsics and intrinsics of each"):
         sensors = zip(content["names"], content["extrinsics"], content["intrinsics"], strict=True)
         for name, extrinsic, lens in sensors:
             T = _read_pose(extrinsic, f"{file}: extrinsics of {name}")
-            calibration[name] = T, [float(lens[key]) for key in ("fx", "fy", "cx", "cy")]
-    return calibration
+            mounts[name] = _Mount(T, [float(lens[key]) for key in ("fx", "fy", "cx", "cy")])
+    return mounts

@@ -124,23 +124,21 @@ class Annotations:
         if not path.is_file():
             return None
         samples = find_records(tables / "sample.json", "scene_token", {scene})
-        boxes_of: dict[str, dict[str, KeyBox]] = defaultdict(dict)
         with described_in(path, _EXPECTED):
-            stamps_ns = {token: stamp_ns(record) for token, record in samples.items()}
+            order = sorted(samples, key=lambda token: stamp_ns(samples[token]))
+            boxes: dict[str, dict[str, KeyBox]] = {token: {} for token in order}
             for token, record in find_records(path, "sample_token", samples).items():
-                where, boxes = f"{path}: record {token}", boxes_of[record["sample_token"]]
-                if record["instance_token"] in boxes:
+                sample, instance = record["sample_token"], record["instance_token"]
+                where = f"{path}: record {token}"
+                if instance in boxes[sample]:
                     raise InputError(
-                        f"{where}: a second box of the instance {record['instance_token']} in the "
-                        f"sample {record['sample_token']}, expected one"
+                        f"{where}: a second box of the instance {instance} in the sample {sample}, "
+                        f"expected one"
                     )
                 size_m = np.array(record["size"], np.float64)[_LENGTH_WIDTH_HEIGHT]
-                boxes[record["instance_token"]] = KeyBox(pose_of(record, where), size_m)
-        order = sorted(stamps_ns, key=stamps_ns.__getitem__)
-        key_ns = np.array([stamps_ns[token] for token in order], np.int64)
-        return (
-            Annotations(str(path), key_ns, tuple(boxes_of[t] for t in order)) if boxes_of else None
-        )
+                boxes[sample][instance] = KeyBox(pose_of(record, where), size_m)
+        key_ns = np.array([stamp_ns(samples[token]) for token in order], np.int64)
+        return Annotations(str(path), key_ns, (*boxes.values(),)) if any(boxes.values()) else None
 
     def at(self, stamp_ns: int, T_lidar_world: Float) -> Boxes | None:
         """Return the boxes at a time in the lidar frame; None outside the time of the key frames.
@@ -152,10 +150,10 @@ class Annotations:
         after = int(np.searchsorted(self.key_ns, stamp_ns))
         before = after if self.key_ns[after] == stamp_ns else after - 1
         earlier, later = self.boxes[before], self.boxes[after]
-        track = [name if name in earlier and name in later else "" for name in {**earlier, **later}]
-        key_boxes = [self._box(name, before, after, stamp_ns) for name in {**earlier, **later}]
+        names = [*{**earlier, **later}]
+        key_boxes = [self._box(name, before, after, stamp_ns) for name in names]
         return checks.boxes(
-            track,
+            [name if name in earlier and name in later else "" for name in names],
             T_lidar_world @ np.reshape([box.T_world_box for box in key_boxes], (-1, 4, 4)),
             np.reshape([box.size_m for box in key_boxes], (-1, 3)),
             f"{self.where}: at {stamp_ns} ns",
@@ -165,16 +163,16 @@ class Annotations:
         """Inter- or extrapolate an object's box between key frames ``before`` and ``after``."""
         # At constant velocity and turn rate, as in the devkit. An object in only one of the two is
         # extrapolated from its nearest motion; it gets no track name, as its position is unknown.
-        boxes = self.boxes
         for first, last in ((before, after), (after, after + 1), (before - 1, before)):
-            inside = 0 <= first < last < len(boxes)
-            if inside and instance in boxes[first] and instance in boxes[last]:
-                first_box, last_box = boxes[first][instance], boxes[last][instance]
+            boxes = [
+                box[instance] for box in self.boxes[max(first, 0) : last + 1] if instance in box
+            ]
+            if 0 <= first < last < len(self.boxes) and len(boxes) == 2:
                 span_ns = self.key_ns[last] - self.key_ns[first]
                 share = float((stamp_ns - self.key_ns[first]) / span_ns)
-                T = interpolate(first_box.T_world_box, last_box.T_world_box, share)
-                return KeyBox(T, (last_box if share > 0.5 else first_box).size_m)
-        return {**boxes[before], **boxes[after]}[instance]
+                T = interpolate(boxes[0].T_world_box, boxes[1].T_world_box, share)
+                return KeyBox(T, boxes[share > 0.5].size_m)
+        return {**self.boxes[before], **self.boxes[after]}[instance]
 
 
 def open_recording(path: Path, scene: str | None) -> NuScenes:
@@ -194,19 +192,14 @@ def open_recording(path: Path, scene: str | None) -> NuScenes:
     return NuScenes(*scenes[name], name)
 
 
-@dataclass(frozen=True)
-class Channel:
-    """One sensor of a scene, with R records (sweeps or images)."""
+class Datum(NamedTuple):
+    """A sweep or image of a scene."""
 
-    stamps_ns: Sequence[int]  # R times of the records, ascending
-    files: Sequence[Path]  # R paths of the records' files; a file may be missing on the disk
-    T_ego_sensor: Sequence[Float]  # R poses (4,4) of the sensor in the vehicle's frame
-    size_px: tuple[int, int]  # width and height of the images; zeros for a lidar
-    intrinsics: Any  # camera matrix (3 x 3) of the first record as parsed from JSON
-
-    def on_disk(self) -> dict[int, Path]:
-        """Return the existing files, by the index of their records."""
-        return {i: file for i, file in enumerate(self.files) if isfile(file)}
+    stamp_ns: int
+    path: Path  # of its file, which may be missing on the disk
+    T_ego_sensor: Float  # (4,4) pose of the sensor in the vehicle's frame
+    size_px: tuple[int, int]  # width and height of an image; zeros for a sweep
+    intrinsics: Any  # camera matrix (3 x 3) as parsed from JSON
 
 
 def _read_path(tables: Path, token: str, name: str) -> tuple[list[Record], PoseTrack]:
@@ -230,25 +223,27 @@ def _read_path(tables: Path, token: str, name: str) -> tuple[list[Record], PoseT
     return records, PoseTrack(str(poses_file), np.array(stamps_ns, np.int64), T)
 
 
-def _channels(tables: Path, records: Sequence[Record], modality: str) -> dict[str, Channel]:
-    """Return the sensors of a modality by channel, from sample data records in order of time."""
+Channels = dict[str, dict[int, Datum]]
+"""Sweeps or images by channel and number."""
+
+
+def _channels(tables: Path, records: Sequence[Record]) -> dict[str, Channels]:
+    """Return the channels by modality, from sample data records in the order of time."""
     path, table = tables / "calibrated_sensor.json", tables / "sample_data.json"
     calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
-    groups: dict[str, list[Record]] = defaultdict(list)
+    tokens = {record["calibrated_sensor_token"] for record in records}
+    T = {token: pose_of(calibrated[token], f"{path}: record {token}") for token in tokens}
+    channels: dict[str, Channels] = defaultdict(lambda: defaultdict(dict))
     for record in records:
-        sensor = sensors[calibrated[record["calibrated_sensor_token"]]["sensor_token"]]
-        if sensor["modality"] == modality:
-            groups[sensor["channel"]].append(record)
-    channels = {}
-    for name, group in sorted(groups.items()):
-        tokens = [record["calibrated_sensor_token"] for record in group]
-        T = {t: pose_of(calibrated[t], f"{path}: record {t}") for t in dict.fromkeys(tokens)}
-        channels[name] = Channel(
-            [stamp_ns(record) for record in group],
-            [checks.file_within(tables.parent, record["filename"], table) for record in group],
-            [T[token] for token in tokens],
-            (int(group[0].get("width") or 0), int(group[0].get("height") or 0)),
-            calibrated[tokens[0]].get("camera_intrinsic"),
+        token = record["calibrated_sensor_token"]
+        sensor = sensors[calibrated[token]["sensor_token"]]
+        channel = channels[sensor["modality"]][sensor["channel"]]
+        channel[len(channel)] = Datum(
+            stamp_ns(record),
+            checks.file_within(tables.parent, record["filename"], table),
+            T[token],
+            (int(record.get("width") or 0), int(record.get("height") or 0)),
+            calibrated[token].get("camera_intrinsic"),
         )
     return channels
 
@@ -260,39 +255,41 @@ class NuScenes(FileSequence):
         self._tables, self._token, root = tables, token, tables.parent
         with described_in(tables / "sample_data.json", _EXPECTED):
             records, self._ego = _read_path(tables, token, name)
-            lidars, self._channels = (_channels(tables, records, k) for k in ("lidar", "camera"))
+            channels = _channels(tables, records)
+        lidars, self._images = channels["lidar"], dict(sorted(channels["camera"].items()))
         if len(lidars) != 1:
             lidar_names = ", ".join(lidars) or "none"
             raise InputError(f"{root}: got the lidars {lidar_names} of {name}, expected one")
         (lidar,) = lidars.values()
-        self._T_ego_lidar, self._stamps_ns = lidar.T_ego_sensor[0], lidar.stamps_ns
+        self._T_ego_lidar = lidar[0].T_ego_sensor
+        self._stamps_ns = {number: sweep.stamp_ns for number, sweep in lidar.items()}
         T_world_lidar = self._ego.T_world_ego @ self._T_ego_lidar
         self._track = PoseTrack(self._ego.where, self._ego.stamp_ns, T_world_lidar)
-        sweeps, channels = lidar.on_disk(), self._channels
+        sweeps = _on_disk(lidar)
         if not sweeps:
             raise InputError(
-                f"{root}: none of the {len(lidar.files)} sweeps of {name} are there; expected "
-                f"files such as {lidar.files[0]}"
+                f"{root}: none of the {len(lidar)} sweeps of {name} are there; expected files such "
+                f"as {lidar[0].path}"
             )
-        images = {name: channel.on_disk() for name, channel in channels.items()}
+        images = {channel: _on_disk(data) for channel, data in self._images.items()}
         super().__init__(
             name,
             root,
             list(sweeps),
-            {name: self._camera(name, channel) for name, channel in channels.items()},
-            {n: {i: channels[n].stamps_ns[i] for i in files} for n, files in images.items()},
+            {channel: self._camera(channel, data[0]) for channel, data in self._images.items()},
+            {n: {i: self._images[n][i].stamp_ns for i in files} for n, files in images.items()},
             checks.truth_beside(root),
             sweeps,
             images,
         )
 
-    def _camera(self, name: str, channel: Channel) -> Camera:
+    def _camera(self, name: str, image: Datum) -> Camera:
         where = f"{self._tables / 'calibrated_sensor.json'}: {name}"
         with described_in(where, "camera_intrinsic of 3 x 3 numbers"):
-            K = np.array(channel.intrinsics, np.float64).reshape(3, 3)
-        T_cam_lidar = inverse(channel.T_ego_sensor[0]) @ self._T_ego_lidar
+            K = np.array(image.intrinsics, np.float64).reshape(3, 3)
+        T_cam_lidar = inverse(image.T_ego_sensor) @ self._T_ego_lidar
         fx_fy_cx_cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-        return checks.pinhole(name, channel.size_px, fx_fy_cx_cy, T_cam_lidar, where)
+        return checks.pinhole(name, image.size_px, fx_fy_cx_cy, T_cam_lidar, where)
 
     def _pose(self, frame: int) -> Float:
         return self._track.at(self._stamps_ns[frame])
@@ -311,7 +308,7 @@ class NuScenes(FileSequence):
     def T_world_cam(self, camera: str, number: int) -> Float:
         """Return the (4,4) pose T_world_cam at the exposure of image ``number`` of a camera."""
         T_world_ego = self._ego.at(self.image_stamps_ns(camera)[number])
-        return T_world_ego @ self._channels[camera].T_ego_sensor[number]
+        return T_world_ego @ self._images[camera][number].T_ego_sensor
 
     def _returns(self, frame: int) -> Returns:
         data = read_bytes(self._files[frame])
@@ -321,3 +318,7 @@ class NuScenes(FileSequence):
         points = self._track.as_fired(rows[:, :3], self._stamps_ns[frame], offset_ns)
         points[np.linalg.norm(points, axis=1) < _NO_RETURN_M] = 0.0
         return Returns(points, (rows[:, 3] / 255).astype(np.float32), offset_ns)
+
+
+def _on_disk(data: Mapping[int, Datum]) -> dict[int, Path]:
+    return {number: datum.path for number, datum in data.items() if isfile(datum.path)}

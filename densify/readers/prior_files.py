@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.config.file_content import needed, open_file, reason
 from densify.geometry.types import Bool, Camera, Float32, Prior
+from densify.readers import checks
 from densify.readers.decoded_files import check_pixels, read_array, read_image
 from densify.readers.timeline import format_frames
 
-_SUFFIXES = (".png", ".exr", ".npy")  # ascending precision
+_SUFFIXES = (".npy", ".exr", ".png")  # descending precision
 _STEM = re.compile(r"(\d+)(?:[_-](?:depth|disp|disparity|pred|prior))?", re.IGNORECASE)
 _CHANNELS = ("Z", "Y", "depth", "Depth")
 _SAME_ASPECT = 0.02
@@ -86,31 +87,17 @@ class PriorFiles:
 
 def _in(folder: Path) -> dict[int, Path]:
     """Return the prior files of a folder or its ``data`` subfolder by image number."""
-    groups = [sorted(f.iterdir()) for f in (folder, folder / "data") if f.is_dir()]
-    for paths in [[folder]] if folder.is_file() else groups:
-        path_of_number: dict[int, Path] = {}
-        # The most precise file of a number wins: a PNG may be only a preview of the .npy.
-        for suffix in _SUFFIXES:
-            for path in paths:
-                stem = _STEM.fullmatch(path.stem)
-                if stem is not None and path.suffix.lower() == suffix:
-                    known = path_of_number.get(int(stem[1]))
-                    if known is not None and known.suffix.lower() == suffix:
-                        raise InputError(
-                            f"--prior: {known} and {path.name} are both of image {int(stem[1])}; "
-                            f"leave one there"
-                        )
-                    path_of_number[int(stem[1])] = path
-        if path_of_number:
-            return dict(sorted(path_of_number.items()))
-    return {}
+    # A PNG may be only a preview of the .npy.
+    folders = (folder, folder / "data")
+    numbered = (checks.numbered_files(path, *_SUFFIXES, stem=_STEM) for path in folders)
+    return next(filter(None, numbered), {})
 
 
 def _value(path: Path) -> Float32:
     """Read the (H,W) float32 values of a prior; 0 marks pixels without a value."""
     read = {".npy": read_array, ".exr": _read_exr, ".png": _read_png}[path.suffix.lower()]
-    image = np.asarray(read(path))
-    image = image.reshape([n for n in image.shape if n != 1]) if image.ndim > 2 else image
+    image = read(path)
+    image = image.squeeze() if image.ndim > 2 else image
     if image.ndim != 2 or image.dtype.kind not in "fui":
         raise InputError(
             f"{path}: got {image.dtype} of shape {image.shape}, expected numbers (H,W): one depth "

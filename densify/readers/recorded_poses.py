@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,14 +16,19 @@ from densify.geometry import poses
 from densify.geometry.types import Float, Int
 from densify.readers import checks
 from densify.readers.file_sequence import Returns
-from densify.readers.stamp_files import TIME_COLUMNS, TextTable, check_digits
+from densify.readers.stamped_files import TIME_COLUMNS, TextTable, existing
+from densify.readers.timeline import format_frames
 
 _PCD_HEADER = 4096  # bytes that hold the header of a .pcd file
 _NO_VIEWPOINT = "0 0 0 1 0 0 0"
 _MAX_BEYOND_NS = 200_000_000  # longest extrapolation of a pose, at constant velocity
-
-_PLACES = tuple((a, f"t{a}", f"p{a}", f"pos_{a}", f"position_{a}") for a in "xyz")
+_POSITIONS = tuple((a, f"t{a}", f"p{a}", f"pos_{a}", f"position_{a}") for a in "xyz")
 _TURNS = tuple((f"q{a}", f"q_{a}", f"rot_{a}", f"orientation_{a}") for a in "wxyz")
+_POSE_FILES = [
+    f"{name}.{suffix}"
+    for name in ("poses", "pose", "trajectory", "odometry", "groundtruth")
+    for suffix in ("txt", "csv", "tum")
+]
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,10 @@ class PoseTrack:
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
 
+    def compensated(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
+        """Move (N,3) points as fired to the vehicle frame at ``stamp_ns``; undoes `as_fired`."""
+        return self._carry(points, stamp_ns, offset_ns, inverse=False)
+
     def taken_back(self, placed: Returns, stamp_ns: int) -> Returns:
         """Undo that points were moved to the world with the poses of this path.
 
@@ -74,10 +83,6 @@ class PoseTrack:
         if placed.offset_ns is not None:
             at_stamp = self.as_fired(at_stamp, stamp_ns, placed.offset_ns)
         return replace(placed, points=at_stamp)
-
-    def compensated(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Move (N,3) points as fired to the vehicle frame at ``stamp_ns``; undoes `as_fired`."""
-        return self._carry(points, stamp_ns, offset_ns, inverse=False)
 
     def _carry(self, points: Float, stamp_ns: int, offset_ns: Int, inverse: bool) -> Float:
         if not len(points):
@@ -90,8 +95,8 @@ class PoseTrack:
         since_ns = np.array([t - stamp_ns for t in times_ns], np.float64)
         fired_ns, row = np.unique(offset_ns, return_inverse=True)  # many points share a firing time
         turns = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))(fired_ns)[row]
-        places_m = T_ref_ego[:, :3, 3].T
-        shift_m = np.stack([np.interp(fired_ns, since_ns, p) for p in places_m], 1)[row]
+        shifts_m = [np.interp(fired_ns, since_ns, axis) for axis in T_ref_ego[:, :3, 3].T]
+        shift_m = np.stack(shifts_m, axis=1)[row]
         if inverse:
             return turns.apply(points - shift_m, inverse=True)
         return turns.apply(points) + shift_m
@@ -105,74 +110,113 @@ def taken_back(placed: Float, T_world_ego: Float) -> Float:
 
 @dataclass(frozen=True)
 class PoseFile:
-    """The n poses of a text file, in the frames that the file uses (usually T_world_body)."""
+    """The n poses of text files, in the frames that the files use (usually T_world_body)."""
 
     path: Path  # file of the poses; the first file if each sweep has its own
     form: str  # name of the file's format, for messages
     T: Float  # (n,4,4) poses in file order
     stamps_ns: tuple[int, ...] | None = None  # n times of the poses, None for a file without times
+    frames: tuple[int, ...] | None = None  # n frames of files for each sweep, None for one file
+
+    @staticmethod
+    def of_folder(
+        folder: Path, name: str, unit: str, sweeps: Mapping[int, Path]
+    ) -> PoseFile | None:
+        """Read the poses of a recording; None without any.
+
+        These are the file ``name``, or for "" a file of a usual name, a file with the suffix .pose
+        beside each sweep, or the viewpoints of .pcd files. ``unit`` is that of the times, "" to
+        find it.
+        """
+        if name:
+            return PoseFile.read(existing(folder, name, "poses: {file: ...}"), unit)
+        for path in (folder / usual for usual in _POSE_FILES):
+            if path.is_file():
+                return PoseFile.read(path, unit)
+        beside = {frame: path.with_suffix(".pose") for frame, path in sweeps.items()}
+        beside = {frame: path for frame, path in beside.items() if path.is_file()}
+        if beside:
+            return PoseFile._of_each(beside, "one file for each sweep", _one_pose)
+        return PoseFile._of_viewpoints(sweeps)
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
         """Read a file with one pose on each line; ``unit`` of the times, "" to find it."""
         table = TextTable.read(path, [name for names in _TURNS for name in names])
-        width, time = len(table.rows[0]), None
-        columns = [i for names in (*_TURNS, *_PLACES) if (i := table.column(names)) is not None]
-        form = "table with quaternions"
+        columns = [i for names in (*_TURNS, *_POSITIONS) if (i := table.column(names)) is not None]
+        width, form, time = len(table.rows[0]), "table with quaternions", None
         if len(columns) == 7:
             time = table.column(TIME_COLUMNS)
         elif width == 8:
             form, columns, time = "TUM", [7, 4, 5, 6, 1, 2, 3], 0
         elif width in (12, 16):
-            lines = zip(_numbers(table), table.lines, strict=True)
-            T = np.stack([checks.rigid(one, f"{path}: line {n}") for one, n in lines])
-            return PoseFile(path, "KITTI 3x4" if width == 12 else "4x4 rows", T)
+            form, columns = "KITTI 3x4" if width == 12 else "4x4 rows", []
         else:
             raise InputError(
                 f"{path}: line {table.lines[0]}: got {width} numbers, expected 12 (KITTI), 16 "
                 f"(4x4), 8 (TUM: time x y z qx qy qz qw), or a first line that names x y z qw qx "
                 f"qy qz"
             )
-        values = _numbers(table, columns)
-        lines = zip(values, table.lines, strict=True)
-        T = np.stack([checks.quaternion_pose(v[:4], v[4:], f"{path}: line {n}") for v, n in lines])
+        T = []
+        for line, words in zip(table.lines, table.rows, strict=True):
+            where = f"{path}: line {line}"
+            text = " ".join([words[i] for i in columns] or words)
+            values = checks.parse_numbers(text, where, len(columns) or width)
+            if columns:
+                T.append(checks.quaternion_pose(values[:4], values[4:], where))
+            else:
+                T.append(checks.rigid(values, where))
         stamps_ns = None
         if time is not None:
             stamps_ns, _ = table.times_ns(time, unit)
-            check_digits(stamps_ns, table.rows[0][time], path)
-        return PoseFile(path, form, T, stamps_ns)
+            table.check_digits(stamps_ns, time)
+        return PoseFile(path, form, np.stack(T), stamps_ns)
 
     @staticmethod
-    def read_each(paths: Sequence[Path]) -> PoseFile:
-        """Read files with one pose each: 3x4 or 4x4 matrices, or x y z qx qy qz qw."""
-        T = []
-        for path in paths:
-            count = len(read_text(path).split())
-            values = checks.parse_numbers(read_text(path), str(path), count)
-            if count in (12, 16):
-                T.append(checks.rigid(values, str(path)))
-            elif count == 7:
-                T.append(checks.quaternion_pose(values[[6, 3, 4, 5]], values[:3], str(path)))
-            else:
-                raise InputError(
-                    f"{path}: got {count} numbers, expected 12 or 16 (rows of T_world_lidar) or "
-                    f"7 (x y z qx qy qz qw); write them as lines of a file poses.txt instead"
-                )
-        return PoseFile(paths[0], "one file for each sweep", np.stack(T))
+    def _of_each(paths: Mapping[int, Path], form: str, read: Callable[[Path], Float]) -> PoseFile:
+        T = np.stack([read(path) for path in paths.values()])
+        return PoseFile(next(iter(paths.values())), form, T, frames=tuple(paths))
 
     @staticmethod
-    def of_viewpoints(paths: Sequence[Path]) -> PoseFile | None:
+    def _of_viewpoints(sweeps: Mapping[int, Path]) -> PoseFile | None:
         """Read the poses in VIEWPOINT of .pcd files; None for other files and without poses."""
+        paths = list(sweeps.values())
         if not all(path.suffix.lower() == ".pcd" for path in paths):
             return None
         try:
             # The default in the first and the last file is no pose.
             if np.allclose([_viewpoint(path) for path in (paths[0], paths[-1])], np.eye(4)):
                 return None
-            T = np.stack([_viewpoint(path) for path in paths])
+            return PoseFile._of_each(sweeps, "VIEWPOINT of each sweep", _viewpoint)
         except InputError:  # some programs write zeros
             return None
-        return PoseFile(paths[0], "VIEWPOINT of each sweep", T)
+
+    def by_frame(self, frames: Sequence[int]) -> dict[int, Float]:
+        """Return the poses by frame: one for each of the ascending ``frames``, or from frame 0."""
+        if self.frames is not None:
+            return dict(zip(self.frames, self.T, strict=True))
+        if len(self.T) == len(frames):
+            return dict(zip(frames, self.T, strict=True))
+        if len(self.T) > frames[-1]:
+            return dict(enumerate(self.T))
+        raise InputError(
+            f"{self.path}: got {len(self.T)} poses for {len(frames)} sweeps numbered "
+            f"{format_frames(frames)}, expected one for each, or for each number from 0"
+        )
+
+
+def _one_pose(path: Path) -> Float:
+    """Return the (4,4) pose of a file: a 3x4 or 4x4 matrix, or x y z qx qy qz qw."""
+    text = read_text(path)
+    values = checks.parse_numbers(text, str(path), len(text.split()))
+    if len(values) in (12, 16):
+        return checks.rigid(values, str(path))
+    if len(values) == 7:
+        return checks.quaternion_pose(values[[6, 3, 4, 5]], values[:3], str(path))
+    raise InputError(
+        f"{path}: got {len(values)} numbers, expected 12 or 16 (rows of T_world_lidar) or 7 (x y z "
+        f"qx qy qz qw); write them as lines of a file poses.txt instead"
+    )
 
 
 def _viewpoint(path: Path) -> Float:
@@ -184,12 +228,3 @@ def _viewpoint(path: Path) -> Float:
     where = f"{path}: VIEWPOINT"
     values = checks.parse_numbers(viewpoints[0] if viewpoints else _NO_VIEWPOINT, where, 7)
     return checks.quaternion_pose(values[3:], values[:3], where)
-
-
-def _numbers(table: TextTable, columns: Sequence[int] | None = None) -> Float:
-    rows = []
-    for line, words in zip(table.lines, table.rows, strict=True):
-        chosen = words if columns is None else [words[i] for i in columns]
-        width = len(table.rows[0] if columns is None else columns)
-        rows.append(checks.parse_numbers(" ".join(chosen), f"{table.path}: line {line}", width))
-    return np.array(rows)

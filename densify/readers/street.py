@@ -12,7 +12,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from threading import Lock
 from typing import Any, TypeVar
 from urllib.parse import parse_qsl
@@ -68,8 +68,8 @@ class Street:
         self._posed = f"{VERSION} {preset} {seed}{options}, with any sensor"
         self._swept = f"{VERSION} {preset} {seed} {sensor}{options}"
         self._pictured = f"{VERSION} {preset} {seed} {hz} Hz, with any sensor"
-        self._returns = lru_cache(_SWEEPS_IN_MEMORY)(self._kept_returns)
-        self._picture = lru_cache(_IMAGES_IN_MEMORY)(self._kept_picture)
+        self._returns = lru_cache(_SWEEPS_IN_MEMORY)(self._render_returns)
+        self._picture = lru_cache(_IMAGES_IN_MEMORY)(self._render_picture)
 
     @staticmethod
     def from_spec(spec: str) -> Street:
@@ -142,25 +142,21 @@ class Street:
     @cached_property
     def bodies(self) -> Bodies:
         """Poses of the scanner and of all simulated bodies at the reference time of each frame."""
-        return self._kept("bodies", self._posed, lambda: self.simulator.bodies)
+        return kept(self._cache, "bodies", lambda: self._posed, lambda: self.simulator.bodies)
 
-    def _kept_returns(self, frame: int) -> Returns:
-        make = partial(self._render, self.simulator.returns, frame)
-        return self._kept("sweep", (self._swept, frame), make)
+    def _render_returns(self, frame: int) -> Returns:
+        return self._kept("sweep", (self._swept, frame), lambda: self.simulator.returns(frame))
 
-    def _kept_picture(self, camera: str, number: int) -> Picture:
-        make = partial(self._render, self.simulator.picture, camera, number)
-        return self._kept("image", (self._pictured, camera, number), make)
+    def _render_picture(self, camera: str, number: int) -> Picture:
+        inputs = (self._pictured, camera, number)
+        return self._kept("image", inputs, lambda: self.simulator.picture(camera, number))
 
-    def _render(self, render: Callable[..., T], *arguments: Any) -> T:
-        with self._building:
-            _ = self.simulator.scene.world.triangles  # made once, for all threads
-        return render(*arguments)
-
-    def _kept(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
+    def _kept(self, step: str, inputs: Any, render: Callable[[], T]) -> T:
         def rendered() -> T:
             _announce()
-            return make()
+            with self._building:
+                _ = self.simulator.scene.world.triangles  # made once, for all threads
+            return render()
 
         return kept(self._cache, step, lambda: inputs, rendered)
 

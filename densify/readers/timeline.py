@@ -137,18 +137,11 @@ class Timeline:
 
     def before(self, frame: int, num: int) -> list[int]:
         """Return up to ``num`` frames directly before a frame, ascending, up to a hole in time."""
-        return [self.frames[row] for row in self._next_to(frame, -1, num)[::-1]]
+        return self._side(frame, -1, num, {})[0][::-1]
 
     def after(self, frame: int, num: int) -> list[int]:
         """Return up to ``num`` frames directly after a frame, ascending, up to a hole in time."""
-        return [self.frames[row] for row in self._next_to(frame, 1, num)]
-
-    def _next_to(self, frame: int, step: int, num: int) -> list[int]:
-        """Return up to ``num`` indices on a frame's side, nearest first, up to a hole in time."""
-        start, end = self.row[frame], len(self.frames) if step > 0 else -1
-        rows = range(start + step, end, step)[:num]
-        holes = (n for n, row in enumerate(rows) if self._hole_before(max(row, row - step)))
-        return list(rows[: next(holes, len(rows))])
+        return self._side(frame, 1, num, {})[0]
 
     def window(
         self, key: int, window: int, left_out: Mapping[int, str] | None = None
@@ -169,23 +162,23 @@ class Timeline:
         return WindowFrames((*reversed(before), key, *after), cuts)
 
     def _side(
-        self, key: int, step: int, window: int, left_out: Mapping[int, str]
+        self, key: int, step: int, num: int, left_out: Mapping[int, str]
     ) -> tuple[list[int], str]:
-        """Return frames beside the key, nearest first, and why they are fewer than ``window``."""
-        side = [self.frames[row] for row in self._next_to(key, step, window)]
-        for n, frame in enumerate(side):
+        """Return up to ``num`` frames beside the key, nearest first, and why there are no more."""
+        side: list[int] = []
+        for row in range(self.row[key] + step, self.row[key] + step * (num + 1), step):
+            previous = self.frames[row - step]
+            if not 0 <= row < len(self.frames):
+                return side, f"the recording {'begins' if step < 0 else 'ends'} at frame {previous}"
+            frame = self.frames[row]
+            if self._hole_before(max(row, row - step)):
+                gap_s = abs(int(self.stamp_ns[row] - self.stamp_ns[row - step])) * 1e-9
+                first, second = sorted((previous, frame))
+                return side, f"{gap_s:.1f} s lie between frames {first} and {second}"
             if frame in left_out:
-                return side[:n], left_out[frame]
-        if len(side) == window:
-            return side, ""
-        last_row = self.row[key] + step * len(side)
-        next_row = last_row + step
-        if not 0 <= next_row < len(self.frames):
-            verb = "begins" if step < 0 else "ends"
-            return side, f"the recording {verb} at frame {self.frames[last_row]}"
-        gap_s = abs(int(self.stamp_ns[next_row] - self.stamp_ns[last_row])) * 1e-9
-        first, second = sorted((self.frames[last_row], self.frames[next_row]))
-        return side, f"{gap_s:.1f} s lie between frames {first} and {second}"
+                return side, left_out[frame]
+            side.append(frame)
+        return side, ""
 
     def _hole_before(self, row: int) -> bool:
         gap_ns = int(self.stamp_ns[row] - self.stamp_ns[row - 1])

@@ -35,7 +35,7 @@ def write_odometry(excerpt: Excerpt, out: Path) -> Path:
         put(sequence / "velodyne" / f"{number:06d}.bin", sweep_data(street, frame, points))
         for name in excerpt.cameras:
             put(sequence / "image_2" / f"{number:06d}.png", excerpt.png_image(name, frame))
-    T_rect_lidar = T_RECTIFIED_LIDAR @ T_level_lidar(street.simulator.tilt_deg)
+    T_rect_lidar = _T_rect_lidar(excerpt)
     T_world_rect = excerpt.T_world_ego(np.array(stamps_ns), poses.inverse(T_rect_lidar))
     T_first_now = poses.inverse(T_world_rect[0]) @ T_world_rect
     since_s = [f"{(ns - stamps_ns[0]) * 1e-9:.6e}\n" for ns in stamps_ns]
@@ -53,11 +53,10 @@ def write_tracking(excerpt: Excerpt, out: Path) -> Path:
         put(folder / "velodyne/0000" / f"{number:06d}.bin", sweep_data(street, frame))
         for name in excerpt.cameras:
             put(folder / name / "0000" / f"{number:06d}.png", excerpt.png_image(name, frame))
-    tilt_deg = street.simulator.tilt_deg
     calibration = (
         f"{projections('P{}')}R_rect {numbers(np.eye(3))}\n"
-        f"Tr_velo_cam {numbers((T_RECTIFIED_LIDAR @ T_level_lidar(tilt_deg))[:3])}\n"
-        f"Tr_imu_velo {numbers(T_lidar_imu(tilt_deg)[:3])}\n"
+        f"Tr_velo_cam {numbers(_T_rect_lidar(excerpt)[:3])}\n"
+        f"Tr_imu_velo {numbers(T_lidar_imu(street.simulator.tilt_deg)[:3])}\n"
     )
     put(folder / "calib" / "0000.txt", calibration)
     records = [oxts_line(street, frame, excerpt.frames[0]) for frame in excerpt.frames]
@@ -68,15 +67,19 @@ def write_tracking(excerpt: Excerpt, out: Path) -> Path:
     return folder
 
 
+def _T_rect_lidar(excerpt: Excerpt) -> Float:
+    return T_RECTIFIED_LIDAR @ T_level_lidar(excerpt.street.simulator.tilt_deg)
+
+
 def _labels(excerpt: Excerpt, frame: int, number: int) -> Iterator[str]:
     """Lines of the boxes in the image, each at the time when the scanner met it."""
     camera, drawn = CAMERAS["image_02"], drawn_boxes(excerpt, frame)
-    T_rect_level = T_RECTIFIED_LIDAR @ T_level_lidar(excerpt.street.simulator.tilt_deg)
+    T_rect_lidar = _T_rect_lidar(excerpt)
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
     for instance, T_world_box, size_m, met_ns in zip(
         drawn.instance, drawn.T_world_box, drawn.size_m, drawn.met_ns, strict=True
     ):
-        T_rect_box = T_rect_level @ poses.inverse(excerpt.pose(met_ns)) @ T_world_box
+        T_rect_box = T_rect_lidar @ poses.inverse(excerpt.pose(met_ns)) @ T_world_box
         T_cam_box = camera.T_cam_lidar @ poses.inverse(T_RECTIFIED_LIDAR) @ T_rect_box
         seen = _rectangle(camera, poses.transform(T_cam_box, corners * size_m))
         if seen is None:

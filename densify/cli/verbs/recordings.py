@@ -38,8 +38,7 @@ def add_info(commands: Any) -> None:
 
 def answer_info(options: argparse.Namespace) -> Iterator[Answer]:
     """Print what a recording holds."""
-    from densify.readers import open_sequence
-    from densify.readers.describe import findings, in_lines
+    from densify.readers import findings, in_lines, open_sequence
 
     sequence = open_sequence(recording_of(options))
     lines, frames, cameras = findings(sequence), [*sequence.frames], [*sequence.cameras]
@@ -65,8 +64,7 @@ def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
     """Print the findings about a recording."""
     config, spec = config_of(options), recording_of(options)
     from densify.doctor import Verdict, examine
-    from densify.readers import open_sequence
-    from densify.readers.describe import describe
+    from densify.readers import describe, open_sequence
 
     sequence = open_sequence(spec)
     diagnosis = examine(sequence, config)

@@ -36,7 +36,7 @@ class _Labelled(NamedTuple):
 def write_kitti_tracking(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write labels, calibration, key sweeps (deskewed) and images of one camera.
 
-    `densify.readers.kitti.tracking` reads the tree. A sequence is a recording, a frame is a key. A
+    `densify.readers.kitti` reads the tree. A sequence is a recording, a frame is a key. A
     box is where the key sweep measured the object. Its type follows from the size. ``occluded`` is
     3, unknown. ``truncated`` is 1 at the image's border. Objects out of view are left out.
     """

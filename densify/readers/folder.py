@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Read any folder of numbered point files, with stamps, poses and images beside them.
 
-``densify.yaml`` (`densify.readers.folder.config`) states what the files leave open.
+``densify.yaml`` (`densify.readers.folder_config`) states what the files leave open.
 
 points: in the lidar's frame, not deskewed. With ``compensated`` they are ego-motion compensated to
     the stamp. The reader undoes this if points have times and poses have stamps. Otherwise it
@@ -16,7 +16,7 @@ images: need a calibration; stamped by names, a file, or the sweeps of the same 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -29,20 +29,14 @@ from densify.geometry import poses
 from densify.geometry.types import Bool, Float
 from densify.readers import checks
 from densify.readers.file_sequence import FileSequence, Returns
-from densify.readers.folder.config import CameraFiles, FolderConfig, SweepFiles
-from densify.readers.folder.series import (
-    Series,
-    find_images,
-    find_pose_file,
-    find_sweeps,
-    images_in,
-    in_time,
-)
+from densify.readers.folder_config import NAME, CameraFiles, FolderConfig, SweepFiles
 from densify.readers.point_fields import Columns, PointLayout, PointTimes, sample_columns
-from densify.readers.point_files import read_table
+from densify.readers.point_files import SUFFIXES, read_table
 from densify.readers.recorded_poses import PoseFile, PoseTrack, taken_back
-from densify.readers.timeline import format_frames
+from densify.readers.stamped_files import NamedFile, Series, existing, files_below, in_time
 
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+_SEARCH_DEPTH = 2  # levels of subfolders
 _ASSUMED_HZ = 10.0
 _UNTIMED = (
     "times of points are left out: they are compensated, and no poses with stamps tell by how much"
@@ -56,7 +50,7 @@ class SweepColumns:
     series: Series  # files and stamps of the sweeps
     settings: SweepFiles  # section ``sweeps`` of densify.yaml
     config: Path | None  # path of densify.yaml, None if the folder has none
-    _own_stamps_ns: dict[int, int] = field(default_factory=dict)
+    _point_stamps_ns: dict[int, int] = field(default_factory=dict)
 
     def returns(self, frame: int, stamp_ns: int) -> Returns:
         """Read all rows of a sweep with reference time ``stamp_ns``, in the lidar frame."""
@@ -75,11 +69,8 @@ class SweepColumns:
         """The meaning of the columns, found in a few sweeps."""
         frame, columns = next(iter(self._samples.items()))
         path, settings = self.series.paths[frame], self.settings
-        named = {
-            quantity: name
-            for quantity in ("intensity", "time", "lidar")
-            if (name := getattr(settings, quantity))
-        }
+        quantities = ("intensity", "time", "lidar")
+        named = {q: getattr(settings, q) for q in quantities if getattr(settings, q)}
         for quantity, name in named.items():
             if name not in columns:
                 raise InputError(
@@ -103,19 +94,20 @@ class SweepColumns:
         """Return a sweep's stamp; without stamps, a time from absolute point times or the rate."""
         if self.series.stamps_ns is not None:
             return self.series.stamps_ns[frame]
-        if self._own_clock is None:
+        times = self._point_clock
+        if times is None:
             return frame * self.period_ns
-        if frame not in self._own_stamps_ns:
-            path, times = self.series.paths[frame], self._own_clock
+        if frame not in self._point_stamps_ns:
+            path = self.series.paths[frame]
             columns = self._columns(path)
             stamp_ns = times.own_stamp_ns(columns[times.field]) if times.field in columns else None
             if stamp_ns is None:
                 raise InputError(f"{path}: no time of a point in {times.field}, which others have")
-            self._own_stamps_ns[frame] = stamp_ns
-        return self._own_stamps_ns[frame]
+            self._point_stamps_ns[frame] = stamp_ns
+        return self._point_stamps_ns[frame]
 
     @cached_property
-    def _own_clock(self) -> PointTimes | None:
+    def _point_clock(self) -> PointTimes | None:
         """The column of absolute point times that replaces missing stamps, None without one."""
         try:
             times = self.layout.times
@@ -126,16 +118,16 @@ class SweepColumns:
     @property
     def stamped_by(self) -> str:
         """The source of the stamps, for people."""
-        if self.series.told_by:
-            return self.series.told_by
-        if self._own_clock is not None:
-            return f"the times of the points ({self._own_clock.field})"
+        if self.series.stamped_by:
+            return self.series.stamped_by
+        if self._point_clock is not None:
+            return f"the times of the points ({self._point_clock.field})"
         article = "the" if self.settings.rate_hz else "an assumed"
         return f"number, at {article} {1e9 / self.period_ns:g} Hz (rate_hz)"
 
     def assumed(self) -> list[str]:
         """Return the assumptions about missing stamps, a sentence each."""
-        if self.series.stamps_ns or self._own_clock is not None or self.settings.rate_hz:
+        if self.series.stamps_ns or self._point_clock is not None or self.settings.rate_hz:
             return []
         return [
             f"the sweeps have no stamps: they are taken for {1e9 / self.period_ns:g} Hz by their "
@@ -150,13 +142,16 @@ class SweepColumns:
             return max(1, int(np.median(np.diff(stamps_ns))))
         return round(1e9 / (self.settings.rate_hz or _ASSUMED_HZ))
 
-    def unused(self) -> list[str]:
-        """Return the names of unused columns with the range of their values, for people."""
-        return [
+    def fields(self) -> str:
+        """Return the columns in use, and the unused ones with the range of their values."""
+        used = {quantity: name for quantity, name in vars(self.layout.fields).items() if name}
+        unused = [
             f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
             for name, column in next(iter(self._samples.values())).items()
-            if name not in vars(self.layout.fields).values()
+            if name not in used.values()
         ]
+        text = ", ".join(f"{quantity} = {name}" for quantity, name in used.items())
+        return f"{text}; not used: {', '.join(unused)}" if unused else text
 
     @cached_property
     def _samples(self) -> dict[int, Columns]:
@@ -193,29 +188,40 @@ class Folder(FileSequence):
         folder = Path(path)
         self._config = FolderConfig.read(folder)
         settings, cameras = self._config.sweeps, self._config.cameras
-        files = find_sweeps(folder, settings.files)
-        self._sweeps = in_time(folder, files, settings.stamps, settings.stamps_unit)
-        self._columns = SweepColumns(self._sweeps, settings, self._config.path)
-        images = {name: _images(folder, name, config) for name, (_, config) in cameras.items()}
+        files = _find_sweeps(folder, settings.files)
+        sweeps = in_time(folder, files, settings.stamps, settings.stamps_unit)
+        self._columns = SweepColumns(sweeps, settings, self._config.path)
+        images = {name: _find_images(folder, name, files) for name, files in cameras.items()}
         super().__init__(
             folder.resolve().name,
             folder,
-            tuple(self._sweeps.paths),
-            {name: camera for name, (camera, _) in cameras.items()},
+            tuple(sweeps.paths),
+            {name: files.camera(name) for name, files in cameras.items()},
             truth=checks.truth_beside(folder),
-            files=self._sweeps.paths,
+            files=sweeps.paths,
             images={name: series.paths for name, series in images.items()},
         )
-        self._by_sweeps: dict[str, str] = {}
+        self._stamped_by_sweeps: dict[str, str] = {}  # a note for each camera
         for name, series in images.items():
-            shift_ns = round(cameras[name][1].clock_offset_s * 1e9)
+            shift_ns = round(cameras[name].clock_offset_s * 1e9)
             stamps_ns = series.stamps_ns
             if stamps_ns is None:
                 stamps_ns = {n: self.stamp_ns(n) for n in self.frames if n in series.paths}
-                self._by_sweeps |= _stamped_by_sweeps(name, series, self.frames, cameras[name][1])
+                if cameras[name].stamps != "sweeps":
+                    self._stamped_by_sweeps[name] = self._pairing(series.paths)
             self._exposed_ns[name] = {number: ns + shift_ns for number, ns in stamps_ns.items()}
         self._read_poses()
         self._is_untimed = settings.compensated and self._track is None
+
+    def _pairing(self, images: Mapping[int, Path]) -> str:
+        """Describe that images have the stamps of sweeps, though nobody asked for it."""
+        text = (
+            f"{len(images)} images without stamps beside {len(self.frames)} sweeps: each is taken "
+            f"as exposed when the sweep of its number is stamped"
+        )
+        if images.keys() != set(self.frames):
+            text += "; if their rates differ, give the images' times (stamps in densify.yaml)"
+        return text
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep."""
@@ -232,25 +238,23 @@ class Folder(FileSequence):
             )
         if self._is_untimed:
             notes.append(_UNTIMED)
-        return notes + [f"{name}: {text}" for name, text in self._by_sweeps.items()]
+        return notes + [f"{name}: {text}" for name, text in self._stamped_by_sweeps.items()]
 
     def findings(self) -> Sequence[tuple[str, str]]:
         """Return what the reader detected, such as columns and stamps, as (name, text) pairs."""
-        layout, first = self._columns.layout, self._sweeps.paths[self.frames[0]]
-        fields = [f"{quantity} = {name}" for quantity, name in vars(layout.fields).items() if name]
-        unused = ", ".join(self._columns.unused())
+        layout, first = self._columns.layout, self._files[self.frames[0]]
         lines = [
             ("files", f"{(first.parent / '*').relative_to(self.where)}{first.suffix}"),
-            ("fields", ", ".join(fields) + (f"; not used: {unused}" if unused else "")),
+            ("fields", self._columns.fields()),
             ("intensity", f"divided by {layout.intensity_scale:g}"),
             ("times", _UNTIMED if self._is_untimed else layout.time_words),
             ("stamped by", self._columns.stamped_by),
-            *self._by_sweeps.items(),
+            *self._stamped_by_sweeps.items(),
         ]
         if self._poses is not None:
             lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
-        used = {str(Path(config.files)) for _, config in self._config.cameras.values()}
-        for name, images in find_images(self.where).items():
+        used = {str(Path(config.files)) for config in self._config.cameras.values()}
+        for name, images in files_below(self.where, _IMAGE_SUFFIXES, _SEARCH_DEPTH).items():
             if name not in used:
                 text = f"{name} holds {len(images)} images without a calibration"
                 lines.append(("no camera", text))
@@ -279,60 +283,58 @@ class Folder(FileSequence):
         return super()._pose(frame)
 
     def _read_poses(self) -> None:
-        """Read the pose file into ``_track`` if its poses have stamps, else by frame number."""
-        settings, frames = self._config.poses, self.frames
-        self._poses: PoseFile | None = None
-        self._track: PoseTrack | None = None
-        path = find_pose_file(self.where, settings.file)
-        pose_files = {f: p for f in frames if (p := self._files[f].with_suffix(".pose")).is_file()}
-        file = (
-            PoseFile.of_viewpoints([*self._files.values()]) if not path and not pose_files else None
-        )
-        if path is None and not pose_files and file is None:
-            if self._config.sweeps.frame == "poses":
-                raise InputError(
-                    f"{self._config.path}: sweeps.frame: got poses, but there are no poses; give "
-                    f"those that placed the sweeps (poses: {{file: NAME}})"
-                )
-            return
-        if path is not None:
-            file = PoseFile.read(path, settings.stamps_unit)
-        elif file is None:
-            frames = [*pose_files]
-            file = PoseFile.read_each([*pose_files.values()])
+        """Read the poses into ``_track`` if they have stamps, else by frame number."""
+        settings = self._config.poses
+        file = PoseFile.of_folder(self.where, settings.file, settings.stamps_unit, self._files)
+        if file is None and self._config.sweeps.frame == "poses":
+            raise InputError(
+                f"{self._config.path}: sweeps.frame: got poses, but there are no poses; give those "
+                f"that placed the sweeps (poses: {{file: NAME}})"
+            )
         self._poses = file
+        self._track: PoseTrack | None = None
+        if file is None:
+            return
         T = poses.inverse(file.T) if settings.inverse else file.T
         T = T if settings.T_frame_lidar is None else T @ settings.T_frame_lidar
         if file.stamps_ns is not None:
             self._track = PoseTrack(str(file.path), np.array(file.stamps_ns, np.int64), T)
-            return
-        if len(T) != len(frames) and len(T) <= frames[-1]:
+        else:
+            self._T_world_lidar = replace(file, T=T).by_frame(self.frames)
+
+
+def _find_sweeps(folder: Path, files: str) -> list[Path]:
+    """Return the numbered point files of a folder, all of the preferred suffix.
+
+    ``files`` is the subfolder of the sweeps; "" searches the folder and two levels below it.
+    """
+    if files:
+        existing(folder, files, "sweeps: {files: ...}", is_folder=True)
+    below = files_below(folder / files, SUFFIXES, 0 if files else _SEARCH_DEPTH)
+    numbered = {
+        name: [path for path in paths if NamedFile.of(path)[1:] != (None, None)]
+        for name, paths in below.items()
+    }
+    for suffix in SUFFIXES:
+        groups = {n: [p for p in ps if p.suffix.lower() == suffix] for n, ps in numbered.items()}
+        groups = {name: paths for name, paths in groups.items() if paths}
+        if len(groups) > 1:
             raise InputError(
-                f"{file.path}: got {len(T)} poses for {len(frames)} sweeps numbered "
-                f"{format_frames(frames)}, expected one for each, or for each number from 0"
+                f"{folder}: several folders hold sweeps: {', '.join(groups)}; name one in "
+                f"{folder / NAME}: sweeps: {{files: ...}}"
             )
-        numbers = frames if len(T) == len(frames) else range(len(T))
-        self._T_world_lidar = dict(zip(numbers, T, strict=True))
-
-
-def _stamped_by_sweeps(
-    name: str, images: Series, frames: Sequence[int], config: CameraFiles
-) -> dict[str, str]:
-    """Return a note, by camera, that images have sweeps' stamps without a request for them."""
-    if config.stamps == "sweeps":
-        return {}
-    text = (
-        f"{len(images.paths)} images without stamps beside {len(frames)} sweeps: each is taken as "
-        f"exposed when the sweep of its number is stamped"
+        for paths in groups.values():
+            return paths
+    raise InputError(
+        f"{folder / files}: no sweeps; expected numbered files such as 000120.bin "
+        f"({', '.join(SUFFIXES)}) in the folder or below it"
     )
-    if images.paths.keys() != set(frames):
-        text += "; if their rates differ, give the images' times (stamps in densify.yaml)"
-    return {name: text}
 
 
-def _images(folder: Path, name: str, config: CameraFiles) -> Series:
-    paths = images_in(folder / config.files)
-    if not paths:
+def _find_images(folder: Path, name: str, config: CameraFiles) -> Series:
+    below = files_below(folder / config.files, _IMAGE_SUFFIXES, 0)
+    if not below:
         key = f"cameras: {{{name}: {{files: {config.files}}}}}"
         raise InputError(f"{folder / config.files}: no images, though densify.yaml names it: {key}")
+    (paths,) = below.values()
     return in_time(folder, paths, config.stamps, config.stamps_unit, shared=False)

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Read any folder of sweeps, described by an optional ``densify.yaml``."""

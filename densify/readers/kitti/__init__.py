@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Read KITTI and its relatives: raw drives, odometry, tracking, KITTI-360."""

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: MIT
+"""Read the files that KITTI's data sets share: sweeps, stamps, GPS/IMU records, calibration, boxes.
+
+Errors begin with the file, and the line where there is one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from densify.config.errors import InputError
+from densify.config.file_content import described_in, parse_yaml, read_bytes, read_text
+from densify.geometry import poses
+from densify.geometry.types import Bool, Camera, Float, Int
+from densify.readers import checks
+from densify.readers.stamped_files import date_ns
+
+NOMINAL_PERIOD_NS = 100_000_000
+"""Time from sweep to sweep where no stamps are recorded: the scanner turns at 10 Hz."""
+
+_EARTH_RADIUS_M = 6_378_137.0  # of the devkit's Mercator projection
+_ENTRY = re.compile(r"\s*([^\s:]+)[:\s]\s*(.*)")
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
+_HALF_VIEW_DEG = 90.0  # of a fisheye
+
+
+def read_points(path: Path) -> tuple[Float, np.ndarray]:
+    """Read (N,3) points (m, lidar frame, 0 0 0 if not finite) and (N,) reflectances (0 to 1)."""
+    data = read_bytes(path)
+    if len(data) % 16:
+        raise InputError(
+            f"{path}: truncated: got {len(data)} bytes, expected a multiple of 16 (x y z "
+            f"reflectance as float32); fetch the file again"
+        )
+    columns = np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)
+    columns[~np.isfinite(columns[:, :3]).all(axis=1)] = 0
+    return columns[:, :3].astype(np.float64), columns[:, 3]
+
+
+def turned_ns(points: Float, revolution_ns: int) -> Int:
+    """Return (N,) int64 firing times of points, not deskewed, since the scanner faced forward."""
+    # -0.5 to 0.5: firing times of the first half are negative
+    revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
+    return np.rint(revolution * revolution_ns).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """Times (ns) by frame, from a file with a line for each frame from 0."""
+
+    path: Path
+    by_frame: Mapping[int, int]  # empty without the file: frame k is at k times 100 ms
+
+    def at(self, frame: int) -> int:
+        """Return the time of a frame; raise InputError if the file has none of it."""
+        if not self.by_frame:
+            return frame * NOMINAL_PERIOD_NS
+        return checks.of_frame(self.by_frame, frame, "stamp", self.path)
+
+    def of(self, frames: Mapping[int, Path]) -> dict[int, int]:
+        """Return the times of those frames that have one, such as of existing images."""
+        known = self.by_frame or frames
+        return {frame: self.at(frame) for frame in frames if frame in known}
+
+    @property
+    def period_ns(self) -> int:
+        """Median time between consecutive stamps; 100 ms for fewer than two."""
+        steps_ns = np.diff(list(self.by_frame.values()))
+        return int(np.median(steps_ns)) if len(steps_ns) else NOMINAL_PERIOD_NS
+
+
+def read_stamps(path: Path, required: bool = True) -> Stamps:
+    """Read the dates (UTC) of a file; lines that are no date are skipped.
+
+    A missing file raises InputError, or if not ``required`` has no stamps.
+    """
+    if not required and not path.exists():
+        return Stamps(path, {})
+    lines = [line.strip() for line in read_text(path).splitlines()]
+    by_frame = {}
+    for frame, line in enumerate(lines):
+        try:
+            if _STAMP.fullmatch(line):
+                by_frame[frame] = date_ns(line)
+        except ValueError:  # a thirteenth month
+            continue
+    if not by_frame and any(lines):
+        raise InputError(
+            f"{path}: got {next(filter(None, lines))!r}, expected stamps such as 2011-09-26 "
+            f"13:10:51.158069617, from 1970 to 2261, a line for each frame"
+        )
+    return Stamps(path, by_frame)
+
+
+def parse_oxts(text: str, where: str) -> Float:
+    """Return the (30,) numbers of a record of the GPS/IMU unit; errors begin with ``where``.
+
+    The first six are latitude and longitude (deg), altitude (m), roll, pitch and yaw (rad).
+    """
+    values = checks.parse_numbers(text, where, 30)
+    if abs(values[0]) >= 90:
+        raise InputError(f"{where}: got a latitude of {values[0]:g} deg, expected -90 to 90")
+    return values
+
+
+def T_first_imu(first: Float, record: Float) -> Float:
+    """Return the (4,4) pose of the GPS/IMU unit in its own frame at the drive's first record."""
+    return poses.inverse(_T_mercator_imu(first, first)) @ _T_mercator_imu(record, first)
+
+
+def _T_mercator_imu(oxts: Float, first: Float) -> Float:
+    """Return the (4,4) pose on the Mercator plane (x east, y north, z up)."""
+    # As convertOxtsToPose of KITTI's devkit: the drive's first record determines the scale.
+    lat_deg, lon_deg, alt_m, roll, pitch, yaw = oxts[:6]
+    scale_m = _EARTH_RADIUS_M * np.cos(np.deg2rad(first[0]))
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+    T[0, 3] = scale_m * np.deg2rad(lon_deg)
+    T[1, 3] = scale_m * np.log(np.tan(np.deg2rad(90 + lat_deg) / 2))
+    T[2, 3] = alt_m
+    return T
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A file of lines ``KEY: numbers``, colon optional; bad entries raise InputError on request."""
+
+    path: Path
+    entries: Mapping[str, str]
+
+    @staticmethod
+    def read(path: Path) -> Calibration:
+        """Read a calibration file; raise InputError if the file is missing."""
+        if not path.is_file():
+            raise InputError(
+                f"{path}: missing; expected KITTI's calibration there (it is a download of its own)"
+            )
+        matches = (_ENTRY.match(line) for line in read_text(path).splitlines())
+        return Calibration(path, {match[1]: match[2] for match in matches if match})
+
+    def numbers(self, key: str, *shape: int) -> Float:
+        """Return the numbers of an entry as an array of the given shape."""
+        if key not in self.entries:
+            raise InputError(f"{self.path}: no key {key}; got {', '.join(self.entries)}")
+        where = f"{self.path}: {key}"
+        return checks.parse_numbers(self.entries[key], where, int(np.prod(shape))).reshape(shape)
+
+    def motion(self, key: str) -> Float:
+        """Return the (4,4) transform of an entry of twelve numbers, its upper three rows."""
+        return checks.rigid(self.numbers(key, 3, 4), f"{self.path}: {key}")
+
+    def rotation(self, key: str, translation: str = "") -> Float:
+        """Return the (4,4) transform of an entry of nine numbers, a (3,3) rotation.
+
+        ``translation`` names the entry of the translation (m), "" for none.
+        """
+        t = self.numbers(translation, 3, 1) if translation else np.zeros((3, 1))
+        return checks.rigid(np.hstack([self.numbers(key, 3, 3), t]), f"{self.path}: {key}")
+
+    def rectified_camera(
+        self, key: str, name: str, size_px: tuple[int, int] | str, T_rect_lidar: Float
+    ) -> Camera:
+        """Return the rectified camera of an entry with a projection matrix P = K [I | t].
+
+        ``size_px`` is width and height, or the entry that has them. ``T_rect_lidar`` (4,4) maps the
+        lidar frame to the frame of rectified camera 0.
+        """
+        P = self.numbers(key, 3, 4)
+        if isinstance(size_px, str):
+            width, height = self.numbers(size_px, 2)
+            size_px = int(width), int(height)
+        fx_fy_cx_cy, T_cam_rect = P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), np.eye(4)
+        camera = checks.pinhole(name, size_px, fx_fy_cx_cy, T_rect_lidar, f"{self.path}: {key}")
+        T_cam_rect[:3, 3] = np.linalg.solve(camera.K, P[:, 3])
+        return replace(camera, T_cam_lidar=T_cam_rect @ T_rect_lidar)
+
+
+def read_fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
+    """Read a fisheye camera from OpenCV's YAML, whose first line YAML libraries reject."""
+    content, _ = parse_yaml(read_text(path).replace("%YAML:1.0", "", 1), path)
+    with described_in(path, "image_width, image_height, xi, k1 k2 p1 p2, gamma1 gamma2 u0 v0"):
+        sections = [content[f"{kind}_parameters"] for kind in ("mirror", "distortion")]
+        lens = [sections[0]["xi"], *(sections[1][key] for key in ("k1", "k2", "p1", "p2"))]
+        projection = content["projection_parameters"]
+        pinhole = [projection[key] for key in ("gamma1", "gamma2", "u0", "v0")]
+        words = [content["image_width"], content["image_height"], *pinhole, *lens]
+    width, height, *numbers = checks.parse_numbers(" ".join(map(str, words)), str(path), 11)
+    return checks.pinhole(
+        name,
+        (int(width), int(height)),
+        numbers[:4],
+        T_cam_lidar,
+        str(path),
+        distortion=tuple(map(float, numbers[4:])),
+        model="mei",
+        max_angle_deg=_HALF_VIEW_DEG,
+    )
+
+
+def read_labels(path: Path) -> tuple[Float, Bool]:
+    """Return the (n,16) numbers of label lines, no type and score, and an (n,) DontCare mask."""
+    rows, is_area = [], []
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words = line.split()
+        if words:
+            row = " ".join([*words[:2], *words[3:17]])  # a score may follow
+            rows.append(checks.parse_numbers(row, f"{path}: line {number}", 16))
+            is_area.append(words[2] == "DontCare")
+    return np.reshape(rows, (-1, 16)), np.array(is_area, bool)
