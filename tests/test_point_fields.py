@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.readers.point_fields import find_fields, find_times, full_scale, scaled
+from densify.readers.point_fields import TimeField, find_fields, find_times, full_scale, scaled
 
 STAMP_NS = 1_317_042_661_099_997_611
 PERIOD_NS = 100_000_000
@@ -50,7 +50,7 @@ TIMES = {  # values, unit, absolute
 @pytest.mark.parametrize("kind", TIMES)
 def test_units_follow_from_the_span(kind: str) -> None:
     values, unit, absolute = TIMES[kind]
-    found, words = find_times([values], "t", PERIOD_NS, [STAMP_NS])
+    found, words = find_times(TimeField("t"), [values], PERIOD_NS, [STAMP_NS])
     assert found is not None, words
     assert (found.unit, found.absolute, found.other_clock) == (unit, absolute, False)
     assert f"t in {unit}, {'absolute' if absolute else 'relative'}" in words
@@ -65,7 +65,9 @@ def test_the_stamp_may_be_the_end_or_the_middle() -> None:
     values = (FIRED_NS - FIRED_NS[0]).astype("u4")
     span = int(values[-1])
     for reference, first in (("start", 0), ("middle", -span / 2), ("end", -span)):
-        found, words = find_times([values], "t", PERIOD_NS, [STAMP_NS], reference=reference)
+        found, words = find_times(
+            TimeField("t", reference=reference), [values], PERIOD_NS, [STAMP_NS]
+        )
         assert found is not None and f"the stamp is the {reference}" in words
         np.testing.assert_allclose(
             found.offset_ns(values, STAMP_NS)[0][[0, -1]], [first, first + span]
@@ -74,7 +76,7 @@ def test_the_stamp_may_be_the_end_or_the_middle() -> None:
 
 def test_another_clock_is_told_and_counted_from_the_first_point() -> None:
     tai_ns = STAMP_NS + 37_000_000_000 + FIRED_NS
-    found, words = find_times([tai_ns], "timestamp", PERIOD_NS, [STAMP_NS])
+    found, words = find_times(TimeField("timestamp"), [tai_ns], PERIOD_NS, [STAMP_NS])
     assert found is not None and found.other_clock and "another clock" in words
     np.testing.assert_array_equal(found.offset_ns(tai_ns, STAMP_NS)[0], FIRED_NS - FIRED_NS[0])
 
@@ -90,13 +92,15 @@ NOT_TIMES = {
 @pytest.mark.parametrize("kind", NOT_TIMES)
 def test_what_tells_no_times_says_why(kind: str) -> None:
     values, says = NOT_TIMES[kind]
-    found, words = find_times([values], "t", PERIOD_NS, [STAMP_NS])
+    found, words = find_times(TimeField("t"), [values], PERIOD_NS, [STAMP_NS])
     assert found is None and says in words
 
 
 def test_what_is_known_is_taken() -> None:
     values = np.linspace(0, 30.0, 50)
-    found, _ = find_times([values], "t", PERIOD_NS, [STAMP_NS], unit="ms", absolute=False)
+    found, _ = find_times(
+        TimeField("t", unit="ms", absolute=False), [values], PERIOD_NS, [STAMP_NS]
+    )
     assert found is not None
     assert found.offset_ns(values, STAMP_NS)[0][-1] == 30_000_000
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from densify.config.errors import InputError
-from densify.readers.decoded_files import read_image
-from densify.readers.stray_bytes import decode_strictly
+from densify.readers.decoded_files import decode_jpeg, read_image
 
 RNG = np.random.default_rng(4)
 PICTURE = cv2.GaussianBlur(RNG.integers(0, 256, (120, 160, 3), np.uint8), (0, 0), 2)
@@ -24,7 +23,7 @@ def jpeg(interval: int) -> bytes:
 
 
 WHOLE = jpeg(10)
-PIXELS, _ = decode_strictly(WHOLE)
+PIXELS, _ = decode_jpeg(WHOLE)
 MARKERS = [m.start() for m in re.finditer(rb"\xff[\xd0-\xd7\xd9]", WHOLE)]
 
 
@@ -34,14 +33,14 @@ def test_stray_bytes_before_markers_are_passed_over(stray: bytes, rows: list[int
     data = WHOLE
     for at in sorted((MARKERS[row] for row in rows), reverse=True):
         data = data[:at] + stray + data[at:]
-    pixels, mended = decode_strictly(data)
+    pixels, mended = decode_jpeg(data)
     np.testing.assert_array_equal(pixels, PIXELS)
     assert mended == f"stray bytes before {len(rows)} marker{'s' * (len(rows) > 1)}"
 
 
 @pytest.mark.parametrize("end", [b"", b"\xff"])
 def test_the_marker_at_the_end_may_be_missing(end: bytes) -> None:
-    pixels, mended = decode_strictly(WHOLE[:-2] + end)
+    pixels, mended = decode_jpeg(WHOLE[:-2] + end)
     np.testing.assert_array_equal(pixels, PIXELS)
     assert mended == "no marker at its end"
 
@@ -49,11 +48,11 @@ def test_the_marker_at_the_end_may_be_missing(end: bytes) -> None:
 def test_missing_data_are_refused() -> None:
     for cut in (3, 10, 500, len(WHOLE) // 2):
         with pytest.raises(ValueError, match="premature end"):
-            decode_strictly(WHOLE[:-cut])
+            decode_jpeg(WHOLE[:-cut])
     at = MARKERS[3]
     for data in (WHOLE[: at - 5] + WHOLE[at:], WHOLE[:at] + bytes(40) + WHOLE[at:]):
         with pytest.raises(ValueError):
-            decode_strictly(data)
+            decode_jpeg(data)
 
 
 @pytest.mark.parametrize("interval", [0, 4, 10])
@@ -65,7 +64,7 @@ def test_wrong_bits_are_not_taken_for_stray_bytes(interval: int) -> None:
         wrong = bytearray(whole)
         wrong[place] ^= 1 << int(rng.integers(8))
         try:
-            num_mended += decode_strictly(bytes(wrong))[1] != ""
+            num_mended += decode_jpeg(bytes(wrong))[1] != ""
         except ValueError:
             num_refused += 1
     assert num_refused > 10 and num_mended <= num_refused // 5  # short intervals leave few bytes

@@ -36,7 +36,7 @@ from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
 from densify.geometry import poses
 from densify.geometry.types import Bool, Float, FlowField, Motion, Stretch
-from densify.readers.arrow_columns import read_feather
+from densify.readers.column_files import read_arrow
 from densify.readers.decoded_files import read_arrays
 from densify.scores.challenge import CLASSES, IGNORED
 
@@ -228,7 +228,7 @@ def labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> Labe
 def _read_feather(path: Path, row: NDArray[np.int64]) -> LabelledFlow:
     """Read an Argoverse 2 label file for N points with the row indices ``row`` (N,)."""
     kinds = {**dict.fromkeys(_FLOW, "m"), "is_valid": "t", "classes_0": "i"}
-    columns = read_feather(path, kinds, "Argoverse 2's flow labels")
+    columns = read_arrow(path, kinds, ("argoverse", "Argoverse 2's flow labels"))
     flow = np.stack([columns[axis].astype(np.float64) for axis in _FLOW], axis=1)
     number = columns["classes_0"].astype(np.int64)
     if len(row) and row.max() >= len(flow):

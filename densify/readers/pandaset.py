@@ -28,9 +28,9 @@ from densify.config.file_content import described_in, read_json
 from densify.geometry import poses
 from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers import checks
+from densify.readers.column_files import read_pickled
 from densify.readers.decoded_files import image_size_px
 from densify.readers.file_sequence import FileSequence, Returns
-from densify.readers.pickled_frame import read_columns
 from densify.readers.recorded_poses import PoseTrack
 
 # The positions of the scanners are not published. These make the rings of the Pandar64 sharpest and
@@ -117,7 +117,7 @@ class PandaSet(FileSequence):
 
     def _returns(self, frame: int) -> Returns:
         path, stamp_ns = self._files[frame], self.stamp_ns(frame)
-        columns = read_columns(path)
+        columns = read_pickled(path)
         x, y, z, brightness, time_s, scanner = (
             np.asarray(columns[name], np.float64) for name in ("x", "y", "z", "i", "t", "d")
         )
@@ -147,7 +147,7 @@ class PandaSet(FileSequence):
         path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"
         if not path.is_file():
             return None
-        columns = read_columns(path)
+        columns = read_pickled(path)
         with described_in(path, "the cuboids of PandaSet"):
             texts = [str(text) for text in columns["uuid"]]
             numbers = (*_CENTRE, *_LENGTH_WIDTH_HEIGHT, "yaw", "cuboids.sensor_id")
