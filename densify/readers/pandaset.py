@@ -35,29 +35,22 @@ from densify.readers.recorded_poses import PoseTrack
 
 # The positions of the scanners are not published. These make the rings of the Pandar64 sharpest and
 # the swings of the PandarGT's mirror smoothest. The same vehicle drove all sequences.
-_AXIS = np.array([-0.0157, 0.00045, 1.0])  # spinning axis of the Pandar64, forward left up
-_POSITION_M = np.array([0.777, 0.002, 1.8593])
+_POSITION_M = np.array([0.777, 0.002, 1.8593])  # of the Pandar64, forward left up
+_AXIS = np.array([-0.0157, 0.00045, 1.0])  # about which it spins, forward left up
 PANDAR_GT_M = np.array([0.580, 0.027, -0.294])
 """(3,) origin of the PandarGT's rays in the Pandar64's frame."""
+
+_R_POSE_VEHICLE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_UP = _AXIS / np.linalg.norm(_AXIS)
+_LEFT = np.cross(_UP, [1.0, 0.0, 0.0]) / np.hypot(_UP[1], _UP[2])
+T_POSE_LIDAR = np.eye(4)
+T_POSE_LIDAR[:3, :3] = _R_POSE_VEHICLE @ np.column_stack([np.cross(_LEFT, _UP), _LEFT, _UP])
+T_POSE_LIDAR[:3, 3] = _R_POSE_VEHICLE @ _POSITION_M
+"""(4,4) pose of the lidar frame (Pandar64) in the vehicle frame of the pose files."""
 
 _LATEST_S = 4e9  # latest accepted stamp: the year 2096
 _CENTRE = tuple(f"position.{axis}" for axis in "xyz")
 _LENGTH_WIDTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "yxz")
-
-
-def _T_pose_lidar() -> Float:
-    forward_left_up = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    up = _AXIS / np.linalg.norm(_AXIS)
-    forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
-    forward /= np.linalg.norm(forward)
-    T = np.eye(4)
-    T[:3, :3] = forward_left_up @ np.column_stack([forward, np.cross(up, forward), up])
-    T[:3, 3] = forward_left_up @ _POSITION_M
-    return T
-
-
-T_POSE_LIDAR = _T_pose_lidar()
-"""(4,4) pose of the lidar frame (Pandar64) in the vehicle frame of the pose files."""
 
 
 def open_recording(path: Path, scene: str | None) -> PandaSet:
@@ -80,16 +73,17 @@ class PandaSet(FileSequence):
         self._stamps_ns, T_world_pose = _stamped_poses(lidar, max(sweeps))
         T_world_lidar = T_world_pose @ T_POSE_LIDAR
         self._track = PoseTrack(str(lidar / "poses.json"), self._stamps_ns, T_world_lidar)
-        images, self._T_world_cam, cameras, exposed_ns = {}, dict[str, Float](), {}, {}
+        images, cameras, exposed_ns = {}, {}, {}
+        self._T_world_cam: dict[str, Float] = {}
         for folder in sorted(path.glob("camera/*")):
             files, name = checks.numbered_files(folder, ".jpg", ".png"), folder.name
             if files:
                 images_ns, self._T_world_cam[name] = _stamped_poses(folder, max(files))
-                exposed_ns[name] = {n: int(images_ns[n]) for n in files}
+                images[name], exposed_ns[name] = files, {n: int(images_ns[n]) for n in files}
                 calm = min(files, key=lambda n: self._step_m(exposed_ns[name][n]))
                 T_cam_world = poses.inverse(self._T_world_cam[name][calm])
                 T_cam_lidar = T_cam_world @ self._track.at(exposed_ns[name][calm])
-                cameras[name], images[name] = _camera(folder, files[min(files)], T_cam_lidar), files
+                cameras[name] = _camera(folder, files[min(files)], T_cam_lidar)
         super().__init__(
             path.resolve().name,
             path,
