@@ -13,8 +13,7 @@ import pytest
 from densify.config.errors import InputError
 from densify.free_space.rings import find_rings
 from densify.readers import open_sequence
-from densify.readers.ouster import Ouster, lost_and_doubled
-from densify.readers.velodyne import MODELS, Velodyne
+from densify.readers.packets import MODELS, Ouster, Velodyne, lost_and_doubled
 
 HEADERS = bytes(42)  # Ethernet, IP, UDP: not looked at
 START_S, PACKET_US, PACKETS_PER_TURN = 1_355_263_594, 1327, 76

@@ -89,22 +89,21 @@ def sweep_columns(
     """
     arrays = load_flow_file(path)
     num_points = len(next(iter(arrays.values())))
-    rows = arrays.get("row", np.arange(num_points))
-    if "row" not in arrays and len(row) and row.max() >= num_points:
+    if "row" not in arrays and row.max(initial=-1) >= num_points:
         raise InputError(
             f"{path}: holds {num_points} points, expected one for each row of the sweep's file "
             f"(more than {row.max()}); add their 'row' where some are left out"
         )
+    rows = arrays.get("row", np.arange(num_points))
     entry_of_row = np.full(int(row.max(initial=0)) + 1, -1, np.int64)
     entries = np.flatnonzero(rows < len(entry_of_row))
     entry_of_row[rows[entries]] = entries
-    known = entry_of_row[row] >= 0
-    entry = entry_of_row[row][known]
+    entry = entry_of_row[row]
+    known = entry >= 0
     columns = {}
-    for name in arrays:
-        values = np.zeros((len(row), *arrays[name].shape[1:]))
-        values[known] = arrays[name][entry]
-        columns[name] = values
+    for name, array in arrays.items():
+        columns[name] = np.zeros((len(row), *array.shape[1:]))
+        columns[name][known] = array[entry[known]]
     if "residual_flow" not in arrays:
         arrived = poses.transform(T_source_target, points + columns["total_flow"])
         residual = arrived - points - columns.get("to_reference", 0.0)
@@ -147,40 +146,20 @@ def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-CATEGORIES = {
-    "ANIMAL": None,
-    "ARTICULATED_BUS": "OTHER_VEHICLES",
-    "BICYCLE": "WHEELED_VRU",
-    "BICYCLIST": "WHEELED_VRU",
-    "BOLLARD": None,
-    "BOX_TRUCK": "OTHER_VEHICLES",
-    "BUS": "OTHER_VEHICLES",
-    "CONSTRUCTION_BARREL": None,
-    "CONSTRUCTION_CONE": None,
-    "DOG": None,
-    "LARGE_VEHICLE": "OTHER_VEHICLES",
-    "MESSAGE_BOARD_TRAILER": None,
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN": None,
-    "MOTORCYCLE": "WHEELED_VRU",
-    "MOTORCYCLIST": "WHEELED_VRU",
-    "OFFICIAL_SIGNALER": "PEDESTRIAN",
-    "PEDESTRIAN": "PEDESTRIAN",
-    "RAILED_VEHICLE": "OTHER_VEHICLES",
-    "REGULAR_VEHICLE": "CAR",
-    "SCHOOL_BUS": "OTHER_VEHICLES",
-    "SIGN": None,
-    "STOP_SIGN": None,
-    "STROLLER": "PEDESTRIAN",
-    "TRAFFIC_LIGHT_TRAILER": None,
-    "TRUCK": "OTHER_VEHICLES",
-    "TRUCK_CAB": "OTHER_VEHICLES",
-    "VEHICULAR_TRAILER": "OTHER_VEHICLES",
-    "WHEELCHAIR": "PEDESTRIAN",
-    "WHEELED_DEVICE": "WHEELED_VRU",
-    "WHEELED_RIDER": "WHEELED_VRU",
+_CATEGORIES_OF_CLASS: dict[str | None, str] = {
+    "CAR": "REGULAR_VEHICLE",
+    "PEDESTRIAN": "OFFICIAL_SIGNALER PEDESTRIAN STROLLER WHEELCHAIR",
+    "WHEELED_VRU": "BICYCLE BICYCLIST MOTORCYCLE MOTORCYCLIST WHEELED_DEVICE WHEELED_RIDER",
+    "OTHER_VEHICLES": "ARTICULATED_BUS BOX_TRUCK BUS LARGE_VEHICLE RAILED_VEHICLE SCHOOL_BUS "
+    "TRUCK TRUCK_CAB VEHICULAR_TRAILER",
+    None: "ANIMAL BOLLARD CONSTRUCTION_BARREL CONSTRUCTION_CONE DOG MESSAGE_BOARD_TRAILER "
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN SIGN STOP_SIGN TRAFFIC_LIGHT_TRAILER",
 }
-"""Class in the Argoverse 2 challenge of 2024 for each category; None if the category is ignored
-(`av2_metacategories` of the package bucketed-scene-flow-eval)."""
+CATEGORIES = dict(
+    sorted((name, of) for of, names in _CATEGORIES_OF_CLASS.items() for name in names.split())
+)
+"""Class in the Argoverse 2 challenge of 2024 for each category, in alphabetical order; None if the
+category is ignored (`av2_metacategories` of the package bucketed-scene-flow-eval)."""
 
 _CLASS_OF = np.array(
     [0] + [IGNORED if c is None else CLASSES.index(c) for c in CATEGORIES.values()], np.uint8
