@@ -19,12 +19,7 @@ import pytest
 from densify.config import resolve
 from densify.config.errors import ComputationError, InputError, OutputError, UnplacedSweepError
 from densify.config.file_content import gunzipped, parse_yaml, read_bytes
-from densify.readers.decoded_files import (
-    decode_image,
-    read_array,
-    read_arrays,
-    read_las,
-)
+from densify.readers.decoded_files import decode_image, read_array, read_arrays, read_las
 
 CHECKOUT = Path(__file__).parents[1]
 
@@ -66,11 +61,9 @@ def npy(shape: str = "(3,)", dtype: str = "<f8", data: bytes = bytes(24)) -> byt
 BAD_NPY = {
     "more than there is": npy("(4,)"),
     "terabytes": npy("(1000000000000,)"),
-    "a negative size": npy("(-3,)"),
     "objects": npy(dtype="|O", data=pickle.dumps([print])),
     "no shape": npy("3"),
     "text": b"\x93NUMPY\x01\0\xff\xffx",
-    "nothing": b"",
 }
 
 
@@ -87,19 +80,18 @@ def test_headers_of_arrays_are_not_believed(case: str, tmp_path: Path) -> None:
 IMAGE = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
 
 
-def encoded(suffix: str, *options: int, image: np.ndarray = IMAGE) -> bytes:
-    return cv2.imencode(suffix, image, options)[1].tobytes()
+def encoded(suffix: str, *options: int) -> bytes:
+    return cv2.imencode(suffix, IMAGE, options)[1].tobytes()
 
 
 @pytest.mark.parametrize(
-    "data",
-    [encoded(".png"), encoded(".jpg"), encoded(".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1)],
-    ids=["png", "jpeg", "progressive"],
+    ("suffix", "options"), [(".png", ()), (".jpg", ()), (".jpg", (cv2.IMWRITE_JPEG_PROGRESSIVE, 1))]
 )
-def test_whole_images_are_decoded_and_cut_ones_are_not(data: bytes) -> None:
+def test_whole_images_are_decoded_and_cut_ones_are_not(suffix: str, options) -> None:
+    data = encoded(suffix, *options)
     expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert np.array_equal(decode_image(data, "x"), expected)
-    for length in (0, 1, 10, 30, len(data) // 2, len(data) - 13):
+    for length in (0, 10, len(data) // 2, len(data) - 13):
         refused(decode_image, data[:length], "x", says="not a complete image", where="x")
 
 
