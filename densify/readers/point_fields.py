@@ -8,7 +8,6 @@ times tells the unit: units differ by a factor of 1000, and a sweep takes about 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +37,8 @@ _NAMES = {
     "ring": "ring line channel laser_id laser_number laserid beam",
     "lidar": "lidar lidar_id scanner sensor_id scanner_channel",
 }
-_SHORTEST_SHARE, _LONGEST_SHARE = 0.08, 4.0  # accepted span of a sweep's times, in periods
+_SHORTEST, _LONGEST = 0.08, 4.0  # accepted span of a sweep's times, in periods
+_FEWEST_STEPS = 500  # that the digits of times must distinguish within a sweep
 _NUM_SAMPLED = 5
 _SAME_CLOCK_NS = 2_000_000_000
 _RELATIVE_NS = 3_000_000_000
@@ -186,69 +186,57 @@ def find_times(
 ) -> tuple[PointTimes | None, str]:
     """Find the unit, epoch, middle and span of the (N,) point times of several sweeps.
 
-    The unit is the most frequent one; the middle and the span are medians. ``period_ns`` is the
-    time between consecutive sweeps; ``stamps_ns`` has the stamps of the given sweeps, None without
-    stamps.
+    The middle and the span are medians. ``period_ns`` is the time between consecutive sweeps;
+    ``stamps_ns`` has the stamps of the given sweeps, None without stamps.
 
     Returns:
         The meaning of the times and its description; or None and the reason of the failure.
     """
-    unit_guesses = [_unit_of(values, field, period_ns) for values in sweeps]
-    units = Counter(guess for guess, _ in unit_guesses)
-    unit = max(units, key=lambda guess: (units[guess], guess != ""))
-    if not unit:
-        return None, next(reason for guess, reason in unit_guesses if not guess)
-    rows = [row for row, (guess, _) in enumerate(unit_guesses) if guess == unit]
-    times_and_masks = [_in_ns(sweeps[row], unit) for row in rows]
-    extents = [_extent(times_ns[is_valid]) for times_ns, is_valid in times_and_masks]
-    middle_ns, reach_ns = np.array(extents).T
-    usual_ns, absolute = float(np.median(middle_ns)), field.absolute
+    finite = [values[np.isfinite(values)] for values in sweeps]
+    extents = np.array([_extent(values) for values in finite if len(values)] or [(0.0, 0.0)])
+    middle, reach = np.median(extents, axis=0).tolist()
+    span = max(float(np.ptp(values)) for values in finite) if any(map(len, finite)) else 0.0
+    dtype, name = sweeps[0].dtype, field.name
+    if dtype.kind == "f" and np.spacing(dtype.type(abs(middle))) * _FEWEST_STEPS > span > 0:
+        return None, (
+            f"{name} has too few digits ({np.finfo(dtype).precision}) to tell times: "
+            f"{middle - reach:.10g} to {middle + reach:.10g}"
+        )
+    if not reach:
+        quantifier = "most" if span else "all"
+        return None, f"{name} is the same for {quantifier} points, so it does not tell their times"
+    unit = field.unit or _unit_of(2 * reach / period_ns)
+    if not unit or abs(middle) >= _LATEST_NS / UNIT_NS[unit]:
+        return None, (
+            f"{name} spans {2 * reach:.6g} in a sweep, which in no unit is about the "
+            f"{1e-6 * period_ns:.0f} ms from sweep to sweep; name its unit"
+        )
+    middles_ns, usual_ns, reach_ns = (x * UNIT_NS[unit] for x in (extents[:, 0], middle, reach))
+    absolute = field.absolute
     if absolute is None:
-        advance_ns = float(np.median(np.abs(middle_ns - usual_ns)))
+        advance_ns = float(np.median(np.abs(middles_ns - usual_ns)))
         absolute = abs(usual_ns) > _RELATIVE_NS or advance_ns > period_ns / 2
     if absolute and stamps_ns is not None:
-        middle_ns = middle_ns - np.array([stamps_ns[row] for row in rows], np.float64)
-        usual_ns = float(np.median(middle_ns))
+        stamps_of_timed = [ns for ns, values in zip(stamps_ns, finite, strict=True) if len(values)]
+        usual_ns = float(np.median(middles_ns - np.array(stamps_of_timed, np.float64)))
     elif absolute:  # the stamps are made of these times
-        usual_ns = {"middle": 0, "end": -1}.get(field.reference, 1) * float(np.median(reach_ns))
+        usual_ns = {"middle": 0, "end": -1}.get(field.reference, 1) * reach_ns
     point_times = PointTimes(
-        field.name,
+        name,
         unit,
         absolute,
         other_clock=absolute and abs(usual_ns) > _SAME_CLOCK_NS,
         middle_ns=round(usual_ns),
-        reach_ns=round(float(np.median(reach_ns))) + period_ns,
+        reach_ns=round(reach_ns) + period_ns,
         reference=field.reference,
     )
     return point_times, str(point_times)
 
 
-def _unit_of(values: NDArray[Any], field: TimeField, period_ns: int) -> tuple[str, str]:
-    """Return the unit of a sweep's times (N,) and "", or else "" and the reason of the failure."""
-    times = values[np.isfinite(values)].astype(np.float64)
-    middle, reach = _extent(times) if len(times) else (0.0, 0.0)
-    span = float(np.ptp(times)) if len(times) else 0.0
-    if values.dtype.kind == "f" and np.spacing(values.dtype.type(abs(middle))) * 500 > span > 0:
-        digits = np.finfo(values.dtype).precision
-        return "", (
-            f"{field.name} has too few digits ({digits}) to tell times: {middle - reach:.10g} to "
-            f"{middle + reach:.10g}"
-        )
-    if not reach:
-        quantifier = "most" if span else "all"
-        return "", (
-            f"{field.name} is the same for {quantifier} points, so it does not tell their times"
-        )
-    share = {unit: 2 * reach * ns / period_ns for unit, ns in UNIT_NS.items()}
-    fit = [unit for unit in share if _SHORTEST_SHARE < share[unit] < _LONGEST_SHARE]
-    fit = [field.unit] if field.unit else fit
-    fit = [unit for unit in fit if abs(middle) < _LATEST_NS / UNIT_NS[unit]]
-    if not fit:
-        return "", (
-            f"{field.name} spans {2 * reach:.6g} in a sweep, which in no unit is about the "
-            f"{1e-6 * period_ns:.0f} ms from sweep to sweep; name its unit"
-        )
-    return fit[0], ""
+def _unit_of(span_in_periods: float) -> str:
+    """Return the unit in which a span, as a share of the period in ns, is a sweep's; "" if none."""
+    shares = {unit: span_in_periods * ns for unit, ns in UNIT_NS.items()}
+    return next((u for u, share in shares.items() if _SHORTEST < share < _LONGEST), "")
 
 
 def full_scale(intensity: NDArray[Any]) -> float:
