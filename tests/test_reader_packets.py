@@ -224,24 +224,6 @@ def test_a_real_ouster(test_data):
     ]
 
 
-def test_lost_and_doubled_packets_of_a_real_ouster_are_told(test_data, tmp_path):
-    pytest.importorskip("ouster.sdk.core")
-    real = test_data / "ouster/OS-1-128_v2.3.0_1024x10_lb_n3.pcap"
-    packets = packets_of(real.read_bytes())
-    largest = max(map(len, packets))
-    returns = [i for i, packet in enumerate(packets) if len(packet) == largest]
-    lost, doubled = returns[70:75], returns[100]  # of the second turn
-    faulty = [p for i, p in enumerate(packets) for _ in range(1 + (i == doubled)) if i not in lost]
-    path = tmp_path / "drive.pcap"
-    path.write_bytes(b"".join(faulty))
-    (tmp_path / "drive.json").write_bytes(
-        real.with_name("OS-1-128_v2.3.0_1024x10.json").read_bytes()
-    )
-    sequence = open_sequence(path)
-    assert sequence.findings()[0][1].startswith("187, 5 lost (2.6 %), 1 captured twice")
-    assert len(np.unique(sequence[1].row % 1024)) <= 1024 - 5 * 16
-
-
 def test_packets_of_an_ouster_are_counted_over_turns() -> None:
     """Its count of turns wraps, packets may come late, and it may send some columns only."""
     turn, column = (a.ravel() for a in np.mgrid[65_534:65_538, 256:768:16])

@@ -327,7 +327,7 @@ class Waymo(FileSequence):
         path = self._segment.file("vehicle_pose")
         return PoseTrack(str(path), np.array(self._stamps_ns, np.int64), T)
 
-    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
-        where = {STAMP: int(self._starts_us[number]), CAMERA: CAMERAS.index(camera) + 1}
+    def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
+        where = {CAMERA: CAMERAS.index(camera.name) + 1, STAMP: int(self._starts_us[number])}
         columns = self._segment.read("camera_image", {"image": "b"}, where)
-        return self._segment.file("camera_image"), columns["image"][0]
+        return checks.decoded_image(columns["image"][0], camera, self._segment.file("camera_image"))
