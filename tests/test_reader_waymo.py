@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from writers.waymo import T_EGO_LIDAR, pixels
+from writers.waymo import POSED_COLUMNS, T_EGO_LIDAR, pixels
 
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
@@ -113,13 +113,13 @@ def test_compensated_they_are_the_points_of_the_published_conversion(written):
             (rows_of(written, "lidar_pose")[1], POSE),
         )
     )
-    image[:, np.arange(image.shape[1]) % 60 > 0, 0] = 0
+    image[:, np.arange(image.shape[1]) % POSED_COLUMNS > 0, 0] = 0
     laser = rows_of(written, "lidar_calibration")[0]
     extrinsic = np.reshape(laser[f"{CALIBRATION}.extrinsic.transform"], (4, 4))
     beams = np.array(laser[f"{CALIBRATION}.beam_inclination.values"])
     expected = official_points(image, beams, extrinsic, pixel_pose, sequence.T_world_lidar(1))
     sweep = sequence[1]
-    kept = sweep.select(sweep.row % image.shape[1] % 60 == 0)
+    kept = sweep.select(sweep.row % image.shape[1] % POSED_COLUMNS == 0)
     assert len(kept) == len(expected) > 200
     compensated = sequence._track.compensated(kept.points, kept.stamp_ns, kept.offset_ns)
     np.testing.assert_allclose(compensated, expected, atol=0.01)

@@ -73,6 +73,9 @@ class PandaSet(FileSequence):
         self._stamps_ns, T_world_pose = _stamped_poses(lidar, max(sweeps))
         T_world_lidar = T_world_pose @ T_POSE_LIDAR
         self._track = PoseTrack(str(lidar / "poses.json"), self._stamps_ns, T_world_lidar)
+        # Where the vehicle moves little from pose to pose, interpolation errs little.
+        step_m = np.linalg.norm(np.diff(T_world_lidar[:, :3, 3], axis=0), axis=1)
+        step_m = np.pad(step_m, 1, constant_values=np.inf)
         images, cameras, exposed_ns = {}, {}, {}
         self._T_world_cam: dict[str, Float] = {}
         for folder in sorted(path.glob("camera/*")):
@@ -80,7 +83,8 @@ class PandaSet(FileSequence):
             if files:
                 images_ns, self._T_world_cam[name] = _stamped_poses(folder, max(files))
                 images[name], exposed_ns[name] = files, {n: int(images_ns[n]) for n in files}
-                calm = min(files, key=lambda n: self._step_m(exposed_ns[name][n]))
+                step_of_image = np.searchsorted(self._stamps_ns, images_ns)
+                calm = min(files, key=lambda n, steps=step_of_image: step_m[steps[n]])
                 T_cam_world = poses.inverse(self._T_world_cam[name][calm])
                 T_cam_lidar = T_cam_world @ self._track.at(exposed_ns[name][calm])
                 cameras[name] = _camera(folder, files[min(files)], T_cam_lidar)
@@ -99,15 +103,6 @@ class PandaSet(FileSequence):
         """Return the recorded (4,4) pose T_world_cam of image ``number`` of a camera."""
         self.check_image(camera, number)
         return self._T_world_cam[camera][number]
-
-    def _step_m(self, stamp_ns: int) -> float:
-        """Return the distance (m) between the poses around a time, inf outside the path."""
-        # Where it is short, interpolation errs little.
-        after = np.searchsorted(self._track.stamp_ns, stamp_ns)
-        if not 0 < after < len(self._track.stamp_ns):
-            return np.inf
-        position_before_m, position_after_m = self._track.T_world_ego[after - 1 : after + 1, :3, 3]
-        return float(np.linalg.norm(position_after_m - position_before_m))
 
     def _returns(self, frame: int) -> Returns:
         path, stamp_ns = self._files[frame], self.stamp_ns(frame)
@@ -144,13 +139,14 @@ class PandaSet(FileSequence):
         columns = read_pickled(path)
         with described_in(path, "the cuboids of PandaSet"):
             texts = [str(text) for text in columns["uuid"]]
-            numbers = (*_CENTRE, *_LENGTH_WIDTH_HEIGHT, "yaw", "cuboids.sensor_id")
-            # Columns: 0 to 2 centre, 3 to 5 size, 6 yaw, 7 scanner
-            table = np.column_stack([np.asarray(columns[name], np.float64) for name in numbers])
-        T_world_box = checks.upright_poses(table[:, :3], table[:, 6] + np.pi / 2)
+            centre_m, size_m, yaw_and_scanner = (
+                np.column_stack([np.asarray(columns[name], np.float64) for name in names])
+                for names in (_CENTRE, _LENGTH_WIDTH_HEIGHT, ("yaw", "cuboids.sensor_id"))
+            )
+        yaw_rad, scanner = yaw_and_scanner.T
+        T_world_box = checks.upright_poses(centre_m, yaw_rad + np.pi / 2)
         T_lidar_box = poses.inverse(self._pose(frame)) @ T_world_box
-        lidar = table[:, 7].astype(np.int64)
-        return checks.boxes(texts, T_lidar_box, table[:, 3:6], str(path), lidar=lidar)
+        return checks.boxes(texts, T_lidar_box, size_m, str(path), lidar=scanner.astype(np.int64))
 
 
 def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:

@@ -21,6 +21,7 @@ from writers.excerpt import Excerpt, drawn_boxes
 
 T_EGO_LIDAR = np.eye(4)  # the place of Waymo's TOP
 T_EGO_LIDAR[:3, 3] = [1.43, 0.0, 2.18]
+POSED_COLUMNS = 60  # poses of the range images are right for each 60th column alone
 _SHUTTER_S = 0.005
 _DOWN, _GLOBAL = 1, 5  # directions of a shutter's readout
 
@@ -73,11 +74,12 @@ def _range_image(excerpt: Excerpt, frame: int, pixel: Int) -> tuple[dict[str, An
     image[:, :2] = -1.0  # no return
     image[pixel, 0] = np.linalg.norm(excerpt.fired(frame), axis=1)
     image[pixel, 1] = np.arctanh(np.minimum(returns.intensity, 0.999))
-    share = (np.arange(num_columns) + 0.5) / num_columns - 0.5
+    share = (np.arange(0, num_columns, POSED_COLUMNS) + 0.5) / num_columns - 0.5
     times_ns = stamp_ns + np.rint(share * period_ns).astype(np.int64)
     T = excerpt.T_world_ego(times_ns, inverse(T_EGO_LIDAR))
     yaw_pitch_roll = Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX")
     columns = np.concatenate([yaw_pitch_roll[:, ::-1], T[:, :3, 3]], axis=1)
+    columns = np.repeat(columns, POSED_COLUMNS, axis=0)
     pose = np.broadcast_to(columns, (num_rows, *columns.shape)).astype(np.float32)
     key = {**_key(excerpt, stamp_ns), LASER: np.int8(1)}
     ranges = {
