@@ -109,7 +109,8 @@ class Argoverse2(FileSequence):
     def boxes(self, frame: int) -> Boxes | None:
         """Return a sweep's annotated boxes in the lidar frame; None in the test split."""
         path, columns = self.where / "annotations.feather", self._annotations
-        rows = np.flatnonzero(columns["timestamp_ns"] == self.stamp_ns(frame)) if columns else ()
+        stamp_ns = self.stamp_ns(frame)
+        rows = np.flatnonzero(columns["timestamp_ns"] == stamp_ns) if columns else np.zeros(0, int)
         if not len(rows):
             return None  # no boxes and not annotated look the same
         size_m = np.stack([columns[name][rows] for name in BOX_SIZE], axis=1)

@@ -92,9 +92,9 @@ def pair_depth_files(
     maps of measured pixels.
     """
     estimated = _of_product(_depth_files(predicted, "PREDICTED"), predicted, filled)
-    true = _depth_files(truth, "TRUTH")
-    published = [file for file in true if file.product in _TRUTH_PRODUCTS]
-    true = published or _of_product(true, truth, filled=False)
+    files = _depth_files(truth, "TRUTH")
+    published = [file for file in files if file.product in _TRUTH_PRODUCTS]
+    true = published or _of_product(files, truth, filled=False)
     are_files = predicted.is_file() and truth.is_file()
     if mask is not None and not (mask.is_file() if are_files else mask.is_dir()):
         kind = "PNG file, as PREDICTED and TRUTH are" if are_files else "folder of masks"
@@ -145,7 +145,7 @@ def _last_name(pattern: re.Pattern[str], text: str) -> str | None:
     return names[-1] if names else None
 
 
-def _of_product(files: Sequence[_File], path: Path, filled: bool) -> Sequence[_File]:
+def _of_product(files: list[_File], path: Path, filled: bool) -> list[_File]:
     """Return densify's filled or measured maps; all files if another method made them."""
     chosen = [file for file in files if file.product in (_FILLED if filled else _MEASURED)]
     if filled and not chosen:

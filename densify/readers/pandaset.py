@@ -83,8 +83,8 @@ class PandaSet(FileSequence):
             if files:
                 images_ns, self._T_world_cam[name] = _stamped_poses(folder, max(files))
                 images[name], exposed_ns[name] = files, {n: int(images_ns[n]) for n in files}
-                step_of_image = np.searchsorted(self._stamps_ns, images_ns)
-                calm = min(files, key=lambda n, steps=step_of_image: step_m[steps[n]])
+                steps = np.searchsorted(self._stamps_ns, images_ns[[*files]])
+                calm = [*files][int(np.argmin(step_m[steps]))]
                 T_cam_world = poses.inverse(self._T_world_cam[name][calm])
                 T_cam_lidar = T_cam_world @ self._track.at(exposed_ns[name][calm])
                 cameras[name] = _camera(folder, files[min(files)], T_cam_lidar)

@@ -211,7 +211,8 @@ def find_times(
             f"{name} spans {2 * reach:.6g} in a sweep, which in no unit is about the "
             f"{1e-6 * period_ns:.0f} ms from sweep to sweep; name its unit"
         )
-    middles_ns, usual_ns, reach_ns = (x * UNIT_NS[unit] for x in (extents[:, 0], middle, reach))
+    middles_ns, usual_ns = extents[:, 0] * UNIT_NS[unit], middle * UNIT_NS[unit]
+    reach_ns = reach * UNIT_NS[unit]
     absolute = field.absolute
     if absolute is None:
         advance_ns = float(np.median(np.abs(middles_ns - usual_ns)))
