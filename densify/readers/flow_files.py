@@ -45,6 +45,7 @@ FARTHEST_M = 1000.0
 """Longest flow vector that is accepted; a longer vector raises InputError."""
 _WIDE = ("residual_flow", "total_flow", "to_reference")
 _KNOWN = (*_WIDE, "row", "moving", "object", "valid")
+Columns = dict[str, NDArray[Any]]
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
@@ -66,27 +67,21 @@ def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowF
     ``source`` and ``target`` are indices in ``stretch.sweeps``. Points that are missing
     in the flow file are static.
     """
-    source_frame, target_frame = stretch.frames[source], stretch.frames[target]
-    sweep = stretch.sweeps[source].sweep
-    T_source_target = stretch.T_target_source(source_frame, target_frame)
-    path = folder / f"{source_frame:06d}_{target_frame:06d}.npz"
-    columns = sweep_columns(path, sweep.row, sweep.points, T_source_target)
+    columns = _step_columns(folder, stretch, stretch.frames[source], stretch.frames[target])
     residual, moving = columns["residual_flow"], columns["moving"].astype(bool)
     residual[~moving] = 0.0
     instance, lost = columns["object"].astype(np.int32), np.zeros(len(moving), bool)
     return FlowField(residual, moving, instance, lost, columns.get("to_reference"))
 
 
-def sweep_columns(
-    path: Path, row: NDArray[np.int64], points: NDArray[np.float64], T_source_target: NDArray[Any]
-) -> dict[str, NDArray[Any]]:
+def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Columns:
     """Read a flow file's arrays, as the module describes them, for N points in the sweep's order.
 
     Missing residual_flow, moving, object and valid are added. A point that is missing in the file
-    has flow 0 and object -1, and is not valid. ``row`` (N,) is the row of each point in the sweep's
-    file. ``points`` is (N,3) metres in the source's lidar frame, in which ``T_source_target`` (4,4)
-    is the pose of the target's lidar frame.
+    has flow 0 and object -1, and is not valid.
     """
+    path, sweep = folder / f"{frame:06d}_{target:06d}.npz", stretch[frame].sweep
+    row = sweep.row
     arrays = load_flow_file(path)
     num_points = len(next(iter(arrays.values())))
     if "row" not in arrays and row.max(initial=-1) >= num_points:
@@ -105,8 +100,9 @@ def sweep_columns(
         columns[name] = np.zeros((len(row), *array.shape[1:]))
         columns[name][known] = array[entry[known]]
     if "residual_flow" not in arrays:
-        arrived = poses.transform(T_source_target, points + columns["total_flow"])
-        residual = arrived - points - columns.get("to_reference", 0.0)
+        T_source_target = stretch.T_target_source(frame, target)
+        arrived = poses.transform(T_source_target, sweep.points + columns["total_flow"])
+        residual = arrived - sweep.points - columns.get("to_reference", 0.0)
         columns["residual_flow"] = np.where(known[:, None], residual, 0.0)
     if "moving" not in arrays:
         columns["moving"] = np.linalg.norm(columns["residual_flow"], axis=1) >= MOVES_M
@@ -115,7 +111,7 @@ def sweep_columns(
     return columns
 
 
-def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
+def load_flow_file(path: Path) -> Columns:
     """Return the arrays of a flow file by name, as stored, after checking shapes and values."""
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
@@ -156,7 +152,7 @@ _CATEGORIES_OF_CLASS: dict[str | None, str] = {
     "MOBILE_PEDESTRIAN_CROSSING_SIGN SIGN STOP_SIGN TRAFFIC_LIGHT_TRAILER",
 }
 CATEGORIES = dict(
-    sorted((name, of) for of, names in _CATEGORIES_OF_CLASS.items() for name in names.split())
+    sorted((name, key) for key, names in _CATEGORIES_OF_CLASS.items() for name in names.split())
 )
 """Class in the Argoverse 2 challenge of 2024 for each category, in alphabetical order; None if the
 category is ignored (`av2_metacategories` of the package bucketed-scene-flow-eval)."""
@@ -185,11 +181,9 @@ def labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> Labe
     """
     if not folder.is_dir():
         raise InputError(f"--truth {folder}: no such folder; expected true flow in it")
-    target = stretch.frames[stretch.frames.index(frame) + 1]
-    path = folder / f"{frame:06d}_{target:06d}.npz"
-    if path.is_file() or any(folder.glob("*_*.npz")):
-        sweep, T = stretch[frame].sweep, stretch.T_target_source(frame, target)
-        columns = sweep_columns(path, sweep.row, sweep.points, T)
+    if any(folder.glob("*_*.npz")):
+        target = stretch.frames[stretch.frames.index(frame) + 1]
+        columns = _step_columns(folder, stretch, frame, target)
         classes = np.where(columns["object"] >= 0, _OBJECT, 0).astype(np.uint8)
         return LabelledFlow(columns["residual_flow"], classes, columns["valid"])
     label_folder = folder / name if (folder / name).is_dir() else folder

@@ -93,6 +93,15 @@ class Topic(NamedTuple):
     num_messages: int
 
 
+class Recorded(NamedTuple):
+    """A message as recorded."""
+
+    topic: str
+    log_ns: int  # time of recording
+    raw: bytes
+    type: str  # message type in ROS 2 notation
+
+
 class Bag:
     """A ROS 1 or ROS 2 bag, opened for reading."""
 
@@ -130,11 +139,11 @@ class Bag:
         counted.
         """
         entries_of_topic: dict[str, list[Entry]] = {topic: [] for topic in topics}
-        last = dict.fromkeys(topics, (-1, 0))  # time of recording and turn of the last message
+        num_recorded_at = Counter[tuple[str, int]]()
         indexed: set[tuple[str, int, int]] = set()
         for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
-            turn = last[topic][1] + 1 if last[topic][0] == log_ns else 0
-            last[topic] = log_ns, turn
+            turn = num_recorded_at[topic, log_ns]
+            num_recorded_at[topic, log_ns] += 1
             try:
                 stamp_ns = _stamp_ns(raw, self._is_ros2)
             except struct.error:
@@ -152,31 +161,31 @@ class Bag:
         recorded = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
         if len(recorded) <= entry.turn:
             raise InputError(f"{self.path}: no message of {topic} at {entry.log_ns} ns any more")
-        _, _, raw, type_ = recorded[entry.turn]
-        return self._decoded(raw, type_, topic)
+        return self._decoded(recorded[entry.turn])
 
     def messages(self, topic: str) -> Iterator[Any]:
         """Yield all decoded messages of a topic in the order of recording."""
-        for name, _, raw, type_ in self._messages([topic]):
-            yield self._decoded(raw, type_, name)
+        for recorded in self._messages([topic]):
+            yield self._decoded(recorded)
 
     def _messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
-    ) -> Iterator[tuple[str, int, bytes, str]]:
-        """Yield topic, recording time (ns), raw bytes and message type, by recording time."""
+    ) -> Iterator[Recorded]:
+        """Yield messages by recording time."""
         streams = []
         for reader in self._readers:
-            wanted = [c for c in reader.connections if c.topic in topics]
-            if wanted:  # an empty list would mean all
-                streams.append(reader.messages(wanted, start_ns, stop_ns))
+            connections = [c for c in reader.connections if c.topic in topics]
+            if connections:  # an empty list would mean all
+                streams.append(reader.messages(connections, start_ns, stop_ns))
         with self._lock:
             try:
                 for connection, log_ns, raw in heapq.merge(*streams, key=lambda record: record[1]):
-                    yield connection.topic, log_ns, raw, connection.msgtype
+                    yield Recorded(connection.topic, log_ns, raw, connection.msgtype)
             except Exception as error:  # the parser may raise any type
                 raise self._unreadable(error) from error
 
-    def _decoded(self, raw: bytes, type_: str, topic: str) -> Any:
+    def _decoded(self, recorded: Recorded) -> Any:
+        topic, _, raw, type_ = recorded
         decode = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
         try:
             return decode(raw, type_)
