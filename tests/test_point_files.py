@@ -38,7 +38,7 @@ DATA """
 PADDED = np.dtype([("head", "V12"), ("a", "V4"), ("i", "u1"), ("t", "<u4"), ("b", "V5")])
 
 
-def write_padded(path: Path, data: str) -> None:
+def write_pcd(path: Path, data: str) -> None:
     """As Ouster's driver writes it: padding between the fields, one of none."""
     rows = np.zeros(60, PADDED)
     rows["head"] = np.frombuffer(POINTS.tobytes(), "V12")
@@ -76,8 +76,8 @@ def write_text(path: Path, header: str, delimiter: str) -> None:
 
 
 WRITERS = {
-    "padded.pcd": lambda p: write_padded(p, "binary"),
-    "words.pcd": lambda p: write_padded(p, "ascii"),
+    "padded.pcd": lambda p: write_pcd(p, "binary"),
+    "words.pcd": lambda p: write_pcd(p, "ascii"),
     "packed.pcd": write_packed,
     "words.ply": lambda p: write_ply(p, text=True),
     "little.ply": lambda p: write_ply(p, byte_order="<"),
@@ -281,7 +281,7 @@ def test_organised_arrays_are_read(tmp_path: Path) -> None:
 
 def test_byte_order_marks_are_skipped_and_utf_16_is_named(tmp_path: Path) -> None:
     path = tmp_path / "words.pcd"
-    write_padded(path, "ascii")
+    write_pcd(path, "ascii")
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     np.testing.assert_array_equal(read_table(path).columns["intensity"], INTENSITY)
     for text in ("x,y,z\n1,2,3\n".encode("utf-16"), "x,y,z\n1,2,3\n".encode("utf-16-le")):
