@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,6 +16,13 @@ PERIOD_NS = 100_000_000
 KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
+class Record(NamedTuple):
+    log_ns: int
+    topic: str
+    type: str
+    message: Any
+
+
 class Maker:
     """Messages, and bags of them. suffix: .db3, .mcap or .bag."""
 
@@ -23,7 +30,7 @@ class Maker:
         self.is_ros2 = suffix != ".bag"
         self.suffix = suffix
         self.types = message_types(self.is_ros2)
-        self.written: list[tuple[int, str, str, Any]] = []
+        self.written: list[Record] = []
 
     def make(self, type_: str, *values: Any) -> Any:
         return self.types.types[type_](*values)
@@ -33,7 +40,7 @@ class Maker:
         return self.make("std_msgs/msg/Header", *(() if self.is_ros2 else (7,)), stamp, frame)
 
     def put(self, topic: str, type_: str, message: Any, log_ns: int) -> None:
-        self.written.append((log_ns, topic, type_, message))
+        self.written.append(Record(log_ns, topic, type_, message))
 
     def cloud(
         self,
@@ -42,38 +49,33 @@ class Maker:
         topic: str = "/points",
         frame: str = "lidar",
         height: int = 1,
-        padding: int = 3,
         row_padding: int = 0,
         big: bool = False,
     ) -> None:
-        """columns: by name, in order; ``padding`` bytes stand between them."""
-        order, offset, layout = ">" if big else "<", 0, []
-        for name, column in columns.items():
-            layout.append((name, column.dtype.str[1:], offset))
-            offset += column.dtype.itemsize + padding
-        names, kinds, offsets = zip(*layout, strict=True)
-        dtype = np.dtype(
-            {
-                "names": names,
-                "formats": [order + k for k in kinds],
-                "offsets": offsets,
-                "itemsize": offset,
-            }
-        )
-        points = np.zeros(len(columns["x"]), dtype)
+        """columns: by name, in order; 3 bytes stand between them."""
+        kinds = [column.dtype.str[1:] for column in columns.values()]
+        sizes = [column.dtype.itemsize + 3 for column in columns.values()]
+        offsets = [sum(sizes[:i]) for i in range(len(sizes))]
+        layout: Any = {
+            "names": [*columns],
+            "formats": [(">" if big else "<") + kind for kind in kinds],
+            "offsets": offsets,
+            "itemsize": sum(sizes),
+        }
+        points = np.zeros(len(columns["x"]), np.dtype(layout))
         for name, column in columns.items():
             points[name] = column
         fields = [
-            self.make("sensor_msgs/msg/PointField", name, at, KINDS[kind], 1)
-            for name, kind, at in layout
+            self.make("sensor_msgs/msg/PointField", name, offset, KINDS[kind], 1)
+            for name, offset, kind in zip(columns, offsets, kinds, strict=True)
         ]
-        width = len(points) // height
-        rows = points.view(np.uint8).reshape(height, width * offset)
-        data = np.pad(rows, ((0, 0), (0, row_padding)), constant_values=9).reshape(-1)
-        step = width * offset + row_padding
-        values = (self.header(stamp_ns, frame), height, width, fields, big, offset, step, data)
-        message = self.make("sensor_msgs/msg/PointCloud2", *values, False)
-        self.put(topic, "sensor_msgs/msg/PointCloud2", message, stamp_ns + PERIOD_NS)
+        rows = points.view(np.uint8).reshape(height, -1)
+        data = np.pad(rows, ((0, 0), (0, row_padding)), constant_values=9)
+        sizes_and_data = (sum(sizes), data.shape[1], data.reshape(-1))
+        shape = (height, len(points) // height)
+        values = (self.header(stamp_ns, frame), *shape, fields, big, *sizes_and_data, False)
+        type_ = "sensor_msgs/msg/PointCloud2"
+        self.put(topic, type_, self.make(type_, *values), stamp_ns + PERIOD_NS)
 
     def sweeps(self, num: int = 2, **options: Any) -> None:
         for i in range(num):
@@ -156,13 +158,9 @@ class Maker:
 
     def write(self, folder: Path, compressed: bool = False) -> Path:
         """The bag: a ROS 2 bag's folder, or a .bag file. compressed: its files as a whole."""
+        folder.mkdir(parents=True, exist_ok=True)
         if self.is_ros2:
-            from rosbags.rosbag2 import (
-                CompressionFormat,
-                CompressionMode,
-                StoragePlugin,
-                Writer,
-            )
+            from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
             mcap = self.suffix == ".mcap"
             plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
@@ -177,12 +175,14 @@ class Maker:
             place = folder / "drive.bag"
             writer, serialize = Writer1(place), self.types.serialize_ros1
         with writer as bag:
-            topics = {(topic, type_) for _, topic, type_, _ in self.written}
+            records = [Record(*record) for record in self.written]
             added = {
-                t: bag.add_connection(t, type_, typestore=self.types) for t, type_ in sorted(topics)
+                topic: bag.add_connection(topic, type_, typestore=self.types)
+                for topic, type_ in sorted({(r.topic, r.type) for r in records})
             }
-            for log_ns, topic, type_, message in sorted(self.written, key=lambda w: w[0]):
-                bag.write(added[topic], log_ns, serialize(message, type_))
+            for record in sorted(records, key=lambda record: record.log_ns):
+                data = serialize(record.message, record.type)
+                bag.write(added[record.topic], record.log_ns, data)
         return place
 
 

@@ -12,7 +12,7 @@ from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Result, Stretch, StretchFlow
 from densify.outputs.flow_writers import write_flow_npz
-from densify.readers.flow_files import MOVES_M, check_argument, read_step
+from densify.readers.flow_files import check_argument, read_step
 from tests.exact_motion import registered
 from tests.scenes import by_flow
 from tests.small_street import KEY, POSES_GIVEN, one_car
@@ -33,23 +33,6 @@ def ours(tmp_path_factory) -> tuple[Result, Path]:
     return result, folder
 
 
-def depth_from(folder: Path) -> Result:
-    return by_flow(one_car(), KEY, 1, config=PLAIN | {"flow": {"engine": f"npz:{folder}"}})
-
-
-def assert_same(found: Result, ours: Result, of_key: bool = True) -> None:
-    """of_key: with the key's own returns, whose way to the reference time a file may not tell."""
-    asked = (ours.cloud.frame != KEY) | of_key
-    assert np.array_equal(found.cloud.frame, ours.cloud.frame)
-    assert np.array_equal(found.cloud.moving, ours.cloud.moving)
-    assert np.abs(found.cloud.points - ours.cloud.points)[asked].max() < 2e-5
-    here, there = found.depth["front"], ours.depth["front"]
-    same = (here.frame == there.frame) & (here.frame >= 0) & ((here.frame != KEY) | of_key)
-    assert same.sum() > 3000
-    np.testing.assert_allclose(here.depth_m[same], there.depth_m[same], atol=2e-5)
-    assert (here.frame == there.frame).mean() > 0.98
-
-
 def test_a_run_leaves_a_file_for_every_step_to_the_key(ours):
     result, folder = ours
     assert result.cloud.moving.sum() > 100
@@ -64,27 +47,38 @@ def test_a_run_leaves_a_file_for_every_step_to_the_key(ours):
 
 def test_the_flow_of_a_run_gives_its_depth_again(ours):
     result, folder = ours
-    assert_same(depth_from(folder), result)
+    again = by_flow(one_car(), KEY, 1, config=PLAIN | {"flow": {"engine": f"npz:{folder}"}})
+    assert np.array_equal(again.cloud.frame, result.cloud.frame)
+    assert np.array_equal(again.cloud.moving, result.cloud.moving)
+    assert np.abs(again.cloud.points - result.cloud.points).max() < 2e-5
+    new, old = again.depth["front"], result.depth["front"]
+    same = (new.frame == old.frame) & (new.frame >= 0)
+    assert same.sum() > 3000 and (new.frame == old.frame).mean() > 0.98
+    np.testing.assert_allclose(new.depth_m[same], old.depth_m[same], atol=2e-5)
 
 
 @pytest.mark.parametrize("dropped", ["residual_flow", "residual_flow and to_reference", "row"])
 def test_other_forms_of_the_same_flow(ours, dropped, tmp_path):
     """Total flow instead of residual flow; a value for every row of the file instead of 'row'."""
     result, folder = ours
-    num_rows = {f: len(one_car()[f]) for f in (KEY - 1, KEY, KEY + 1)}
-    for path in folder.iterdir():
-        with np.load(path) as loaded:
+    stretch = result.flow.stretch
+    for source, target in result.flow.steps:
+        name, num_rows = f"{source:06d}_{target:06d}.npz", len(one_car()[source])
+        with np.load(folder / name) as loaded:
             arrays = dict(loaded)
         if dropped == "row":
             row = arrays.pop("row")
-            for name, array in arrays.items():
-                whole = np.zeros((num_rows[int(path.stem[:6])], *array.shape[1:]), array.dtype)
-                whole[row] = array
-                arrays[name] = whole
+            for key, array in arrays.items():
+                arrays[key] = np.zeros((num_rows, *array.shape[1:]), array.dtype)
+                arrays[key][row] = array
         else:
-            arrays = {name: a for name, a in arrays.items() if name not in dropped.split(" and ")}
-        np.savez(tmp_path / path.name, **arrays)
-    assert_same(depth_from(tmp_path), result, of_key="to_reference" not in dropped)
+            arrays = {key: a for key, a in arrays.items() if key not in dropped.split(" and ")}
+        np.savez(tmp_path / name, **arrays)
+        step = (stretch, stretch.frames.index(source), stretch.frames.index(target))
+        read, expected = read_step(tmp_path, *step), read_step(folder, *step)
+        assert np.array_equal(read.moving, expected.moving)
+        moved_m = expected.total[expected.moving]
+        np.testing.assert_allclose(read.total[read.moving], moved_m, atol=2e-5)
 
 
 # --- one file -------------------------------------------------------------------------------------
@@ -115,18 +109,14 @@ def test_rows_say_which_points_and_the_rest_stands_still(stretch, tmp_path):
 
 
 def test_what_moves_less_than_5_cm_without_being_said_to_move_stands_still(stretch, tmp_path):
-    row = stretch[STEP[0]].sweep.row
-    flow = np.zeros((10, 3))
+    row, flow = stretch[STEP[0]].sweep.row, np.zeros((10, 3))
     flow[:4, 0] = 0.049, 0.051, -3.0, -0.01
-    saved(tmp_path, residual_flow=flow, row=row)
-    field = read_step(tmp_path, stretch, 0, 1)
-    assert MOVES_M == 0.05 and np.flatnonzero(field.moving).tolist() == [1, 2]
-    assert not field.displacement[~field.moving].any()
-    said = np.arange(10) % 2 == 1
-    saved(tmp_path, residual_flow=flow, row=row, moving=said.astype(np.uint8))
-    field = read_step(tmp_path, stretch, 0, 1)
-    assert np.array_equal(field.moving, said)
-    assert np.array_equal(field.displacement, np.where(said[:, None], flow, 0))
+    stated = {"moving": np.arange(10) % 2}
+    for arrays, moving in (({}, [1, 2]), (stated, [1, 3, 5, 7, 9])):
+        saved(tmp_path, residual_flow=flow, row=row, **arrays)
+        field = read_step(tmp_path, stretch, 0, 1)
+        assert np.flatnonzero(field.moving).tolist() == moving
+        np.testing.assert_array_equal(field.displacement, flow * field.moving[:, None])
 
 
 def test_ego_motion_is_taken_out_of_total_flow(stretch, tmp_path):
@@ -144,18 +134,15 @@ def test_ego_motion_is_taken_out_of_total_flow(stretch, tmp_path):
 
 
 def test_total_flow_holds_the_way_to_the_reference_time_once(stretch, tmp_path):
-    sweep = stretch[STEP[0]].sweep
     one = np.ones((10, 3))
     field = FlowField(2 * one, one[:, 0] > 0, np.zeros(10, np.int32), one[:, 0] < 0, 0.25 * one)
-    write_flow_npz(tmp_path, StretchFlow(stretch, {STEP: field}), "tiny")
-    path = tmp_path / f"{STEP[0]:06d}_{STEP[1]:06d}.npz"
+    (path,) = write_flow_npz(tmp_path, StretchFlow(stretch, {STEP: field}), "tiny")
     with np.load(path) as arrays:
-        known = {name: arrays[name] for name in ("total_flow", "to_reference", "row")}
-    saved(tmp_path, **known)
-    found = read_step(tmp_path, stretch, 0, 1)
-    np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-5)
-    np.testing.assert_allclose(found.total, field.total, atol=1e-5)
-    assert len(sweep) == 10
+        kept = {name: arrays[name] for name in ("total_flow", "to_reference", "row")}
+    np.savez(path, **kept)
+    read = read_step(tmp_path, stretch, 0, 1)
+    np.testing.assert_allclose(read.displacement, field.displacement, atol=1e-5)
+    np.testing.assert_allclose(read.total, field.total, atol=1e-5)
 
 
 FLOW = np.zeros((30, 3))

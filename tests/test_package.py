@@ -245,8 +245,8 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "kiss_icp": "densify/registration/odometry.py",
     "laspy": ("densify/readers/decoded_files.py", "densify/outputs/cloud_laz.py"),
     "numba": ("densify/geometry/compiled.py",),
-    "pickle": ("densify/readers/pickled_frame.py",),
-    "simplejpeg": "densify/readers/stray_bytes.py",
+    "pickle": ("densify/readers/column_files.py",),
+    "simplejpeg": "densify/readers/decoded_files.py",
     "small_gicp": "densify/registration/alignment.py",
     "torch": ("densify/flow/", "densify/dataset/loader.py", "densify/learning/"),
 }

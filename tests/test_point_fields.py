@@ -6,31 +6,26 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.readers.point_fields import find_fields, find_times, full_scale, scaled
+from densify.readers.point_fields import TimeField, find_fields, find_times, full_scale, scaled
 
 STAMP_NS = 1_317_042_661_099_997_611
 PERIOD_NS = 100_000_000
 FIRED_NS = np.sort(np.random.default_rng(2).integers(0, 99_900_000, 400))
 
-DRIVERS = {  # names, and what plays intensity, time, ring
-    "velodyne": ("x y z intensity ring time", ("intensity", "time", "ring")),
-    "ouster": ("x y z intensity t reflectivity ring ambient range", ("intensity", "t", "ring")),
-    "hesai": ("x y z intensity timestamp ring", ("intensity", "timestamp", "ring")),
-    "livox": ("x y z reflectivity tag line offset_time", ("reflectivity", "offset_time", "line")),
-    "autoware": ("X Y Z I RETURN_TYPE CHANNEL TIME_STAMP", ("I", "TIME_STAMP", "CHANNEL")),
-    "cloudcompare": (
-        "x y z scalar_Intensity scalar_GpsTime scalar_Ring",
-        ("scalar_Intensity", "scalar_GpsTime", "scalar_Ring"),
-    ),
-    "bare": ("x y z", ("", "", "")),
+DRIVERS = {  # names: those of intensity, time, ring
+    "x y z intensity ring time": ("intensity", "time", "ring"),
+    "x y z intensity t reflectivity ring ambient range": ("intensity", "t", "ring"),
+    "x y z reflectivity tag line offset_time": ("reflectivity", "offset_time", "line"),
+    "X Y Z I RETURN_TYPE CHANNEL TIME_STAMP": ("I", "TIME_STAMP", "CHANNEL"),
+    "x y z scalar_Intensity scalar_Ring": ("scalar_Intensity", "", "scalar_Ring"),
+    "x y z": ("", "", ""),
 }
 
 
-@pytest.mark.parametrize("driver", DRIVERS)
-def test_fields_of_drivers(driver: str) -> None:
-    names, parts = DRIVERS[driver]
+@pytest.mark.parametrize("names", DRIVERS)
+def test_fields_of_drivers(names: str) -> None:
     fields = find_fields(names.split())
-    assert (fields.intensity, fields.time, fields.ring) == parts
+    assert (fields.intensity, fields.time, fields.ring) == DRIVERS[names]
     assert [fields.x.lower(), fields.y.lower(), fields.z.lower()] == ["x", "y", "z"]
 
 
@@ -50,33 +45,43 @@ TIMES = {  # values, unit, absolute
 @pytest.mark.parametrize("kind", TIMES)
 def test_units_follow_from_the_span(kind: str) -> None:
     values, unit, absolute = TIMES[kind]
-    found, words = find_times([values], "t", PERIOD_NS, [STAMP_NS])
-    assert found is not None, words
-    assert (found.unit, found.absolute, found.other_clock) == (unit, absolute, False)
+    times, words = find_times(TimeField("t"), [values], PERIOD_NS, [STAMP_NS])
+    assert times is not None, words
+    assert (times.unit, times.absolute, times.other_clock) == (unit, absolute, False)
     assert f"t in {unit}, {'absolute' if absolute else 'relative'}" in words
-    offset_ns, right = found.offset_ns(values, STAMP_NS)
-    assert right.all()
-    assert offset_ns.dtype == np.int64
-    expected = FIRED_NS - (100_000_000 if "before" in kind else 0)
-    assert np.abs(offset_ns - expected).max() < 1200  # digits of the floats, and whole us
+    offset_ns, is_valid = times.offset_ns(values, STAMP_NS)
+    assert is_valid.all() and offset_ns.dtype == np.int64
+    expected_ns = FIRED_NS - (100_000_000 if "before" in kind else 0)
+    assert np.abs(offset_ns - expected_ns).max() < 1200  # digits of the floats, and whole us
 
 
-def test_the_stamp_may_be_the_end_or_the_middle() -> None:
+@pytest.mark.parametrize(("reference", "share"), [("start", 0), ("middle", 0.5), ("end", 1)])
+def test_the_stamp_may_be_the_end_or_the_middle(reference: str, share: float) -> None:
     values = (FIRED_NS - FIRED_NS[0]).astype("u4")
-    span = int(values[-1])
-    for reference, first in (("start", 0), ("middle", -span / 2), ("end", -span)):
-        found, words = find_times([values], "t", PERIOD_NS, [STAMP_NS], reference=reference)
-        assert found is not None and f"the stamp is the {reference}" in words
-        np.testing.assert_allclose(
-            found.offset_ns(values, STAMP_NS)[0][[0, -1]], [first, first + span]
-        )
+    field = TimeField("t", reference=reference)
+    times, words = find_times(field, [values], PERIOD_NS, [STAMP_NS])
+    assert times is not None and f"the stamp is the {reference}" in words
+    expected_ns = values - share * values[-1].astype(float)
+    np.testing.assert_allclose(times.offset_ns(values, STAMP_NS)[0], expected_ns, atol=1)
 
 
 def test_another_clock_is_told_and_counted_from_the_first_point() -> None:
     tai_ns = STAMP_NS + 37_000_000_000 + FIRED_NS
-    found, words = find_times([tai_ns], "timestamp", PERIOD_NS, [STAMP_NS])
-    assert found is not None and found.other_clock and "another clock" in words
-    np.testing.assert_array_equal(found.offset_ns(tai_ns, STAMP_NS)[0], FIRED_NS - FIRED_NS[0])
+    times, words = find_times(TimeField("timestamp"), [tai_ns], PERIOD_NS, [STAMP_NS])
+    assert times is not None and times.other_clock and "another clock" in words
+    np.testing.assert_array_equal(times.offset_ns(tai_ns, STAMP_NS)[0], FIRED_NS - FIRED_NS[0])
+
+
+def test_times_far_from_the_sweep_are_invalid() -> None:
+    values = (STAMP_NS + FIRED_NS) * 1e-9
+    wrong = [3, 50, 51, 52]
+    values[wrong] = np.nan, 0.0, 1e300, values[0] + 60
+    times, words = find_times(TimeField("t"), [values], PERIOD_NS, [STAMP_NS])
+    assert times is not None, words
+    offset_ns, is_valid = times.offset_ns(values, STAMP_NS)
+    assert np.flatnonzero(~is_valid).tolist() == wrong and not offset_ns[wrong].any()
+    assert times.own_stamp_ns(values) == pytest.approx(STAMP_NS + FIRED_NS[0], abs=300)
+    assert times.own_stamp_ns(values[:0]) is None
 
 
 NOT_TIMES = {
@@ -90,15 +95,15 @@ NOT_TIMES = {
 @pytest.mark.parametrize("kind", NOT_TIMES)
 def test_what_tells_no_times_says_why(kind: str) -> None:
     values, says = NOT_TIMES[kind]
-    found, words = find_times([values], "t", PERIOD_NS, [STAMP_NS])
-    assert found is None and says in words
+    times, words = find_times(TimeField("t"), [values], PERIOD_NS, [STAMP_NS])
+    assert times is None and says in words
 
 
 def test_what_is_known_is_taken() -> None:
     values = np.linspace(0, 30.0, 50)
-    found, _ = find_times([values], "t", PERIOD_NS, [STAMP_NS], unit="ms", absolute=False)
-    assert found is not None
-    assert found.offset_ns(values, STAMP_NS)[0][-1] == 30_000_000
+    times, _ = find_times(TimeField("t", "ms", absolute=False), [values], PERIOD_NS, [STAMP_NS])
+    assert times is not None
+    assert times.offset_ns(values, STAMP_NS)[0][-1] == 30_000_000
 
 
 def test_intensities_are_brought_to_one() -> None:
@@ -106,6 +111,5 @@ def test_intensities_are_brought_to_one() -> None:
         intensity = np.array(values, np.float32)
         assert full_scale(intensity) == scale
         assert scaled(intensity, scale).max() <= 1
-    np.testing.assert_array_equal(
-        scaled(np.array([np.nan, 300, 51.0]), 255), [0, 1, np.float32(0.2)]
-    )
+    clipped = scaled(np.array([np.nan, 300, 51.0]), 255)
+    np.testing.assert_array_equal(clipped, [0, 1, np.float32(0.2)])

@@ -30,32 +30,17 @@ def test_the_street_is_given_back(written, excerpt):
     check_sweeps(sequence, excerpt, -HALF_NS, inverse(T_EGO_LIDAR), point_m=0.06)
     check_cameras(sequence, excerpt, inverse(T_EGO_LIDAR), same_pixels=False)
     check_truth(sequence, excerpt)
-    near = np.abs(sequence[0].points).max(axis=1) < 8
-    away = excerpt.street[FRAMES[0]].points - inverse(T_EGO_LIDAR)[:3, 3]
-    assert np.abs(sequence[0].points - away)[near].max() < 0.005
-
-
-def test_a_pose_for_each_image(written, excerpt):
-    sequence = open_sequence(written)
     for number, frame in enumerate(FRAMES):
-        expected = excerpt.street.T_world_lidar(frame) @ inverse(
-            excerpt.street.cameras[CAMERA].T_cam_lidar
-        )
+        T_lidar_cam = inverse(excerpt.street.cameras[CAMERA].T_cam_lidar)
+        expected = excerpt.street.T_world_lidar(frame) @ T_lidar_cam
         np.testing.assert_allclose(sequence.T_world_cam(CAMERA, number), expected, atol=1e-4)
 
 
 def test_two_scanners_keep_their_places(tmp_path):
     street = Street("static", 0, "dual32", cameras=())
-    written = write_street("argoverse2", street, tmp_path, [60])
-    sweep, true = Argoverse2(written)[0], street[60]
-    np.testing.assert_array_equal(sweep.lidar, true.lidar)
-    np.testing.assert_allclose(sweep.scanner_origins, true.scanner_origins + [1.35, 0, 1.64])
-    laser = feather.read_table(next((written / "sensors" / "lidar").iterdir()))["laser_number"]
-    assert set(laser.to_numpy()) == set(range(64))
-    away = true.points - true.scanner_origins[true.lidar]
-    elevation_deg = np.degrees(np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1])))
-    for ring in (0, 31, 32, 63):
-        assert np.ptp(elevation_deg[laser.to_numpy() == ring]) < 0.01
+    sweep = Argoverse2(write_street("argoverse2", street, tmp_path, [60]))[0]
+    np.testing.assert_array_equal(sweep.lidar, street[60].lidar)
+    np.testing.assert_allclose(sweep.scanner_origins, street[60].scanner_origins + [1.35, 0, 1.64])
 
 
 def test_logs_are_scenes(written):

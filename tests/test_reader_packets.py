@@ -13,8 +13,8 @@ import pytest
 from densify.config.errors import InputError
 from densify.free_space.rings import find_rings
 from densify.readers import open_sequence
-from densify.readers.ouster import Ouster, lost_and_doubled
-from densify.readers.velodyne import MODELS, Velodyne
+from densify.readers.packets import MODELS, Ouster, Velodyne, lost_and_doubled
+from tests.reader_checks import check_refused
 
 HEADERS = bytes(42)  # Ethernet, IP, UDP: not looked at
 START_S, PACKET_US, PACKETS_PER_TURN = 1_355_263_594, 1327, 76
@@ -118,11 +118,17 @@ def test_what_is_cut_off_is_left_out(vlp16):
     assert list(Velodyne(vlp16, "VLP-16").frames) == [0]
 
 
-def test_the_model_has_to_be_named(vlp16):
-    for spec, got in ((vlp16, "no model"), (f"velodyne:{vlp16}#HDL-64", "the model HDL-64")):
-        with pytest.raises(InputError, match=f"got {got}; name the Velodyne") as error:
+def test_the_model_or_the_metadata_has_to_be_named(vlp16):
+    for spec, got in ((vlp16, "no model and no metadata"), (f"velodyne:{vlp16}#HDL-64", "HDL-64")):
+        with pytest.raises(InputError, match=f"got .*{got}; name the Velodyne") as error:
             open_sequence(spec)
         assert all(model in str(error.value) for model in MODELS)
+    (vlp16.parent / "other.json").write_text("{}")
+    with pytest.raises(InputError, match=r"an Ouster's metadata .json .*there: other\.json"):
+        open_sequence(f"ouster:{vlp16}#third.json")
+
+
+PLAIN_PACKET = struct.pack("<IIII", 0, 0, 600, 600) + bytes(600)
 
 
 @pytest.mark.parametrize(
@@ -131,16 +137,13 @@ def test_the_model_has_to_be_named(vlp16):
         (b"", "not a capture of packets"),
         (b"\x0a\x0d\x0d\x0a" + bytes(60), "editcap"),
         (capture(0), "no Velodyne packets"),
-        (capture(0) + struct.pack("<IIII", 0, 0, 600, 600) + bytes(600), "no Velodyne packets"),
+        (capture(0) + PLAIN_PACKET, "no Velodyne packets"),
     ],
 )
 def test_what_is_no_capture_is_refused_in_a_line(tmp_path, content, says):
     pytest.importorskip("velodyne_decoder")
-    path = tmp_path / "drive.pcap"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=says) as error:
-        open_sequence(f"velodyne:{path}#VLP-16")
-    assert "\n" not in str(error.value) and str(path) in str(error.value)
+    (tmp_path / "drive.pcap").write_bytes(content)
+    check_refused(f"velodyne:{tmp_path / 'drive.pcap'}#VLP-16", says, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -155,19 +158,15 @@ def test_without_the_package_the_remedy_is_named(vlp16, monkeypatch, package, re
 
 
 def test_an_ousters_metadata_is_found_beside_it(vlp16):
-    (vlp16.parent / "drive.json").write_text("{}")
-    (vlp16.parent / "other.json").write_text("{}")
-    with pytest.raises(InputError, match="which metadata"):
-        open_sequence(f"ouster:{vlp16}#third.json")
+    metadata = vlp16.with_suffix(".json")
+    metadata.write_text("{}")
+    metadata.with_name("other.json").write_text("{}")
     pytest.importorskip("ouster.sdk.core")
-    with pytest.raises(InputError, match=r"drive\.pcap: cannot be decoded with drive\.json"):
-        open_sequence(vlp16)
-    (vlp16.parent / "drive.json").write_text("{")
-    with pytest.raises(InputError, match=r"drive\.json: not a whole JSON file"):
-        open_sequence(vlp16)
-    (vlp16.parent / "drive.json").rename(vlp16.parent / "third.json")
-    with pytest.raises(InputError, match=r"which metadata\? beside it: other\.json, third\.json"):
-        open_sequence(vlp16)
+    check_refused(vlp16, r"drive\.pcap: cannot be decoded with drive\.json")
+    metadata.write_text("{")
+    check_refused(vlp16, r"drive\.json: not a whole JSON file")
+    metadata.rename(metadata.with_name("third.json"))
+    check_refused(vlp16, r"there: other\.json, third\.json")
 
 
 # Real captures
@@ -223,24 +222,6 @@ def test_a_real_ouster(test_data):
     assert sequence.findings() == [
         ("packets", "192, 0 lost (0.0 %), 0 captured twice and read once")
     ]
-
-
-def test_lost_and_doubled_packets_of_a_real_ouster_are_told(test_data, tmp_path):
-    pytest.importorskip("ouster.sdk.core")
-    real = test_data / "ouster/OS-1-128_v2.3.0_1024x10_lb_n3.pcap"
-    packets = packets_of(real.read_bytes())
-    largest = max(map(len, packets))
-    returns = [i for i, packet in enumerate(packets) if len(packet) == largest]
-    lost, doubled = returns[70:75], returns[100]  # of the second turn
-    faulty = [p for i, p in enumerate(packets) for _ in range(1 + (i == doubled)) if i not in lost]
-    path = tmp_path / "drive.pcap"
-    path.write_bytes(b"".join(faulty))
-    (tmp_path / "drive.json").write_bytes(
-        real.with_name("OS-1-128_v2.3.0_1024x10.json").read_bytes()
-    )
-    sequence = open_sequence(path)
-    assert sequence.findings()[0][1].startswith("187, 5 lost (2.6 %), 1 captured twice")
-    assert len(np.unique(sequence[1].row % 1024)) <= 1024 - 5 * 16
 
 
 def test_packets_of_an_ouster_are_counted_over_turns() -> None:

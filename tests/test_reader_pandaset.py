@@ -17,8 +17,8 @@ from densify.config.errors import InputError
 from densify.free_space.rings import find_rings
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
+from densify.readers.column_files import read_pickled
 from densify.readers.pandaset import T_POSE_LIDAR, PandaSet
-from densify.readers.pickled_frame import read_columns
 from densify.readers.street import Street
 from tests.reader_checks import check_cameras, check_sweeps, check_truth
 from tests.recorded import CAMERA
@@ -40,11 +40,13 @@ def test_the_street_is_given_back(written, excerpt):
     np.testing.assert_allclose(sequence.T_world_cam(CAMERA, 1), expected, atol=1e-9)
 
 
-def test_both_scanners_stand_where_they_do(tmp_path):
-    street = Street("static", 0, "pandaset", cameras=())
+def test_points_of_both_scanners(tmp_path):
+    """Those of the real vehicle stand where the street's do."""
+    street = Street("static", 0, "dual32", cameras=())
     sequence = PandaSet(write_street("pandaset", street, tmp_path, [60, 61]))
     check_sweeps(sequence, Excerpt.of(street, [60, 61], []), HALF_NS, point_m=1e-5, offset_ns=500)
-    np.testing.assert_array_equal(sequence[0].scanner_origins, street[60].scanner_origins)
+    sensor = Street("static", 0, "pandaset", cameras=()).simulator.sensor
+    np.testing.assert_array_equal(sequence[0].scanner_origins, sensor.origins_m)
 
 
 # Pickles that want to run something
@@ -74,7 +76,7 @@ def test_a_pickle_runs_nothing(tmp_path):
     for data in evil:
         path.write_bytes(gzip.compress(data))
         with pytest.raises(InputError, match="nothing in it was run") as error:
-            read_columns(path)
+            read_pickled(path)
         assert "\n" not in str(error.value)
     assert not trace.exists()
 
@@ -94,7 +96,7 @@ def test_a_real_sequence(test_data):
     # it hangs 9 cm before the scanner and 5 cm below it, and looks ahead
     np.testing.assert_allclose(inverse(front.T_cam_lidar)[:3, 3], [0.08, 0, -0.05], atol=0.02)
     np.testing.assert_allclose(inverse(front.T_cam_lidar)[:3, 2], [1, 0, 0], atol=0.03)
-    sweep, columns = sequence[24], read_columns(path / "lidar/24.pkl.gz")
+    sweep, columns = sequence[24], read_pickled(path / "lidar/24.pkl.gz")
     assert len(sweep) == 167_214 and np.bincount(sweep.lidar).tolist() == [106_021, 61_193]
     np.testing.assert_allclose(sweep.intensity * 255, columns["i"], atol=1e-4)
     since_s = columns["t"] - 1557539958.900671

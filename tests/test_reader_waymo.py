@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The Waymo readeron a street written as a segment and against the published formulas."""
+"""The Waymo reader on a street written as a segment and against the published formulas."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from writers.waymo import T_EGO_LIDAR, pixels
+from scipy.spatial.transform import Rotation
+from writers.waymo import POSED_COLUMNS, T_EGO_LIDAR, pixels
 
 from densify.geometry.poses import inverse, transform
 from densify.readers import describe, open_sequence
 from densify.readers.waymo import Waymo
-from tests.reader_checks import check_truth
+from tests.reader_checks import check_cameras, check_truth
 from tests.recorded import FRAMES
 
-parquet = pytest.importorskip("pyarrow.parquet")
+pyarrow, parquet = (pytest.importorskip(name) for name in ("pyarrow", "pyarrow.parquet"))
 
 FORMAT = "waymo"
 LIDAR, POSE = "[LiDARComponent].range_image_return", "[LiDARPoseComponent].range_image_return1"
@@ -30,11 +31,8 @@ def rows_of(root, component):
     return table_of(root, component).to_pylist()
 
 
-def put(root, component, rows, schema=None):
-    import pyarrow
-
-    schema = schema or table_of(root, component).schema
-    table = pyarrow.Table.from_pylist(rows, schema=schema)
+def put(root, component, rows):
+    table = pyarrow.Table.from_pylist(rows, schema=table_of(root, component).schema)
     parquet.write_table(table, root / component / "street.parquet")
 
 
@@ -70,22 +68,15 @@ def test_the_street_is_given_back(written, excerpt):
 
 def test_cameras_are_given_back(written, excerpt):
     sequence = open_sequence(written)
-    for name, ours in zip(("FRONT", "FRONT_LEFT"), excerpt.cameras, strict=True):
-        read, true = sequence.cameras[name], excerpt.street.cameras[ours]
-        np.testing.assert_allclose(read.K, true.K, atol=1e-9)
-        np.testing.assert_allclose(
-            read.T_cam_lidar, true.T_cam_lidar @ inverse(T_EGO_LIDAR), atol=1e-9
-        )
-        assert (read.width_px, read.height_px) == (true.width_px, true.height_px)
+    names = dict(zip(excerpt.cameras, ("FRONT", "FRONT_LEFT"), strict=True))
+    T_lidar_ego = inverse(T_EGO_LIDAR)
+    check_cameras(sequence, excerpt, T_lidar_ego, 1000, same_pixels=False, names=names)
+    for street_name, name in names.items():
+        read, true = sequence.cameras[name], excerpt.street.cameras[street_name]
         assert read.is_rectified and read.row_time_s == pytest.approx(true.row_time_s, rel=0.01)
-        exposed_ns, true_ns = sequence.image_stamps_ns(name), excerpt.street.image_stamps_ns(ours)
-        for number, image in enumerate(excerpt.image_numbers(ours)):
-            assert abs(exposed_ns[number] - true_ns[image]) < 1000
-            difference = sequence.image(name, number).astype(int) - excerpt.street.image(
-                ours, image
-            )
-            assert np.abs(difference).mean() < 4
-            T_world_lidar = excerpt.street.simulator.T_world_lidar_at(true_ns[image])
+        exposed_ns = excerpt.street.image_stamps_ns(street_name)
+        for number, image in enumerate(excerpt.image_numbers(street_name)):
+            T_world_lidar = excerpt.street.simulator.T_world_lidar_at(exposed_ns[image])
             expected = T_world_lidar @ inverse(true.T_cam_lidar)
             np.testing.assert_allclose(sequence.T_world_cam(name, number), expected, atol=2e-3)
     assert "rolling shutter of 18.8 ms" in describe(sequence)
@@ -97,85 +88,65 @@ def test_cameras_are_given_back(written, excerpt):
 def official_points(image, inclinations, extrinsic, pixel_pose=None, frame_pose=None):
     """compute_range_image_polar, _cartesian of waymo_open_dataset/utils/range_image_utils.py, pixel
     by pixel."""
-    height, width = image.shape[:2]
-    correction = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
+    width, correction = image.shape[1], np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
     points = []
-    for v in range(height):
-        for u in range(width):
-            if image[v, u, 0] <= 0:
-                continue
-            ratio = (width - u - 0.5) / width
-            azimuth, rise = (ratio * 2 - 1) * np.pi - correction, inclinations[::-1][v]
-            ray = [np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)]
-            point = extrinsic[:3, :3] @ (image[v, u, 0] * np.array(ray)) + extrinsic[:3, 3]
-            if pixel_pose is not None:
-                roll, pitch, yaw, *place = pixel_pose[v, u]
-                c, s = np.cos, np.sin
-                Rx = np.array([[1, 0, 0], [0, c(roll), -s(roll)], [0, s(roll), c(roll)]])
-                Ry = np.array([[c(pitch), 0, s(pitch)], [0, 1, 0], [-s(pitch), 0, c(pitch)]])
-                Rz = np.array([[c(yaw), -s(yaw), 0], [s(yaw), c(yaw), 0], [0, 0, 1]])
-                point = Rz @ Ry @ Rx @ point + place
-                point = transform(inverse(frame_pose), point[None])[0]
-            points.append(point)
+    for v, u in np.argwhere(image[..., 0] > 0):
+        ratio, rise = (width - u - 0.5) / width, inclinations[::-1][v]
+        azimuth = (ratio * 2 - 1) * np.pi - correction
+        ray = [np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)]
+        point = extrinsic[:3, :3] @ (image[v, u, 0] * np.array(ray)) + extrinsic[:3, 3]
+        if pixel_pose is not None:
+            roll_pitch_yaw, position = np.split(pixel_pose[v, u], 2)
+            world = Rotation.from_euler("xyz", roll_pitch_yaw).apply(point) + position
+            point = transform(inverse(frame_pose), world[None])[0]
+        points.append(point)
     return np.array(points)
-
-
-def thinned(root, component, name):
-    row = rows_of(root, component)[1]
-    return np.reshape(row[f"{name}.values"], row[f"{name}.shape"])
 
 
 def test_compensated_they_are_the_points_of_the_published_conversion(written):
     sequence = open_sequence(written)
-    image, pose = thinned(written, "lidar", f"{LIDAR}1"), thinned(written, "lidar_pose", POSE)
-    image[:, np.arange(image.shape[1]) % 60 > 0, 0] = 0
+    image, pixel_pose = (
+        np.reshape(row[f"{name}.values"], row[f"{name}.shape"])
+        for row, name in (
+            (rows_of(written, "lidar")[1], f"{LIDAR}1"),
+            (rows_of(written, "lidar_pose")[1], POSE),
+        )
+    )
+    image[:, np.arange(image.shape[1]) % POSED_COLUMNS > 0, 0] = 0
     laser = rows_of(written, "lidar_calibration")[0]
     extrinsic = np.reshape(laser[f"{CALIBRATION}.extrinsic.transform"], (4, 4))
     beams = np.array(laser[f"{CALIBRATION}.beam_inclination.values"])
-    expected = official_points(image, beams, extrinsic, pose, sequence.T_world_lidar(1))
+    expected = official_points(image, beams, extrinsic, pixel_pose, sequence.T_world_lidar(1))
     sweep = sequence[1]
-    kept = sweep.select(sweep.row % image.shape[1] % 60 == 0)
+    kept = sweep.select(sweep.row % image.shape[1] % POSED_COLUMNS == 0)
     assert len(kept) == len(expected) > 200
-    found = sequence._track.compensated(kept.points, kept.stamp_ns, kept.offset_ns)
-    np.testing.assert_allclose(found, expected, atol=0.01)
+    compensated = sequence._track.compensated(kept.points, kept.stamp_ns, kept.offset_ns)
+    np.testing.assert_allclose(compensated, expected, atol=0.01)
 
 
 def test_five_lidars_and_both_returns(broken):
     """A small side lidar with even beams, turned, that hits something twice."""
-    schema = table_of(broken, "lidar").schema
-    rows = rows_of(broken, "lidar")
-    rng = np.random.default_rng(0)
+    rng, rows = np.random.default_rng(0), rows_of(broken, "lidar")
     side = {1: rng.uniform(3, 20, (5, 8, 4)), 2: rng.uniform(20, 30, (5, 8, 4))}
     side[1][0, 0, 0] = side[2][0, :, 0] = -1
-    for row in list(rows):
-        new = dict(row, **{"key.laser_name": 4})
-        for number, image in side.items():
-            new[f"{LIDAR}{number}.values"] = image.ravel()
-            new[f"{LIDAR}{number}.shape"] = image.shape
-        rows.insert(0, new)
-    put(broken, "lidar", rows, schema)
+    images = {f"{LIDAR}{number}.values": image.ravel() for number, image in side.items()}
+    images |= {f"{LIDAR}{number}.shape": image.shape for number, image in side.items()}
+    put(broken, "lidar", [{**row, **images, "key.laser_name": 4} for row in rows] + rows)
     lasers = rows_of(broken, "lidar_calibration")
     T = np.array([[0, 1.0, 0, 0.5], [-1, 0, 0, -1], [0, 0, 1, 1], [0, 0, 0, 1]])
-    lasers.append(
-        dict(
-            lasers[0],
-            **{
-                "key.laser_name": 4,
-                f"{CALIBRATION}.extrinsic.transform": T.ravel(),
-                f"{CALIBRATION}.beam_inclination.values": None,
-                f"{CALIBRATION}.beam_inclination.min": -1.5,
-                f"{CALIBRATION}.beam_inclination.max": 0.5,
-            },
-        )
-    )
-    put(broken, "lidar_calibration", lasers)
+    changes = {
+        "key.laser_name": 4,
+        f"{CALIBRATION}.extrinsic.transform": T.ravel(),
+        f"{CALIBRATION}.beam_inclination.values": None,
+        f"{CALIBRATION}.beam_inclination.min": -1.5,
+        f"{CALIBRATION}.beam_inclination.max": 0.5,
+    }
+    put(broken, "lidar_calibration", [*lasers, {**lasers[0], **changes}])
     sweep = open_sequence(broken)[1]
-    mine = sweep.select(sweep.lidar == 3)
+    turned = sweep.select(sweep.lidar == 3)
     beams = -1.5 + 2.0 * (np.arange(5) + 0.5) / 5
-    expected = np.concatenate(
-        [official_points(image.astype(np.float32), beams, T) for image in side.values()]
-    )
-    np.testing.assert_allclose(mine.points, expected, atol=1e-5)
-    assert len(mine) == 39 + 32 and not mine.offset_ns.any()
+    expected = [official_points(image.astype(np.float32), beams, T) for image in side.values()]
+    np.testing.assert_allclose(turned.points, np.concatenate(expected), atol=1e-5)
+    assert len(turned) == 39 + 32 and not turned.offset_ns.any()
     np.testing.assert_allclose(sweep.scanner_origins[3], T[:3, 3])
     np.testing.assert_allclose(sweep.R_scanner_lidar[3], T[:3, :3].T)

@@ -25,28 +25,28 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse
-from densify.geometry.types import Boxes, Camera, Float
+from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers import checks
-from densify.readers.arrow_columns import read_feather
+from densify.readers.column_files import read_arrow
 from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.recorded_poses import PoseTrack
 
 BOX_SIZE = ("length_m", "width_m", "height_m")
 SCANNERS = ("up_lidar", "down_lidar")
 LASERS_PER_SCANNER = 32
-_POSES = "city_SE3_egovehicle.feather"
-_WHAT = "Argoverse 2 recordings"
+_TRACK = "city_SE3_egovehicle.feather"
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_FX_FY_CX_CY = ("fx_px", "fy_px", "cx_px", "cy_px")
 
 
 def open_recording(path: Path, scene: str | None) -> Argoverse2:
     """Open a log: its folder, or that of its split or the data set with its name as ``scene``."""
-    if scene is None and (path / _POSES).is_file():
+    if scene is None and (path / _TRACK).is_file():
         return Argoverse2(path)
     folders = (path, path / "train", path / "val", path / "test")
-    log_folders = [file.parent for folder in folders for file in folder.glob(f"*/{_POSES}")]
+    log_folders = [file.parent for folder in folders for file in folder.glob(f"*/{_TRACK}")]
     logs = {log.name: log for log in log_folders}
-    none = f"no Argoverse 2 log; expected {_POSES} and sensors/lidar in it, or in folders within it"
+    none = f"no Argoverse 2 log; expected {_TRACK} and sensors/lidar in it, or in folders within it"
     return Argoverse2(logs[checks.chosen_scene("argoverse2", path, scene, sorted(logs), none)])
 
 
@@ -61,13 +61,14 @@ class Argoverse2(FileSequence):
                 f"315966265259836000.feather"
             )
         self._stamps_ns = list(sweeps)
-        track = _read(log / _POSES, {"timestamp_ns": "i"}, _POSE)
-        stamp_ns, rows = np.unique(track["timestamp_ns"].astype(np.int64), return_index=True)
-        T_city_ego = _poses(track, log / _POSES, rows)
-        self._track = PoseTrack(str(log / _POSES), stamp_ns, T_city_ego)
+        path = log / _TRACK
+        columns = _read(path, {"timestamp_ns": "i"}, _POSE)
+        stamp_ns, rows = np.unique(columns["timestamp_ns"].astype(np.int64), return_index=True)
+        self._track = PoseTrack(str(path), stamp_ns, _poses(columns, path, rows))
         path = log / "calibration" / "egovehicle_SE3_sensor.feather"
-        sensors = _read(path, {"sensor_name": "s"}, _POSE)
-        self._T_ego_sensor = dict(zip(sensors["sensor_name"], _poses(sensors, path), strict=True))
+        columns = _read(path, {"sensor_name": "s"}, _POSE)
+        poses = _poses(columns, path, np.arange(len(columns["sensor_name"])))
+        self._T_ego_sensor = dict(zip(columns["sensor_name"], poses, strict=True))
         missing = [name for name in SCANNERS if name not in self._T_ego_sensor]
         if missing:
             raise InputError(
@@ -89,8 +90,8 @@ class Argoverse2(FileSequence):
         )
 
     def _returns(self, frame: int) -> Returns:
-        kinds = {"x": "m", "y": "m", "z": "m", "intensity": "m"}
-        columns = _read(self._files[frame], {**kinds, "laser_number": "i", "offset_ns": "i"})
+        kinds = {**dict.fromkeys("xyz", "m"), "intensity": "m", "laser_number": "i"}
+        columns = _read(self._files[frame], {**kinds, "offset_ns": "i"})
         offset_ns = columns["offset_ns"].astype(np.int64)
         points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
         return Returns(
@@ -107,10 +108,9 @@ class Argoverse2(FileSequence):
 
     def boxes(self, frame: int) -> Boxes | None:
         """Return a sweep's annotated boxes in the lidar frame; None in the test split."""
-        if self._annotations is None:
-            return None
         path, columns = self.where / "annotations.feather", self._annotations
-        rows = np.flatnonzero(columns["timestamp_ns"] == self.stamp_ns(frame))
+        stamp_ns = self.stamp_ns(frame)
+        rows = np.flatnonzero(columns["timestamp_ns"] == stamp_ns) if columns else np.zeros(0, int)
         if not len(rows):
             return None  # no boxes and not annotated look the same
         size_m = np.stack([columns[name][rows] for name in BOX_SIZE], axis=1)
@@ -118,11 +118,11 @@ class Argoverse2(FileSequence):
         return checks.boxes(columns["track_uuid"][rows], T, size_m, f"{path}: sweep {frame}")
 
     @cached_property
-    def _annotations(self) -> dict[str, NDArray[Any]] | None:
+    def _annotations(self) -> dict[str, NDArray[Any]]:
+        """Columns of the boxes of all sweeps, empty without a file of boxes."""
         path = self.where / "annotations.feather"
-        if not path.is_file():
-            return None
-        return _read(path, {"timestamp_ns": "i", "track_uuid": "s"}, (*BOX_SIZE, *_POSE))
+        kinds = {"timestamp_ns": "i", "track_uuid": "s"}
+        return _read(path, kinds, (*BOX_SIZE, *_POSE)) if path.is_file() else {}
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """Return the (4,4) pose of a camera in the city frame at the exposure of an image."""
@@ -133,18 +133,14 @@ class Argoverse2(FileSequence):
 def _read(
     path: Path, kinds: dict[str, str], numbers: tuple[str, ...] = ()
 ) -> dict[str, NDArray[Any]]:
-    return read_feather(path, {**kinds, **dict.fromkeys(numbers, "n")}, _WHAT)
+    kinds = {**kinds, **dict.fromkeys(numbers, "n")}
+    return read_arrow(path, kinds, ("argoverse", "Argoverse 2 recordings"))
 
 
-def _poses(
-    columns: dict[str, NDArray[Any]], path: Path, rows: NDArray[np.int64] | None = None
-) -> Float:
-    """Return the (n,4,4) poses in these rows of the table, in all rows for None."""
+def _poses(columns: dict[str, NDArray[Any]], path: Path, rows: Int) -> Float:
+    """Return the (n,4,4) poses in these rows (n,) of the table."""
     table = np.stack([columns[name] for name in _POSE], axis=1)
-    rows = np.arange(len(table)) if rows is None else rows
-    T = [
-        checks.quaternion_pose(table[row, :4], table[row, 4:], f"{path}: row {row}") for row in rows
-    ]
+    T = [checks.quaternion_pose(table[r, :4], table[r, 4:], f"{path}: row {r}") for r in rows]
     return np.reshape(T, (-1, 4, 4))
 
 
@@ -154,21 +150,19 @@ def _cameras(log: Path, T_ego_sensor: dict[str, Float]) -> dict[str, Camera]:
     if not names:
         return {}
     path = log / "calibration" / "intrinsics.feather"
-    numbers = ("fx_px", "fy_px", "cx_px", "cy_px")
-    columns = _read(path, {"sensor_name": "s", "width_px": "i", "height_px": "i"}, numbers)
-    cameras = {}
+    kinds = {"sensor_name": "s", "width_px": "i", "height_px": "i"}
+    columns, cameras = _read(path, kinds, _FX_FY_CX_CY), {}
     for name in names:
-        row = np.flatnonzero(columns["sensor_name"] == name)
-        if len(row) != 1 or name not in T_ego_sensor:
+        rows = np.flatnonzero(columns["sensor_name"] == name).tolist()
+        if len(rows) != 1 or name not in T_ego_sensor:
             raise InputError(
-                f"{path}: camera {name} has images, but {len(row)} rows here and "
+                f"{path}: camera {name} has images, but {len(rows)} rows here and "
                 f"{'a' if name in T_ego_sensor else 'no'} pose in egovehicle_SE3_sensor.feather; "
                 f"expected one of each"
             )
-        fx, fy, cx, cy = (float(columns[c][row[0]]) for c in numbers)
-        size_px = int(columns["width_px"][row[0]]), int(columns["height_px"][row[0]])
+        (row,) = rows
+        size_px = int(columns["width_px"][row]), int(columns["height_px"][row])
+        lens = [columns[key][row] for key in _FX_FY_CX_CY]
         T_cam_ego = inverse(T_ego_sensor[name])
-        cameras[name] = checks.pinhole(
-            name, size_px, (fx, fy, cx, cy), T_cam_ego, f"{path}: {name}"
-        )
+        cameras[name] = checks.pinhole(name, size_px, lens, T_cam_ego, f"{path}: {name}")
     return cameras

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Decode arrays, images and LAS files; sizes in headers are checked before memory is allocated."""
+"""Decode arrays, images and LAS files; sizes in headers are checked before memory is allocated.
+
+JPEG files that hold all pixels but break a rule of the format (ITU-T T.81, annex B) are mended.
+"""
 
 from __future__ import annotations
 
 import io
 import logging
 import math
+import re
 import struct
 import zipfile
 from collections.abc import Sequence
@@ -17,13 +21,22 @@ from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.config.file_content import MOST_BYTES, check_size, open_file, read_bytes, reason
-from densify.readers.stray_bytes import decode_strictly
 
 Arrays = dict[str, NDArray[Any]]
 
 MOST_PIXELS = 1 << 27
 _log = logging.getLogger("densify")
-_folders_told: set[Path] = set()
+_folders_warned_of: set[Path] = set()
+
+# Some USB cameras send a few bytes too many before a restart marker. Others leave out the marker at
+# the end. libjpeg decodes all pixels of these files, and warns of them as of damaged files.
+_STRAY, _CUT_OFF, _NO_END = "extraneous bytes", "premature end of data", "Premature end of JPEG"
+_RESTART_OR_END = re.compile(rb"\xff[\xd0-\xd7\xd9]")
+_SCAN, _END = b"\xff\xda", b"\xff\xd9"
+_MARKER_BYTES = 2
+_MOST_STRAY_BYTES = 16  # wrongly decoded data often leave more, up to all of a restart interval
+_MOST_MARKERS = 512  # each takes some milliseconds
+
 # Offset of the points, number of records, bytes per point, number of points.
 _LAS_HEADER = struct.Struct("<96xIIxHI")
 # LAS 1.4 only: offset and number of extended records, number of points.
@@ -58,9 +71,8 @@ def read_arrays(
 
 
 def _array(data: bytes) -> NDArray[Any]:
-    file = io.BytesIO(data)
-    version = np.lib.format.read_magic(file)
-    header = np.lib.format
+    file, header = io.BytesIO(data), np.lib.format
+    version = header.read_magic(file)
     read = header.read_array_header_1_0 if version == (1, 0) else header.read_array_header_2_0
     shape, _, dtype = read(file)
     num_bytes = len(data) - file.tell()
@@ -69,6 +81,9 @@ def _array(data: bytes) -> NDArray[Any]:
     file.seek(0)
     array: NDArray[Any] = np.load(file, allow_pickle=False)
     return array
+
+
+# Images
 
 
 def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
@@ -82,12 +97,24 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
     ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16.
     """
     import cv2
+    from PIL import Image
 
     try:
-        if _checked_format(data, where) == "JPEG" and not as_stored:
-            pixels, mended = decode_strictly(data)
-            if mended:
-                _tell_mended(where, mended)
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as header:
+            check_pixels(header.size, where)
+            header.verify()
+        if header.format == "JPEG" and not as_stored:
+            pixels, mended = decode_jpeg(data)
+            folder = Path(where).parent
+            if mended and folder not in _folders_warned_of:
+                _folders_warned_of.add(folder)
+                _log.warning(
+                    "%s: %s; all of its pixels are there and are read. Others like it in %s are "
+                    "not named",
+                    where,
+                    mended,
+                    folder,
+                )
             return pixels
         flags = cv2.IMREAD_UNCHANGED if as_stored else cv2.IMREAD_COLOR
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -101,28 +128,6 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
             f"{where}: not a complete image, or damaged ({len(data)} bytes); expected a PNG or "
             f"JPEG file"
         ) from error
-
-
-def _tell_mended(where: Path | str, mended: str) -> None:
-    """Warn of an image that breaks the rules of its format; once for a folder or topic."""
-    if (folder := Path(where).parent) not in _folders_told:
-        _folders_told.add(folder)
-        _log.warning(
-            "%s: %s; all of its pixels are there and are read. Others like it in %s are not named",
-            where,
-            mended,
-            folder,
-        )
-
-
-def _checked_format(data: bytes, where: Path | str) -> str:
-    """Return "PNG" or "JPEG", the format of an image file; raise an exception if damaged."""
-    from PIL import Image
-
-    with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-        check_pixels(image.size, where)
-        image.verify()
-        return str(image.format)
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
@@ -150,6 +155,78 @@ def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
             f"{where}: got an image of {width} x {height} px, expected {MOST_PIXELS:,} pixels at "
             f"most"
         )
+
+
+def decode_jpeg(data: bytes) -> tuple[NDArray[np.uint8], str]:
+    """Return the pixels (H,W,3), as blue, green, red, of a JPEG, and what was mended, "" for none.
+
+    Raise ValueError if pixels are missing or wrong.
+    """
+    pixels, complaint = _decoded_strictly(data)
+    repairs = []
+    if complaint.startswith(_NO_END):
+        data = data.rstrip(b"\xff") + _END
+        repairs.append("no marker at its end")
+        pixels, complaint = _decoded_strictly(data)
+    if _STRAY in complaint:
+        data, num_markers = _without_stray_bytes(data)
+        repairs.append(f"stray bytes before {num_markers} marker{'s' * (num_markers > 1)}")
+        pixels, complaint = _decoded_strictly(data)
+    if pixels is None:
+        raise ValueError(complaint)
+    return pixels, " and ".join(repairs)
+
+
+def _decoded_strictly(data: bytes) -> tuple[NDArray[np.uint8] | None, str]:
+    """Return the pixels, or None and the first complaint of libjpeg."""
+    import simplejpeg
+
+    try:
+        # OpenCV and Pillow decode damaged JPEG data to wrong colours.
+        return simplejpeg.decode_jpeg(data, "BGR", strict=True), ""
+    except ValueError as error:
+        return None, str(error)
+
+
+def _without_stray_bytes(data: bytes) -> tuple[bytes, int]:
+    """Return mended data, and the number of markers after stray bytes; ValueError if damaged."""
+    num_mended, end = 0, data.rfind(_SCAN)
+    for _ in range(_MOST_MARKERS):
+        marker = _RESTART_OR_END.search(data, end)
+        if marker is None or data[end - _MARKER_BYTES : end] == _END:
+            return data, num_mended
+        begin, tail = marker.start(), data[marker.start() :]
+        # Without a byte that belongs to it, the interval before the marker is cut off.
+        num_stray = 0
+        while num_stray <= _MOST_STRAY_BYTES:
+            _, complaint = _decoded_strictly(data[: begin - num_stray - 1] + tail)
+            if _CUT_OFF in complaint:
+                break
+            num_stray += 1
+        if num_stray:
+            data = data[: begin - num_stray] + tail
+            if num_stray > _MOST_STRAY_BYTES or not _ends_in_ones(data, begin - num_stray):
+                raise ValueError(f"{num_stray} bytes before the marker at {begin} are not decoded")
+            num_mended += 1
+        end = begin - num_stray + _MARKER_BYTES
+    raise ValueError(f"more than {_MOST_MARKERS} restart markers")
+
+
+def _ends_in_ones(data: bytes, end: int) -> bool:
+    """Return True if the bits that fill up the last byte before a marker are ones, as must be."""
+    # In an interval that is decoded wrongly these bits may be anything.
+    last = data[end - 1]
+    if data[end - 2 : end] == b"\xff\x00" or last == 0xFF:
+        return True
+    filled = last | (last + 1)  # the lowest zero becomes one
+    changed = data[: end - 1] + bytes([filled]) + b"\x00" * (filled == 0xFF) + data[end:]
+    # The lowest zero must be data, not filling.
+    pixels, complaint = _decoded_strictly(data)
+    changed_pixels, changed_complaint = _decoded_strictly(changed)
+    return complaint != changed_complaint or not np.array_equal(pixels, changed_pixels)  # type: ignore
+
+
+# LAS
 
 
 def read_las(path: Path) -> Any:

@@ -19,6 +19,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from densify.config.errors import InputError
 
@@ -33,7 +34,8 @@ _LAYOUTS = (
 )
 _TRUTH_PRODUCTS = ("groundtruth", "groundtruth_depth")
 _MEASURED, _FILLED = ("depth", "groundtruth"), ("depth_filled", "groundtruth_filled")
-_OURS = ("depth", *_FILLED, "confidence")  # no other trees have these
+# No other trees have these.
+_ONLY_DENSIFY = ("depth", *_FILLED, "confidence")
 
 
 @dataclass(frozen=True)
@@ -56,13 +58,26 @@ class DepthPairs:
     without_mask: tuple[Path, ...] = ()
 
 
-@dataclass(frozen=True)
-class _File:
+class _File(NamedTuple):
     path: Path
     frame: str
     drive: str | None
     camera: str | None
-    product: str | None = None
+    product: str | None = None  # None for a plain name
+
+    @staticmethod
+    def parse(path: Path) -> _File:
+        """Return what a path says of its depth map."""
+        text = path.absolute().as_posix()
+        for layout in _LAYOUTS:
+            if match := re.search(layout, text):
+                groups = match.groupdict()
+                drive = _last_name(_DRIVE, text[: match.end("product")]) or groups.get("folder")
+                frame = str(int(groups["frame"]))
+                return _File(path, frame, drive, groups["camera"], groups["product"])
+        frame = str(int(path.stem)) if path.stem.isdecimal() else path.stem
+        folder = path.absolute().parent.as_posix()
+        return _File(path, frame, _last_name(_DRIVE, folder), _last_name(_CAMERA, folder))
 
 
 def pair_depth_files(
@@ -76,87 +91,77 @@ def pair_depth_files(
     ``groundtruth`` maps exclude other maps. ``filled`` pairs densify's filled maps instead of its
     maps of measured pixels.
     """
-    estimated = _product(_found(predicted, "PREDICTED"), predicted, filled)
-    true = _found(truth, "TRUTH")
-    true = [f for f in true if f.product in _TRUTH_PRODUCTS] or _product(true, truth, filled=False)
+    estimated = _of_product(_depth_files(predicted, "PREDICTED"), predicted, filled)
+    files = _depth_files(truth, "TRUTH")
+    published = [file for file in files if file.product in _TRUTH_PRODUCTS]
+    true = published or _of_product(files, truth, filled=False)
     are_files = predicted.is_file() and truth.is_file()
     if mask is not None and not (mask.is_file() if are_files else mask.is_dir()):
         kind = "PNG file, as PREDICTED and TRUTH are" if are_files else "folder of masks"
         raise InputError(f"--mask {mask}: expected a {kind}")
     if are_files:
         return DepthPairs((DepthPair(predicted, truth, mask),))
-    matched = _match(estimated, true, predicted, truth)
-    if not matched:
+    estimated_of_true = _match(estimated, true, predicted, truth)
+    if not estimated_of_true:
         raise InputError(
             f"no pair of {estimated[0].path} and {len(estimated) - 1} more with {true[0].path} and "
             f"{len(true) - 1} more; expected the same drive, camera and frame, or equal names"
         )
-    masks: Mapping[Path, Path] = {}
+    mask_of_true: Mapping[Path, Path] = {}
     if mask is not None:
-        paired = [file for file in true if file.path in matched]
-        masks = _match(_found(mask, "--mask"), paired, mask, truth)
-    used = set(matched.values())
+        paired = [file for file in true if file.path in estimated_of_true]
+        mask_of_true = _match(_depth_files(mask, "--mask"), paired, mask, truth)
+    used, paths = set(estimated_of_true.values()), sorted(estimated_of_true)
     return DepthPairs(
-        tuple(DepthPair(matched[path], path, masks.get(path)) for path in sorted(matched)),
+        tuple(DepthPair(estimated_of_true[path], path, mask_of_true.get(path)) for path in paths),
         without_truth=tuple(file.path for file in estimated if file.path not in used),
-        without_prediction=tuple(file.path for file in true if file.path not in matched),
-        without_mask=tuple(sorted(matched.keys() - masks.keys())) if mask is not None else (),
+        without_prediction=tuple(f.path for f in true if f.path not in estimated_of_true),
+        without_mask=tuple(path for path in paths if mask and path not in mask_of_true),
     )
 
 
-def _found(path: Path, argument: str) -> list[_File]:
+def _depth_files(path: Path, argument: str) -> list[_File]:
     """Return the PNG files at a path, in order; plain names only if no file has a known layout."""
     if path.is_file():
-        return [_parsed(path)]
-    images = sorted(path.rglob("*.png"))
-    # Hidden files are unfinished results.
-    images = [p for p in images if "/." not in f"/{p.relative_to(path).as_posix()}"]
-    # Exported maps are copies of the maps beside them.
+        return [_File.parse(path)]
+    # Hidden files are unfinished results. Exported maps are copies of the maps beside them.
     exported = {p.parent for p in path.rglob("export.yaml")} - {path}
-    images = [p for p in images if not exported.intersection(p.parents)]
+    images = [
+        image
+        for image in sorted(path.rglob("*.png"))
+        if "/." not in f"/{image.relative_to(path).as_posix()}"
+        and not exported.intersection(image.parents)
+    ]
     if not images:
         raise InputError(
             f"{argument} {path}: no such file or folder with PNG files, expected depth maps"
         )
-    files = [_parsed(image) for image in images]
+    files = [_File.parse(image) for image in images]
     return [file for file in files if file.product is not None] or files
 
 
-def _parsed(path: Path) -> _File:
-    text = path.absolute().as_posix()
-    for layout in _LAYOUTS:
-        if match := re.search(layout, text):
-            groups = match.groupdict()
-            drive = _last(_DRIVE, text[: match.end("product")]) or groups.get("folder")
-            frame = str(int(groups["frame"]))
-            return _File(path, frame, drive, groups["camera"], groups["product"])
-    frame = str(int(path.stem)) if path.stem.isdecimal() else path.stem
-    folder = path.absolute().parent.as_posix()
-    return _File(path, frame, _last(_DRIVE, folder), _last(_CAMERA, folder))
-
-
-def _last(pattern: re.Pattern[str], text: str) -> str | None:
+def _last_name(pattern: re.Pattern[str], text: str) -> str | None:
     names = [match[1] for match in pattern.finditer(text)]
     return names[-1] if names else None
 
 
-def _product(files: Sequence[_File], path: Path, filled: bool) -> list[_File]:
+def _of_product(files: list[_File], path: Path, filled: bool) -> list[_File]:
     """Return densify's filled or measured maps; all files if another method made them."""
-    wanted = [file for file in files if file.product in (_FILLED if filled else _MEASURED)]
-    if filled and not wanted:
+    chosen = [file for file in files if file.product in (_FILLED if filled else _MEASURED)]
+    if filled and not chosen:
         raise InputError(
             f"--filled: {path}: holds no {' or '.join(_FILLED)} maps; leave --filled out"
         )
-    has_densify_maps = any(file.product in _OURS for file in files)
-    return wanted if wanted and (has_densify_maps or filled) else list(files)
+    is_densify = filled or any(file.product in _ONLY_DENSIFY for file in files)
+    return chosen if chosen and is_densify else files
 
 
 def _match(
     left: Sequence[_File], right: Sequence[_File], left_path: Path, right_path: Path
 ) -> dict[Path, Path]:
     """Return right -> left path where frames agree, and drive and camera too if all name them."""
-    everything = (*left, *right)
-    shared = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in everything)]
+    files = (*left, *right)
+    shared = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in files)]
     left_by_key = _keyed(left, ["frame", *shared], left_path)
     right_by_key = _keyed(right, ["frame", *shared], right_path)
     return {path: left_by_key[key] for key, path in right_by_key.items() if key in left_by_key}

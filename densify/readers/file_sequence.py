@@ -51,7 +51,7 @@ class FileSequence(ABC):
         exposed_ns: Mapping[str, Mapping[int, int]] | None = None,
         truth: Truth | None = None,  # of a simulated recording
         files: Mapping[int, Path] | None = None,  # by frame; None if sweeps share files
-        # PNG or JPEG files by camera and number; a reader without them overrides `_encoded_image`
+        # PNG or JPEG files by camera and number; a reader without them overrides `_image`
         images: Mapping[str, Mapping[int, Path]] | None = None,
     ) -> None:
         """Store the files and times that the reader found."""
@@ -99,13 +99,8 @@ class FileSequence(ABC):
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         """Return an existing image, (H,W,3) uint8 RGB."""
-        path, data = self._encoded_image(camera.name, number)
-        return checks.decoded_image(data, camera, path)
-
-    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
-        """Return the path of an existing image's file, for messages, and the file's bytes."""
-        path = self._image_files[camera][number]
-        return path, read_bytes(path)
+        path = self._image_files[camera.name][number]
+        return checks.decoded_image(read_bytes(path), camera, path)
 
     def _pose(self, frame: int) -> Float:
         """Return the (4,4) T_world_lidar of an existing sweep; InputError without poses."""
@@ -163,8 +158,7 @@ class FileSequence(ABC):
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
         """Read an image as (H,W,3) RGB; raise InputError if it is missing or of another size."""
-        calibrated = self.check_image(camera, number)
-        return self._image(calibrated, number)
+        return self._image(self.check_image(camera, number), number)
 
     def T_world_lidar(self, frame: int) -> Float:
         """Return the recorded (4,4) pose of the lidar in the world at a sweep's reference time."""

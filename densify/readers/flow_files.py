@@ -36,7 +36,7 @@ from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
 from densify.geometry import poses
 from densify.geometry.types import Bool, Float, FlowField, Motion, Stretch
-from densify.readers.arrow_columns import read_feather
+from densify.readers.column_files import read_arrow
 from densify.readers.decoded_files import read_arrays
 from densify.scores.challenge import CLASSES, IGNORED
 
@@ -45,6 +45,7 @@ FARTHEST_M = 1000.0
 """Longest flow vector that is accepted; a longer vector raises InputError."""
 _WIDE = ("residual_flow", "total_flow", "to_reference")
 _KNOWN = (*_WIDE, "row", "moving", "object", "valid")
+Columns = dict[str, NDArray[Any]]
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
@@ -66,48 +67,42 @@ def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowF
     ``source`` and ``target`` are indices in ``stretch.sweeps``. Points that are missing
     in the flow file are static.
     """
-    source_frame, target_frame = stretch.frames[source], stretch.frames[target]
-    sweep = stretch.sweeps[source].sweep
-    T_source_target = stretch.T_target_source(source_frame, target_frame)
-    path = folder / f"{source_frame:06d}_{target_frame:06d}.npz"
-    columns = sweep_columns(path, sweep.row, sweep.points, T_source_target)
+    columns = _step_columns(folder, stretch, stretch.frames[source], stretch.frames[target])
     residual, moving = columns["residual_flow"], columns["moving"].astype(bool)
     residual[~moving] = 0.0
     instance, lost = columns["object"].astype(np.int32), np.zeros(len(moving), bool)
     return FlowField(residual, moving, instance, lost, columns.get("to_reference"))
 
 
-def sweep_columns(
-    path: Path, row: NDArray[np.int64], points: NDArray[np.float64], T_source_target: NDArray[Any]
-) -> dict[str, NDArray[Any]]:
+def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Columns:
     """Read a flow file's arrays, as the module describes them, for N points in the sweep's order.
 
     Missing residual_flow, moving, object and valid are added. A point that is missing in the file
-    has flow 0 and object -1, and is not valid. ``row`` (N,) is the row of each point in the sweep's
-    file. ``points`` is (N,3) metres in the source's lidar frame, in which ``T_source_target`` (4,4)
-    is the pose of the target's lidar frame.
+    has flow 0 and object -1, and is not valid.
     """
+    path, sweep = folder / f"{frame:06d}_{target:06d}.npz", stretch[frame].sweep
+    row = sweep.row
     arrays = load_flow_file(path)
     num_points = len(next(iter(arrays.values())))
-    rows = arrays.get("row", np.arange(num_points))
-    if "row" not in arrays and len(row) and row.max() >= num_points:
+    if "row" not in arrays and row.max(initial=-1) >= num_points:
         raise InputError(
             f"{path}: holds {num_points} points, expected one for each row of the sweep's file "
             f"(more than {row.max()}); add their 'row' where some are left out"
         )
+    rows = arrays.get("row", np.arange(num_points))
     entry_of_row = np.full(int(row.max(initial=0)) + 1, -1, np.int64)
     entries = np.flatnonzero(rows < len(entry_of_row))
     entry_of_row[rows[entries]] = entries
-    known = entry_of_row[row] >= 0
-    entry = entry_of_row[row][known]
+    entry = entry_of_row[row]
+    known = entry >= 0
     columns = {}
-    for name in arrays:
-        values = np.zeros((len(row), *arrays[name].shape[1:]))
-        values[known] = arrays[name][entry]
-        columns[name] = values
+    for name, array in arrays.items():
+        columns[name] = np.zeros((len(row), *array.shape[1:]))
+        columns[name][known] = array[entry[known]]
     if "residual_flow" not in arrays:
-        arrived = poses.transform(T_source_target, points + columns["total_flow"])
-        residual = arrived - points - columns.get("to_reference", 0.0)
+        T_source_target = stretch.T_target_source(frame, target)
+        arrived = poses.transform(T_source_target, sweep.points + columns["total_flow"])
+        residual = arrived - sweep.points - columns.get("to_reference", 0.0)
         columns["residual_flow"] = np.where(known[:, None], residual, 0.0)
     if "moving" not in arrays:
         columns["moving"] = np.linalg.norm(columns["residual_flow"], axis=1) >= MOVES_M
@@ -116,7 +111,7 @@ def sweep_columns(
     return columns
 
 
-def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
+def load_flow_file(path: Path) -> Columns:
     """Return the arrays of a flow file by name, as stored, after checking shapes and values."""
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
@@ -147,40 +142,20 @@ def load_flow_file(path: Path) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-CATEGORIES = {
-    "ANIMAL": None,
-    "ARTICULATED_BUS": "OTHER_VEHICLES",
-    "BICYCLE": "WHEELED_VRU",
-    "BICYCLIST": "WHEELED_VRU",
-    "BOLLARD": None,
-    "BOX_TRUCK": "OTHER_VEHICLES",
-    "BUS": "OTHER_VEHICLES",
-    "CONSTRUCTION_BARREL": None,
-    "CONSTRUCTION_CONE": None,
-    "DOG": None,
-    "LARGE_VEHICLE": "OTHER_VEHICLES",
-    "MESSAGE_BOARD_TRAILER": None,
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN": None,
-    "MOTORCYCLE": "WHEELED_VRU",
-    "MOTORCYCLIST": "WHEELED_VRU",
-    "OFFICIAL_SIGNALER": "PEDESTRIAN",
-    "PEDESTRIAN": "PEDESTRIAN",
-    "RAILED_VEHICLE": "OTHER_VEHICLES",
-    "REGULAR_VEHICLE": "CAR",
-    "SCHOOL_BUS": "OTHER_VEHICLES",
-    "SIGN": None,
-    "STOP_SIGN": None,
-    "STROLLER": "PEDESTRIAN",
-    "TRAFFIC_LIGHT_TRAILER": None,
-    "TRUCK": "OTHER_VEHICLES",
-    "TRUCK_CAB": "OTHER_VEHICLES",
-    "VEHICULAR_TRAILER": "OTHER_VEHICLES",
-    "WHEELCHAIR": "PEDESTRIAN",
-    "WHEELED_DEVICE": "WHEELED_VRU",
-    "WHEELED_RIDER": "WHEELED_VRU",
+_CATEGORIES_OF_CLASS: dict[str | None, str] = {
+    "CAR": "REGULAR_VEHICLE",
+    "PEDESTRIAN": "OFFICIAL_SIGNALER PEDESTRIAN STROLLER WHEELCHAIR",
+    "WHEELED_VRU": "BICYCLE BICYCLIST MOTORCYCLE MOTORCYCLIST WHEELED_DEVICE WHEELED_RIDER",
+    "OTHER_VEHICLES": "ARTICULATED_BUS BOX_TRUCK BUS LARGE_VEHICLE RAILED_VEHICLE SCHOOL_BUS "
+    "TRUCK TRUCK_CAB VEHICULAR_TRAILER",
+    None: "ANIMAL BOLLARD CONSTRUCTION_BARREL CONSTRUCTION_CONE DOG MESSAGE_BOARD_TRAILER "
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN SIGN STOP_SIGN TRAFFIC_LIGHT_TRAILER",
 }
-"""Class in the Argoverse 2 challenge of 2024 for each category; None if the category is ignored
-(`av2_metacategories` of the package bucketed-scene-flow-eval)."""
+CATEGORIES = dict(
+    sorted((name, key) for key, names in _CATEGORIES_OF_CLASS.items() for name in names.split())
+)
+"""Class in the Argoverse 2 challenge of 2024 for each category, in alphabetical order; None if the
+category is ignored (`av2_metacategories` of the package bucketed-scene-flow-eval)."""
 
 _CLASS_OF = np.array(
     [0] + [IGNORED if c is None else CLASSES.index(c) for c in CATEGORIES.values()], np.uint8
@@ -206,11 +181,9 @@ def labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> Labe
     """
     if not folder.is_dir():
         raise InputError(f"--truth {folder}: no such folder; expected true flow in it")
-    target = stretch.frames[stretch.frames.index(frame) + 1]
-    path = folder / f"{frame:06d}_{target:06d}.npz"
-    if path.is_file() or any(folder.glob("*_*.npz")):
-        sweep, T = stretch[frame].sweep, stretch.T_target_source(frame, target)
-        columns = sweep_columns(path, sweep.row, sweep.points, T)
+    if any(folder.glob("*_*.npz")):
+        target = stretch.frames[stretch.frames.index(frame) + 1]
+        columns = _step_columns(folder, stretch, frame, target)
         classes = np.where(columns["object"] >= 0, _OBJECT, 0).astype(np.uint8)
         return LabelledFlow(columns["residual_flow"], classes, columns["valid"])
     label_folder = folder / name if (folder / name).is_dir() else folder
@@ -228,7 +201,7 @@ def labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> Labe
 def _read_feather(path: Path, row: NDArray[np.int64]) -> LabelledFlow:
     """Read an Argoverse 2 label file for N points with the row indices ``row`` (N,)."""
     kinds = {**dict.fromkeys(_FLOW, "m"), "is_valid": "t", "classes_0": "i"}
-    columns = read_feather(path, kinds, "Argoverse 2's flow labels")
+    columns = read_arrow(path, kinds, ("argoverse", "Argoverse 2's flow labels"))
     flow = np.stack([columns[axis].astype(np.float64) for axis in _FLOW], axis=1)
     number = columns["classes_0"].astype(np.int64)
     if len(row) and row.max() >= len(flow):

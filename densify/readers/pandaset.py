@@ -28,36 +28,29 @@ from densify.config.file_content import described_in, read_json
 from densify.geometry import poses
 from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers import checks
+from densify.readers.column_files import read_pickled
 from densify.readers.decoded_files import image_size_px
 from densify.readers.file_sequence import FileSequence, Returns
-from densify.readers.pickled_frame import read_columns
 from densify.readers.recorded_poses import PoseTrack
 
 # The positions of the scanners are not published. These make the rings of the Pandar64 sharpest and
 # the swings of the PandarGT's mirror smoothest. The same vehicle drove all sequences.
-_AXIS = np.array([-0.0157, 0.00045, 1.0])  # spinning axis of the Pandar64, forward left up
-_POSITION_M = np.array([0.777, 0.002, 1.8593])
+_POSITION_M = np.array([0.777, 0.002, 1.8593])  # of the Pandar64, forward left up
+_AXIS = np.array([-0.0157, 0.00045, 1.0])  # about which it spins, forward left up
 PANDAR_GT_M = np.array([0.580, 0.027, -0.294])
 """(3,) origin of the PandarGT's rays in the Pandar64's frame."""
+
+_R_POSE_VEHICLE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_UP = _AXIS / np.linalg.norm(_AXIS)
+_LEFT = np.cross(_UP, [1.0, 0.0, 0.0]) / np.hypot(_UP[1], _UP[2])
+T_POSE_LIDAR = np.eye(4)
+T_POSE_LIDAR[:3, :3] = _R_POSE_VEHICLE @ np.column_stack([np.cross(_LEFT, _UP), _LEFT, _UP])
+T_POSE_LIDAR[:3, 3] = _R_POSE_VEHICLE @ _POSITION_M
+"""(4,4) pose of the lidar frame (Pandar64) in the vehicle frame of the pose files."""
 
 _LATEST_S = 4e9  # latest accepted stamp: the year 2096
 _CENTRE = tuple(f"position.{axis}" for axis in "xyz")
 _LENGTH_WIDTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "yxz")
-
-
-def _T_pose_lidar() -> Float:
-    forward_left_up = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    up = _AXIS / np.linalg.norm(_AXIS)
-    forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
-    forward /= np.linalg.norm(forward)
-    T = np.eye(4)
-    T[:3, :3] = forward_left_up @ np.column_stack([forward, np.cross(up, forward), up])
-    T[:3, 3] = forward_left_up @ _POSITION_M
-    return T
-
-
-T_POSE_LIDAR = _T_pose_lidar()
-"""(4,4) pose of the lidar frame (Pandar64) in the vehicle frame of the pose files."""
 
 
 def open_recording(path: Path, scene: str | None) -> PandaSet:
@@ -80,16 +73,21 @@ class PandaSet(FileSequence):
         self._stamps_ns, T_world_pose = _stamped_poses(lidar, max(sweeps))
         T_world_lidar = T_world_pose @ T_POSE_LIDAR
         self._track = PoseTrack(str(lidar / "poses.json"), self._stamps_ns, T_world_lidar)
-        images, self._T_world_cam, cameras, exposed_ns = {}, dict[str, Float](), {}, {}
+        # Where the vehicle moves little from pose to pose, interpolation errs little.
+        step_m = np.linalg.norm(np.diff(T_world_lidar[:, :3, 3], axis=0), axis=1)
+        step_m = np.pad(step_m, 1, constant_values=np.inf)
+        images, cameras, exposed_ns = {}, {}, {}
+        self._T_world_cam: dict[str, Float] = {}
         for folder in sorted(path.glob("camera/*")):
             files, name = checks.numbered_files(folder, ".jpg", ".png"), folder.name
             if files:
                 images_ns, self._T_world_cam[name] = _stamped_poses(folder, max(files))
-                exposed_ns[name] = {n: int(images_ns[n]) for n in files}
-                calm = min(files, key=lambda n: self._step_m(exposed_ns[name][n]))
+                images[name], exposed_ns[name] = files, {n: int(images_ns[n]) for n in files}
+                steps = np.searchsorted(self._stamps_ns, images_ns[[*files]])
+                calm = [*files][int(np.argmin(step_m[steps]))]
                 T_cam_world = poses.inverse(self._T_world_cam[name][calm])
                 T_cam_lidar = T_cam_world @ self._track.at(exposed_ns[name][calm])
-                cameras[name], images[name] = _camera(folder, files[min(files)], T_cam_lidar), files
+                cameras[name] = _camera(folder, files[min(files)], T_cam_lidar)
         super().__init__(
             path.resolve().name,
             path,
@@ -106,18 +104,9 @@ class PandaSet(FileSequence):
         self.check_image(camera, number)
         return self._T_world_cam[camera][number]
 
-    def _step_m(self, stamp_ns: int) -> float:
-        """Return the distance (m) between the poses around a time, inf outside the path."""
-        # Where it is short, interpolation errs little.
-        after = np.searchsorted(self._track.stamp_ns, stamp_ns)
-        if not 0 < after < len(self._track.stamp_ns):
-            return np.inf
-        position_before_m, position_after_m = self._track.T_world_ego[after - 1 : after + 1, :3, 3]
-        return float(np.linalg.norm(position_after_m - position_before_m))
-
     def _returns(self, frame: int) -> Returns:
         path, stamp_ns = self._files[frame], self.stamp_ns(frame)
-        columns = read_columns(path)
+        columns = read_pickled(path)
         x, y, z, brightness, time_s, scanner = (
             np.asarray(columns[name], np.float64) for name in ("x", "y", "z", "i", "t", "d")
         )
@@ -147,16 +136,17 @@ class PandaSet(FileSequence):
         path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"
         if not path.is_file():
             return None
-        columns = read_columns(path)
+        columns = read_pickled(path)
         with described_in(path, "the cuboids of PandaSet"):
             texts = [str(text) for text in columns["uuid"]]
-            numbers = (*_CENTRE, *_LENGTH_WIDTH_HEIGHT, "yaw", "cuboids.sensor_id")
-            # Columns: 0 to 2 centre, 3 to 5 size, 6 yaw, 7 scanner
-            table = np.column_stack([np.asarray(columns[name], np.float64) for name in numbers])
-        T_world_box = checks.upright_poses(table[:, :3], table[:, 6] + np.pi / 2)
+            centre_m, size_m, yaw_and_scanner = (
+                np.column_stack([np.asarray(columns[name], np.float64) for name in names])
+                for names in (_CENTRE, _LENGTH_WIDTH_HEIGHT, ("yaw", "cuboids.sensor_id"))
+            )
+        yaw_rad, scanner = yaw_and_scanner.T
+        T_world_box = checks.upright_poses(centre_m, yaw_rad + np.pi / 2)
         T_lidar_box = poses.inverse(self._pose(frame)) @ T_world_box
-        lidar = table[:, 7].astype(np.int64)
-        return checks.boxes(texts, T_lidar_box, table[:, 3:6], str(path), lidar=lidar)
+        return checks.boxes(texts, T_lidar_box, size_m, str(path), lidar=scanner.astype(np.int64))
 
 
 def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:

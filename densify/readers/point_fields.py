@@ -8,11 +8,10 @@ times tells the unit: units differ by a factor of 1000, and a sweep takes about 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +37,12 @@ _NAMES = {
     "ring": "ring line channel laser_id laser_number laserid beam",
     "lidar": "lidar lidar_id scanner sensor_id scanner_channel",
 }
-_SHORTEST_SHARE, _LONGEST_SHARE = 0.08, 4.0  # accepted span of a sweep's times, in periods
+_SHORTEST, _LONGEST = 0.08, 4.0  # accepted span of a sweep's times, in periods
+_FEWEST_STEPS = 500  # that the digits of times must distinguish within a sweep
 _NUM_SAMPLED = 5
 _SAME_CLOCK_NS = 2_000_000_000
 _RELATIVE_NS = 3_000_000_000
+_LATEST_NS = 1 << 62  # the year 2116; differences of such times fit 64 bits
 _FULL_SCALES = (1.0, 255.0, 65535.0)
 
 
@@ -89,14 +90,13 @@ class PointTimes:
 
         Returns (N,) int64 times, 0 where invalid, and an (N,) mask of the valid times.
         """
-        is_valid = self._right(values, stamp_ns)
+        times_ns, is_valid = self._times_ns(values, stamp_ns)
         offset_ns = np.zeros(len(values), np.int64)
         if is_valid.any():
-            times = widened(values[is_valid])
-            zero, zero_ns = self._zero(times)
-            since_ns = np.rint((times - times.dtype.type(zero)) * UNIT_NS[self.unit])
-            is_of_stamp = self.absolute and not self.other_clock and not self.reference
-            offset_ns[is_valid] = since_ns.astype(np.int64) + is_of_stamp * (zero_ns - stamp_ns)
+            zero_ns = stamp_ns if self.absolute else 0
+            if self.reference or self.other_clock:
+                zero_ns = self._reference_ns(times_ns[is_valid])
+            offset_ns[is_valid] = times_ns[is_valid] - zero_ns
         return offset_ns, is_valid
 
     def own_stamp_ns(self, values: NDArray[Any]) -> int | None:
@@ -104,35 +104,21 @@ class PointTimes:
 
         The stamp is the earliest time or the time of `reference`; None if no time is valid.
         """
-        is_valid = self._right(values, None)
-        if not is_valid.any():
-            return None
-        times = widened(values[is_valid])
-        return self._zero(times)[1] if self.reference else self._in_ns(times.min())
+        times_ns, is_valid = self._times_ns(values, None)
+        return self._reference_ns(times_ns[is_valid]) if is_valid.any() else None
 
-    def _right(self, values: NDArray[Any], stamp_ns: int | None) -> Bool:
-        """Return an (N,) mask of the valid times, within `reach_ns` of the middle of the sweep."""
-        times_ns = values.astype(np.float64) * UNIT_NS[self.unit]
-        middle_ns = self.middle_ns + ((stamp_ns or 0) if self.absolute else 0.0)
-        if (self.other_clock or stamp_ns is None) and np.isfinite(times_ns).any():
-            middle_ns, _ = _extent(times_ns)
-        is_valid: Bool = np.abs(times_ns - middle_ns) <= self.reach_ns
-        return is_valid
+    def _times_ns(self, values: NDArray[Any], stamp_ns: int | None) -> tuple[Int, Bool]:
+        """Return (N,) times in ns and a mask of those within `reach_ns` of the sweep's middle."""
+        times_ns, is_valid = _in_ns(values, self.unit)
+        middle_ns = self.middle_ns + (stamp_ns or 0) * self.absolute
+        if (self.other_clock or stamp_ns is None) and is_valid.any():
+            middle_ns = round(_extent(times_ns[is_valid])[0])
+        return times_ns, is_valid & (np.abs(times_ns - middle_ns) <= self.reach_ns)
 
-    def _zero(self, times: NDArray[Any]) -> tuple[Any, int]:
-        """Return the time to subtract from valid times (M,), in the field's unit and in ns."""
-        low, high = times.min(), times.max()
-        if self.reference or self.other_clock:
-            share = {"": 0, "start": 0, "middle": 0.5, "end": 1}[self.reference]
-            zero = low + times.dtype.type(share * (high - low))
-        else:
-            zero = times.dtype.type(np.floor(low) if self.absolute else 0)
-        return zero, self._in_ns(zero)
-
-    def _in_ns(self, time: Any) -> int:
-        """Return a time in nanoseconds; whole units are converted as int to keep every digit."""
-        whole = int(time)
-        return whole * UNIT_NS[self.unit] + round(float(time - whole) * UNIT_NS[self.unit])
+    def _reference_ns(self, times_ns: Int) -> int:
+        """Return the part of a sweep's valid times (M,) that `reference` names, else the start."""
+        first, last = int(times_ns.min()), int(times_ns.max())
+        return {"middle": (first + last) // 2, "end": last}.get(self.reference, first)
 
     def __str__(self) -> str:
         text = f"{self.field} in {self.unit}, " + ("absolute" if self.absolute else "relative")
@@ -141,16 +127,21 @@ class PointTimes:
         return text + (f", the stamp is the {self.reference}" if self.reference else "")
 
 
-def widened(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the values as float64 if they are floats, else as int64."""
-    return values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
+def _in_ns(values: NDArray[Any], unit: str) -> tuple[Int, Bool]:
+    """Return (N,) times in ns, and a mask of those that are finite numbers below `_LATEST_NS`."""
+    with np.errstate(invalid="ignore"):
+        is_valid: Bool = np.abs(values.astype(np.float64)) < _LATEST_NS / UNIT_NS[unit]
+    values = np.where(is_valid, values, 0)
+    whole = values.astype(np.int64)  # converted as integers, to keep every digit
+    fraction_ns = np.rint((values - whole) * UNIT_NS[unit]).astype(np.int64)
+    return whole * UNIT_NS[unit] + fraction_ns, is_valid
 
 
 def _extent(times: NDArray[Any]) -> tuple[float, float]:
     """Return the middle of a sweep's times (N,) and half their span, without outlying times."""
     # Outlying times are farther from the middle of the shortest interval that holds half of the
     # times than twice the width of this interval.
-    times = np.sort(times[np.isfinite(times)].astype(np.float64))
+    times = np.sort(times.astype(np.float64))
     half = len(times) // 2
     width = times[half:] - times[: len(times) - half]
     first = int(np.argmin(width))
@@ -178,77 +169,75 @@ def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K,
     return columns_of_sweep
 
 
+class TimeField(NamedTuple):
+    """What the user says of a field of point times; the rest is found."""
+
+    name: str
+    unit: str = ""  # one of `UNIT_NS`
+    absolute: bool | None = None  # as in `PointTimes`
+    reference: str = ""  # as in `PointTimes`
+
+
 def find_times(
+    field: TimeField,
     sweeps: Sequence[NDArray[Any]],
-    field: str,
     period_ns: int,
     stamps_ns: Sequence[int] | None,
-    unit: str = "",
-    absolute: bool | None = None,
-    reference: str = "",
 ) -> tuple[PointTimes | None, str]:
     """Find the unit, epoch, middle and span of the (N,) point times of several sweeps.
 
-    Known values of ``unit``, ``absolute`` and ``reference`` are kept, "" or None is found. The unit
-    is the most frequent one; the middle and the span are medians. ``period_ns`` is the time between
-    consecutive sweeps; ``stamps_ns`` has the stamps of the given sweeps, None without stamps.
+    The middle and the span are medians. ``period_ns`` is the time between consecutive sweeps;
+    ``stamps_ns`` has the stamps of the given sweeps, None without stamps.
 
     Returns:
         The meaning of the times and its description; or None and the reason of the failure.
     """
-    unit_guesses = [_unit_of(values, field, period_ns, unit) for values in sweeps]
-    units = Counter(guess for guess, _ in unit_guesses)
-    unit = max(units, key=lambda guess: (units[guess], guess != ""))
-    if not unit:
-        return None, next(reason for guess, reason in unit_guesses if not guess)
-    rows = [row for row, (guess, _) in enumerate(unit_guesses) if guess == unit]
-    unit_ns = UNIT_NS[unit]
-    extents = np.array([_extent(sweeps[row].astype(np.float64) * unit_ns) for row in rows])
-    middle_ns, reach_ns = extents.T
-    usual_ns = float(np.median(middle_ns))
+    finite = [values[np.isfinite(values)] for values in sweeps]
+    extents = np.array([_extent(values) for values in finite if len(values)] or [(0.0, 0.0)])
+    middle, reach = np.median(extents, axis=0).tolist()
+    span = max(float(np.ptp(values)) for values in finite) if any(map(len, finite)) else 0.0
+    dtype, name = sweeps[0].dtype, field.name
+    if dtype.kind == "f" and np.spacing(dtype.type(abs(middle))) * _FEWEST_STEPS > span > 0:
+        return None, (
+            f"{name} has too few digits ({np.finfo(dtype).precision}) to tell times: "
+            f"{middle - reach:.10g} to {middle + reach:.10g}"
+        )
+    if not reach:
+        quantifier = "most" if span else "all"
+        return None, f"{name} is the same for {quantifier} points, so it does not tell their times"
+    unit = field.unit or _unit_of(2 * reach / period_ns)
+    if not unit or abs(middle) >= _LATEST_NS / UNIT_NS[unit]:
+        return None, (
+            f"{name} spans {2 * reach:.6g} in a sweep, which in no unit is about the "
+            f"{1e-6 * period_ns:.0f} ms from sweep to sweep; name its unit"
+        )
+    middles_ns, usual_ns = extents[:, 0] * UNIT_NS[unit], middle * UNIT_NS[unit]
+    reach_ns = reach * UNIT_NS[unit]
+    absolute = field.absolute
     if absolute is None:
-        advance_ns = float(np.median(np.abs(middle_ns - usual_ns)))
+        advance_ns = float(np.median(np.abs(middles_ns - usual_ns)))
         absolute = abs(usual_ns) > _RELATIVE_NS or advance_ns > period_ns / 2
     if absolute and stamps_ns is not None:
-        middle_ns = middle_ns - np.array([stamps_ns[row] for row in rows], np.float64)
-        usual_ns = float(np.median(middle_ns))
+        stamps_of_timed = [ns for ns, values in zip(stamps_ns, finite, strict=True) if len(values)]
+        usual_ns = float(np.median(middles_ns - np.array(stamps_of_timed, np.float64)))
     elif absolute:  # the stamps are made of these times
-        usual_ns = {"middle": 0, "end": -1}.get(reference, 1) * float(np.median(reach_ns))
+        usual_ns = {"middle": 0, "end": -1}.get(field.reference, 1) * reach_ns
     point_times = PointTimes(
-        field,
+        name,
         unit,
         absolute,
         other_clock=absolute and abs(usual_ns) > _SAME_CLOCK_NS,
         middle_ns=round(usual_ns),
-        reach_ns=round(float(np.median(reach_ns))) + period_ns,
-        reference=reference,
+        reach_ns=round(reach_ns) + period_ns,
+        reference=field.reference,
     )
     return point_times, str(point_times)
 
 
-def _unit_of(values: NDArray[Any], field: str, period_ns: int, unit: str) -> tuple[str, str]:
-    """Return the unit of a sweep's times (N,) and "", or else "" and the reason of the failure."""
-    times = widened(values)
-    times = times[np.isfinite(times)]
-    middle, reach = _extent(times) if len(times) else (0.0, 0.0)
-    span = float(np.ptp(times)) if len(times) else 0.0
-    if values.dtype.kind == "f" and np.spacing(values.dtype.type(abs(middle))) * 500 > span > 0:
-        digits = np.finfo(values.dtype).precision
-        return "", (
-            f"{field} has too few digits ({digits}) to tell times: {middle - reach:.10g} to "
-            f"{middle + reach:.10g}"
-        )
-    if not reach:
-        quantifier = "most" if span else "all"
-        return "", f"{field} is the same for {quantifier} points, so it does not tell their times"
-    share = {u: 2 * reach * ns / period_ns for u, ns in UNIT_NS.items()}
-    fit = [unit] if unit else [u for u in share if _SHORTEST_SHARE < share[u] < _LONGEST_SHARE]
-    if not fit:
-        return "", (
-            f"{field} spans {2 * reach:.6g} in a sweep, which in no unit is about the "
-            f"{1e-6 * period_ns:.0f} ms from sweep to sweep; name its unit"
-        )
-    return fit[0], ""
+def _unit_of(span_in_periods: float) -> str:
+    """Return the unit in which a span, as a share of the period in ns, is a sweep's; "" if none."""
+    shares = {unit: span_in_periods * ns for unit, ns in UNIT_NS.items()}
+    return next((u for u, share in shares.items() if _SHORTEST < share < _LONGEST), "")
 
 
 def full_scale(intensity: NDArray[Any]) -> float:
@@ -283,7 +272,7 @@ class PointLayout:
         stamps_ns: Sequence[int] | None,
         named: Mapping[str, str] | None = None,  # known names of fields, as in `Fields`
         intensity_scale: float = 0.0,  # known divisor of intensities, 0 to find it
-        **times: Any,  # known unit, absolute or reference of `find_times`
+        **times: Any,  # known unit, absolute or reference, as in `TimeField`
     ) -> PointLayout:
         """Find the layout from the columns of several sweeps; ``where`` begins error messages."""
         fields = Fields(**(vars(find_fields(sweeps[0])) | dict(named or {})))
@@ -298,7 +287,8 @@ class PointLayout:
         if fields.time:
             values = [sweeps[row][fields.time] for row in alike]
             stamps_ns = None if stamps_ns is None else [stamps_ns[row] for row in alike]
-            point_times, words = find_times(values, fields.time, period_ns, stamps_ns, **times)
+            field = TimeField(fields.time, **times)
+            point_times, words = find_times(field, values, period_ns, stamps_ns)
         if fields.intensity and not intensity_scale:
             intensity_scale = max(full_scale(sweeps[row][fields.intensity]) for row in alike)
         return PointLayout(fields, point_times, words, intensity_scale or 1.0)

@@ -17,39 +17,237 @@ poses: Odometry, PoseStamped, or /tf, converted to the lidar by fixed frames and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import re
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+from urllib.parse import parse_qsl
 
 import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.types import Camera, Float, Float32
+from densify.geometry.types import Camera, Float
 from densify.readers import checks
 from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.point_fields import PointLayout, sample_columns
 from densify.readers.recorded_poses import PoseTrack
-from densify.readers.ros_bag import POSES, Bag, Entry, Topics, place_of
-from densify.readers.ros_messages import (
-    Transforms,
+from densify.readers.ros_bag import (
+    CLOUDS,
+    IMAGES,
+    TRANSFORMS,
+    Bag,
+    Entry,
+    Topic,
     camera_of,
     check_encoding,
     cloud_columns,
     image_rgb,
-    plain,
-    recorded_track,
 )
 
 _USUAL_PERIOD_NS = 100_000_000
+_FIXED_M = 1e-6  # frames that move less, in metres or radians, are fixed
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_POSES = (
+    _ODOMETRY,
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
+_TYPES = {"points": CLOUDS, "images": IMAGES, "poses": _POSES}  # of messages, by option
+_USAGE = "#points=/topic,/topic&images=/topic,/topic&poses=/topic, tf or none"
+_NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
 
 
 def open_recording(path: Path, scene: str | None) -> RosBag:
     """Open a bag; ``scene`` has its topics, such as ``points=/lidar&images=none``, None to find."""
     return RosBag(path, scene)
+
+
+class Topics(NamedTuple):
+    """The topics of a bag that are used."""
+
+    points: list[str]  # topics of the lidars. Each message of the first topic is a sweep.
+    images: list[str]  # topics of the cameras' images
+    poses: str  # topic of the poses, ``tf`` for /tf, or "" to read no poses
+    # Options that the user gave (points, images, poses). A problem with a named topic is an error;
+    # other unusable topics are skipped.
+    named: Collection[str]
+
+    @staticmethod
+    def choose(bag: Bag, options: str | None) -> Topics:
+        """Choose the topics to read, by the user's options (after ``#``) and the message types."""
+        named = dict(parse_qsl(options or "", keep_blank_values=True))
+        unknown = [key for key in named if key not in _TYPES]
+        if unknown or (options and not named):
+            raise InputError(
+                f"{bag.path}#{options}: got {unknown[0] if unknown else options}, expected {_USAGE}"
+            )
+        chosen = {
+            key: [name for name in text.split(",") if name not in ("", "none")]
+            for key, text in named.items()
+        }
+        if not chosen.get("points"):
+            chosen["points"] = [_only_cloud(bag)]
+        if "images" not in chosen:
+            chosen["images"] = _usual_images([topic.name for topic in bag.of_type(*IMAGES)])
+        if "poses" not in chosen:
+            odometry = bag.of_type(_ODOMETRY)
+            chosen["poses"] = [odometry[0].name if len(odometry) == 1 else "tf"]
+        for key, names in chosen.items():
+            for name in names:
+                topic = bag.topics.get(name)
+                if (key, name) != ("poses", "tf") and (not topic or topic.type not in _TYPES[key]):
+                    got = f"a topic of {topic.type}" if topic else "no such topic"
+                    fit = _listed(bag.of_type(*_TYPES[key])) or "none"
+                    raise InputError(f"{bag.path}: {key}={name}: {got}; topics that fit: {fit}")
+        pose_topic = "".join(chosen["poses"][:1])
+        return Topics(chosen["points"], chosen["images"], pose_topic, named.keys())
+
+
+def _only_cloud(bag: Bag) -> str:
+    """Return the only topic of point clouds; raise InputError for no or several topics."""
+    clouds = bag.of_type(*CLOUDS)
+    if len(clouds) == 1:
+        return clouds[0].name
+    if clouds:
+        raise InputError(
+            f"{bag.path}: several topics could be the sweeps: {_listed(clouds)}; name one "
+            f"or all lidars of the vehicle: --data 'ros:{bag.path}#points=/topic,/topic'"
+        )
+    raise InputError(
+        f"{bag.path}: no PointCloud2; got {_listed(list(bag.topics.values())) or 'no messages'}; "
+        f"play raw packets through the sensor's driver and record the points that come out"
+    )
+
+
+def _usual_images(topics: Sequence[str]) -> list[str]:
+    """Return one image topic for each camera, preferably rectified, then uncompressed."""
+    topic_of_camera: dict[str, str] = {}
+    for topic in sorted(topics, key=lambda t: ("rect" not in t, t.endswith("/compressed"), t)):
+        if not _NO_PICTURES.search(topic.lower()):
+            topic_of_camera.setdefault(_namespace(topic), topic)
+    return sorted(topic_of_camera.values())
+
+
+def _namespace(topic: str) -> str:
+    """Return the camera's namespace: ``/front/image_raw/compressed`` gives ``/front``."""
+    return topic.removesuffix("/compressed").rpartition("/")[0]
+
+
+def _listed(topics: Sequence[Topic]) -> str:
+    return ", ".join(f"{t.name} ({t.type.rpartition('/')[2]}, {t.num_messages})" for t in topics)
+
+
+# Frames and poses
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """The tree of coordinate frames of a bag."""
+
+    where: str  # path of the bag, for messages
+    # Name of the parent frame and the constant pose T_parent_child (4,4), by child frame
+    fixed: dict[str, tuple[str, Float]] = field(default_factory=dict)
+    # Name of the parent frame and the path T_parent_child over time, by child frame
+    moving: dict[str, tuple[str, PoseTrack]] = field(default_factory=dict)
+
+    @staticmethod
+    def read(bag: Bag) -> Transforms:
+        """Read all transforms of /tf_static and /tf. A frame that never moves in /tf is fixed."""
+        tree = Transforms(str(bag.path))
+        recorded: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
+        for topic in bag.of_type(*TRANSFORMS):
+            transforms = (t for message in bag.messages(topic.name) for t in message.transforms)
+            for transform in transforms:
+                parent, child = _plain(transform.header.frame_id), _plain(transform.child_frame_id)
+                where = f"{bag.path}: {topic.name}: {parent} to {child}"
+                T = _pose(transform.transform.translation, transform.transform.rotation, where)
+                if topic.name.endswith("tf_static"):
+                    tree.fixed[child] = (parent, T)
+                else:
+                    recorded[parent, child][_stamp_ns(transform.header)] = T
+        for (parent, child), T_at_stamp in recorded.items():
+            T = np.stack([*T_at_stamp.values()])
+            if child in tree.fixed:
+                continue
+            if np.abs(T - T[0]).max() < _FIXED_M:
+                tree.fixed[child] = (parent, T[0])
+            else:
+                track = _track(f"{bag.path}: /tf: {parent} to {child}", T_at_stamp)
+                tree.moving[child] = (parent, track)
+        return tree
+
+    def between(self, target: str, source: str) -> Float | None:
+        """Return T_target_source (4,4) along fixed frames; None if no fixed frames join the two."""
+        T_above_target, T_above_source = self._above(target), self._above(source)
+        for ancestor in T_above_source:
+            if ancestor in T_above_target:
+                return poses.inverse(T_above_target[ancestor]) @ T_above_source[ancestor]
+        return None
+
+    def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
+        """Return a frame's moving parent and path T_parent_frame in it; None if it is fixed."""
+        # The nearest moving parent is usually odom, not map, which jumps at loop closures.
+        for body, T_body_frame in self._above(frame).items():
+            if body in self.moving:
+                world, track = self.moving[body]
+                return world, replace(track, T_world_ego=track.T_world_ego @ T_body_frame)
+        return None
+
+    def _above(self, frame: str) -> dict[str, Float]:
+        """Return T_ancestor_frame (4,4) of a frame and all frames above it that are fixed to it."""
+        T_ancestor_frame, ancestor = {frame: np.eye(4)}, frame
+        while ancestor in self.fixed:
+            parent, T = self.fixed[ancestor]
+            if parent in T_ancestor_frame:
+                raise InputError(f"{self.where}: /tf_static: {parent} is above itself")
+            T_ancestor_frame[parent] = T @ T_ancestor_frame[ancestor]
+            ancestor = parent
+        return T_ancestor_frame
+
+
+def _recorded_track(bag: Bag, topic: str, transforms: Transforms, lidar: str) -> PoseTrack:
+    """Read the path T_world_lidar of frame ``lidar`` from a topic of odometry or poses."""
+    T_at_stamp, where = dict[int, Float](), f"{bag.path}: {topic}"
+    for message in bag.messages(topic):
+        pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+        # Poses without a child frame are assumed to be poses of the lidar itself.
+        child = _plain(getattr(message, "child_frame_id", "")) or lidar
+        T_child_lidar = transforms.between(child, lidar)
+        if T_child_lidar is None:
+            raise InputError(
+                f"{where}: nothing in /tf_static joins its frame {child} to the lidar's, {lidar}; "
+                f"name other poses, or none: #poses=none"
+            )
+        T = _pose(pose.position, pose.orientation, where)
+        T_at_stamp[_stamp_ns(message.header)] = T @ T_child_lidar
+    return _track(where, T_at_stamp)
+
+
+def _track(where: str, T_at_stamp: dict[int, Float]) -> PoseTrack:
+    T = np.reshape([T_at_stamp[stamp] for stamp in sorted(T_at_stamp)], (-1, 4, 4))
+    return PoseTrack(where, np.array(sorted(T_at_stamp), np.int64), T)
+
+
+def _plain(frame: str) -> str:
+    """Return the name of a frame without leading and trailing slashes, as in ROS 2."""
+    return frame.strip("/")
+
+
+def _stamp_ns(header: Any) -> int:
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def _pose(position: Any, rotation: Any, where: str) -> Float:
+    quaternion = (rotation.w, rotation.x, rotation.y, rotation.z)
+    return checks.quaternion_pose(quaternion, (position.x, position.y, position.z), where)
+
+
+# The sequence
 
 
 class Lidar(NamedTuple):
@@ -77,7 +275,7 @@ class RosBag(FileSequence):
         for topic in topics.points:
             self._lidars.append(self._lidar(topic))
         self._image_topics: dict[str, str] = {}
-        self._left_out: list[str] = []
+        self._unusable: list[str] = []  # reasons why topics of images are left out
         cameras = {}
         for topic in topics.images:
             try:
@@ -85,50 +283,59 @@ class RosBag(FileSequence):
             except InputError as error:
                 if "images" in topics.named:
                     raise
-                self._left_out.append(str(error))
+                self._unusable.append(str(error))
                 continue
             self._check_size(camera, topic)
             cameras[camera.name], self._image_topics[camera.name] = camera, topic
-        stamps = {
-            name: {n: entry.stamp_ns for n, entry in enumerate(self._index[topic])}
+        exposed_ns = {
+            name: {number: entry.stamp_ns for number, entry in enumerate(self._index[topic])}
             for name, topic in self._image_topics.items()
         }
-        self._sweeps = self._lidars[0].entries
-        self._stamps_ns = [entry.stamp_ns for entry in self._sweeps]
+        self._stamps_ns = [entry.stamp_ns for entry in self._lidars[0].entries]
         truth = checks.truth_beside(path if path.is_dir() else path.parent)
-        frames = range(len(self._sweeps))
-        super().__init__(path.resolve().name, path, frames, cameras, stamps, truth)
+        frames = range(len(self._stamps_ns))
+        super().__init__(path.resolve().name, path, frames, cameras, exposed_ns, truth)
 
     def findings(self) -> Sequence[tuple[str, str]]:
         """Return the chosen topics and assumptions as pairs of a label and a text."""
         lines = []
         for lidar in self._lidars:
-            layout = lidar.layout
-            used = [
-                f"{quantity} = {name}" for quantity, name in vars(layout.fields).items() if name
-            ]
-            undone = f", out of the world of {self._topics.poses}" if lidar.placed else ""
-            lines.append(("lidar", f"{lidar.topic} in {lidar.frame}{undone}: {', '.join(used)}"))
+            layout, undone = lidar.layout, f", out of the world of {self._topics.poses}"
+            fields = [f"{key} = {name}" for key, name in vars(layout.fields).items() if name]
+            text = f"{lidar.topic} in {lidar.frame}{undone * lidar.placed}: {', '.join(fields)}"
+            lines.append(("lidar", text))
             scale = f"intensity divided by {layout.intensity_scale:g}"
             lines.append(("times", f"{layout.time_words}; {scale}"))
         lines += [("images", f"{topic} ({name})") for name, topic in self._image_topics.items()]
-        lines += [("no camera", text) for text in self._left_out]
-        return [*lines, ("poses from", self._track_and_words[1])]
+        lines += [("no camera", text) for text in self._unusable]
+        return [*lines, ("poses from", self._track_and_source[1])]
+
+    def gaps(self) -> list[str]:
+        """Return a sentence for each topic whose headers lack stamps, or whose messages repeat."""
+        counts = (
+            (self._bag.num_unstamped, "headers have no stamp: taken is when they were recorded"),
+            (self._bag.num_twice, "messages were recorded twice and are read once"),
+        )
+        return [f"{t}: {num[t]} {text}" for num, text in counts for t in self._index if num[t]]
 
     def _returns(self, frame: int) -> Returns:
-        sweep, numbered = self._sweeps[frame], list[tuple[int, Returns]]()
+        stamp_ns, numbered = self._stamps_ns[frame], list[tuple[int, Returns]]()
         for number, lidar in enumerate(self._lidars):
-            nearest = min(lidar.entries, key=lambda e: abs(e.stamp_ns - sweep.stamp_ns))
-            nearest = nearest if number else sweep
-            if abs(nearest.stamp_ns - sweep.stamp_ns) <= self._lidars[0].period_ns // 2:
-                numbered.append((number, self._returns_of(lidar, nearest, sweep.stamp_ns)))
+            entry = min(lidar.entries, key=lambda entry: abs(entry.stamp_ns - stamp_ns))
+            entry = entry if number else lidar.entries[frame]
+            if abs(entry.stamp_ns - stamp_ns) <= self._lidars[0].period_ns // 2:
+                numbered.append((number, self._returns_of(lidar, entry, stamp_ns)))
         clouds = [cloud for _, cloud in numbered]
-        timed = all(cloud.offset_ns is not None for cloud in clouds)
+        offsets_ns = [cloud.offset_ns for cloud in clouds if cloud.offset_ns is not None]
+        intensities = [
+            np.zeros(len(cloud.points), np.float32) if cloud.intensity is None else cloud.intensity
+            for cloud in clouds
+        ]
         origins = np.stack([lidar.T_first_lidar[:3, 3] for lidar in self._lidars])
         return Returns(
             np.concatenate([cloud.points for cloud in clouds]),
-            np.concatenate([_intensity(cloud) for cloud in clouds]),
-            np.concatenate([cloud.offset_ns for cloud in clouds]) if timed else None,  # type: ignore
+            np.concatenate(intensities),
+            np.concatenate(offsets_ns) if len(offsets_ns) == len(clouds) else None,
             np.concatenate([np.full(len(cloud.points), n, np.uint8) for n, cloud in numbered]),
             origins if len(self._lidars) > 1 else None,
             num_untimed=sum(cloud.num_untimed for cloud in clouds),
@@ -140,51 +347,16 @@ class RosBag(FileSequence):
         columns = cloud_columns(self._bag.message(lidar.topic, entry), where)
         returns, valid = lidar.layout.returns(columns, where, entry.stamp_ns)
         if lidar.placed:
-            returns = self._taken_back(returns, entry.stamp_ns)
+            track, source = self._track_and_source
+            if track is None:
+                raise InputError(f"{self.where}: registered clouds need their odometry: {source}")
+            returns = track.taken_back(returns, entry.stamp_ns)
         points = np.zeros_like(returns.points)
         points[valid] = poses.transform(lidar.T_first_lidar, returns.points[valid])
         offset_ns = returns.offset_ns
         if offset_ns is not None:
             offset_ns = offset_ns + (entry.stamp_ns - stamp_ns)
         return replace(returns, points=points, offset_ns=offset_ns)
-
-    def _taken_back(self, placed: Returns, stamp_ns: int) -> Returns:
-        """Return points of the world of odometry as fired, in the frame that odometry places."""
-        track, words = self._track_and_words
-        if track is None:
-            raise InputError(f"{self._bag.path}: registered clouds need their odometry: {words}")
-        return track.taken_back(placed, stamp_ns)
-
-    def gaps(self) -> list[str]:
-        """Return a sentence for each topic whose headers lack stamps, or whose messages repeat."""
-        num, num_twice = self._bag.num_unstamped, self._bag.num_twice
-        return [
-            f"{topic}: {num[topic]} headers have no stamp: taken is when they were recorded"
-            for topic in self._index
-            if num[topic]
-        ] + [
-            f"{topic}: {num_twice[topic]} messages were recorded twice and are read once"
-            for topic in self._index
-            if num_twice[topic]
-        ]
-
-    def _check_size(self, camera: Camera, topic: str) -> None:
-        """Raise InputError if the first image of a topic is not of the camera's size."""
-        where, info = f"{self._bag.path}: {topic}", f"{place_of(topic)}/camera_info"
-        message = self._bag.message(topic, self._index[topic][0])
-        if hasattr(message, "format"):
-            height, width = image_rgb(message, where).shape[:2]
-        else:
-            height, width = message.height, message.width
-        camera_info = next(self._bag.messages(info))
-        binning = max(camera_info.binning_x, camera_info.binning_y)
-        if binning > 1 and (width, height) == (camera_info.width, camera_info.height):
-            raise InputError(
-                f"{where}: {info} says binning {binning}, but the images have all of its {width} x "
-                f"{height} px: they are binned already; record it with binning_x and binning_y 0, "
-                f"or leave the camera out of #images="
-            )
-        checks.image_size((height, width), camera, where)
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         topic = self._image_topics[camera.name]
@@ -194,11 +366,11 @@ class RosBag(FileSequence):
         return rgb
 
     def _pose(self, frame: int) -> Float:
-        track, _ = self._track_and_words
+        track, _ = self._track_and_source
         return super()._pose(frame) if track is None else track.at(self.stamp_ns(frame))
 
     @cached_property
-    def _track_and_words(self) -> tuple[PoseTrack | None, str]:
+    def _track_and_source(self) -> tuple[PoseTrack | None, str]:
         """Poses of the first lidar (None without poses), and their source or the reason as text."""
         chosen, lidar = self._topics.poses, self._lidars[0].frame
         if not chosen:
@@ -206,7 +378,7 @@ class RosBag(FileSequence):
         named = "poses" in self._topics.named
         if chosen != "tf":
             try:
-                track = recorded_track(self._bag, chosen, self._transforms, lidar)
+                track = _recorded_track(self._bag, chosen, self._transforms, lidar)
             except InputError as error:
                 if named:
                     raise
@@ -217,7 +389,7 @@ class RosBag(FileSequence):
             return parent_and_track[1], f"/tf, {parent_and_track[0]} to {lidar}"
         if named:
             raise InputError(f"{self._bag.path}: /tf: nothing tells where {lidar} was")
-        names = ", ".join(topic.name for topic in self._bag.of_type(*POSES))
+        names = ", ".join(topic.name for topic in self._bag.of_type(*_POSES))
         hint = f"; name one of {names}: #poses=" if names else ", and there is no odometry"
         return None, f"none: /tf does not tell where {lidar} was{hint}"
 
@@ -229,8 +401,8 @@ class RosBag(FileSequence):
         )
         if not columns_of_entry:
             raise InputError(f"{where}: the messages looked at hold no points")
-        frame = plain(self._bag.message(topic, next(iter(columns_of_entry))).header.frame_id)
-        placed_frame = self._placed_in(frame)
+        frame = _plain(self._bag.message(topic, next(iter(columns_of_entry))).header.frame_id)
+        placed_frame = self._frame_placed_in(frame)
         frame = placed_frame or frame
         first = self._lidars[0].frame if self._lidars else frame
         T = self._transforms.between(first, frame)
@@ -239,25 +411,25 @@ class RosBag(FileSequence):
                 f"{self._bag.path}: nothing in /tf_static joins the frame {frame} of {topic} to "
                 f"{first}; name the topic of one lidar: #points={topic}"
             )
-        steps = np.diff([e.stamp_ns for e in entries])
-        period_ns = max(1, int(np.median(steps))) if len(steps) else _USUAL_PERIOD_NS
+        steps_ns = np.diff([entry.stamp_ns for entry in entries])
+        period_ns = max(1, int(np.median(steps_ns))) if len(steps_ns) else _USUAL_PERIOD_NS
         stamps_ns = [entry.stamp_ns for entry in columns_of_entry]
         layout = PointLayout.find([*columns_of_entry.values()], where, period_ns, stamps_ns)
         return Lidar(topic, frame, bool(placed_frame), entries, T, period_ns, layout)
 
-    def _placed_in(self, frame: str) -> str:
+    def _frame_placed_in(self, frame: str) -> str:
         """Return the frame that the chosen odometry places in ``frame``, "" if in another."""
         if self._topics.poses in ("", "tf"):
             return ""
         message = next(self._bag.messages(self._topics.poses), None)
-        if message is None or plain(message.header.frame_id) != frame:
+        if message is None or _plain(message.header.frame_id) != frame:
             return ""
-        return plain(getattr(message, "child_frame_id", "")) or "lidar"
+        return _plain(getattr(message, "child_frame_id", "")) or "lidar"
 
     def _camera(self, topic: str) -> Camera:
         """Return the camera of a topic; raise InputError without images, CameraInfo or mounting."""
-        prefix, prefixes = place_of(topic), [place_of(t) for t in self._topics.images]
-        where, info = f"{self._bag.path}: {topic}", f"{prefix}/camera_info"
+        where, namespace = f"{self._bag.path}: {topic}", _namespace(topic)
+        info = f"{namespace}/camera_info"
         message = next(self._bag.messages(info), None) if info in self._bag.topics else None
         if message is None:
             raise InputError(f"{where}: no {info} with its calibration; leave it out of #images=")
@@ -265,17 +437,31 @@ class RosBag(FileSequence):
             raise InputError(f"{where}: holds no images")
         image = self._bag.message(topic, self._index[topic][0])
         check_encoding(image, where)
-        frame, lidar = plain(image.header.frame_id), self._lidars[0].frame
+        frame, lidar = _plain(image.header.frame_id), self._lidars[0].frame
         T = self._transforms.between(frame, lidar)
         if T is None:
             raise InputError(
                 f"{where}: nothing in /tf_static joins the camera's frame {frame} to the "
                 f"lidar's, {lidar}; record /tf_static, or leave images out: #images=none"
             )
-        name = (prefix if prefixes.count(prefix) == 1 else topic).strip("/").replace("/", "_")
+        namespaces = [_namespace(name) for name in self._topics.images]
+        name = (namespace if namespaces.count(namespace) == 1 else topic).strip("/")
         rectified = "rect" in topic.removesuffix("/compressed").rpartition("/")[2]
-        return camera_of(message, name or "camera", T, rectified, f"{self._bag.path}: {info}")
+        name = name.replace("/", "_") or "camera"
+        return camera_of(message, name, T, rectified, f"{self._bag.path}: {info}")
 
-
-def _intensity(cloud: Returns) -> Float32:
-    return np.zeros(len(cloud.points), np.float32) if cloud.intensity is None else cloud.intensity
+    def _check_size(self, camera: Camera, topic: str) -> None:
+        """Raise InputError if the first image of a topic is not of the camera's size."""
+        where, info = f"{self._bag.path}: {topic}", f"{_namespace(topic)}/camera_info"
+        image = self._bag.message(topic, self._index[topic][0])
+        is_raw = hasattr(image, "height")
+        size = (image.height, image.width) if is_raw else image_rgb(image, where).shape[:2]
+        message = next(self._bag.messages(info))
+        binning = max(message.binning_x, message.binning_y)
+        if binning > 1 and size == (message.height, message.width):
+            raise InputError(
+                f"{where}: {info} says binning {binning}, but the images have all of its "
+                f"{message.width} x {message.height} px: they are binned already; record it with "
+                f"binning_x and binning_y 0, or leave the camera out of #images="
+            )
+        checks.image_size(size, camera, where)

@@ -1,48 +1,80 @@
 # SPDX-License-Identifier: MIT
-"""Read messages of ROS bags without ROS; one scan indexes header stamps, decoding is on demand."""
+"""Read ROS bags without ROS: index their messages, and decode points, images and calibrations.
+
+One scan indexes header stamps; a message is decoded on demand.
+"""
 
 from __future__ import annotations
 
 import heapq
-import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from threading import RLock
 from typing import Any, NamedTuple
-from urllib.parse import parse_qsl
 from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.config.file_content import needed, open_file, reason
+from densify.geometry.types import Camera, Float
+from densify.readers import checks
+from densify.readers.decoded_files import decode_image
 
 _MCAP = b"\x89MCAP0\r\n"  # begins and ends a file
 _MEND = "a bag that was cut off can be mended: rosbag reindex, ros2 bag reindex, mcap recover"
 
-_DRIVERS = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
-_LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\n"
-_LIVOX_POINT += "uint8 tag\nuint8 line"
-_LIVOX = (
+_LIVOX_PACKAGES = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
+_LIVOX_POINT = (
+    "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line"
+)
+_LIVOX_CLOUD = (
     "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
 )
-_TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"
-_DEFINITIONS = {"tf2_msgs/msg/TFMessage": _TRANSFORMS, "tf/msg/tfMessage": _TRANSFORMS}
-for _package in _DRIVERS:
+_LIVOX = {"x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "offset_time": "u4", "line": "u1"}
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_DEFINITIONS = dict.fromkeys(TRANSFORMS, "geometry_msgs/TransformStamped[] transforms")
+for _package in _LIVOX_PACKAGES:
     _DEFINITIONS[f"{_package}/msg/CustomPoint"] = _LIVOX_POINT
-    _DEFINITIONS[f"{_package}/msg/CustomMsg"] = f"{_LIVOX}{_package}/CustomPoint[] points"
+    _DEFINITIONS[f"{_package}/msg/CustomMsg"] = f"{_LIVOX_CLOUD}{_package}/CustomPoint[] points"
 
-_CLOUDS = ("sensor_msgs/msg/PointCloud2", *(f"{package}/msg/CustomMsg" for package in _DRIVERS))
-_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_ODOMETRY = "nav_msgs/msg/Odometry"
-POSES = (
-    _ODOMETRY,
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-)
-_USAGE = "#points=/topic,/topic&images=/topic,/topic&poses=/topic, tf or none"
-_NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
+CLOUDS = ("sensor_msgs/msg/PointCloud2", *(f"{name}/msg/CustomMsg" for name in _LIVOX_PACKAGES))
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+
+_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_LENSES = {  # densify's lens model, and allowed numbers of coefficients
+    "plumb_bob": ("pinhole", (4, 5)),
+    "radtan": ("pinhole", (4, 5)),
+    "rational_polynomial": ("pinhole", (8, 12, 14)),
+    "thin_prism": ("pinhole", (12, 14)),
+    "equidistant": ("fisheye", (4,)),
+    "fisheye": ("fisheye", (4,)),
+    "kannala_brandt4": ("fisheye", (4,)),
+}
+_ENCODINGS = {  # channels, type of a value, and OpenCV's conversion to RGB
+    "rgb8": (3, "u1", None),
+    "bgr8": (3, "u1", "COLOR_BGR2RGB"),
+    "rgba8": (4, "u1", "COLOR_RGBA2RGB"),
+    "bgra8": (4, "u1", "COLOR_BGRA2RGB"),
+    "8uc3": (3, "u1", "COLOR_BGR2RGB"),
+    "mono8": (1, "u1", "COLOR_GRAY2RGB"),
+    "8uc1": (1, "u1", "COLOR_GRAY2RGB"),
+    "mono16": (1, "u2", "COLOR_GRAY2RGB"),
+    "16uc1": (1, "u2", "COLOR_GRAY2RGB"),
+    # OpenCV names a mosaic by the second row's second and third pixel, ROS by its first two
+    "bayer_rggb8": (1, "u1", "COLOR_BayerBG2RGB"),
+    "bayer_bggr8": (1, "u1", "COLOR_BayerRG2RGB"),
+    "bayer_gbrg8": (1, "u1", "COLOR_BayerGR2RGB"),
+    "bayer_grbg8": (1, "u1", "COLOR_BayerGB2RGB"),
+    "yuv422": (2, "u1", "COLOR_YUV2RGB_UYVY"),
+    "uyvy": (2, "u1", "COLOR_YUV2RGB_UYVY"),
+    "yuv422_yuy2": (2, "u1", "COLOR_YUV2RGB_YUYV"),
+    "yuyv": (2, "u1", "COLOR_YUV2RGB_YUYV"),
+}
 
 
 class Entry(NamedTuple):
@@ -59,6 +91,15 @@ class Topic(NamedTuple):
     name: str
     type: str  # message type in ROS 2 notation, such as sensor_msgs/msg/PointCloud2
     num_messages: int
+
+
+class Recorded(NamedTuple):
+    """A message as recorded."""
+
+    topic: str
+    log_ns: int  # time of recording
+    raw: bytes
+    type: str  # message type in ROS 2 notation
 
 
 class Bag:
@@ -98,11 +139,11 @@ class Bag:
         counted.
         """
         entries_of_topic: dict[str, list[Entry]] = {topic: [] for topic in topics}
-        last = dict.fromkeys(topics, (-1, 0))  # time of recording and turn of the last message
+        num_recorded_at = Counter[tuple[str, int]]()
         indexed: set[tuple[str, int, int]] = set()
         for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
-            turn = last[topic][1] + 1 if last[topic][0] == log_ns else 0
-            last[topic] = log_ns, turn
+            turn = num_recorded_at[topic, log_ns]
+            num_recorded_at[topic, log_ns] += 1
             try:
                 stamp_ns = _stamp_ns(raw, self._is_ros2)
             except struct.error:
@@ -120,31 +161,31 @@ class Bag:
         recorded = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
         if len(recorded) <= entry.turn:
             raise InputError(f"{self.path}: no message of {topic} at {entry.log_ns} ns any more")
-        _, _, raw, type_ = recorded[entry.turn]
-        return self._decoded(raw, type_, topic)
+        return self._decoded(recorded[entry.turn])
 
     def messages(self, topic: str) -> Iterator[Any]:
         """Yield all decoded messages of a topic in the order of recording."""
-        for name, _, raw, type_ in self._messages([topic]):
-            yield self._decoded(raw, type_, name)
+        for recorded in self._messages([topic]):
+            yield self._decoded(recorded)
 
     def _messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
-    ) -> Iterator[tuple[str, int, bytes, str]]:
-        """Yield topic, recording time (ns), raw bytes and message type, by recording time."""
+    ) -> Iterator[Recorded]:
+        """Yield messages by recording time."""
         streams = []
         for reader in self._readers:
-            wanted = [c for c in reader.connections if c.topic in topics]
-            if wanted:  # an empty list would mean all
-                streams.append(reader.messages(wanted, start_ns, stop_ns))
+            connections = [c for c in reader.connections if c.topic in topics]
+            if connections:  # an empty list would mean all
+                streams.append(reader.messages(connections, start_ns, stop_ns))
         with self._lock:
             try:
                 for connection, log_ns, raw in heapq.merge(*streams, key=lambda record: record[1]):
-                    yield connection.topic, log_ns, raw, connection.msgtype
+                    yield Recorded(connection.topic, log_ns, raw, connection.msgtype)
             except Exception as error:  # the parser may raise any type
                 raise self._unreadable(error) from error
 
-    def _decoded(self, raw: bytes, type_: str, topic: str) -> Any:
+    def _decoded(self, recorded: Recorded) -> Any:
+        topic, _, raw, type_ = recorded
         decode = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
         try:
             return decode(raw, type_)
@@ -237,79 +278,131 @@ def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-@dataclass(frozen=True)
-class Topics:
-    """The topics of a bag that are used."""
+# Contents of messages
 
-    points: tuple[str, ...]  # topics of the lidars. Each message of the first topic is a sweep.
-    images: tuple[str, ...]  # topics of the cameras' images
-    poses: str  # topic of the poses, ``tf`` for /tf, or "" to read no poses
-    # Options that the user gave (points, images, poses). A problem with a named topic is an error;
-    # other unusable topics are skipped.
-    named: Collection[str]
 
-    @staticmethod
-    def choose(bag: Bag, options: str | None) -> Topics:
-        """Choose the topics to read, by the user's options (after ``#``) and the message types."""
-        chosen = dict(parse_qsl(options or "", keep_blank_values=True))
-        wrong = [key for key in chosen if key not in ("points", "images", "poses")]
-        if wrong or (options and not chosen):
+def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
+    """Return the one-number fields of a PointCloud2 or Livox CustomMsg by name, (N,) as stored."""
+    if not hasattr(message, "point_step"):
+        rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
+        table = np.array(rows, list(_LIVOX.items()))
+        return {name: table[name] for name in _LIVOX}
+    order, layout = ">" if message.is_bigendian else "<", dict[str, tuple[str, int]]()
+    for entry in message.fields:
+        if entry.count > 1 or not entry.name or entry.name in layout:
+            continue
+        kind = _DATATYPES.get(entry.datatype)
+        if kind is None or entry.offset + int(kind[1]) > message.point_step:
             raise InputError(
-                f"{bag.path}#{options}: got {wrong[0] if wrong else options}, expected {_USAGE}"
+                f"{where}: field {entry.name}: got type {entry.datatype} at byte {entry.offset} of "
+                f"{message.point_step}, expected one of ROS's eight types inside the point"
             )
-        images = _guessed_images([topic.name for topic in bag.of_type(*_IMAGES)])
-        odometry = bag.of_type(_ODOMETRY)
-        poses = chosen.get("poses") or (odometry[0].name if len(odometry) == 1 else "tf")
-        if "points" not in chosen:
-            chosen["points"] = _only_cloud(bag)
-        if "images" in chosen:
-            named = chosen["images"].replace("none", "")
-            images = named.split(",") if named else []
-        _check_topics(bag, "points", chosen["points"].split(","), _CLOUDS)
-        _check_topics(bag, "images", images, _IMAGES)
-        _check_topics(bag, "poses", [poses] if poses not in ("none", "tf") else [], POSES)
-        points = tuple(chosen["points"].split(","))
-        return Topics(points, tuple(images), poses.replace("none", ""), chosen.keys())
+        layout[entry.name] = (order + kind, entry.offset)
+    formats, offsets = [kind for kind, _ in layout.values()], [at for _, at in layout.values()]
+    spec: Any = {"names": [*layout], "formats": formats, "offsets": offsets}
+    # Some drivers leave the step of an only row at zero.
+    step = message.row_step or message.width * message.point_step * (message.height == 1)
+    points_of_rows = _rows(message, step, message.point_step, where)
+    points = points_of_rows.reshape(-1).view(np.dtype(spec | {"itemsize": message.point_step}))
+    return {name: points[name] for name in layout}
 
 
-def _only_cloud(bag: Bag) -> str:
-    """Return the only topic of point clouds; raise InputError for no or several topics."""
-    clouds = bag.of_type(*_CLOUDS)
-    if len(clouds) == 1:
-        return clouds[0].name
-    if clouds:
+def _rows(message: Any, step: int, item_bytes: int, where: str) -> NDArray[np.uint8]:
+    """Return a message's data without row padding, as bytes (height, width · item_bytes)."""
+    data, used = np.ascontiguousarray(message.data, np.uint8), message.width * item_bytes
+    if step < used or len(data) < message.height * step:
         raise InputError(
-            f"{bag.path}: several topics could be the sweeps: {_listed(clouds)}; name one "
-            f"or all lidars of the vehicle: --data 'ros:{bag.path}#points=/topic,/topic'"
+            f"{where}: got {len(data)} bytes and rows of {step}, expected {message.height} rows of "
+            f"{message.width} times {item_bytes} bytes"
         )
-    raise InputError(
-        f"{bag.path}: no PointCloud2; got {_listed(list(bag.topics.values())) or 'no messages'}; "
-        f"play raw packets through the sensor's driver and record the points that come out"
-    )
+    rows = data[: message.height * step].reshape(message.height, step)
+    return np.ascontiguousarray(rows[:, :used])
 
 
-def _guessed_images(topics: Sequence[str]) -> list[str]:
-    """Return one image topic for each camera, preferably rectified, then uncompressed."""
-    best: dict[str, str] = {}
-    for topic in sorted(topics, key=lambda t: ("rect" not in t, t.endswith("/compressed"), t)):
-        if not _NO_PICTURES.search(topic.lower()):
-            best.setdefault(place_of(topic), topic)
-    return sorted(best.values())
+def check_encoding(message: Any, where: str) -> None:
+    """Raise InputError for an Image or CompressedImage message in an encoding that is not read."""
+    if hasattr(message, "format"):
+        begin = bytes(np.asarray(message.data[:8], np.uint8))
+        if not begin.startswith((b"\xff\xd8", b"\x89PNG")):
+            raise InputError(
+                f"{where}: got images of the format {message.format!r}, expected JPEG or PNG; "
+                f"leave the camera out: name others with #images="
+            )
+    elif message.encoding.lower() not in _ENCODINGS:
+        raise InputError(
+            f"{where}: got the encoding {message.encoding}, expected one of "
+            f"{', '.join(_ENCODINGS)}; leave the camera out: name others with #images="
+        )
 
 
-def place_of(topic: str) -> str:
-    """Return the camera's namespace: ``/front/image_raw/compressed`` gives ``/front``."""
-    return topic.removesuffix("/compressed").rpartition("/")[0]
+def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
+    """Return an Image or CompressedImage message as (H,W,3) uint8 RGB."""
+    import cv2
+
+    check_encoding(message, where)
+    if hasattr(message, "format"):
+        bgr = decode_image(np.ascontiguousarray(message.data, np.uint8).tobytes(), where)
+        return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
+    channels, kind, conversion = _ENCODINGS[message.encoding.lower()]
+    pixels = _rows(message, message.step, channels * int(kind[1]), where)
+    if kind == "u2":
+        order = ">" if message.is_bigendian else "<"
+        pixels = (pixels.view(order + kind) >> 8).astype(np.uint8)
+    pixels = pixels.reshape(message.height, message.width, channels)
+    if conversion is None:
+        return pixels
+    return np.ascontiguousarray(cv2.cvtColor(pixels, getattr(cv2, conversion)), dtype=np.uint8)
 
 
-def _check_topics(bag: Bag, option: str, names: Sequence[str], types: Sequence[str]) -> None:
-    for name in names:
-        topic = bag.topics.get(name)
-        if topic is None or topic.type not in types:
-            got = "no such topic" if topic is None else f"a topic of {topic.type}"
-            fit = _listed(bag.of_type(*types)) or "none"
-            raise InputError(f"{bag.path}: {option}={name}: {got}; topics that fit: {fit}")
+def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, where: str) -> Camera:
+    """Convert a CameraInfo message to a camera, adjusted for binning and region of interest.
+
+    ``T_optical_lidar`` is the (4,4) pose of the lidar in the message's optical frame. Rectified
+    images use P and the rotation R, raw images K and the distortion D.
+    """
+    matrix = {  # ROS 1 writes K, ROS 2 k
+        key: np.asarray(getattr(info, key if hasattr(info, key) else key.upper()), np.float64)
+        for key in "kdrp"
+    }
+    K = (matrix["p"].reshape(3, 4)[:, :3] if rectified else matrix["k"].reshape(3, 3)).copy()
+    if not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 0 or abs(K[2, 2] - 1) > 1e-6:
+        raise InputError(
+            f"{where}: got {'P' if rectified else 'K'} = {np.round(K.ravel(), 4).tolist()}, "
+            f"expected a calibration with positive focal lengths"
+        )
+    if min(info.width, info.height) < 1:
+        raise InputError(f"{where}: got {info.width} x {info.height} px, expected the image's size")
+    T, model, distortion = T_optical_lidar, "pinhole", tuple[float, ...]()
+    if not rectified:
+        model, distortion = _lens(info.distortion_model, tuple(matrix["d"].tolist()), where)
+    elif matrix["r"].any():  # drivers leave zeros where they do not say
+        T = checks.rigid(np.column_stack([matrix["r"].reshape(3, 3), np.zeros(3)]), where) @ T
+    camera = Camera(name, int(info.width), int(info.height), K, T, distortion, model)
+    return _binned(camera, info)
 
 
-def _listed(topics: Sequence[Topic]) -> str:
-    return ", ".join(f"{t.name} ({t.type.rpartition('/')[2]}, {t.num_messages})" for t in topics)
+def _lens(named: str, distortion: tuple[float, ...], where: str) -> tuple[str, tuple[float, ...]]:
+    """Return densify's lens model and coefficients for ROS's distortion model and D."""
+    model, counts = _LENSES.get(named, ("pinhole", ()))
+    if not any(distortion) and model == "pinhole":
+        return "pinhole", ()
+    if len(distortion) not in counts:
+        raise InputError(
+            f"{where}: got {len(distortion)} coefficients of the distortion model {named!r}, "
+            f"expected one of {', '.join(_LENSES)}, with "
+            f"{' or '.join(str(n) for n in counts) or 'its'} coefficients; name rectified images "
+            f"with #images="
+        )
+    return model, distortion
+
+
+def _binned(camera: Camera, info: Any) -> Camera:
+    """Adjust a camera to the region of interest and the binning of a CameraInfo."""
+    # Binning averages sensor pixels, which moves pixel centres relative to the corner.
+    roi, by = info.roi, np.array([max(1, info.binning_x), max(1, info.binning_y)])
+    size = [roi.width or camera.width_px, roi.height or camera.height_px]
+    K = camera.K.copy()
+    K[:2, 2] -= (roi.x_offset, roi.y_offset)
+    K[:2, 2] = (K[:2, 2] + 0.5) / by - 0.5
+    K[[0, 1], [0, 1]] /= by
+    return replace(camera, K=K, width_px=int(size[0] // by[0]), height_px=int(size[1] // by[1]))

@@ -37,12 +37,13 @@ def write_points(
     folder: Path, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], point: Float
 ) -> None:
     """Write body, object (-1 none) and body-fixed position (N,3) of a sweep's N raw points."""
-    _save(_points_path(folder, frame), body=body, instance=instance, point=point)
+    path = folder / "points" / f"{frame:010d}.npz"
+    _save(path, body=body, instance=instance, point=point)
 
 
 def write_depth(folder: Path, camera: str, frame: int, depth_m: Float32, moving: Bool) -> None:
     """Write an image's true depth (H,W) in metres and a mask (H,W) of moving objects."""
-    _save(_depth_path(folder, camera, frame), depth_m=depth_m, moving=moving)
+    _save(folder / "depth" / camera / f"{frame:010d}.npz", depth_m=depth_m, moving=moving)
 
 
 def _save(path: Path, **arrays: Any) -> None:
@@ -50,20 +51,12 @@ def _save(path: Path, **arrays: Any) -> None:
     np.savez_compressed(path, **arrays)
 
 
-def _points_path(folder: Path, frame: int) -> Path:
-    return folder / "points" / f"{frame:010d}.npz"
-
-
-def _depth_path(folder: Path, camera: str, frame: int) -> Path:
-    return folder / "depth" / camera / f"{frame:010d}.npz"
-
-
 class FileTruth:
     """Ground truth (`Truth`) read from a ``truth`` folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self.bodies = Bodies(*_load(folder / "bodies.npz", *_BODIES))
+        self.bodies = Bodies(*self._load("bodies.npz", *_BODIES))
 
     def sweep(self, frame: int) -> SweepTruth:
         """Return the ground truth of a sweep's N raw points, in the lidar frame at its stamp."""
@@ -77,31 +70,31 @@ class FileTruth:
 
     def depth_m(self, camera: str, frame: int) -> Float32:
         """Return the true depth (H,W) of an image in metres, 0 for pixels without a surface."""
-        depth_m: Float32 = _load(_depth_path(self._folder, camera, frame), "depth_m")[0]
+        depth_m: Float32 = self._load(f"depth/{camera}/{frame:010d}.npz", "depth_m")[0]
         return depth_m
 
     def moving_mask(self, camera: str, frame: int) -> Bool:
         """Return a mask (H,W) of an image, True for pixels of moving objects."""
-        moving: Bool = _load(_depth_path(self._folder, camera, frame), "moving")[0]
+        moving: Bool = self._load(f"depth/{camera}/{frame:010d}.npz", "moving")[0]
         return moving
 
     def _points(self, frame: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Float]:
         """Return body (N,), instance (N,) and body-fixed position (N,3) of a sweep's points."""
         self.bodies.check(frame)
-        path, num_bodies = _points_path(self._folder, frame), self.bodies.moving.shape[1]
-        body, instance, point = _load(path, "body", "instance", "point")
+        name, num_bodies = f"points/{frame:010d}.npz", self.bodies.moving.shape[1]
+        body, instance, point = self._load(name, "body", "instance", "point")
         if ((body < 0) | (body >= num_bodies)).any():
             raise InputError(
-                f"{path}: got bodies {body.min()} to {body.max()}, expected bodies below "
-                f"{num_bodies}"
+                f"{self._folder / name}: got bodies {body.min()} to {body.max()}, expected bodies "
+                f"below {num_bodies}"
             )
         return body, instance, point
 
-
-def _load(path: Path, *names: str) -> list[NDArray[Any]]:
-    if not path.exists():
-        raise InputError(f"{path}: no such truth file; write the frame again")
-    arrays = read_arrays(path, names)
-    if missing := [name for name in names if name not in arrays]:
-        raise InputError(f"{path}: holds no {', '.join(missing)}; write the truth again")
-    return [arrays[name] for name in names]
+    def _load(self, name: str, *columns: str) -> list[NDArray[Any]]:
+        path = self._folder / name
+        if not path.exists():
+            raise InputError(f"{path}: no such truth file; write the frame again")
+        arrays = read_arrays(path, columns)
+        if missing := [column for column in columns if column not in arrays]:
+            raise InputError(f"{path}: holds no {', '.join(missing)}; write the truth again")
+        return [arrays[column] for column in columns]

@@ -22,9 +22,9 @@ files.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,29 +36,32 @@ from densify.config.file_content import described_in
 from densify.geometry.poses import inverse, transform
 from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers import checks
-from densify.readers.arrow_columns import read_parquet
+from densify.readers.column_files import read_arrow
 from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.recorded_poses import PoseTrack
 
 _NOMINAL_PERIOD_NS = 100_000_000
-OBJECT = "key.laser_object_id"
-BOX_CENTRE = tuple(f"[LiDARBoxComponent].box.center.{axis}" for axis in "xyz")
-BOX_SIZE = tuple(f"[LiDARBoxComponent].box.size.{axis}" for axis in "xyz")  # length, width, height
-BOX_HEADING = "[LiDARBoxComponent].box.heading"
 LASERS = ("TOP", "FRONT", "SIDE_LEFT", "SIDE_RIGHT", "REAR")
 CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
-STAMP, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.camera_name"
 T_OPTICAL_WAYMO = np.array(  # Waymo's camera frame is x forward, y left, z up
     [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-DOWN, RIGHT, UP, LEFT = 1, 2, 3, 4
-"""Readout directions of a rolling shutter, as numbered in the data set."""
+_READOUT = {1: (0.0, 1.0), 2: (1.0, 0.0), 3: (0.0, -1.0), 4: (-1.0, 0.0)}
+"""Direction x, y in the image of a rolling shutter's readout: down, right, up, left."""
 
-_LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+STAMP, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.camera_name"
+OBJECT = "key.laser_object_id"
+_LENS = tuple(f"intrinsic.{n}" for n in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3"))
+_SIZE = ("width", "height", "rolling_shutter_direction")
 
 
-@dataclass(frozen=True)
-class Components:
+def full_name(component: str, column: str) -> str:
+    """Return the name of a column in its file, such as ``[LiDARBoxComponent].box.heading``."""
+    words = ("LiDAR" if word == "lidar" else word.capitalize() for word in component.split("_"))
+    return column if column.startswith("key.") else f"[{''.join(words)}Component].{column}"
+
+
+class Segment(NamedTuple):
     """The Parquet tables of the segment named ``context``; ``root`` is the split's folder."""
 
     root: Path
@@ -69,10 +72,13 @@ class Components:
         return self.root / component / f"{self.context}.parquet"
 
     def read(
-        self, component: str, columns: Mapping[str, str], where: Mapping[str, int] | None = None
+        self, component: str, kinds: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Return columns of a component; see `densify.readers.arrow_columns.read_parquet`."""
-        return read_parquet(self.file(component), columns, "Waymo recordings", where)
+        """Return columns by name without the head; kinds as in `column_files.read_arrow`."""
+        full_kinds = {full_name(component, name): kind for name, kind in kinds.items()}
+        path, data_set = self.file(component), ("waymo", "Waymo recordings")
+        columns = read_arrow(path, full_kinds, data_set, where)
+        return dict(zip(kinds, columns.values(), strict=True))
 
 
 class Laser(NamedTuple):
@@ -108,92 +114,92 @@ class Image(NamedTuple):
     T_world_vehicle: Float  # (4,4) pose of the vehicle in the world
 
 
-def read_lasers(files: Components) -> dict[int, Laser]:
+def read_lasers(segment: Segment) -> dict[int, Laser]:
     """Return the lidars' calibrations by Waymo's number, from 1 (TOP)."""
-    head = "[LiDARCalibrationComponent]"
-    extrinsic, beams = f"{head}.extrinsic.transform", f"{head}.beam_inclination"
-    columns = {LASER: "i", extrinsic: "l", f"{beams}.values": "l"}
-    rows = files.read("lidar_calibration", {**columns, f"{beams}.min": "m", f"{beams}.max": "m"})
+    beams, low, high = (f"beam_inclination.{key}" for key in ("values", "min", "max"))
+    kinds = {LASER: "i", "extrinsic.transform": "l", beams: "l", low: "m", high: "m"}
+    columns = segment.read("lidar_calibration", kinds)
     lasers = {}
-    for row, laser in enumerate(rows[LASER].tolist()):
-        where = f"{files.file('lidar_calibration')}: lidar {laser}"
-        values = rows[f"{beams}.values"][row]
-        low, high = float(rows[f"{beams}.min"][row]), float(rows[f"{beams}.max"][row])
+    for number, T, values, *bounds in zip(*columns.values(), strict=True):
+        where = f"{segment.file('lidar_calibration')}: lidar {number}"
         beams_rad = None if values is None or not len(values) else values.astype(np.float64)
-        if not np.isfinite((low, high) if beams_rad is None else beams_rad).all():
+        if not np.isfinite(bounds if beams_rad is None else beams_rad).all():
             raise InputError(f"{where}: got beams that are not finite, expected rad")
-        lasers[laser] = Laser(checks.rigid(rows[extrinsic][row], where), beams_rad, (low, high))
+        bounds_rad = float(bounds[0]), float(bounds[1])
+        lasers[int(number)] = Laser(checks.rigid(T, where), beams_rad, bounds_rad)
     return lasers
 
 
-def read_boxes(files: Components) -> dict[int, Boxes]:
+def read_boxes(segment: Segment) -> dict[int, Boxes]:
     """Return boxes by ``frame_timestamp_micros``, in the vehicle's frame at ``vehicle_pose``."""
-    numbers = (*BOX_CENTRE, *BOX_SIZE, BOX_HEADING)
-    rows = files.read("lidar_box", {STAMP: "i", OBJECT: "s", **dict.fromkeys(numbers, "n")})
-    centre_m, size_m = (
-        np.stack([rows[name].astype(np.float64) for name in names], axis=1)
-        for names in (BOX_CENTRE, BOX_SIZE)
-    )
-    T_vehicle_box = checks.upright_poses(centre_m, rows[BOX_HEADING].astype(np.float64))
-    path, boxes = files.file("lidar_box"), {}
-    for us in np.unique(rows[STAMP]).tolist():
-        in_sweep = rows[STAMP] == us
-        where = f"{path}: frame_timestamp_micros {us}"
-        boxes[us] = checks.boxes(
-            rows[OBJECT][in_sweep], T_vehicle_box[in_sweep], size_m[in_sweep], where
-        )
+    numbers = [f"box.{key}.{axis}" for key in ("center", "size") for axis in "xyz"]
+    kinds = {STAMP: "i", OBJECT: "s", **dict.fromkeys((*numbers, "box.heading"), "n")}
+    columns = segment.read("lidar_box", kinds)
+    centre_m, size_m = np.hsplit(np.stack([columns[n] for n in numbers], 1).astype(np.float64), 2)
+    T_vehicle_box = checks.upright_poses(centre_m, columns["box.heading"].astype(np.float64))
+    boxes = {}
+    for us in np.unique(columns[STAMP]).tolist():
+        rows = columns[STAMP] == us
+        where = f"{segment.file('lidar_box')}: frame_timestamp_micros {us}"
+        boxes[us] = checks.boxes(columns[OBJECT][rows], T_vehicle_box[rows], size_m[rows], where)
     return boxes
 
 
-def read_images(files: Components, starts_us: Int) -> dict[str, dict[int, Image]]:
+def read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]:
     """Return times and poses of images by camera name and frame number; ``starts_us`` is (n,)."""
-    head = "[CameraImageComponent]"
-    pose, shutter = f"{head}.pose.transform", f"{head}.rolling_shutter_params"
-    times = [f"{shutter}.{name}" for name in ("camera_trigger_time", "camera_readout_done_time")]
-    numbers = [f"{head}.pose_timestamp", *times, f"{shutter}.shutter"]
-    columns = {STAMP: "i", CAMERA: "i", pose: "l", **dict.fromkeys(numbers, "n")}
-    rows, images_of_camera = files.read("camera_image", columns), dict[str, dict[int, Image]]()
-    frame_of = {int(us): number for number, us in enumerate(starts_us)}
-    name_of = dict(enumerate(CAMERAS, 1))
-    for row in np.argsort(rows[STAMP], kind="stable").tolist():
-        name, frame = name_of[int(rows[CAMERA][row])], frame_of.get(int(rows[STAMP][row]))
-        if frame is None:
-            continue
-        pose_s, trigger_s, done_s, shutter_s = (float(rows[name][row]) for name in numbers)
-        T = checks.rigid(rows[pose][row], f"{files.file('camera_image')}: {name}, frame {frame}")
-        exposed_ns = _whole_us((trigger_s + done_s) / 2)
-        image = Image(_whole_us(pose_s), exposed_ns, max(done_s - trigger_s - shutter_s, 0.0), T)
-        images_of_camera.setdefault(name, {})[frame] = image
-    return {name: images_of_camera[name] for name in CAMERAS if name in images_of_camera}
+    keys = ("shutter", "camera_trigger_time", "camera_readout_done_time")
+    seconds = ("pose_timestamp", *(f"rolling_shutter_params.{key}" for key in keys))
+    kinds = {STAMP: "i", CAMERA: "i", "pose.transform": "l", **dict.fromkeys(seconds, "n")}
+    columns = segment.read("camera_image", kinds)
+    frame_of_start = {int(us): frame for frame, us in enumerate(starts_us)}
+    images_of_camera: dict[str, dict[int, Image]] = {name: {} for name in CAMERAS}
+    for us, camera, T, *times_s in sorted(zip(*columns.values(), strict=True), key=itemgetter(0)):
+        if (frame := frame_of_start.get(int(us))) is not None:
+            pose_s, shutter_s, trigger_s, done_s = map(float, times_s)
+            name = dict(enumerate(CAMERAS, 1))[int(camera)]
+            images_of_camera[name][frame] = Image(
+                _whole_us(pose_s),
+                _whole_us((trigger_s + done_s) / 2),
+                max(done_s - trigger_s - shutter_s, 0.0),
+                checks.rigid(T, f"{segment.file('camera_image')}: {name}, frame {frame}"),
+            )
+    return {name: images for name, images in images_of_camera.items() if images}
 
 
-def read_cameras(files: Components, images: Mapping[str, Mapping[int, Image]]) -> dict[str, Camera]:
-    """Return the calibrated cameras that have images, by name, with their rolling shutters."""
-    head = "[CameraCalibrationComponent]"
-    lens = [f"{head}.intrinsic.{n}" for n in _LENS]
-    size = [f"{head}.{n}" for n in ("width", "height", "rolling_shutter_direction")]
-    extrinsic = f"{head}.extrinsic.transform"
-    columns = {CAMERA: "i", extrinsic: "l", **dict.fromkeys(lens, "n")}
-    rows = files.read("camera_calibration", {**columns, **dict.fromkeys(size, "i")})
-    cameras = {}
+def read_cameras(
+    segment: Segment, images: Mapping[str, Mapping[int, Image]]
+) -> Iterator[tuple[str, Camera]]:
+    """Yield the calibrated cameras that have images, with their names and rolling shutters."""
+    kinds = {
+        CAMERA: "i",
+        "extrinsic.transform": "l",
+        **dict.fromkeys(_LENS, "n"),
+        **dict.fromkeys(_SIZE, "i"),
+    }
+    columns = segment.read("camera_calibration", kinds)
     for name, camera_images in images.items():
-        where = f"{files.file('camera_calibration')}: {name}"
-        row = rows[CAMERA].tolist().index(CAMERAS.index(name) + 1)
-        f_u, f_v, c_u, c_v, *distortion = (float(rows[n][row]) for n in lens)
-        width, height, direction = (int(rows[n][row]) for n in size)
+        where = f"{segment.file('camera_calibration')}: {name}"
+        row = columns[CAMERA].tolist().index(CAMERAS.index(name) + 1)
+        f_u, f_v, c_u, c_v, *distortion = (float(columns[key][row]) for key in _LENS)
+        width, height, direction = (int(columns[key][row]) for key in _SIZE)
         readout_s = float(np.median([image.readout_s for image in camera_images.values()]))
-        T_cam_vehicle = T_OPTICAL_WAYMO @ inverse(checks.rigid(rows[extrinsic][row], where))
-        cameras[name] = checks.pinhole(
-            name,
-            (width, height),
-            (f_u, f_v, c_u - 0.5, c_v - 0.5),
-            T_cam_vehicle,
-            where,
-            distortion=tuple(distortion) if any(distortion) else (),
-            row_time_s={DOWN: 1.0, UP: -1.0}.get(direction, 0.0) * readout_s / max(height, 1),
-            column_time_s={RIGHT: 1.0, LEFT: -1.0}.get(direction, 0.0) * readout_s / max(width, 1),
+        x, y = _READOUT.get(direction, (0.0, 0.0))
+        T_cam_vehicle = T_OPTICAL_WAYMO @ inverse(
+            checks.rigid(columns["extrinsic.transform"][row], where)
         )
-    return cameras
+        yield (
+            name,
+            checks.pinhole(
+                name,
+                (width, height),
+                (f_u, f_v, c_u - 0.5, c_v - 0.5),
+                T_cam_vehicle,
+                where,
+                distortion=tuple(distortion) if any(distortion) else (),
+                row_time_s=y * readout_s / max(height, 1),
+                column_time_s=x * readout_s / max(width, 1),
+            ),
+        )
 
 
 def _whole_us(seconds: float) -> int:
@@ -214,34 +220,29 @@ class Waymo(FileSequence):
     """A Waymo segment in the vehicle's frame, stamped at the recorded pose, about mid-spin."""
 
     def __init__(self, root: Path, context: str) -> None:
-        files = self._parts = Components(root, context)
-        self._starts_us = np.unique(files.read("lidar", {STAMP: "i"})[STAMP])
+        segment = self._segment = Segment(root, context)
+        self._starts_us = np.unique(segment.read("lidar", {STAMP: "i"})[STAMP])
         if not len(self._starts_us):
-            raise InputError(f"{files.file('lidar')}: holds no frames")
+            raise InputError(f"{segment.file('lidar')}: holds no frames")
         starts_ns = self._starts_us * 1000
-        steps = np.diff(starts_ns)
-        self._period_ns = int(np.median(steps)) if len(steps) else _NOMINAL_PERIOD_NS
-        has_images = files.file("camera_image").is_file()
+        steps_ns = np.diff(starts_ns)
+        self._period_ns = int(np.median(steps_ns)) if len(steps_ns) else _NOMINAL_PERIOD_NS
+        has_images = segment.file("camera_image").is_file()
         with described_in(root, f"calibration and images of {context} in the data set's own form"):
-            self._lasers = read_lasers(files)
-            self._images = read_images(files, self._starts_us) if has_images else {}
-            cameras = read_cameras(files, self._images) if has_images else {}
+            self._lasers = read_lasers(segment)
+            self._images = read_images(segment, self._starts_us) if has_images else {}
+            cameras = dict(read_cameras(segment, self._images)) if has_images else {}
         front = self._images.get(CAMERAS[0], {})
         self._stamps_ns = [
-            front[number].pose_ns if number in front else int(ns) + self._period_ns // 2
-            for number, ns in enumerate(starts_ns)
+            front[frame].pose_ns if frame in front else int(ns) + self._period_ns // 2
+            for frame, ns in enumerate(starts_ns)
         ]
-        super().__init__(
-            context,
-            root,
-            range(len(starts_ns)),
-            cameras,
-            {
-                name: {n: i.exposed_ns for n, i in shots.items()}
-                for name, shots in self._images.items()
-            },
-            checks.truth_beside(root),
-        )
+        exposed_ns = {
+            name: {frame: image.exposed_ns for frame, image in images.items()}
+            for name, images in self._images.items()
+        }
+        frames, truth = range(len(starts_ns)), checks.truth_beside(root)
+        super().__init__(context, root, frames, cameras, exposed_ns, truth)
 
     def _pose(self, frame: int) -> Float:
         return self._T_world_vehicle[frame]
@@ -253,27 +254,27 @@ class Waymo(FileSequence):
 
     @cached_property
     def _boxes(self) -> dict[int, Boxes]:
-        return read_boxes(self._parts) if self._parts.file("lidar_box").is_file() else {}
+        return read_boxes(self._segment) if self._segment.file("lidar_box").is_file() else {}
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """Return the pose T_world_cam (4,4) at the middle of the exposure of image ``number``."""
         image = self._images[camera][number]
         T_world_vehicle = image.T_world_vehicle
         if len(self.frames) > 1:
-            before, after = (self._track.at(ns) for ns in (image.pose_ns, image.exposed_ns))
-            T_world_vehicle = T_world_vehicle @ inverse(before) @ after
+            T_at_pose, T_exposed = (self._track.at(ns) for ns in (image.pose_ns, image.exposed_ns))
+            T_world_vehicle = T_world_vehicle @ inverse(T_at_pose) @ T_exposed
         return T_world_vehicle @ inverse(self.cameras[camera].T_cam_lidar)
 
     def _returns(self, frame: int) -> Returns:
         points, intensity, offset_ns, lidar = [], [], [], []
-        for (number, _), image in self._range_images(frame).items():
+        for number, image in self._range_images(frame):
             laser = self._lasers[number]
-            away = laser.directions(image.shape[:2]) * image[..., :1]
-            met = transform(laser.T_vehicle_laser, away.reshape(-1, 3))
-            points.append(np.where(image[..., 0].ravel()[:, None] > 0, met, np.nan))
+            rays = laser.directions(image.shape[:2]) * image[..., :1]
+            in_vehicle = transform(laser.T_vehicle_laser, rays.reshape(-1, 3))
+            points.append(np.where(image[..., 0].reshape(-1, 1) > 0, in_vehicle, np.nan))
             intensity.append(np.tanh(image[..., 1].ravel()))
             offset_ns.append(self._offset_ns(frame, number, image.shape).ravel())
-            lidar.append(np.full(len(met), number - 1, np.uint8))
+            lidar.append(np.full(len(in_vehicle), number - 1, np.uint8))
         T = np.tile(np.eye(4), (len(LASERS), 1, 1))
         for number, laser in self._lasers.items():
             T[number - 1] = laser.T_vehicle_laser
@@ -286,21 +287,17 @@ class Waymo(FileSequence):
             checks.scanner_axes(T),
         )
 
-    def _range_images(self, frame: int) -> dict[tuple[int, int], Float]:
-        """Return (H,W,4) by lidar and return, from 1; channels: range (m), intensity, 2 unused."""
-        names = {number: f"[LiDARComponent].range_image_return{number}" for number in (1, 2)}
-        columns = {f"{name}.{key}": "l" for name in names.values() for key in ("values", "shape")}
-        start_us = int(self._starts_us[frame])
-        rows = self._parts.read("lidar", {LASER: "i", **columns}, {STAMP: start_us})
-        range_images = {}
-        for row in np.argsort(rows[LASER], kind="stable"):
-            for number, name in names.items():
-                values, shape = rows[f"{name}.values"][row], rows[f"{name}.shape"][row]
+    def _range_images(self, frame: int) -> Iterator[tuple[int, Float]]:
+        """Yield lidar, from 1, and range image (H,W,4): range (m), intensity and two unused."""
+        names = [f"range_image_return{n}.{key}" for n in (1, 2) for key in ("values", "shape")]
+        kinds = {LASER: "i", **dict.fromkeys(names, "l")}
+        columns = self._segment.read("lidar", kinds, {STAMP: int(self._starts_us[frame])})
+        for laser, *returns in sorted(zip(*columns.values(), strict=True), key=itemgetter(0)):
+            for values, shape in zip(returns[::2], returns[1::2], strict=True):
                 if values is not None and len(values):
-                    height, width, num = shape.tolist()
-                    image = values.reshape(height, width, num).astype(np.float64)
-                    range_images[int(rows[LASER][row]), number] = image
-        return range_images
+                    height, width, num_channels = shape.tolist()
+                    image = values.reshape(height, width, num_channels)
+                    yield int(laser), image.astype(np.float64)
 
     def _offset_ns(self, frame: int, laser: int, size: tuple[int, ...]) -> Int:
         """Return firing times (H,W) in ns since the sweep's stamp, 0 for lidars other than TOP."""
@@ -314,26 +311,23 @@ class Waymo(FileSequence):
     @cached_property
     def _T_world_vehicle(self) -> dict[int, Float]:
         """Poses T_world_vehicle (4,4) of the vehicle at the sweeps' stamps, by frame."""
-        name = "[VehiclePoseComponent].world_from_vehicle.transform"
-        rows, where = (
-            self._parts.read("vehicle_pose", {STAMP: "i", name: "l"}),
-            self._parts.file("vehicle_pose"),
-        )
-        poses = {
+        where = self._segment.file("vehicle_pose")
+        kinds = {STAMP: "i", "world_from_vehicle.transform": "l"}
+        columns = self._segment.read("vehicle_pose", kinds)
+        T_of_start = {
             int(us): checks.rigid(values, f"{where}: frame_timestamp_micros {us}")
-            for us, values in zip(rows[STAMP], rows[name], strict=True)
+            for us, values in zip(*columns.values(), strict=True)
         }
-        T_of = {number: poses[int(us)] for number, us in enumerate(self._starts_us) if us in poses}
-        return {frame: checks.of_frame(T_of, frame, "vehicle pose", where) for frame in self.frames}
+        T_of_frame = {f: T_of_start[us] for f, us in enumerate(self._starts_us) if us in T_of_start}
+        return {f: checks.of_frame(T_of_frame, f, "vehicle pose", where) for f in self.frames}
 
     @cached_property
     def _track(self) -> PoseTrack:
         T = np.stack([self._T_world_vehicle[frame] for frame in self.frames])
-        path = self._parts.file("vehicle_pose")
+        path = self._segment.file("vehicle_pose")
         return PoseTrack(str(path), np.array(self._stamps_ns, np.int64), T)
 
-    def _encoded_image(self, camera: str, number: int) -> tuple[Path, bytes]:
-        name = "[CameraImageComponent].image"
-        where = {STAMP: int(self._starts_us[number]), CAMERA: CAMERAS.index(camera) + 1}
-        rows = self._parts.read("camera_image", {name: "b"}, where)
-        return self._parts.file("camera_image"), rows[name][0]
+    def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
+        where = {CAMERA: CAMERAS.index(camera.name) + 1, STAMP: int(self._starts_us[number])}
+        columns = self._segment.read("camera_image", {"image": "b"}, where)
+        return checks.decoded_image(columns["image"][0], camera, self._segment.file("camera_image"))

@@ -70,91 +70,75 @@ def _put_poses(folder: Path, stamps_ns: Int, T_world: Float) -> None:
 def _cuboids(excerpt: Excerpt, frame: int) -> dict[str, NDArray[Any]]:
     """The columns of a frame's boxes; what moves before two scanners has one for each."""
     together = drawn_boxes(excerpt, frame)
-    apart = [
-        drawn_boxes(excerpt, frame, lidar)
-        for lidar in range(len(excerpt.street.simulator.sensor.scanners))
-    ]
-    names, scanners, T, size_m = [], [], [], []
+    scanners = range(len(excerpt.street.simulator.sensor.scanners))
+    apart = {lidar: drawn_boxes(excerpt, frame, lidar) for lidar in scanners}
+    boxes = []  # number of the box, scanner, pose, size
     for row, instance in enumerate(together.instance.tolist()):
-        rows = [np.flatnonzero(boxes.instance == instance).tolist() for boxes in apart]
-        drawn = [(-1, together, row)]
-        if together.moving[row] and len(rows) == 2 and all(rows):
-            drawn = [(lidar, apart[lidar], rows[lidar][0]) for lidar in range(2)]
-        for scanner, boxes, at in drawn:
-            names.append(str(UUID(int=2 * instance + max(scanner, 0))))
-            scanners.append(scanner)
-            T.append(boxes.T_world_box[at])
-            size_m.append(boxes.size_m[at])
-    T_world_box = np.reshape(T, (-1, 4, 4))
-    length_m, width_m, height_m = np.reshape(size_m, (-1, 3)).T
-    x, y, z = T_world_box[:, :3, 3].T
+        seen_by = [lidar for lidar in scanners if instance in apart[lidar].instance]
+        drawn = {-1: together}
+        if together.moving[row] and len(seen_by) == 2:
+            drawn = apart
+        for lidar, drawing in drawn.items():
+            at = drawing.instance.tolist().index(instance)
+            number = 2 * instance + max(lidar, 0)
+            boxes.append((number, lidar, drawing.T_world_box[at], drawing.size_m[at]))
+    numbers, lidars, T, size_m = zip(*boxes, strict=True) if boxes else ((), (), (), ())
+    T_world_box, size_m = np.reshape(T, (-1, 4, 4)), np.reshape(size_m, (-1, 3))
     return {
-        "uuid": np.array(names, object),
+        "uuid": np.array([str(UUID(int=number)) for number in numbers], object),
         "yaw": np.arctan2(T_world_box[:, 1, 0], T_world_box[:, 0, 0]) - np.pi / 2,
-        **{"position.x": x, "position.y": y, "position.z": z},
-        **{"dimensions.x": width_m, "dimensions.y": length_m, "dimensions.z": height_m},
-        "cuboids.sensor_id": np.array(scanners, np.int64),
+        **{f"position.{axis}": T_world_box[:, i, 3] for i, axis in enumerate("xyz")},
+        **{f"dimensions.{axis}": size_m[:, i] for i, axis in enumerate("yxz")},
+        "cuboids.sensor_id": np.array(lidars, np.int64),
     }
 
 
 # The pickle that pandas 1.0 makes of a data frame, without pandas
 
 
-class _Name(NamedTuple):
-    """A name that a pickle refers to."""
-
-    module: str
-    name: str
-
-
 class _Made(NamedTuple):
-    """What a name is called with, and the state set on the outcome."""
+    """What a pickle calls, with which arguments (None: it is only named), and the state it sets."""
 
-    name: _Name
-    args: tuple[Any, ...]
+    name: str
+    args: tuple[Any, ...] | None = None
     state: Any = None
 
 
 class _Pickler(pickle._Pickler):
     def save(self, obj: Any, save_persistent_id: bool = True) -> None:
-        if isinstance(obj, _Name):
-            self.write(f"c{obj.module}\n{obj.name}\n".encode())
-        elif isinstance(obj, _Made):
-            self.save(obj.name)
+        if not isinstance(obj, _Made):
+            super().save(obj, save_persistent_id)
+            return
+        module, _, name = obj.name.rpartition(".")
+        self.write(f"c{module}\n{name}\n".encode())
+        if obj.args is not None:
             self.save(obj.args)
             self.write(pickle.REDUCE)
-            if obj.state is not None:
-                self.save(obj.state)
-                self.write(pickle.BUILD)
-        else:
-            super().save(obj, save_persistent_id)
+        if obj.state is not None:
+            self.save(obj.state)
+            self.write(pickle.BUILD)
 
 
 def put_frame(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write (N,) columns; those of a kind lie together, as pandas stores them."""
-    names = list(columns)
-    kinds = dict.fromkeys(column.dtype for column in columns.values())
-    base = "pandas.core.indexes.base"
-
-    def index(of: list[str]) -> _Made:
-        made = (_Name(base, "Index"), {"data": np.array(of, object), "name": None})
-        return _Made(_Name(base, "_new_Index"), made)
-
+    names, base = list(columns), "pandas.core.indexes.base"
     blocks = []
-    for kind in kinds:
-        places = [i for i, name in enumerate(names) if columns[name].dtype == kind]
-        values = np.stack([columns[names[i]] for i in places])
-        rows: Any = np.array(places)
-        if places[-1] + 1 - places[0] == len(places):
-            rows = _Made(_Name("builtins", "slice"), (places[0], places[-1] + 1, 1))
+    for kind in dict.fromkeys(column.dtype for column in columns.values()):
+        numbers = [i for i, name in enumerate(names) if columns[name].dtype == kind]
+        rows: Any = np.array(numbers)
+        if numbers[-1] + 1 - numbers[0] == len(numbers):
+            rows = _Made("builtins.slice", (numbers[0], numbers[-1] + 1, 1))
+        values = np.stack([columns[names[i]] for i in numbers])
         blocks.append({"values": values, "mgr_locs": rows})
-    num = {"name": None, "start": 0, "stop": len(columns[names[0]]), "step": 1}
-    rows_index = _Made(
-        _Name(base, "_new_Index"), (_Name("pandas.core.indexes.range", "RangeIndex"), num)
-    )
-    state = {"0.14.1": {"axes": [index(names), rows_index], "blocks": blocks}}
-    manager = _Name("pandas.core.internals.managers", "BlockManager")
-    data = {"_data": _Made(manager, (), (None, state)), "_typ": "dataframe"}
+    rows_index = {"name": None, "start": 0, "stop": len(columns[names[0]]), "step": 1}
+    indices = {
+        f"{base}.Index": {"data": np.array(names, object), "name": None},
+        "pandas.core.indexes.range.RangeIndex": rows_index,
+    }
+    axes = [_Made(f"{base}._new_Index", (_Made(n), state)) for n, state in indices.items()]
+    state = (None, {"0.14.1": {"axes": axes, "blocks": blocks}})
+    manager = _Made("pandas.core.internals.managers.BlockManager", (), state)
+    data = {"_data": manager, "_typ": "dataframe"}
     file = io.BytesIO()
-    _Pickler(file, 3).dump(_Made(_Name("pandas.core.frame", "DataFrame"), (), data))
+    _Pickler(file, 3).dump(_Made("pandas.core.frame.DataFrame", (), data))
     put(path, gzip.compress(file.getvalue(), 1, mtime=0))

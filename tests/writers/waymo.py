@@ -16,30 +16,21 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.poses import inverse
 from densify.geometry.types import Camera, Float, Float32, Int
-from densify.readers.waymo import (
-    BOX_CENTRE,
-    BOX_HEADING,
-    BOX_SIZE,
-    CAMERA,
-    CAMERAS,
-    DOWN,
-    LASER,
-    OBJECT,
-    STAMP,
-    T_OPTICAL_WAYMO,
-)
+from densify.readers.waymo import CAMERA, CAMERAS, LASER, OBJECT, STAMP, T_OPTICAL_WAYMO, full_name
 from writers.excerpt import Excerpt, drawn_boxes
 
 T_EGO_LIDAR = np.eye(4)  # the place of Waymo's TOP
 T_EGO_LIDAR[:3, 3] = [1.43, 0.0, 2.18]
+POSED_COLUMNS = 60  # poses of the range images are right for each 60th column alone
 _SHUTTER_S = 0.005
+_DOWN, _GLOBAL = 1, 5  # directions of a shutter's readout
 
 
 def write_waymo(excerpt: Excerpt, out: Path) -> Path:
     street, root = excerpt.street, out / "street"
     stamps_ns = [street.stamp_ns(frame) for frame in excerpt.frames]
     row_of = {frame: pixels(excerpt, frame) for frame in excerpt.frames}
-    name = "[VehiclePoseComponent].world_from_vehicle.transform"
+    name = "world_from_vehicle.transform"
     vehicle = [{**_key(excerpt, ns), name: _T_world_ego(excerpt, ns).ravel()} for ns in stamps_ns]
     _put(root, "lidar_calibration", [_laser(excerpt)])
     _put(root, "vehicle_pose", vehicle)
@@ -83,31 +74,31 @@ def _range_image(excerpt: Excerpt, frame: int, pixel: Int) -> tuple[dict[str, An
     image[:, :2] = -1.0  # no return
     image[pixel, 0] = np.linalg.norm(excerpt.fired(frame), axis=1)
     image[pixel, 1] = np.arctanh(np.minimum(returns.intensity, 0.999))
-    share = (np.arange(num_columns) + 0.5) / num_columns - 0.5
+    share = (np.arange(0, num_columns, POSED_COLUMNS) + 0.5) / num_columns - 0.5
     times_ns = stamp_ns + np.rint(share * period_ns).astype(np.int64)
     T = excerpt.T_world_ego(times_ns, inverse(T_EGO_LIDAR))
     yaw_pitch_roll = Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX")
     columns = np.concatenate([yaw_pitch_roll[:, ::-1], T[:, :3, 3]], axis=1)
+    columns = np.repeat(columns, POSED_COLUMNS, axis=0)
     pose = np.broadcast_to(columns, (num_rows, *columns.shape)).astype(np.float32)
     key = {**_key(excerpt, stamp_ns), LASER: np.int8(1)}
     ranges = {
         **key,
-        **_matrix("[LiDARComponent].range_image_return1", image, (num_rows, num_columns, 4)),
-        "[LiDARComponent].range_image_return2.values": None,
-        "[LiDARComponent].range_image_return2.shape": None,
+        **_matrix("range_image_return1", image, (num_rows, num_columns, 4)),
+        "range_image_return2.values": None,
+        "range_image_return2.shape": None,
     }
-    return ranges, {**key, **_matrix("[LiDARPoseComponent].range_image_return1", pose, pose.shape)}
+    return ranges, {**key, **_matrix("range_image_return1", pose, pose.shape)}
 
 
 def _laser(excerpt: Excerpt) -> dict[str, Any]:
     beams_rad = np.radians(_beams_deg(excerpt))
-    head = "[LiDARCalibrationComponent]"
     return {
         LASER: np.int8(1),
-        f"{head}.extrinsic.transform": T_EGO_LIDAR.ravel(),
-        f"{head}.beam_inclination.min": float(beams_rad[0]),
-        f"{head}.beam_inclination.max": float(beams_rad[-1]),
-        f"{head}.beam_inclination.values": beams_rad,
+        "extrinsic.transform": T_EGO_LIDAR.ravel(),
+        "beam_inclination.min": float(beams_rad[0]),
+        "beam_inclination.max": float(beams_rad[-1]),
+        "beam_inclination.values": beams_rad,
     }
 
 
@@ -118,31 +109,29 @@ def _boxes(excerpt: Excerpt, frame: int) -> Iterator[dict[str, Any]]:
         yield {
             **_key(excerpt, stamp_ns),
             OBJECT: f"object_{instance}",
-            **dict(zip(BOX_CENTRE, T[:3, 3].tolist(), strict=True)),
-            **dict(zip(BOX_SIZE, size_m.tolist(), strict=True)),
-            BOX_HEADING: float(np.arctan2(T[1, 0], T[0, 0])),
+            **{f"box.center.{axis}": value for axis, value in zip("xyz", T[:3, 3], strict=True)},
+            **{f"box.size.{axis}": value for axis, value in zip("xyz", size_m, strict=True)},
+            "box.heading": float(np.arctan2(T[1, 0], T[0, 0])),
         }
 
 
 def _lens(camera: Camera, number: int) -> dict[str, Any]:
-    head = "[CameraCalibrationComponent]"
     lens = {"f_u": camera.K[0, 0], "f_v": camera.K[1, 1]}
     lens |= {"c_u": camera.K[0, 2] + 0.5, "c_v": camera.K[1, 2] + 0.5}
     lens |= dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0)
     T_vehicle_cam = T_EGO_LIDAR @ inverse(camera.T_cam_lidar) @ T_OPTICAL_WAYMO
     return {
         CAMERA: np.int8(number),
-        **{f"{head}.intrinsic.{name}": float(value) for name, value in lens.items()},
-        f"{head}.extrinsic.transform": T_vehicle_cam.ravel(),
-        f"{head}.width": np.int32(camera.width_px),
-        f"{head}.height": np.int32(camera.height_px),
-        f"{head}.rolling_shutter_direction": np.int8(DOWN if camera.row_time_s else 5),
+        **{f"intrinsic.{name}": float(value) for name, value in lens.items()},
+        "extrinsic.transform": T_vehicle_cam.ravel(),
+        "width": np.int32(camera.width_px),
+        "height": np.int32(camera.height_px),
+        "rolling_shutter_direction": np.int8(_DOWN if camera.row_time_s else _GLOBAL),
     }
 
 
 def _images(excerpt: Excerpt) -> list[dict[str, Any]]:
-    records, head = [], "[CameraImageComponent]"
-    shutter = f"{head}.rolling_shutter_params"
+    records, shutter = [], "rolling_shutter_params"
     for number, name in enumerate(excerpt.cameras, 1):
         half_s = (excerpt.street.cameras[name].readout_s + _SHUTTER_S) / 2
         exposed_ns = excerpt.street.image_stamps_ns(name)
@@ -153,9 +142,9 @@ def _images(excerpt: Excerpt) -> list[dict[str, Any]]:
                 {
                     **_key(excerpt, stamp_ns),
                     CAMERA: np.int8(number),
-                    f"{head}.image": excerpt.jpeg_image(name, image),
-                    f"{head}.pose.transform": _T_world_ego(excerpt, pose_ns).ravel(),
-                    f"{head}.pose_timestamp": pose_ns * 1e-9,
+                    "image": excerpt.jpeg_image(name, image),
+                    "pose.transform": _T_world_ego(excerpt, pose_ns).ravel(),
+                    "pose_timestamp": pose_ns * 1e-9,
                     f"{shutter}.shutter": _SHUTTER_S,
                     f"{shutter}.camera_trigger_time": exposed_ns[image] * 1e-9 - half_s,
                     f"{shutter}.camera_readout_done_time": exposed_ns[image] * 1e-9 + half_s,
@@ -182,7 +171,8 @@ def _put(root: Path, component: str, records: Sequence[Mapping[str, Any]]) -> No
         kind = None
         if records[0][name] is None:
             kind = arrow.list_(arrow.int32() if name.endswith("shape") else arrow.float32())
-        columns[name] = arrow.array([record[name] for record in records], kind)
+        values = [record[name] for record in records]
+        columns[full_name(component, name)] = arrow.array(values, kind)
     (root / component).mkdir(parents=True)
     table = arrow.table(columns)
     arrow.parquet.write_table(table, root / component / "street.parquet", row_group_size=1)
