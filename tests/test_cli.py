@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 import yaml
 
-from densify.cli import verbs
+from densify.cli import recordings
+from densify.cli.commands import command_line
 from densify.cli.screen import Answer
-from densify.cli.verbs import recordings
 from densify.config import Config, as_mapping, resolve
 from densify.config.errors import ComputationError, InputError
 from tests.command import exit_code, files_in, refused
@@ -179,7 +179,7 @@ def test_the_recording_is_an_argument_or_an_option(border_drive: Path, capsys) -
 
 
 def test_verbs_have_few_options() -> None:
-    parser = verbs._command_line()
+    parser = command_line()
     (subparsers,) = (a for a in parser._actions if hasattr(a, "choices") and a.choices)
     for verb in ("run", "dataset"):
         options = [a for a in subparsers.choices[verb]._actions if a.option_strings]
