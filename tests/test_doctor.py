@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from densify.bench import doctor as bench
 from densify.config import Config
 from densify.config.errors import InputError
-from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, clocks, paths, points, rings
-from densify.doctor.paths import changed
+from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, motion, stored
+from densify.doctor.motion import changed
 from densify.free_space.sectors import lost_deg
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
@@ -106,31 +106,31 @@ def test_lost_packets_blind_sectors_and_sweeps_in_a_map_are_named(good: Sample) 
         shift_m = 2.0 * (sweep.frame - FRAMES[0])
         return replace(sweep, points=sweep.points + [shift_m, 0, 0])
 
-    assert points.check_directions(good)[0].verdict == Verdict.FINE
-    (lost,) = points.check_directions(with_sweeps(good, lambda s: cut(s, False)))
+    assert stored.check_directions(good)[0].verdict == Verdict.FINE
+    (lost,) = stored.check_directions(with_sweeps(good, lambda s: cut(s, False)))
     assert lost.verdict == Verdict.SUSPICIOUS
     assert lost.values["lost_deg"] == pytest.approx(30, abs=1)
     often = np.full((7, 360), 90)
     often[::2, 100:240] = 0
     np.testing.assert_array_equal(lost_deg(often), [140, 0] * 3 + [140])
-    (blind,) = points.check_directions(with_sweeps(good, lambda s: cut(s, True)))
+    (blind,) = stored.check_directions(with_sweeps(good, lambda s: cut(s, True)))
     assert blind.verdict == Verdict.SUSPICIOUS and "20 to 50 deg" in blind.evidence
-    assert points.check_frame(good)[0].verdict == Verdict.FINE
+    assert motion.check_frame(good)[0].verdict == Verdict.FINE
     still = Trajectory(tuple(range(5)), np.arange(5), np.stack([np.eye(4)] * 5))
     in_map = with_sweeps(good, placed)
     in_map = replace(in_map, spots=tuple(replace(s, trajectory=still) for s in in_map.spots))
-    assert points.check_frame(in_map)[0].verdict == Verdict.WRONG
+    assert motion.check_frame(in_map)[0].verdict == Verdict.WRONG
 
 
 WHO_NAMES = {
-    "poses": paths.check_poses,
-    "unit of points": points.check_units,
-    "axes": points.check_axes,
-    "scanner's place": rings.check_rings,
-    "stamps": clocks.check_stamps,
-    "point times": clocks.check_point_times,
-    "intensity": points.check_intensity,
-    "scanner 0": points.check_sensors,
+    "poses": motion.check_poses,
+    "unit of points": stored.check_units,
+    "axes": stored.check_axes,
+    "scanner's place": motion.check_rings,
+    "stamps": stored.check_stamps,
+    "point times": stored.check_point_times,
+    "intensity": stored.check_intensity,
+    "scanner 0": motion.check_sensors,
     "calibration": cameras.check_cameras,
     "images": cameras.check_cameras,
 }
@@ -150,7 +150,7 @@ def test_a_scanner_that_drops_out_is_named(good: Sample) -> None:
         origins = np.zeros((2, 3))
         return replace(sweep, lidar=lidar.astype(sweep.lidar.dtype), scanner_origins=origins)
 
-    found = {f.check: f for f in points.check_sensors(with_sweeps(good, two))}
+    found = {f.check: f for f in motion.check_sensors(with_sweeps(good, two))}
     assert found["scanner 1"].verdict == Verdict.SUSPICIOUS
     assert f"none in sweeps {FRAMES[1]}" in found["scanner 1"].evidence
 
@@ -164,7 +164,7 @@ def test_compensated_sweeps_are_told_from_fired_ones(good: Sample) -> None:
         return Spot(straight, spot.trajectory)
 
     sample = replace(good, spots=tuple(compensated(spot) for spot in good.spots))
-    (found,) = (f for f in rings.check_rings(sample) if f.check == "motion compensation")
+    (found,) = (f for f in motion.check_rings(sample) if f.check == "motion compensation")
     assert found.verdict == Verdict.WRONG
     assert found.remedy == "--set register.deskew=false"
     assert found.values["undone"] > 2 * found.values["as_stored"]
@@ -173,7 +173,7 @@ def test_compensated_sweeps_are_told_from_fired_ones(good: Sample) -> None:
 def test_where_a_scanner_stands_is_found(good: Sample) -> None:
     place_m = (1.1, -0.3, 1.75)
     sweep = good.spots[0].sweeps[2]
-    found_m = rings.found_origin(sweep.points[::2] + place_m, np.zeros(3))
+    found_m = motion.find_origin(sweep.points[::2] + place_m, np.zeros(3))
     np.testing.assert_allclose(found_m, place_m, atol=0.03)
 
 
@@ -278,7 +278,7 @@ def test_poses_that_are_slightly_off_are_told_by_how_much(
         T[2, 3] += climb * np.linalg.norm((T - first)[:2, 3])
         return T
 
-    found = paths.check_poses(with_fault(good, street, pose=pose))[0]
+    found = motion.check_poses(with_fault(good, street, pose=pose))[0]
     assert found.verdict == Verdict.SUSPICIOUS and words in found.evidence, found
     assert "register.source=kiss-icp" in found.remedy
 
@@ -303,16 +303,16 @@ def with_points(sweep: Sweep, points: np.ndarray) -> Sweep:
 def test_own_vehicle_is_what_stays_beside_it(good: Sample) -> None:
     hood = np.random.default_rng(0).uniform([3.6, -0.5, -0.4], [3.9, 0.5, -0.3], (400, 3))
     sample = with_sweeps(good, lambda sweep: with_points(sweep, hood))
-    (found,) = points.check_own_vehicle(sample)
+    (found,) = motion.check_own_vehicle(sample)
     assert found.verdict == Verdict.SUSPICIOUS
     assert found.remedy in ("--set register.min_range_m=3.9", "--set register.min_range_m=4.0")
-    (before,) = points.check_own_vehicle(good)
+    (before,) = motion.check_own_vehicle(good)
     assert before.verdict == Verdict.FINE
 
 
 def test_a_kerb_that_runs_along_the_road_is_no_own_vehicle(good: Sample) -> None:
     kerb = np.random.default_rng(0).uniform([-4.5, 3.0, -1.2], [4.5, 3.4, -1.1], (2000, 3))
-    (found,) = points.check_own_vehicle(with_sweeps(good, lambda sweep: with_points(sweep, kerb)))
+    (found,) = motion.check_own_vehicle(with_sweeps(good, lambda sweep: with_points(sweep, kerb)))
     assert found.verdict == Verdict.FINE, found
 
 
@@ -328,7 +328,7 @@ def test_a_road_that_rises_or_mirrors_is_no_own_vehicle(
         road[:num_below, 2] -= 3
         return replace(sweep, points=np.concatenate([road, sweep.points[6000:]]) @ R.T)
 
-    (found,) = points.check_own_vehicle(with_sweeps(good, on_a_slope))
+    (found,) = motion.check_own_vehicle(with_sweeps(good, on_a_slope))
     assert found.verdict == Verdict.FINE, found
 
 
@@ -337,7 +337,7 @@ def test_returns_of_the_own_vehicle_are_no_rings(good: Sample) -> None:
     roof = np.stack([np.cos(turn) * np.cos(down), np.sin(turn) * np.cos(down), np.sin(down)], 1)
 
     for sample in (good, with_sweeps(good, lambda sweep: with_points(sweep, roof))):
-        (found,) = points.check_sensors(sample)
+        (found,) = motion.check_sensors(sample)
         assert "16 rings, -15.0 to 15.0 deg up" in found.evidence
 
 
@@ -360,7 +360,7 @@ def test_checks_that_cannot_be_made_are_named(street: Faulty) -> None:
 
 
 def test_a_recording_of_every_tenth_sweep_has_whole_turns(good: Sample, street: Faulty) -> None:
-    (found,) = clocks.check_point_times(
+    (found,) = stored.check_point_times(
         with_fault(good, street, stamp_ns=lambda frame, ns: ns + (frame - 112) * 900_000_000)
     )
     assert found.verdict == Verdict.FINE and "one of 10 turns" in found.evidence
@@ -368,7 +368,7 @@ def test_a_recording_of_every_tenth_sweep_has_whole_turns(good: Sample, street: 
 
 def test_points_without_times_are_named(good: Sample) -> None:
     untimed = with_sweeps(good, lambda sweep: replace(sweep, offset_ns=None))
-    for check in (clocks.check_point_times, clocks.check_deskewing):
+    for check in (stored.check_point_times, motion.check_deskewing):
         (found,) = check(untimed)
         assert found.verdict == Verdict.UNKNOWN and "no times" in found.evidence
 
@@ -414,7 +414,7 @@ def test_the_clock_of_poses_is_measured_in_a_bend(late_ms: int) -> None:
 
     bend = Bend()
     sample = Sample(bend, Timeline.of(bend), (spot(8), spot(18), spot(28)), {})  # type: ignore[arg-type]
-    *others, clock = paths.check_poses(sample)
+    *others, clock = motion.check_poses(sample)
     assert clock.check == "clock of poses", others
     assert abs(clock.values["late_s"] - late_ms * 1e-3) < 0.025
     assert clock.values["low_s"] - 0.01 <= late_ms * 1e-3 <= clock.values["high_s"] + 0.01
@@ -434,4 +434,4 @@ def test_the_order_of_quaternions_is_named(right: str) -> None:
     read = T.copy()
     read[:3, :3] = Rotation.from_quat(as_xyzw).as_matrix()
     mistake = f"their quaternions are {right}, read as {other}"
-    np.testing.assert_allclose(paths.HYPOTHESES[mistake](read), T, atol=1e-12)
+    np.testing.assert_allclose(motion.HYPOTHESES[mistake](read), T, atol=1e-12)
