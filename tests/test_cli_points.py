@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.cli.motion import read_points
+from densify.cli.recordings import read_points
 from tests.command import exit_code, refused
 
 

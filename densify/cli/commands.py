@@ -190,7 +190,7 @@ DIR  {_ONE_RUN}, or of several keys of a drive
     ),
     Verb(
         "flow",
-        "motion",
+        "recordings",
         "estimate scene flow of a recording or between two point files",
         f"""
 [SOURCE|SPEC]  earlier points, or a recording
@@ -243,7 +243,7 @@ TRUTH  a PNG or a folder
     ),
     Verb(
         "labels",
-        "motion",
+        "recordings",
         "make scene flow labels from tracked boxes and poses",
         f"""
 {_RECORDING}
@@ -257,7 +257,7 @@ TRUTH  a PNG or a folder
     ),
     Verb(
         "train flow",
-        "motion",
+        "recordings",
         "train a network for scene flow, with or without labels",
         f"""
 {_RECORDINGS}
