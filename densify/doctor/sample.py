@@ -116,7 +116,7 @@ class Sample:
         timeline = Timeline.of(sequence)
         unreadable: dict[int, str] = {}
         spots = []
-        for frames in _choose_frames(timeline):
+        for frames in choose_frames(timeline):
             sweeps = []
             for frame in frames:
                 try:
@@ -165,7 +165,7 @@ class Sample:
         )
 
 
-def _choose_frames(timeline: Timeline) -> list[list[int]]:
+def choose_frames(timeline: Timeline) -> list[list[int]]:
     """Return the frame numbers of each spot: sweeps about 0.1 s apart, without a hole in time."""
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
     unbroken = timeline.runs(timeline.frames)
