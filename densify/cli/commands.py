@@ -354,6 +354,7 @@ TRUTH  a PNG or a folder
         "[TABLE+]  flow, registration (default: all)",
     ),
 )
+VERBS = (*_USUAL, *_MORE)
 _GROUPS = {
     "train": "train a network for scene flow",
     "bench": "measure tables: this package's methods beside published ones",
@@ -382,7 +383,7 @@ def command_line() -> argparse.ArgumentParser:
         prog="densify", metavar="VERB", required=True, help=argparse.SUPPRESS
     )
     groups: dict[str, Any] = {"": commands}
-    for verb in (*_USUAL, *_MORE):
+    for verb in VERBS:
         group, _, name = verb.name.rpartition(" ")
         if group not in groups:
             group_parser = _add(commands, group, _GROUPS[group])
