@@ -163,7 +163,7 @@ class Screen(logging.Handler):
 def screen() -> Iterator[Screen]:
     """Send the package's log to a new screen within the ``with`` block."""
     log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
-    level, propagate, progress_level = log.level, log.propagate, progress.level
+    before = log.level, log.propagate, progress.level
     shown = Screen()
     log.addHandler(shown)
     log.setLevel(logging.INFO)
@@ -177,8 +177,8 @@ def screen() -> Iterator[Screen]:
             yield shown
     finally:
         log.removeHandler(shown)
-        log.setLevel(level)
-        log.propagate = propagate
+        log_level, log.propagate, progress_level = before
+        log.setLevel(log_level)
         progress.setLevel(progress_level)
 
 

@@ -94,9 +94,9 @@ def camera_views(
         number = min(stamps_ns, key=lambda n: abs(stamps_ns[n] - sweep_ns), default=None)
         if number is not None and abs(stamps_ns[number] - sweep_ns) <= sample.timeline.period_ns:
             pairs.append((registered, number))
-    most = max(_LEAST_IMAGES, _MOST_IMAGES // len(sample.sequence.cameras))
+    num_views = max(_LEAST_IMAGES, _MOST_IMAGES // len(sample.sequence.cameras))
     views: list[View] = []
-    for row in np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).astype(int)):
+    for row in np.unique(np.linspace(0, len(pairs) - 1, min(num_views, len(pairs))).astype(int)):
         registered, number = pairs[row]
         try:
             image = sample.sequence.image(camera.name, number)

@@ -270,20 +270,20 @@ def _returns_of(sample: Sample, lidar: int) -> Float:
 
 def _check_origin(lidar: int, points: Float, R: Float, origins_m: tuple[Float, Float]) -> Finding:
     """Compare a scanner's given position (3,) with that of the sharpest rings, scanner axes."""
-    given, best = (sharpness(points, origin_m) for origin_m in origins_m)
+    given_sharpness, best = (sharpness(points, origin_m) for origin_m in origins_m)
     off_m = float(np.linalg.norm(origins_m[1] - origins_m[0]))
     given_m, best_m = (origin_m @ R for origin_m in origins_m)
     values = {"given_m": given_m.tolist(), "found_m": best_m.tolist(), "off_m": off_m}
-    values |= {"sharpness_given": given, "sharpness_found": best}
+    values |= {"sharpness_given": given_sharpness, "sharpness_found": best}
     text = (
         f"rings are sharpest ({best:.2f}) seen from {_position(best_m)}; from the given "
-        f"{_position(given_m)}: {given:.2f}"
+        f"{_position(given_m)}: {given_sharpness:.2f}"
     )
     line = f"scanner_origins: {[[round(float(v), 2) for v in best_m]]}"
     verdict, remedy = FINE, f"give the scanner's place in the points' frame ({line})"
     if best < LEAST_SHARPNESS:
         verdict, text = UNKNOWN, f"{text}; no distinct rings"
-    elif off_m > _OFF_M and best > CLEARLY * given:
+    elif off_m > _OFF_M and best > CLEARLY * given_sharpness:
         verdict = WRONG
     return finding(_position_of(lidar), verdict, text, remedy, **values)
 
@@ -329,12 +329,12 @@ def _check_compensation(
         return finding(name, UNKNOWN, reason)
     spot, period_s = sample.fastest, sample.timeline.period_ns * 1e-9
     sweep = spot.middle.select(spot.middle.lidar == lidar)
-    near = sample_rows(sweep, COMPENSATED_M)
-    points, is_untimed = sweep.points[near], sweep.offset_ns is None
+    rows = sample_rows(sweep, COMPENSATED_M)
+    points, is_untimed = sweep.points[rows], sweep.offset_ns is None
     if sweep.offset_ns is None:
         offset_s = turning_s(points, period_s)
     else:
-        offset_s = np.asarray(sweep.offset_ns[near] * 1e-9, np.float64)
+        offset_s = np.asarray(sweep.offset_ns[rows] * 1e-9, np.float64)
     rings = rings_by_motion(points, offset_s, spot.twist, R, origins_m)
     if not rings.are_distinct:  # the origin was looked for in smeared rings
         straight = poses.transform_each(-offset_s[:, None] * spot.twist, points) @ R.T

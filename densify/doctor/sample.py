@@ -175,6 +175,6 @@ def choose_frames(timeline: Timeline) -> list[list[int]]:
         for run in unbroken
         for start in range(len(run) - length + 1)
     ]
-    most = max(1, len(timeline.frames) // length)
-    rows = np.rint(np.linspace(0, len(spots) - 1, min(_NUM_SPOTS, most))).astype(int)
+    num_spots = min(_NUM_SPOTS, max(1, len(timeline.frames) // length))
+    rows = np.rint(np.linspace(0, len(spots) - 1, num_spots)).astype(int)
     return [spots[row] for row in np.unique(rows)]
