@@ -214,7 +214,7 @@ def passing(yaw_deg: float, late_s: float, is_fence: bool) -> tuple[Camera, list
     camera = Camera("left", 1000, 400, K, T_cam_lidar)
     right = turned(camera, yaw_deg * np.eye(4)[1])
     rng, views = np.random.default_rng(0), []
-    twist, half = np.array([0, 0, 0, 4.0, 0, 0]), np.linspace(-0.5, 0.5, 15)
+    twist, half = np.array([0, 0, 0, 4.0, 0, 0]), np.linspace(-0.5, 0.5, 9)
     for _ in range(8):
         image, edges, is_level = np.full((400, 1000, 3), 60, np.uint8), [], []
         for x_m in rng.uniform(-11, 11, 8):
