@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.doctor.paths import changed
+from densify.doctor.motion import changed
 from densify.geometry import poses
 from densify.geometry.types import Float, LidarSequence, Sweep
 

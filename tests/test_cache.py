@@ -43,19 +43,12 @@ class Why(NamedTuple):
     unreadable: bool
 
 
-@dataclass(frozen=True)
-class Inner:
-    points: NDArray[np.float64]
-    scale: np.float32
-    names: tuple[str, ...]
-
-
 @dataclass
 class Outer:
-    inner: tuple[Inner, ...]
+    points: NDArray[np.float64]
+    scale: np.float32
     pair: tuple[int, float]
     by_frame: Mapping[int, str | Why]
-    maybe: NDArray[np.int64] | None
     rows: Sequence[list[bool]]
     later: NDArray[np.float32] = field(init=False)
 
@@ -76,19 +69,17 @@ def same(a: Any, b: Any) -> bool:
     return repr(a) == repr(b)
 
 
-@pytest.mark.parametrize("maybe", [None, np.arange(3)])
-def test_what_is_kept_comes_back(maybe, tmp_path: Path) -> None:
+def test_what_is_kept_comes_back(tmp_path: Path) -> None:
     turned = np.asfortranarray(np.arange(12.0).reshape(4, 3))
-    inner = Inner(turned, np.float32(0.1), ("a", "ä"))
-    scalars = Inner(np.array(-0.0), np.float32(np.nan), ())
-    by_frame = {3: "x", -4: Why("y", True)}
-    value = Outer((inner, scalars), (1 << 60, 1 / 3), by_frame, maybe, ([True], []))
+    by_frame = {3: "ä", -4: Why("y", True)}
+    value = Outer(turned, np.float32(np.nan), (1 << 60, 1 / 3), by_frame, ([True], []))
     value.later = np.zeros((0, 3), np.float32)
+    values = [value, (np.array(-0.0), None, "x", ())]
     cache = Cache(LIMIT, tmp_path)
-    assert cache.get("outer", 1, lambda: value) is value
-    found = cache.get("outer", 1, lambda: None)
-    assert same(found, value)
-    found.later += 1  # writable
+    assert cache.get("outer", 1, lambda: values) is values
+    again = cache.get("outer", 1, lambda: None)
+    assert same(again, values)
+    again[0].later += 1  # writable
 
 
 def test_what_has_other_parts_is_not_kept(tmp_path: Path) -> None:
@@ -161,10 +152,9 @@ def test_damaged_and_foreign_entries_are_made_again(tmp_path: Path, monkeypatch,
     objects = tmp_path / "objects.npz"
     np.savez(objects, json=np.array([Planted()], object))
     bad = [whole[:n] for n in (0, 10, len(whole) // 2, len(whole) - 1)]
-    bad += [bytes(len(whole)), chance.randbytes(len(whole)), pickle.dumps(Planted())]
-    bad += [objects.read_bytes()]
-    for place in chance.choices(range(300, len(whole) - 600), k=20):
-        bad.append(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    bad += [chance.randbytes(len(whole)), pickle.dumps(Planted()), objects.read_bytes()]
+    for at in chance.choices(range(300, len(whole) - 600), k=10):
+        bad.append(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
     for data in bad:
         path.write_bytes(data)
         get(cache)
@@ -182,8 +172,6 @@ def test_what_was_used_longest_ago_goes_first(tmp_path: Path) -> None:
         (made,) = [path for path in tmp_path.iterdir() if path.stat().st_mtime > 100]
         os.utime(made, (inputs, inputs))
     assert get(cache, 0) == 0  # used again
-    cache.trim()
-    assert len(list(tmp_path.iterdir())) == 4
     Cache(int(2.5 * made.stat().st_size), tmp_path).trim()
     assert [get(cache, inputs) for inputs in (0, 3, 1)] == [0, 0, 1]
     Cache(0, tmp_path).trim()
@@ -205,36 +193,20 @@ def test_one_of_several_at_once_makes_it(tmp_path: Path) -> None:
     assert [path.suffix for path in tmp_path.iterdir()] == [".npz"]
 
 
-def test_one_vanished_entry_does_not_stop_the_trimming(tmp_path: Path, monkeypatch) -> None:
-    for inputs in range(4):
-        get(Cache(LIMIT, tmp_path), inputs)
-    gone, unlink = min(tmp_path.iterdir()), Path.unlink
-    os.utime(gone, (1, 1))  # the first to go
-
-    def vanished(path: Path, missing_ok: bool = False) -> None:
-        if path == gone:
-            raise FileNotFoundError(path)
-        unlink(path, missing_ok)
-
-    monkeypatch.setattr(Path, "unlink", vanished)
-    Cache(0, tmp_path).trim()
-    assert list(tmp_path.iterdir()) == [gone]
-
-
 # Folders
 
 
 def test_the_folder_is_the_users_alone(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("DENSIFY_CACHE_DIR", str(tmp_path / "cache"))
     get(Cache())
-    assert {p.stat().st_mode & 0o777 for p in (tmp_path / "cache").rglob("steps")} == {0o700}
-    monkeypatch.setattr(os, "getuid", lambda: tmp_path.stat().st_uid + 1)
+    assert (tmp_path / "cache" / "steps").stat().st_mode & 0o777 == 0o700
     os.chown(tmp_path / "cache", 12345, -1)
+    monkeypatch.setattr(os, "getuid", lambda: 1)
     with pytest.raises(InputError, match="others can write"):
         Cache()
 
 
-@pytest.mark.parametrize(("mode", "name"), [(0o770, ""), (0o702, "steps"), (0o770, "street")])
+@pytest.mark.parametrize(("mode", "name"), [(0o770, ""), (0o702, "steps")])
 def test_a_folder_that_others_can_write_to_is_refused(
     mode: int, name: str, tmp_path: Path, monkeypatch, capsys
 ) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Flow between two point files on the command line."""
+"""Flow between two point files on the command line, and every way such a file can be broken."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from densify.cli.recordings import read_points
 from tests.command import exit_code, refused
 
 
@@ -34,24 +35,40 @@ def test_flow_between_two_files(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "says"),
+    ("name", "content", "part"),
     [
         ("absent.npy", None, "No such file"),
         ("flat.npy", np.zeros(9), "shape (9,)"),
+        ("none.npy", np.zeros((0, 3)), "holds no points"),
         ("nan.npy", np.array([[1, 2, 3], [1, np.nan, 3]]), "1 of 2 points are not finite"),
+        ("objects.npy", np.array([[{}, {}, {}]], dtype=object), "Object arrays"),
+        ("garbage.npz", b"no zip", "not a readable .npz"),
         ("cloud.stl", b"solid", "got .stl, expected one of .pcd, .bin, .ply"),
     ],
 )
-def test_bad_point_files(name, content, says, tmp_path: Path, capsys) -> None:
+def test_bad_point_files(name, content, part, tmp_path: Path, capsys) -> None:
     np.save(tmp_path / "good.npy", np.ones((5, 3)))
     if isinstance(content, bytes):
         (tmp_path / name).write_bytes(content)
     elif content is not None:
-        np.save(tmp_path / name, content)
+        np.save(tmp_path / name, content, allow_pickle=True)
     out = tmp_path / "f.npz"
     line = refused(capsys, 2, "flow", tmp_path / "good.npy", tmp_path / name, "--out", out)
-    assert name in line and says in line
+    assert name in line and part in line
     assert not out.exists()
+
+
+def test_point_files_of_every_kind_agree(tmp_path: Path) -> None:
+    wall = [[20.0, y / 8, -1.5, 0.25] for y in range(9)]
+    points = np.array(wall, np.float32)
+    np.save(tmp_path / "p.npy", points)
+    np.savez(tmp_path / "p.npz", points=points)
+    np.savetxt(tmp_path / "p.txt", points)
+    points.tofile(tmp_path / "p.bin")
+    for name in ("p.npy", "p.npz", "p.txt", "p.bin"):
+        read = read_points(tmp_path / name)
+        assert read.dtype == np.float64
+        assert np.array_equal(read, points[:, :3])
 
 
 @pytest.mark.parametrize("out", ["flow.txt", "folder.npz", "file/deep/flow.npz"])

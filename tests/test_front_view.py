@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.cli.verbs.run import _front_first
+from densify.cli.runs import _front_first
 from densify.geometry.types import CameraView
 from densify.outputs import plots
 from densify.outputs.front_view import front_first

@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from writers import FORMATS
 
-from densify.cli.verbs.flow import read_points
+from densify.cli.recordings import read_points
 from densify.config import resolve
 from densify.config.errors import ComputationError, InputError
 from densify.config.file_content import gunzipped, read_bytes, read_json

@@ -25,53 +25,34 @@ from tests.tiny_street import MOVERS, tiny
 EXAMPLE = Path(__file__).parents[1] / "examples" / "plugin"
 
 
-# --- the example, installed ----------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that the example is installed in."""
-    folder = tmp_path_factory.mktemp("site")
-    offline = ["--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
-    install = [sys.executable, "-m", "pip", "install", "-q", *offline, "--target", str(folder)]
-    done = subprocess.run([*install, str(EXAMPLE)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return folder
-
-
-@pytest.fixture(scope="module")
-def sweeps(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording in the example's format, with traffic."""
-    folder, recorded = tmp_path_factory.mktemp("sweeps"), tiny(MOVERS)
+def test_the_example_installs_reads_and_estimates(tmp_path: Path) -> None:
+    site, sweeps, recorded = tmp_path / "site", tmp_path / "sweeps", tiny(MOVERS)
+    sweeps.mkdir()
     for frame in range(4, 9):
         sweep = recorded[frame]
         columns = np.column_stack([sweep.points, sweep.intensity]).astype(np.float32)
-        np.save(folder / f"{frame:06d}.npy", columns)
-    return folder
+        np.save(sweeps / f"{frame:06d}.npy", columns)
+    offline = ["--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
+    python("pip", "install", "-q", *offline, "--target", site, EXAMPLE)
+    paths = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
+    options = ["--key", 7, "--window", 1, "--flow", "still", "--out", tmp_path / "out"]
+    python("densify", "run", "--data", sweeps, *options, PYTHONPATH=paths)
+    metrics = json.loads((tmp_path / "out" / "000007" / "metrics.json").read_text())
+    assert metrics["num_moving"] == 0 < metrics["num_points"]
+    printed = python("densify", "info", "--data", f"npy:{sweeps}", PYTHONPATH=paths)
+    assert "4-8 (5, no gaps)" in printed
 
 
-def command(installed: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    paths = [str(installed), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return subprocess.run(
-        [sys.executable, "-m", "densify", *map(str, arguments)],
+def python(*arguments: object, **environment: str) -> str:
+    """What a module of Python, run as a program, prints."""
+    done = subprocess.run(
+        [sys.executable, "-m", *map(str, arguments)],
         capture_output=True,
         text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        env={**os.environ, **environment},
     )
-
-
-def test_the_example_reads_and_estimates(installed: Path, sweeps: Path, tmp_path: Path) -> None:
-    options = ["--key", 7, "--window", 1, "--flow", "still"]
-    done = command(installed, "run", "--data", sweeps, *options, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    folder = tmp_path / "out" / "000007"
-    metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["num_moving"] == 0 < metrics["num_points"]
-    told = command(installed, "info", "--data", f"npy:{sweeps}")
-    assert told.returncode == 0 and "4-8 (5, no gaps)" in told.stdout, told.stdout + told.stderr
-
-
-# --- packages that are wrong ---------------------------------------------------------------------
+    return done.stdout
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ from densify.config import resolve
 from densify.depth.confidence import expected_outliers
 from densify.free_space.lone_returns import without_lone
 from densify.geometry import poses
-from densify.geometry.types import Camera
 from densify.outputs import write_result
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import run
@@ -28,13 +27,13 @@ from tests.small_street import KEY, POSES_GIVEN, one_car
 
 
 class Changed(TinySequence):
-    """The small street with other cameras, image stamps (ms) and times of points."""
+    """The small street with other cameras, image stamps (ms), sweeps and poses."""
 
-    def __init__(self, cameras=(CAMERA,), images_ms=None, times=None):
+    def __init__(self, sweep=None, *, cameras=(CAMERA,), images_ms=None, pose=None, gaps=()):
         usual = one_car()
         super().__init__(usual.scene, usual.frames)
         self.cameras = {camera.name: camera for camera in cameras}
-        self._images_ms, self._times = images_ms, times
+        self._sweep, self._images_ms, self._pose, self._gaps = sweep, images_ms, pose, gaps
 
     def image_stamps_ns(self, camera):
         if self._images_ms is None:
@@ -46,73 +45,39 @@ class Changed(TinySequence):
 
     def __getitem__(self, frame):
         sweep = super().__getitem__(frame)
-        return sweep if self._times is None else replace(sweep, offset_ns=self._times(sweep))
+        return self._sweep(sweep) if self._sweep else sweep
+
+    def T_world_lidar(self, frame):
+        T = super().T_world_lidar(frame)
+        return self._pose(T, 0.1 * frame) if self._pose else T
 
     def gaps(self):
-        return ["a file is missing"] if self._times is None else []
+        return self._gaps
 
 
-class DropsOut(Changed):
+def shifted(*by_m: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = by_m
+    return T
+
+
+def untimed(sweep):
+    return replace(sweep, offset_ns=None)
+
+
+def dropping_out(sweep):
     """A second scanner measures half of the points, but not in the key sweep."""
-
-    def __getitem__(self, frame):
-        sweep = super().__getitem__(frame)
-        lidar = (np.arange(len(sweep)) % 2) * (frame != KEY)
-        origins = np.zeros((2, 3))
-        return replace(sweep, lidar=lidar.astype(sweep.lidar.dtype), scanner_origins=origins)
+    lidar = (np.arange(len(sweep)) % 2) * (sweep.frame != KEY)
+    origins = np.zeros((2, 3))
+    return replace(sweep, lidar=lidar.astype(sweep.lidar.dtype), scanner_origins=origins)
 
 
-def moved(T_change) -> Camera:
-    return replace(CAMERA, T_cam_lidar=T_change @ CAMERA.T_cam_lidar)
-
-
-def warnings_of(sequence, **options) -> tuple[str, ...]:
-    return run(sequence, KEY, 1, "icp", config=POSES_GIVEN, **options).warnings
-
-
-def test_nothing_is_said_of_what_is_right():
-    assert warnings_of(one_car()) == ()
-
-
-@pytest.mark.parametrize(
-    ("sequence", "says"),
-    [
-        (lambda: Changed(), "a file is missing"),
-        (lambda: Changed(times=lambda sweep: None), "the points have no times of their own"),
-        (lambda: DropsOut(), f"sweeps {KEY} have no returns of scanner 1, which others have"),
-        (
-            lambda: Changed(images_ms={"front": {0: 10**12}}),
-            "front: no image belongs to the sweep, the nearest was taken 1e+09 s away",
-        ),
-        (
-            lambda: Changed([moved(np.diag([1.0, -1, -1, 1]) @ shifted(0, 500, 0))]),
-            "0.00 % of the pixels have a measured depth",
-        ),
-        (
-            lambda: Changed([CAMERA, replace(CAMERA, name="rear")], {"front": {3: 300}}),
-            "rear is left out: the recording has no images of it",
-        ),
-    ],
-)
-def test_what_looks_wrong_is_said(sequence, says, tmp_path):
-    result = run(sequence(), KEY, 1, "icp", config=POSES_GIVEN)
-    assert sum(says in warning for warning in result.warnings) == 1, result.warnings
-    write_result(result, tmp_path, config={}, data="tiny")
-    record = yaml.safe_load((tmp_path / f"{KEY:06d}" / "run.yaml").read_text())
-    assert set(result.warnings) <= set(record["warnings"])
-
-
-def test_points_that_are_left_out_are_counted(tmp_path):
-    class Cut(TinySequence):
-        def __getitem__(self, frame):
-            return replace(super().__getitem__(frame), num_untimed=700 * (frame == KEY + 1))
-
-    usual = one_car()
-    (told,) = warnings_of(Cut(usual.scene, usual.frames))
-    assert told.startswith(f"700 points of sweeps {KEY + 1} are left out: their times lie outside")
-    near = {"register": {"source": "dataset", "min_range_m": 8.0}}
-    (told,) = run(one_car(), KEY, 1, "icp", config=POSES_GIVEN | near).warnings
-    assert "register.min_range_m = 8 takes" in told and "% of the points as the own" in told
+def snowing(sweep):
+    """Snow: a share of the returns comes from flakes before the surfaces."""
+    rng = np.random.default_rng(sweep.frame)
+    flake = rng.random(len(sweep)) < 0.08
+    before = np.where(flake, rng.random(len(sweep)), 1.0)
+    return replace(sweep, points=sweep.points * before[:, None])
 
 
 def compensated(sweep, twist, moment):
@@ -122,23 +87,63 @@ def compensated(sweep, twist, moment):
     return replace(sweep, points=points)
 
 
-class Snowy(TinySequence):
-    """The small street in snow: a share of the returns comes from flakes before the surfaces."""
+STAMP, FIRST, LAST = (lambda ns: 0), np.min, np.max
+TWIST = [0, 0, 0, 4.0, 0, 0]  # of the small street's lidar
+TWO = [CAMERA, replace(CAMERA, name="rear")]
+UPSIDE_DOWN = replace(
+    CAMERA, T_cam_lidar=np.diag([1.0, -1, -1, 1]) @ shifted(0, 500, 0) @ CAMERA.T_cam_lidar
+)
+ODOMETRY = {"source": "kiss-icp"}
+TWICE = "compensated already, to {}, and now a second time".format
+LOOKS_WRONG = [
+    (Changed(gaps=["a file is missing"]), "a file is missing", {}),
+    (Changed(untimed), "the points have no times of their own", {}),
+    (Changed(dropping_out), f"sweeps {KEY} have no returns of scanner 1, which others have", {}),
+    (
+        Changed(images_ms={"front": {0: 10**12}}),
+        "front: no image belongs to the sweep, the nearest was taken 1e+09 s away",
+        {},
+    ),
+    (Changed(cameras=[UPSIDE_DOWN]), "0.00 % of the pixels have a measured depth", {}),
+    (
+        Changed(cameras=TWO, images_ms={"front": {3: 300}}),
+        "rear is left out: the recording has no images of it",
+        {},
+    ),
+    (
+        Changed(lambda sweep: replace(sweep, num_untimed=700 * (sweep.frame == KEY + 1))),
+        f"700 points of sweeps {KEY + 1} are left out: their times lie outside",
+        {},
+    ),
+    (one_car(), "register.min_range_m = 8 takes", {"min_range_m": 8.0}),
+    (Changed(lambda sweep: compensated(sweep, TWIST, STAMP)), TWICE("its stamp"), {}),
+    (Changed(lambda sweep: compensated(sweep, TWIST, FIRST)), TWICE("its first point"), ODOMETRY),
+    (Changed(lambda sweep: compensated(sweep, TWIST, LAST)), TWICE("its last point"), {}),
+]
 
-    share = 0.08
 
-    def __getitem__(self, frame):
-        rng, sweep = np.random.default_rng(frame), super().__getitem__(frame)
-        flake = rng.random(len(sweep)) < self.share
-        before = np.where(flake, rng.random(len(sweep)), 1.0)
-        return replace(sweep, points=sweep.points * before[:, None])
+@pytest.mark.parametrize(("sequence", "says", "register"), LOOKS_WRONG)
+def test_what_looks_wrong_is_said(sequence, says, register, tmp_path):
+    config = POSES_GIVEN | {"register": {"source": "dataset"} | register}
+    result = run(sequence, KEY, 1, "icp", config=config)
+    assert sum(says in warning for warning in result.warnings) == 1, result.warnings
+    write_result(result, tmp_path, config={}, data="tiny")
+    record = yaml.safe_load((tmp_path / f"{KEY:06d}" / "run.yaml").read_text())
+    assert set(result.warnings) <= set(record["warnings"])
+
+
+def test_nothing_is_said_of_what_is_right():
+    undeskewed = {"register": {"source": "dataset", "deskew": False}}
+    for sequence, config in ((one_car(), {}), (Changed(untimed), undeskewed)):
+        assert run(sequence, KEY, 1, "icp", config=POSES_GIVEN | config).warnings == ()
+    own_poses = run(one_car(), KEY, 1, "icp", config={"register": ODOMETRY})
+    assert not any("compensated" in warning for warning in own_poses.warnings)
 
 
 def test_snow_is_no_motion_and_is_told():
-    usual = one_car()
     clear, snowy = (
         run(sequence, KEY, 2, "flow", config=POSES_GIVEN)
-        for sequence in (usual, Snowy(usual.scene, usual.frames))
+        for sequence in (one_car(), Changed(snowing))
     )
     assert not any("snow" in warning for warning in clear.warnings)
     (told,) = [warning for warning in snowy.warnings if "snow" in warning]
@@ -155,24 +160,6 @@ def test_good_weather_is_left_as_it_is(place, test_data):
     sequence = densify.open_sequence(test_data / place)
     sweep = sequence[sequence.frames[0]]
     assert without_lone(sweep) is sweep
-
-
-STAMP, FIRST, LAST = (lambda ns: 0), np.min, np.max
-
-
-@pytest.mark.parametrize(
-    ("moment", "says"), [(STAMP, "its stamp"), (FIRST, "its first point"), (LAST, "its last point")]
-)
-@pytest.mark.parametrize("source", ["dataset", "kiss-icp"])
-def test_sweeps_that_are_compensated_already_are_told(moment, says, source):
-    class Carried(TinySequence):
-        def __getitem__(self, frame):
-            return compensated(super().__getitem__(frame), [0, 0, 0, 4.0, 0, 0], moment)
-
-    usual, settings = one_car(), POSES_GIVEN | {"register": {"source": source}}
-    told = run(Carried(usual.scene, usual.frames), KEY, 1, "icp", config=settings).warnings
-    assert sum(f"compensated already, to {says}, and now a second time" in w for w in told) == 1
-    assert not any("compensated" in w for w in run(usual, KEY, 1, "icp", config=settings).warnings)
 
 
 @pytest.mark.parametrize("drive", ["2011_09_26_drive_0002_sync", "2011_09_26_drive_0013_sync"])
@@ -198,38 +185,37 @@ WRONG_POSES = {
 
 @pytest.mark.parametrize("kind", WRONG_POSES)
 def test_poses_that_the_sweeps_contradict_are_told(kind):
-    class Wrong(TinySequence):
-        def T_world_lidar(self, frame):
-            T = super().T_world_lidar(frame)
-            return WRONG_POSES[kind](T, 0.1 * frame)
-
-    usual = one_car()
-    told = run(Wrong(usual.scene, usual.frames), KEY, 3, "icp", config=POSES_GIVEN).warnings
-    (found,) = [w for w in told if "the recording's poses are off by" in w]
-    assert kind in found and "--set register.source=kiss-icp" in found
-    own = POSES_GIVEN | {"register": {"source": "kiss-icp"}}
-    told = run(Wrong(usual.scene, usual.frames), KEY, 3, "icp", config=own).warnings
-    assert not any("poses" in w for w in told)
+    wrong = Changed(pose=WRONG_POSES[kind])
+    told = run(wrong, KEY, 3, "icp", config=POSES_GIVEN).warnings
+    (error,) = [w for w in told if "the recording's poses are off by" in w]
+    assert kind in error and "--set register.source=kiss-icp" in error
+    if kind == "deg from":
+        own = POSES_GIVEN | {"register": ODOMETRY}
+        assert not any("poses" in w for w in run(wrong, KEY, 3, "icp", config=own).warnings)
 
 
-@pytest.mark.parametrize("is_compensated", [False, True])
-def test_maps_of_sweeps_without_times_know_it(is_compensated):
+def test_maps_of_sweeps_without_times_know_it():
     """They are smeared, unless the sweeps are compensated already."""
 
     class Untimed(TinySequence):
+        moment = None
+
         def __getitem__(self, frame):
             sweep = super().__getitem__(frame)
-            if is_compensated:
-                sweep = compensated(sweep, [0, 0, 0, 30.0, 0, 0], STAMP)
-            return replace(sweep, offset_ns=None)
+            if self.moment is not None:
+                sweep = compensated(sweep, [0, 0, 0, 30.0, 0, 0], self.moment)
+            return untimed(sweep)
 
     fast = Scene(World(street(50.0)), Arc(0, -1.5, 0, 30.0), Scanner(48, 720))
-    timed, untimed = (
-        expected_outliers(run(sequence, KEY, 1, "flow", config=POSES_GIVEN).depth["front"])
-        for sequence in (TinySequence(fast, range(7)), Untimed(fast, range(7)))
+    straight = Untimed(fast, range(7))
+    straight.moment = STAMP
+    timed, smeared, undone = (
+        expected_outliers(run(sequence, KEY, 1, "flow", config=POSES_GIVEN).depth["front"])[
+            "measured"
+        ]
+        for sequence in (TinySequence(fast, range(7)), Untimed(fast, range(7)), straight)
     )
-    more = untimed["measured"] / timed["measured"]
-    assert more < 2 if is_compensated else more > 10
+    assert smeared > 10 * timed and undone < 2 * timed
 
 
 def test_more_moving_points_than_there_can_be_are_told():
@@ -252,12 +238,6 @@ def test_a_run_of_empty_maps_fails(border_drive, tmp_path, capsys):
     assert (tmp_path / "out" / f"{FRAMES[4]:06d}" / "run.yaml").is_file()
 
 
-def shifted(*by_m: float) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, 3] = by_m
-    return T
-
-
 def test_sweeps_far_apart_follow_less_well():
     usual = one_car()
     every_second = TinySequence(usual.scene, usual.frames[1::2])
@@ -266,18 +246,11 @@ def test_sweeps_far_apart_follow_less_well():
         assert any("sweeps are 0.2 s apart" in warning for warning in found) == says
 
 
-def test_times_that_were_not_wanted_are_not_missed():
-    config = {**POSES_GIVEN, "register": {"source": "dataset", "deskew": False}}
-    sequence = Changed(times=lambda sweep: None)
-    assert run(sequence, KEY, 1, "icp", config=config).warnings == ()
-
-
 def test_cameras_without_images_are_left_out_unless_none_has_any():
-    rear = replace(CAMERA, name="rear")
-    cameras = Changed([CAMERA, rear], {"front": {3: 300}})
+    cameras = Changed(cameras=TWO, images_ms={"front": {3: 300}})
     assert [camera.name for camera in choose_cameras(cameras, None)] == ["front"]
     assert [camera.name for camera in choose_cameras(cameras, ["rear"])] == ["rear"]
-    nowhere = Changed([CAMERA, rear], {})
+    nowhere = Changed(cameras=TWO, images_ms={})
     assert [camera.name for camera in choose_cameras(nowhere, None)] == ["front", "rear"]
 
 

@@ -14,8 +14,8 @@ from densify.config import Config
 from densify.config.errors import InputError
 from densify.doctor import Sample, Verdict
 from densify.doctor.cameras import camera_views, check_calibration
-from densify.doctor.findings import Finding
-from densify.doctor.paths import check_poses
+from densify.doctor.motion import check_poses
+from densify.doctor.sample import Finding
 from densify.geometry.types import Camera, Float, LidarSequence, Progress
 from densify.readers.recorded_poses import PoseTrack
 from densify.scores.edge_fit import Silhouettes, View, turned

@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from typing import NoReturn, TextIO
 
 from densify import __version__
+from densify.cli.commands import parse
 from densify.cli.screen import Screen, screen
-from densify.cli.verbs import parse
 from densify.config.errors import ComputationError, InputError, is_out_of_memory
 from densify.pipeline.heap import keep_freed_memory
 
@@ -87,8 +87,8 @@ def _run(arguments: Sequence[str] | None, shown: Screen) -> None:
     except SystemExit:  # help, version or a bad argument; a closed stdout shows only on flushing
         sys.stdout.flush()
         raise
-    shown.heed(options)
-    for answer in options.verb(options):
+    shown.begin(options)
+    for answer in options.verb.run(options):
         shown.show(answer)
 
 

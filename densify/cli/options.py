@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Define the options that several verbs share, and read their values."""
+"""Read the options of verbs: the table that lists them, their values, and what they name."""
 
 from __future__ import annotations
 
@@ -7,144 +7,18 @@ import argparse
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from densify.cli.screen import Answer
-from densify.config import Config, presets, resolve
-from densify.config.errors import InputError
+from densify.config import Config, resolve
+from densify.config.errors import ComputationError, InputError
 
 if TYPE_CHECKING:
     from densify.geometry.types import LidarSequence
 
-_DATA = (
-    "the recording: a folder or file, READER:PATH, or the built-in simulation "
-    "street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG] (default: street)"
-)
 _MOST_DIGITS = 18
-
-
-def add_verb(
-    commands: Any,
-    name: str,
-    verb: Callable[[argparse.Namespace], Iterable[Answer]] | None,
-    about: str,
-    epilog: str = "",
-) -> argparse.ArgumentParser:
-    """Add a verb to the command line and return its parser; ``verb`` None has verbs of its own."""
-    description = f"{about[0].upper()}{about[1:]}."
-    parser: argparse.ArgumentParser = commands.add_parser(
-        name, help=about, description=description, epilog=epilog or None
-    )
-    if verb is not None:
-        parser.set_defaults(verb=verb, name=name)
-        option(parser, "--json", "print the results as one JSON object")
-    return parser
-
-
-def option(parser: argparse.ArgumentParser, usage: str, about: str, **more: Any) -> None:
-    """Add an option by its usage, ``--name METAVAR``, or ``--name`` for a flag without a value."""
-    name, _, metavar = usage.partition(" ")
-    kind: dict[str, Any] = {"metavar": metavar} if metavar else {"action": "store_true"}
-    parser.add_argument(name, help=about, **kind, **more)
-
-
-def add_recording(parser: argparse.ArgumentParser, several: bool = False) -> None:
-    """Add the argument for the recording, positional and as ``--data``."""
-    parser.add_argument("recording", metavar="SPEC", nargs="*" if several else "?", help=_DATA)
-    number = "+" if several else 1
-    option(
-        parser,
-        "--data SPEC",
-        "the recording, as an option",
-        nargs=number,
-        action="extend",
-        default=[],
-    )
-
-
-def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add some of the options window, method, camera, config (with ``--set``) and overwrite."""
-    if "window" in names:
-        about = (
-            "number of sweeps on each side of the key (default: 5). More sweeps are denser and "
-            "slower. Take twice as many at 20 Hz"
-        )
-        option(parser, "--window W", about, type=natural, default=5)
-    if "method" in names:
-        about = "flow: scene flow (default); icp: rigid accumulation; none: single sweep"
-        parser.add_argument("--method", choices=("flow", "icp", "none"), default="flow", help=about)
-    if "camera" in names:
-        about = "take only this camera; may be given several times (default: all cameras)"
-        option(parser, "--camera NAME", about, action="append", dest="cameras")
-    if "config" in names:
-        option(
-            parser,
-            "--config FILE|NAME",
-            f"settings: a YAML file, or a preset: {', '.join(presets())}",
-        )
-        knob, about = "--set section.key=value", "change one setting; may be given several times"
-        option(parser, knob, about, action="append", default=[], dest="overrides")
-    if "overwrite" in names:
-        option(parser, "--overwrite", "replace existing files (default: stop before them)")
-
-
-def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
-    """Return the specs of the recordings that a command names, else log and return ``default``."""
-    given = options.recording or []
-    specs = [*([given] if isinstance(given, str) else given), *options.data]
-    if not specs:
-        logging.getLogger("densify").info("no recording given: taking the simulator, %s", default)
-    return specs or [default]
-
-
-def recording_of(options: argparse.Namespace) -> str:
-    """Return the spec of the one recording that a command names."""
-    specs = recordings_of(options)
-    if len(specs) > 1:
-        raise InputError(f"got {len(specs)} recordings, {', '.join(specs)}; expected one")
-    return specs[0]
-
-
-def config_of(options: argparse.Namespace) -> Config:
-    """Return the settings of ``--config``, ``--set``, ``--flow``, ``--score`` and ``--report``."""
-    short = []
-    if getattr(options, "flow", None) is not None:
-        short.append(f"flow.engine={options.flow}")
-    if getattr(options, "score", False):
-        short.append("output.score=true")
-    if getattr(options, "report", False):
-        short += ["output.report=true", "output.rejected=true"]
-    return resolve(options.config, [*options.overrides, *short])
-
-
-def check_new_file(path: Path, overwrite: bool, suffix: str = "") -> None:
-    """Raise InputError, before the computation, if a file exists or cannot be created."""
-    if path.suffix != (suffix or path.suffix):
-        raise InputError(f"--out {path}: expected a name that ends in {suffix}")
-    if path.is_dir():
-        raise InputError(
-            f"--out {path}: is a folder, expected the name of a {suffix or 'new'} file"
-        )
-    if path.exists() and not overwrite:
-        raise InputError(f"--out {path}: already there and kept; give --overwrite or another name")
-    place = next(place for place in path.parents if os.path.lexists(place))
-    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
-        raise InputError(f"--out {path}: cannot write in {place}; choose another")
-
-
-def sliced(sequence: LidarSequence, keys: range | None) -> list[int]:
-    """Return the frame numbers selected by ``--keys``; all frames for None."""
-    from densify.readers.timeline import format_frames
-
-    there = [frame for frame in sequence.frames if keys is None or frame in keys]
-    if keys is not None and not there:
-        raise InputError(
-            f"--keys {keys.start}:{keys.stop}: {sequence.name} has no sweep among them; it has "
-            f"{format_frames(sequence.frames)}"
-        )
-    return there
 
 
 def natural(text: str) -> int:
@@ -170,15 +44,16 @@ def words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
-def key_range(text: str, other: str = "") -> range:
-    """Parse ``A:B[:S]`` as a range; ``other`` says what else is accepted, for the message."""
+def key_range(text: str, alternative: str = "") -> range:
+    """Parse ``A:B[:S]`` as a range; the message names the ``alternative`` too."""
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
         first, end, step = (*map(int, numbers), 1)[:3]
         if first < end and step > 0:
             return range(first, end, step)
     raise argparse.ArgumentTypeError(
-        f"got {text!r}, expected {other}A:B[:S] with A < B, such as 0:100:5 for frames 0, 5 to 95"
+        f"got {text!r}, expected {alternative}A:B[:S] with A < B, such as 0:100:5 for frames 0, 5 "
+        f"to 95"
     )
 
 
@@ -197,3 +72,122 @@ def shard(text: str) -> tuple[int, int]:
 
 def _are_digits(*texts: str) -> bool:
     return all(t.isascii() and t.isdigit() and len(t) <= _MOST_DIGITS for t in texts)
+
+
+_PARSERS: dict[str, Callable[[str], Any]] = {
+    **dict.fromkeys(("K", "N", "W"), natural),
+    **dict.fromkeys(("C", "MS"), float),
+    **dict.fromkeys(("DIR", "FILE", "DIR|FILE", "F.npz|DIR", "PNG|DIR", "MODEL", "RUN"), Path),
+    **dict.fromkeys(("PREDICTED", "TRUTH", "TARGET"), Path),
+    **dict.fromkeys(("A:B", "A:B[:S]"), key_range),
+    **dict.fromkeys(("NAME,…", "KIND,…"), words),
+    "X": positive,
+    "all|A:B[:S]": all_or_range,
+    "i/n": shard,
+}
+"""METAVAR of an option -> function that parses its value; those of other METAVARs are texts."""
+
+
+def add_options(parser: argparse.ArgumentParser, table: str) -> None:
+    """Add the options of a table to a parser.
+
+    A row begins at the margin: ``--name METAVAR =DEFAULT``, two blanks, and the help, which may
+    end in "(required)". A switch has no METAVAR, a positional argument no name. ``METAVAR...`` may
+    be given several times, ``METAVAR+`` takes several values, ``[METAVAR]`` and ``[METAVAR+]`` may
+    be absent, ``{a,b}`` are the choices. `_PARSERS` has the types of values by METAVAR.
+    """
+    for row in re.split(r"\n(?=\S)", table.strip()):
+        usage, _, about = row.partition("  ")
+        about = " ".join(about.split())
+        name, *values = usage.split()
+        settings: dict[str, Any] = {}
+        if values and values[-1].startswith("="):
+            settings["default"] = values.pop().removeprefix("=")
+            about += f" (default: {settings['default']})"
+        if not name.startswith("--"):
+            settings |= _settings_of(name.strip("[]"))
+            if name.startswith("["):
+                settings["nargs"] = "*" if settings.pop("action", None) else "?"
+            name = settings["metavar"].partition("|")[0].lower()
+        elif values:
+            settings |= _settings_of(values[0]) | {"required": about.endswith("(required)")}
+        else:
+            settings["action"] = "store_true"
+        parser.add_argument(name, help=about, **settings)
+
+
+def _settings_of(usage: str) -> dict[str, Any]:
+    """Return the arguments of ``add_argument`` for a METAVAR with its suffix."""
+    if usage.startswith("{"):
+        return {"choices": usage.strip("{}").split(",")}
+    metavar = usage.removesuffix("...").removesuffix("+")
+    settings: dict[str, Any] = {"metavar": metavar, "type": _PARSERS.get(metavar, str)}
+    if usage.endswith("+"):
+        settings |= {"nargs": "+", "action": "extend"}
+    elif usage.endswith("..."):
+        settings |= {"action": "append", "nargs": "+" if usage.endswith("+...") else None}
+    return settings
+
+
+def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
+    """Return the specs of the recordings that a command names, else log and return ``default``."""
+    positional = [options.spec] if isinstance(options.spec, str) else options.spec or []
+    specs = [*positional, *(options.data or [])]
+    if not specs:
+        logging.getLogger("densify").info("no recording given: taking the simulator, %s", default)
+    return specs or [default]
+
+
+def recording_of(options: argparse.Namespace) -> str:
+    """Return the spec of the one recording that a command names."""
+    specs = recordings_of(options)
+    if len(specs) > 1:
+        raise InputError(f"got {len(specs)} recordings, {', '.join(specs)}; expected one")
+    return specs[0]
+
+
+def config_of(options: argparse.Namespace) -> Config:
+    """Return the settings of ``--config``, ``--set``, ``--flow``, ``--score`` and ``--report``."""
+    short = []
+    if getattr(options, "flow", None) is not None:
+        short.append(f"flow.engine={options.flow}")
+    if getattr(options, "score", False):
+        short.append("output.score=true")
+    if getattr(options, "report", False):
+        short += ["output.report=true", "output.rejected=true"]
+    return resolve(options.config, [*(options.set or []), *short])
+
+
+def check_new_file(path: Path, overwrite: bool, suffix: str = "") -> None:
+    """Raise InputError, before the computation, if a file exists or cannot be created."""
+    if path.suffix != (suffix or path.suffix):
+        raise InputError(f"--out {path}: expected a name that ends in {suffix}")
+    if path.is_dir():
+        raise InputError(
+            f"--out {path}: is a folder, expected the name of a {suffix or 'new'} file"
+        )
+    if path.exists() and not overwrite:
+        raise InputError(f"--out {path}: already there and kept; give --overwrite or another name")
+    parent = next(folder for folder in path.parents if os.path.lexists(folder))
+    if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+        raise InputError(f"--out {path}: cannot write in {parent}; choose another")
+
+
+def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:
+    """Return the frame numbers selected by ``--keys``; all frames for None."""
+    from densify.readers.timeline import format_frames
+
+    frames = [frame for frame in sequence.frames if keys is None or frame in keys]
+    if keys is not None and not frames:
+        raise InputError(
+            f"--keys {keys.start}:{keys.stop}: {sequence.name} has no sweep among them; it has "
+            f"{format_frames(sequence.frames)}"
+        )
+    return frames
+
+
+def raise_failures(failures: Mapping[int, Exception], num: int, unit: str) -> None:
+    """Raise ComputationError if some of ``num`` keys or sweeps (``unit``), by number, failed."""
+    if failures:
+        reasons = "; ".join(f"{unit} {number}: {error}" for number, error in failures.items())
+        raise ComputationError(f"{len(failures)} of {num} {unit}s not made: {reasons}")

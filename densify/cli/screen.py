@@ -19,6 +19,12 @@ from densify.config.errors import brief
 if TYPE_CHECKING:
     from densify.geometry.types import Progress
 
+_BAR = "{desc:<10} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
+_SCHEMA = 1
+"""Version of what ``--json`` prints; grows when a key changes its meaning or goes."""
+_MOST_FIRST = 3
+_MOST_WARNINGS = 20
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -36,18 +42,18 @@ class Answer:
         lines = [self.text] if self.text else []
         lines += map(str, self.files)
         if self.first:
-            rows = [[f"  {path}", what] for path, what in self.first.items()]
+            rows = [[f"  {path}", content] for path, content in self.first.items()]
             lines += ["open first:", aligned(rows, "<")]
         return lines
 
 
-def first_of(files: Sequence[Path], kinds: Mapping[str, str], most: int = 3) -> dict[Path, str]:
-    """Return the files to open first -> their content, one for each path pattern of ``kinds``."""
+def first_of(files: Sequence[Path], kinds: Mapping[str, str]) -> dict[Path, str]:
+    """Return three files to open first -> their content, one for each path pattern of ``kinds``."""
     first: dict[Path, str] = {}
-    for pattern, what in kinds.items():
-        found = next((f for f in files if f.match(pattern) and f not in first), None)
-        if found is not None and len(first) < most:
-            first[found] = what
+    for pattern, content in kinds.items():
+        path = next((f for f in files if f.match(pattern) and f not in first), None)
+        if path is not None and len(first) < _MOST_FIRST:
+            first[path] = content
     return first
 
 
@@ -103,28 +109,24 @@ def look_up(metrics: Mapping[str, Any], *path: str) -> Any:
     return value
 
 
-_LAYOUT = "{desc:<10} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
-_SCHEMA = 1
-"""Version of what ``--json`` prints; grows when a key changes its meaning or goes."""
-
-
 class Screen(logging.Handler):
     """The output of one command: text, or one JSON object at the end; log lines above the bar."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
-        self._json = False
+        self._is_json = False
         self._facts: dict[str, Any] = {}
         self._warnings: list[str] = []
 
-    def heed(self, options: argparse.Namespace) -> None:
+    def begin(self, options: argparse.Namespace) -> None:
         """Read ``--json`` from the options of a command."""
-        self._json = options.json
-        self._facts = {"schema": _SCHEMA, "verb": options.name, "files": [], "open_first": []}
+        verb = options.verb.name.rpartition(" ")[2]
+        self._is_json = options.json
+        self._facts = {"schema": _SCHEMA, "verb": verb, "files": [], "open_first": []}
 
     def show(self, answer: Answer) -> None:
         """Print the answer, or keep it until the end for ``--json``."""
-        if self._json:
+        if self._is_json:
             files = {"files": answer.files, "open_first": [*answer.first]}
             for name, value in {**answer.facts, **files}.items():
                 joined = isinstance(value, list | tuple) and name in self._facts
@@ -139,7 +141,7 @@ class Screen(logging.Handler):
         """Print the error and the JSON object, if present, and return the exit code."""
         if error is not None:
             logging.getLogger("densify").error("%s", error)
-        if self._json:
+        if self._is_json:
             from densify.outputs.atomic import plain
 
             outcome = {"exit_code": exit_code, "error": error, "warnings": self._warnings}
@@ -161,7 +163,8 @@ class Screen(logging.Handler):
 def screen() -> Iterator[Screen]:
     """Send the package's log to a new screen within the ``with`` block."""
     log, progress = logging.getLogger("densify"), logging.getLogger("densify.progress")
-    before, shown = (log.level, log.propagate, progress.level), Screen()
+    before = log.level, log.propagate, progress.level
+    shown = Screen()
     log.addHandler(shown)
     log.setLevel(logging.INFO)
     log.propagate = False
@@ -174,9 +177,9 @@ def screen() -> Iterator[Screen]:
             yield shown
     finally:
         log.removeHandler(shown)
-        log.setLevel(before[0])
-        log.propagate = before[1]
-        progress.setLevel(before[2])
+        log_level, log.propagate, progress_level = before
+        log.setLevel(log_level)
+        progress.setLevel(progress_level)
 
 
 @contextmanager
@@ -184,8 +187,8 @@ def progress_on_stderr() -> Iterator[Progress]:
     """Yield a callback (stage, done, total) that shows progress on stderr."""
     from tqdm import tqdm
 
-    hidden = not sys.stderr.isatty()
-    with tqdm(total=1, file=sys.stderr, leave=False, bar_format=_LAYOUT, disable=hidden) as bar:
+    is_hidden = not sys.stderr.isatty()
+    with tqdm(total=1, file=sys.stderr, leave=False, bar_format=_BAR, disable=is_hidden) as bar:
 
         def show(stage: str, done: int, total: int) -> None:
             if done < bar.n or total != bar.total:  # another stage
@@ -203,16 +206,17 @@ def _above_bars() -> AbstractContextManager[None]:
     return nullcontext() if bars is None else bars.tqdm.external_write_mode(sys.stderr)
 
 
-def tell_doubts(doubts: Iterable[tuple[str, str, int]], most: int = 20) -> None:
-    """Log each distinct warning once with its keys; ``doubts`` are (warning, recording, key)."""
+def log_warnings(warned: Iterable[tuple[str, str, int]]) -> None:
+    """Log each distinct warning once with its keys; ``warned`` are (warning, recording, key)."""
     from densify.readers.timeline import format_frames
 
     log = logging.getLogger("densify")
     keys: dict[tuple[str, str], list[int]] = {}
-    for warning, recording, key in doubts:
+    for warning, recording, key in warned:
         keys.setdefault((warning, recording), []).append(key)
     ordered = sorted(keys.items(), key=lambda entry: -len(entry[1]))
-    for (warning, recording), found in ordered[:most]:
-        log.warning("%s: %s", f"{recording} key {format_frames(found)}".lstrip(), warning)
-    if len(ordered) > most:
-        log.warning("... and %d more warnings, see run.yaml or the manifest", len(ordered) - most)
+    for (warning, recording), of_warning in ordered[:_MOST_WARNINGS]:
+        log.warning("%s: %s", f"{recording} key {format_frames(of_warning)}".lstrip(), warning)
+    num_more = len(ordered) - _MOST_WARNINGS
+    if num_more > 0:
+        log.warning("... and %d more warnings, see run.yaml or the manifest", num_more)

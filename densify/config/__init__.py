@@ -1,14 +1,286 @@
 # SPDX-License-Identifier: MIT
-"""Hold the settings (`densify.config.sections`) and resolve their values (`.resolving`)."""
+"""Define every setting of the pipeline, and resolve presets, files and changes to a `Config`.
 
-from densify.config.resolving import as_mapping as as_mapping
-from densify.config.resolving import presets as presets
-from densify.config.resolving import resolve as resolve
-from densify.config.sections import AccumulateSettings as AccumulateSettings
-from densify.config.sections import Config as Config
-from densify.config.sections import FlowSettings as FlowSettings
-from densify.config.sections import ObjectiveSettings as ObjectiveSettings
-from densify.config.sections import OutputSettings as OutputSettings
-from densify.config.sections import PriorSettings as PriorSettings
-from densify.config.sections import ProjectSettings as ProjectSettings
-from densify.config.sections import RegisterSettings as RegisterSettings
+Each stage has a frozen dataclass. A new setting needs a comment in configs/default.yaml, a new
+section a line in `Config`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from densify.config.errors import InputError, did_you_mean
+from densify.config.file_content import parse_yaml, read_yaml
+from densify.config.plugins import check_engine_spec
+
+_FEW_POINTS_PER_S = 800_000  # 64 rings have 1.2 million, 32 have 700,000
+_AROUND_FEW_S, _AROUND_S = 0.5, 0.3
+
+
+def within(default: float | None, low: float, high: float) -> Any:
+    """Return a dataclass field for a number with inclusive bounds."""
+    return field(default=default, metadata={"limits": (low, high)})
+
+
+def one_of(*words: str) -> Any:
+    """Return a dataclass field for a choice of words, the first word by default."""
+    return field(default=words[0], metadata={"words": words})
+
+
+@dataclass(frozen=True)
+class Section:
+    """The settings of one stage, checked on construction."""
+
+    def __post_init__(self) -> None:
+        for knob in fields(self):
+            value = checked(type(self), knob.name, getattr(self, knob.name), "")
+            object.__setattr__(self, knob.name, value)
+
+
+def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
+    """Return a user's value converted to the type of its setting; errors begin with ``where``."""
+    knob = section.__dataclass_fields__[key]
+    kind, _, optional = str(knob.type).partition(" | ")
+    if optional and value is None:
+        return None
+    got = value
+    if kind == "float" and isinstance(value, str | int) and not isinstance(value, bool):
+        with suppress(ValueError, OverflowError):
+            value = float(value)  # text too: YAML 1.1 reads 1e-3 as text
+    fits = type(value).__name__ == kind
+    if words := knob.metadata.get("words"):
+        fits, expected = fits and value in words, f"one of {', '.join(words)}"
+    elif limits := knob.metadata.get("limits"):
+        fits = fits and limits[0] <= value <= limits[1]
+        expected = f"a {'whole ' * (kind == 'int')}number from {limits[0]:g} to {limits[1]:g}"
+    else:
+        expected = "true or false" if kind == "bool" else "text"
+    if fits:
+        return value
+    name = f"{section.__name__.removesuffix('Settings').lower()}.{key}"
+    raise InputError(
+        f"{where}{name}: got {got!r}, expected {expected}{' or null' * bool(optional)}"
+    )
+
+
+@dataclass(frozen=True)
+class RegisterSettings(Section):
+    """Settings for the pose of the lidar at every sweep."""
+
+    source: str = one_of("kiss-icp", "dataset")
+    voxel_size_m: float = within(0.5, 0.05, 10)
+    min_range_m: float = within(2.8, 0, 50)
+    max_range_m: float = within(120.0, 5, 500)
+    deskew: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.min_range_m >= self.max_range_m:
+            raise InputError(
+                f"register.min_range_m: got {self.min_range_m:g}, expected less than "
+                f"register.max_range_m = {self.max_range_m:g}"
+            )
+
+
+@dataclass(frozen=True)
+class FlowSettings(Section):
+    """Settings for scene flow."""
+
+    engine: str = "groups"
+    look_around_s: float | None = within(None, 0, 5)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_engine_spec(self.engine)
+
+    def around(self, points_per_s: float) -> tuple[float, float]:
+        """Return how far around the window motion is searched, and those sweeps' spacing, s."""
+        # Sparse sweeps show little of a moving object: every one is searched (spacing 0), farther.
+        is_sparse = points_per_s < _FEW_POINTS_PER_S
+        needed_s, step_s = (_AROUND_FEW_S, 0.0) if is_sparse else (_AROUND_S, _AROUND_S)
+        return needed_s if self.look_around_s is None else self.look_around_s, step_s
+
+
+@dataclass(frozen=True)
+class ObjectiveSettings(Section):
+    """Settings of engine paper; all but static_prior also apply to the flow of two point files."""
+
+    solver: str = one_of("pcg", "adam")
+    alpha: float = within(10.0, 0, 1e6)
+    num_neighbors: int = within(50, 1, 500)
+    static_prior: bool = True
+
+
+@dataclass(frozen=True)
+class AccumulateSettings(Section):
+    """Settings for the accumulated cloud at the key's time."""
+
+    unfollowed: str = one_of("drop", "rigid")
+    far_m: float = within(40.0, 0, 500)
+
+
+@dataclass(frozen=True)
+class ProjectSettings(Section):
+    """Settings for depth maps of the accumulated cloud."""
+
+    at: str = one_of("camera", "sweep")
+    per: str = one_of("sweep", "image")
+    depth: str = one_of("auto", "z", "range")
+    visibility: bool = True
+    rims: str = one_of("image", "strict", "keep")
+    fill_reach: float = within(1.5, 0.1, 5)
+    max_outliers: float | None = within(None, 0.0001, 1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.per == "image" and self.at == "sweep":
+            raise InputError(
+                "project.per=image: each map shows its image's own exposure; got project.at=sweep, "
+                "expected camera"
+            )
+
+
+@dataclass(frozen=True)
+class PriorSettings(Section):
+    """Settings for depth images from the user (--prior), which complete unmeasured pixels."""
+
+    kind: str = one_of("auto", "depth", "inverse")
+
+
+@dataclass(frozen=True)
+class OutputSettings(Section):
+    """Settings for files in addition to the files that every run writes."""
+
+    flow: str = one_of("none", "npz")
+    optical_flow: bool = False
+    rejected: bool = False
+    score: bool = False
+    report: bool = False
+    movers: str = one_of("keep", "drop", "separate")
+
+
+@dataclass(frozen=True)
+class Config:
+    """The whole configuration, one section per stage; ``Config()`` has the defaults."""
+
+    register: RegisterSettings = RegisterSettings()
+    flow: FlowSettings = FlowSettings()
+    objective: ObjectiveSettings = ObjectiveSettings()
+    accumulate: AccumulateSettings = AccumulateSettings()
+    project: ProjectSettings = ProjectSettings()
+    prior: PriorSettings = PriorSettings()
+    output: OutputSettings = OutputSettings()
+
+    @property
+    def is_scored(self) -> bool:
+        """True if results have baselines and are scored against the held-out key sweep."""
+        return self.output.score or self.output.report
+
+    def scored(self) -> Config:
+        """Return this configuration with ``output.score`` set."""
+        return replace(self, output=replace(self.output, score=True))
+
+
+_SECTIONS: dict[str, Any] = {f.name: type(f.default) for f in fields(Config)}
+
+
+def resolve(
+    config: Config | str | Path | Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
+) -> Config:
+    """Return the settings given by ``config``, then changed by the overrides.
+
+    Args:
+        config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a
+            YAML file of that form; or a str, the name of a preset or else of a file. Settings that
+            are not given have their defaults.
+        overrides: Texts ``section.key=value``, with values as in YAML; later overrides win.
+    """
+    values = as_mapping(config if isinstance(config, Config) else Config())
+    if isinstance(config, Mapping):
+        _apply_changes(values, config, "configuration")
+    elif isinstance(config, str | Path):
+        path = _config_path(config)
+        _apply_changes(values, read_yaml(path)[0] or {}, str(path))
+    elif not isinstance(config, Config | None):
+        raise InputError(
+            f"configuration: got {type(config).__name__}, expected a densify.Config, a mapping, or "
+            f"the name of a preset or YAML file"
+        )
+    apply_overrides(values, overrides)
+    return Config(**{name: section(**values[name]) for name, section in _SECTIONS.items()})
+
+
+def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
+    """Return ``{section: {key: value}}`` with every setting; `resolve` inverts it."""
+    return asdict(config)
+
+
+def presets() -> dict[str, Path]:
+    """Return preset name -> its YAML file."""
+    package = Path(__file__).parents[1]
+    inside = package / "configs"  # installed
+    folder = inside if inside.is_dir() else package.parent / "configs"  # checkout
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def _config_path(name: str | Path) -> Path:
+    path = presets().get(name, Path(name)) if isinstance(name, str) else name
+    if path.is_file():
+        return path
+    hint = _expected(str(name), presets(), "preset")
+    raise InputError(f"configuration {name}: no such preset or file; {hint}")
+
+
+def apply_overrides(
+    values: dict[str, dict[str, Any]],
+    overrides: Iterable[str],
+    sections: Mapping[str, type[Section]] = _SECTIONS,
+) -> None:
+    """Overwrite settings ``{section: {key: value}}`` in place by texts ``section.key=value``."""
+    for override in overrides:
+        where = f"--set {override}"
+        name, equals, text = override.partition("=")
+        section, dot, key = name.strip().partition(".")
+        if not (equals and dot and section and key):
+            raise InputError(
+                f"{where}: expected section.key=value, for example project.fill_reach=1"
+            )
+        value = parse_yaml(text, where)[0] if text.strip() else ""
+        _apply_changes(values, {section: {key: value}}, where, sections)
+
+
+def _apply_changes(
+    values: dict[str, dict[str, Any]],
+    changes: Any,
+    where: str,
+    sections: Mapping[str, type[Section]] = _SECTIONS,
+) -> None:
+    """Overwrite settings ``{section: {key: value}}`` in place; errors begin with ``where``."""
+    for name, keys in _mapping(changes, where, "sections"):
+        if name not in values:
+            hint = _expected(str(name), values, "section")
+            raise InputError(f"{where}: unknown section {name}; {hint}")
+        for key, value in _mapping(keys, f"{where}: section {name}", "keys"):
+            if key not in values[name]:
+                hint = _expected(str(key), values[name], f"key of {name}")
+                owners = [section for section, known in values.items() if key in known]
+                hint = f"did you mean {owners[0]}.{key}?" if owners else hint
+                raise InputError(f"{where}: unknown key {name}.{key}; {hint}")
+            values[name][key] = checked(sections[name], key, value, f"{where}: ")
+
+
+def _mapping(value: Any, where: str, content: str) -> Iterable[tuple[Any, Any]]:
+    if not isinstance(value, Mapping):
+        raise InputError(
+            f"{where}: got {value!r}, expected a mapping of {content}, for example "
+            f"project: {{fill_reach: 1}}"
+        )
+    return value.items()
+
+
+def _expected(got: str, known: Mapping[str, Any], kind: str) -> str:
+    return f"{did_you_mean(got, known)}expected a {kind}: {', '.join(known)}"

@@ -62,38 +62,41 @@ class Table:
 
     def names(self) -> list[str]:
         """Return the built-in names, then the names from other packages."""
-        return [row.name for row in self.built_in] + sorted(self._added())
+        return [*self._rows()]
 
     def require(self, name: str, where: str) -> None:
         """Raise InputError, starting with ``where``, if no plug-in has this name; import none."""
-        if name not in (row.name for row in self.built_in) and name not in self._added():
-            usages = [row.usage for row in self.built_in] + sorted(self._added())
+        rows = self._rows()
+        if name not in rows:
+            usages = [getattr(row, "usage", row.name) for row in rows.values()]
             raise InputError(
-                f"{where}: got {name!r}, {did_you_mean(name, self.names())}expected one of "
+                f"{where}: got {name!r}, {did_you_mean(name, rows)}expected one of "
                 f"{', '.join(usages)} (packages add others by entry points in {self.group})"
             )
 
     def row(self, name: str, where: str) -> Plugin:
         """Return the plug-in of this name; the module of another package is imported."""
         self.require(name, where)
-        rows = {row.name: row for row in self.built_in}
-        return rows[name] if name in rows else self._load(self._added()[name])
+        return self._loaded(self._rows()[name])
 
     def __iter__(self) -> Iterator[Plugin]:
         """Yield all plug-ins, the most general built-in last; import other packages' one by one."""
-        yield from self.built_in[:-1]
-        yield from (self._load(point) for _, point in sorted(self._added().items()))
-        yield self.built_in[-1]
+        rows = self._rows()
+        general = self.built_in[-1]
+        yield from (self._loaded(row) for name, row in rows.items() if name != general.name)
+        yield general
 
-    def _added(self) -> dict[str, EntryPoint]:
-        """Return name -> entry point for other packages. Built-in names cannot be replaced."""
+    def _rows(self) -> dict[str, Plugin | EntryPoint]:
+        """Return name -> plug-in; entry points of other packages replace no built-in name."""
         from importlib.metadata import entry_points
 
-        built_in = {row.name for row in self.built_in}
-        points = entry_points(group=self.group)
-        return {point.name: point for point in points if point.name not in built_in}
+        points = sorted(entry_points(group=self.group), key=lambda point: point.name)
+        built_in = {row.name: row for row in self.built_in}
+        return built_in | {point.name: point for point in points if point.name not in built_in}
 
-    def _load(self, point: EntryPoint) -> Plugin:
+    def _loaded(self, point: Plugin | EntryPoint) -> Plugin:
+        if isinstance(point, Plugin):
+            return point
         label = f"{self.kind} {point.name} of the package {point.dist.name if point.dist else '?'}"
         try:
             module = point.load()
@@ -230,30 +233,22 @@ class Form(NamedTuple):
 
     module: str  # module of `densify.outputs.export` with the function ``write_NAME``
     owned: tuple[str, ...]  # files and folders that the format writes
-    of_drive: bool = False  # True if an export can cover several keys of a drive
+    of_drive: bool = True  # True if an export can cover several keys of a drive
 
 
 EXPORTS = {
-    "npy": Form("maps_and_clouds", ("depth", "depth_filled", "confidence")),
-    "exr": Form("maps_and_clouds", ("depth", "depth_filled", "confidence")),
-    "ply": Form("maps_and_clouds", ("cloud.ply",)),
-    "pcd": Form("maps_and_clouds", ("cloud.pcd",)),
-    "nerfstudio": Form(
-        "camera_files", ("transforms.json", "images", "depth", "cloud.ply"), of_drive=True
-    ),
-    "colmap": Form("camera_files", ("images", "sparse"), of_drive=True),
-    "splats": Form(
-        "camera_files", ("images", "depths", "sparse", "movers", "tracks.json"), of_drive=True
-    ),
-    "moge": Form("training_sets", (".index.txt", "keys"), of_drive=True),
-    "wai": Form("training_sets", ("scene_meta.json", "images", "depth"), of_drive=True),
-    "kitti": Form(
-        "maps_and_clouds", ("train", "val", "files.txt", "annotations.json"), of_drive=True
-    ),
-    "kitti-tracking": Form(
-        "kitti_tracking", ("label_02", "calib", "velodyne", "image_02"), of_drive=True
-    ),
-    "rrd": Form("rrd", ("recording.rrd",), of_drive=True),
-    "mcap": Form("mcap", ("recording.mcap",), of_drive=True),
+    "npy": Form("maps_and_clouds", ("depth", "depth_filled", "confidence"), of_drive=False),
+    "exr": Form("maps_and_clouds", ("depth", "depth_filled", "confidence"), of_drive=False),
+    "ply": Form("maps_and_clouds", ("cloud.ply",), of_drive=False),
+    "pcd": Form("maps_and_clouds", ("cloud.pcd",), of_drive=False),
+    "nerfstudio": Form("camera_files", ("transforms.json", "images", "depth", "cloud.ply")),
+    "colmap": Form("camera_files", ("images", "sparse")),
+    "splats": Form("camera_files", ("images", "depths", "sparse", "movers", "tracks.json")),
+    "moge": Form("training_sets", (".index.txt", "keys")),
+    "wai": Form("training_sets", ("scene_meta.json", "images", "depth")),
+    "kitti": Form("maps_and_clouds", ("train", "val", "files.txt", "annotations.json")),
+    "kitti-tracking": Form("kitti_tracking", ("label_02", "calib", "velodyne", "image_02")),
+    "rrd": Form("rrd", ("recording.rrd",)),
+    "mcap": Form("mcap", ("recording.mcap",)),
 }
 """Name of an export format of ``densify export`` -> its writer."""

@@ -22,10 +22,9 @@ from typing import Any
 import numpy as np
 
 from densify import __version__
-from densify.config import Config, as_mapping
+from densify.config import Config, Section, as_mapping, one_of, within
 from densify.config.errors import InputError
 from densify.config.file_content import read_json
-from densify.config.sections import Section, one_of, within
 from densify.geometry.types import Camera, LidarSequence
 from densify.outputs.atomic import plain, write_file
 from densify.outputs.kitti_tree import drive_folder, split_of

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
-from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
-from densify.doctor.paths import CAM_AXES, changed
-from densify.doctor.sample import Sample
+from densify.doctor.motion import CAM_AXES, changed
+from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, finding
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float, RegisteredSweep
 from densify.readers.timeline import format_frames
@@ -29,10 +28,15 @@ from densify.scores.edge_fit import (
 
 _MOST_IMAGES, _LEAST_IMAGES = 36, 4  # of all cameras; of one camera for a verdict
 _CLEARLY = 1.25
-_AS_MANY = 0.5  # least share of the edges visible as given; one object may match by chance
+_LEAST_EDGES = 0.5  # share of the edges visible as given; one object may match by chance
 _OFF_DEG, _WRONG_DEG, _UNSURE_DEG = 0.5, 0.75, 0.25  # an offset of 1 degree is 4 standard errors
 _CLOCK_OFF_S, _CLOCK_WRONG_S = 0.02, 0.05
 _LEAST_SPEED_M_S = 3.0
+_DIRECTIONS = (
+    ("higher", "lower"),
+    ("farther right", "farther left"),
+    ("clockwise", "anticlockwise"),
+)
 
 
 def check_cameras(sample: Sample) -> list[Finding]:
@@ -83,19 +87,17 @@ def camera_views(
     Missing ``silhouettes`` (by frame number) are added. The message is "" if no image is
     unreadable.
     """
-    exposed_ns = sample.sequence.image_stamps_ns(camera.name)
-    numbers, stamps_ns = list(exposed_ns), np.array([*exposed_ns.values()], np.int64)
-    near: list[tuple[RegisteredSweep, int, float]] = []
+    stamps_ns = sample.sequence.image_stamps_ns(camera.name)
+    pairs: list[tuple[RegisteredSweep, int]] = []
     for registered in (r for spot in sample.registered for r in spot.stretch.sweeps[1:]):
-        if len(numbers):
-            row = int(np.argmin(np.abs(stamps_ns - registered.sweep.stamp_ns)))
-            apart_ns = int(stamps_ns[row] - registered.sweep.stamp_ns)
-            if abs(apart_ns) <= sample.timeline.period_ns:
-                near.append((registered, numbers[row], apart_ns * 1e-9))
-    most = max(_LEAST_IMAGES, _MOST_IMAGES // len(sample.sequence.cameras))
+        sweep_ns = registered.sweep.stamp_ns
+        number = min(stamps_ns, key=lambda n: abs(stamps_ns[n] - sweep_ns), default=None)
+        if number is not None and abs(stamps_ns[number] - sweep_ns) <= sample.timeline.period_ns:
+            pairs.append((registered, number))
+    num_views = max(_LEAST_IMAGES, _MOST_IMAGES // len(sample.sequence.cameras))
     views: list[View] = []
-    for place in np.unique(np.linspace(0, len(near) - 1, min(most, len(near))).astype(int)):
-        registered, number, apart_s = near[place]
+    for row in np.unique(np.linspace(0, len(pairs) - 1, min(num_views, len(pairs))).astype(int)):
+        registered, number = pairs[row]
         try:
             image = sample.sequence.image(camera.name, number)
         except InputError as error:
@@ -103,6 +105,7 @@ def camera_views(
         frame = registered.sweep.frame
         if frame not in silhouettes:
             silhouettes[frame] = silhouettes_of(registered.sweep)
+        apart_s = (stamps_ns[number] - registered.sweep.stamp_ns) * 1e-9
         twist = registered.twist_after if apart_s > 0 else registered.twist_before
         edges = image_edges(image, camera.focal_px)
         views.append(View(silhouettes[frame], *edges, twist, apart_s))
@@ -127,32 +130,26 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
         text = f"{num} images near registered sweeps, {_LEAST_IMAGES} are needed to tell"
         return [finding(name, UNKNOWN, text)]
     with_clock = any(np.linalg.norm(v.twist[3:]) > _LEAST_SPEED_M_S for v in views)
-    fit, (_, num_given) = best_fit(camera, views, with_clock), score(camera, views)
-    others = {}
-    for what, T_cam_lidar in alternatives(camera.T_cam_lidar).items():
-        other, num_edges = score(replace(camera, T_cam_lidar=T_cam_lidar), views)
-        others[what] = other if num_edges > _AS_MANY * num_given else 0.0
-    best = max(others, key=lambda what: others[what])
-    values = {"score": fit.score, "clearness": fit.clearness, "other": others[best]}
+    fit = best_fit(camera, views, with_clock)
+    mistake, mistake_score = _best_mistake(camera, views)
+    values = {"score": fit.score, "clearness": fit.clearness, "other": mistake_score}
     values |= dict(zip(("pitch_deg", "yaw_deg", "roll_deg"), fit.offset.tolist(), strict=False))
-    if others[best] > _CLEARLY * max(fit.score, fit.rival, 0.0):
-        text = f"depth discontinuities lie on image edges with {best}, and not as given"
-        return [finding(name, WRONG, text, f"give {best}", **values)]
-    off_deg, error_deg = np.abs(fit.offset[:3]), fit.error[:3]
-    told = _joint(fit, with_clock)
-    among = [told, *map(_described, fit.others)]
-    num_other = num_changed(fit.others[fit.are_equal]).min(initial=2)
-    is_one_of_many = fit.are_equal.any() and num_changed(fit.offset) >= min(num_other, 2)
+    if mistake_score > _CLEARLY * max(fit.score, fit.rival, 0.0):
+        text = f"depth discontinuities lie on image edges with {mistake}, and not as given"
+        return [finding(name, WRONG, text, f"give {mistake}", **values)]
+    error_deg = fit.error[:3]
+    explanations = [_best_explanation(fit, with_clock), *map(_explanation, fit.others)]
+    num_changes = num_changed(fit.others[fit.are_equal]).min(initial=2)
+    is_one_of_many = fit.are_equal.any() and num_changed(fit.offset) >= min(num_changes, 2)
     if is_one_of_many or fit.clearness < _CLEARLY or error_deg[:2].max() > _UNSURE_DEG:
         text = (
             f"no turn of up to 2.7 deg puts the depth discontinuities of {num} sweeps on image "
             f"edges better than others do: images and sweeps do not show the same, or too little; "
-            f"the best fit: {told}"
+            f"the best fit: {explanations[0]}"
         )
-        if len(among) > 1:
-            text = (
-                f"{len(among)} explanations fit {num} images about equally: {'; or '.join(among)}"
-            )
+        if len(explanations) > 1:
+            text = f"{len(explanations)} explanations fit {num} images about equally: "
+            text += "; or ".join(explanations)
         is_as_given = num_changed(fit.offset) == 0 and fit.score > fit.usual
         verdict = UNKNOWN if is_as_given or num < 2 * _LEAST_IMAGES else SUSPICIOUS
         remedy = (
@@ -160,53 +157,58 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
             "rest tell a turn from a clock"
         )
         return [finding(name, verdict, text, remedy, **values)]
-    off = off_deg > np.maximum(_OFF_DEG, 2 * error_deg)
-    verdict = FINE
+    verdict, text = FINE, f"{explanations[0]} (best fit of {num} images)"
+    excess_deg = np.abs(fit.offset[:3]) - 2 * error_deg
+    off = (np.abs(fit.offset[:3]) > _OFF_DEG) & (excess_deg > 0)
     if off.any():
-        is_wrong = (off & (off_deg - 2 * error_deg > _WRONG_DEG)).any()
-        verdict = WRONG if is_wrong else SUSPICIOUS
-    text = f"{told} (best fit of {num} images)"
-    if verdict == FINE:
+        verdict = WRONG if (off & (excess_deg > _WRONG_DEG)).any() else SUSPICIOUS
+    else:
         text = f"right within {_OFF_DEG} deg: {text}"
-    if len(among) > 1:
-        text += f"; more changes at once fit about equally: {'; or '.join(among[1:])}"
-    calibration = finding(name, verdict, text, _corrected(camera, fit), **values)
+    if len(explanations) > 1:
+        text += f"; more changes at once fit about equally: {'; or '.join(explanations[1:])}"
+    calibration = finding(name, verdict, text, _corrected_line(camera, fit), **values)
     if with_clock:
         return [calibration, _check_clock(camera, fit, num)]
     text = f"the vehicle is slower than {_LEAST_SPEED_M_S:g} m/s where it was looked at"
     return [calibration, finding(f"{camera.name}: clock", UNKNOWN, text)]
 
 
-_WAYS = (("higher", "lower"), ("farther right", "farther left"), ("clockwise", "anticlockwise"))
+def _best_mistake(camera: Camera, views: list[View]) -> tuple[str, float]:
+    """Return the common mistake whose correction scores best, and its score."""
+    num_given = score(camera, views)[1]
+    scores = {}
+    for mistake, T_cam_lidar in alternatives(camera.T_cam_lidar).items():
+        value, num_edges = score(replace(camera, T_cam_lidar=T_cam_lidar), views)
+        scores[mistake] = value if num_edges > _LEAST_EDGES * num_given else 0.0
+    best = max(scores, key=lambda mistake: scores[mistake])
+    return best, scores[best]
 
 
-def _joint(fit: Fit, with_clock: bool) -> str:
+def _best_explanation(fit: Fit, with_clock: bool) -> str:
     """Return the fitted rotation and delay with their errors, as a clause."""
     turns = [
-        f"{abs(turn):.2f} ± {error:.2f} deg {way[int(turn < 0)]}"
-        for turn, error, way in zip(fit.offset, fit.error, _WAYS, strict=False)
+        f"{abs(turn):.2f} ± {error:.2f} deg {directions[int(turn < 0)]}"
+        for turn, error, directions in zip(fit.offset, fit.error, _DIRECTIONS, strict=False)
     ]
     clock = f", images {1e3 * fit.offset[3]:+.0f} ms late" if with_clock else ""
     return f"points belong {', '.join(turns)} in the image{clock}"
 
 
-def _described(offset: Float) -> str:
-    """Return an offset (4,) of another explanation as a clause."""
+def _explanation(offset: Float) -> str:
+    """Return an offset (4,) that fits about equally as a clause."""
     turns = [
-        f"{abs(turn):.1f} deg {way[int(turn < 0)]}"
-        for turn, way in zip(offset, _WAYS, strict=False)
+        f"{abs(turn):.1f} deg {directions[int(turn < 0)]}"
+        for turn, directions in zip(offset, _DIRECTIONS, strict=False)
     ]
     return f"{', '.join(turns)} and images {1e3 * offset[3]:+.0f} ms late"
 
 
-def _corrected(camera: Camera, fit: Fit) -> str:
+def _corrected_line(camera: Camera, fit: Fit) -> str:
     """Return the corrected line. Angles that are 0 within two standard errors are left."""
     offset = np.where(np.abs(fit.offset) > 2 * fit.error, fit.offset, 0.0)
-    rows = ", ".join(
-        str([round(float(v), 5) for v in row]) for row in turned(camera, offset).T_cam_lidar[:3]
-    )
+    rows = turned(camera, offset).T_cam_lidar[:3].round(5).tolist()
     where = f"cameras.{camera.name} in densify.yaml, or the recording's own calibration file"
-    return f"T_cam_lidar: [{rows}]  # {where}"
+    return f"T_cam_lidar: {rows}  # {where}"
 
 
 def _check_clock(camera: Camera, fit: Fit, num: int) -> Finding:

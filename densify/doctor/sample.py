@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Select a few sweeps from the whole recording to examine, and register them by odometry."""
+"""Define what a check takes and returns: a few registered sweeps of the recording, and findings."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +22,41 @@ _NUM_SWEEPS = 5  # of a spot
 _STEP_S = 0.1
 
 
+class Verdict(IntEnum):
+    """The severity of a finding."""
+
+    FINE = 0
+    UNKNOWN = 1  # the recording allows no verdict, such as one of a vehicle at rest
+    SUSPICIOUS = 2
+    WRONG = 3
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+FINE, UNKNOWN, SUSPICIOUS, WRONG = Verdict
+Value = float | int | str | list[float]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of one check."""
+
+    check: str  # name of the checked property, such as "stamps"
+    verdict: Verdict  # severity
+    evidence: str  # sentence with the number on which the verdict is based
+    # Option or line that corrects the error; empty if the verdict is FINE or UNKNOWN
+    remedy: str = ""
+    values: Mapping[str, Value] = field(default_factory=dict)  # name (with unit) -> measured number
+
+
+def finding(
+    check: str, verdict: Verdict, evidence: str, remedy: str = "", **values: Value
+) -> Finding:
+    """Return a finding, with the remedy only if the verdict is SUSPICIOUS or WRONG."""
+    return Finding(check, verdict, evidence, remedy if verdict >= SUSPICIOUS else "", values)
+
+
 @dataclass(frozen=True)
 class Spot:
     """A spot: a few consecutive sweeps at one position in the recording."""
@@ -28,35 +65,39 @@ class Spot:
     trajectory: Trajectory | None  # poses by odometry; None if registration failed
     failure: str = ""  # reason of the failure
 
+    @staticmethod
+    def of(sweeps: tuple[Sweep, ...], settings: RegisterSettings) -> Spot:
+        """Return a spot of these sweeps, registered by odometry if possible."""
+        if len(sweeps) < 2:
+            return Spot(sweeps, None, "one sweep alone cannot be registered")
+        try:
+            trajectory = find_trajectory([in_range(s, settings) for s in sweeps], settings)
+        except SweepError as error:
+            return Spot(sweeps, None, str(error))
+        return Spot(sweeps, trajectory)
+
     @cached_property
     def stretch(self) -> Stretch:
         """The sweeps deskewed, in the world of odometry; empty if registration failed."""
         return Stretch(()) if self.trajectory is None else deskew(self.sweeps, self.trajectory)
 
     @property
-    def middle(self) -> int:
-        """Index of the middle sweep."""
-        return len(self.sweeps) // 2
+    def middle(self) -> Sweep:
+        """The sweep in the middle."""
+        return self.sweeps[len(self.sweeps) // 2]
 
     @property
     def twist(self) -> Float:
         """(6,) velocity (rad/s, m/s) at the middle sweep, lidar frame; 0 if registration failed."""
         if self.trajectory is None:
             return np.zeros(6)
-        sweep = self.stretch.sweeps[self.middle]
-        return 0.5 * (sweep.twist_before + sweep.twist_after)
+        registered = self.stretch.sweeps[len(self.sweeps) // 2]
+        return 0.5 * (registered.twist_before + registered.twist_after)
 
     @property
     def speed_m_s(self) -> float:
         """Speed at the middle sweep."""
         return float(np.linalg.norm(self.twist[3:]))
-
-    def too_slow(self, least_m_s: float) -> str:
-        """Return the sentence that a check needs a faster vehicle."""
-        return (
-            f"the vehicle drives at {self.speed_m_s:.1f} m/s where it was looked at, "
-            f"{least_m_s:g} are needed"
-        )
 
 
 @dataclass(frozen=True)
@@ -75,7 +116,7 @@ class Sample:
         timeline = Timeline.of(sequence)
         unreadable: dict[int, str] = {}
         spots = []
-        for frames in _chosen(timeline):
+        for frames in choose_frames(timeline):
             sweeps = []
             for frame in frames:
                 try:
@@ -83,16 +124,21 @@ class Sample:
                 except InputError as error:
                     unreadable[frame] = str(error)
             if sweeps:
-                spots.append(spot_of(tuple(sweeps), settings))
+                spots.append(Spot.of(tuple(sweeps), settings))
         if not spots:
             frame, reason = next(iter(unreadable.items()))
             raise InputError(f"{sequence.name}: no sweep can be read; frame {frame}: {reason}")
         return Sample(sequence, timeline, tuple(spots), unreadable, settings)
 
     @property
+    def middles(self) -> list[Sweep]:
+        """The middle sweep of each spot."""
+        return [spot.middle for spot in self.spots]
+
+    @property
     def lidars(self) -> list[int]:
         """Indices of the scanners."""
-        return sorted({int(n) for s in self.spots for n in np.unique(s.sweeps[s.middle].lidar)})
+        return sorted({int(n) for sweep in self.middles for n in np.unique(sweep.lidar)})
 
     @property
     def registered(self) -> list[Spot]:
@@ -100,12 +146,26 @@ class Sample:
         return [spot for spot in self.spots if spot.trajectory is not None]
 
     @property
-    def fastest(self) -> Spot | None:
-        """Registered spot with the highest speed; None if there is none."""
-        return max(self.registered, key=lambda spot: spot.speed_m_s, default=None)
+    def fastest(self) -> Spot:
+        """Spot with the highest speed, a registered one if there is any."""
+        return max(self.registered or self.spots, key=lambda spot: spot.speed_m_s)
+
+    @property
+    def unregistered(self) -> str:
+        """Why a check that needs registered sweeps is impossible, "" if it is possible."""
+        return "" if self.registered else "no sweeps could be registered"
+
+    def too_slow(self, least_m_s: float) -> str:
+        """Return why a check that needs this speed is impossible, "" if it is possible."""
+        if self.unregistered or self.fastest.speed_m_s >= least_m_s:
+            return self.unregistered
+        return (
+            f"the vehicle drives at {self.fastest.speed_m_s:.1f} m/s where it was looked at, "
+            f"{least_m_s:g} are needed"
+        )
 
 
-def _chosen(timeline: Timeline) -> list[list[int]]:
+def choose_frames(timeline: Timeline) -> list[list[int]]:
     """Return the frame numbers of each spot: sweeps about 0.1 s apart, without a hole in time."""
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
     unbroken = timeline.runs(timeline.frames)
@@ -115,17 +175,6 @@ def _chosen(timeline: Timeline) -> list[list[int]]:
         for run in unbroken
         for start in range(len(run) - length + 1)
     ]
-    most = max(1, len(timeline.frames) // length)
-    rows = np.rint(np.linspace(0, len(spots) - 1, min(_NUM_SPOTS, most))).astype(int)
+    num_spots = min(_NUM_SPOTS, max(1, len(timeline.frames) // length))
+    rows = np.rint(np.linspace(0, len(spots) - 1, num_spots)).astype(int)
     return [spots[row] for row in np.unique(rows)]
-
-
-def spot_of(sweeps: tuple[Sweep, ...], settings: RegisterSettings) -> Spot:
-    """Return a spot of these sweeps, registered by odometry if possible."""
-    if len(sweeps) < 2:
-        return Spot(sweeps, None, "one sweep alone cannot be registered")
-    try:
-        trajectory = find_trajectory([in_range(s, settings) for s in sweeps], settings)
-    except SweepError as error:
-        return Spot(sweeps, None, str(error))
-    return Spot(sweeps, trajectory)

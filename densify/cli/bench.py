@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: MIT
+"""Answer ``densify bench``: measured tables."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from densify.bench import gate, paper
+from densify.bench.depth import bench_depth
+from densify.bench.doctor import bench_doctor
+from densify.bench.flow import DEFAULT_METHODS, bench_flow
+from densify.bench.readme import tables
+from densify.bench.verdicts import Verdict, verdicts
+from densify.cli.options import config_of, recording_of, recordings_of
+from densify.cli.screen import Answer, aligned, numbers_table, progress_on_stderr
+from densify.config import as_mapping, resolve
+from densify.config.cache import Cache
+from densify.config.errors import InputError
+from densify.readers import open_sequence
+
+_KEYS = [120]
+_UNSEEN = (
+    "street?seed=41@70",
+    "street:crossing?seed=42@90",
+    "street:highway?seed=43@60",
+    "street?seed=44@100",
+)
+
+
+def answer_bench_flow(options: argparse.Namespace) -> Iterator[Answer]:
+    """Compare scene flow engines."""
+    config = config_of(options)
+    methods = DEFAULT_METHODS if options.methods is None else options.methods
+    for sequence in [open_sequence(spec) for spec in recordings_of(options)]:
+        for key in options.key or _KEYS:
+            with progress_on_stderr() as progress:
+                measured = bench_flow(
+                    sequence, key, options.window, config, methods, progress, options.truth
+                )
+            title = f"{measured['data']}, key {key}, {measured['num_pairs']} pairs"
+            text = f"{title}\n{numbers_table(measured['methods'])}\n"
+            yield Answer(text, {"runs": [measured]})
+    yield Answer(facts={"config": as_mapping(config)})
+
+
+def answer_bench_gate(options: argparse.Namespace) -> Iterator[Answer]:
+    """Judge a change by its figures."""
+    kinds = gate.KINDS if options.only is None else options.only
+    for kind in kinds:
+        if kind not in gate.KINDS:
+            raise InputError(f"--only {kind}: expected some of {', '.join(gate.KINDS)}")
+    named = os.environ.get("DENSIFY_TEST_DATA")
+    data = options.data or (Path(named) if named else None)
+    stored = gate.read(options.stored) if options.stored.exists() else gate.Stored({}, {})
+    with progress_on_stderr() as progress:
+        now = gate.measure(data, kinds, options.keys, options.draws, progress, Cache())
+    luck = now.luck if options.draws else stored.luck
+    for group, names in gate.GROUPS.items():
+        before, after = (
+            {k: f for k, f in figures.items() if k in names}
+            for figures in (stored.figures, now.figures)
+        )
+        rows = list(verdicts(before, after, luck))
+        if rows:
+            titles = [group, "keys", "before", "now", "change", "error", "luck", "worst", ""]
+            yield Answer(aligned([titles, *map(_verdict_cells, rows)]) + "\n")
+    yield Answer(facts={"figures": now.figures, "luck": luck})
+    if options.write is not None:
+        merged = gate.Stored(stored.figures | now.figures, stored.luck | luck)
+        gate.write(options.write, merged)
+        yield Answer(files=[options.write])
+
+
+def _verdict_cells(v: Verdict) -> list[str]:
+    key, change = v.worst
+    numbers = [f"{v.before:.4g}", f"{v.now:.4g}"]
+    numbers += [f"{value:+.4f}" for value in (v.change, v.error, v.luck)]
+    return [v.figure, str(len(v.keys)), *numbers, f"{key} {change:+.4f}", v.word]
+
+
+def answer_bench_doctor(options: argparse.Namespace) -> Iterator[Answer]:
+    """Measure how often the doctor finds errors."""
+    config = config_of(options)
+    sequences = [open_sequence(spec) for spec in recordings_of(options)]
+    with progress_on_stderr() as progress:
+        shares = bench_doctor(sequences, config, progress)
+    titles = list(next(iter(shares.values())))
+    rows = [
+        [mistake, *(format(row[title], "d" if title == "of" else ".0%") for title in titles)]
+        for mistake, row in shares.items()
+    ]
+    yield Answer(aligned([["", *titles], *rows]), {"mistakes": shares})
+
+
+def answer_bench_depth(options: argparse.Namespace) -> Iterator[Answer]:
+    """Compare depth maps of several settings."""
+    variants = {"as configured": config_of(options)}
+    for name, *changes in options.variant or []:
+        variants[name] = resolve(options.config, [*(options.set or []), *changes])
+    sequence, keys = open_sequence(recording_of(options)), options.key or _KEYS
+    with progress_on_stderr() as progress:
+        measured = bench_depth(
+            sequence,
+            keys,
+            options.window,
+            variants,
+            options.camera,
+            options.scanner,
+            options.method,
+            progress,
+        )
+    configs = {name: as_mapping(config) for name, config in variants.items()}
+    text = f"{measured['data']}, keys {', '.join(map(str, keys))}"
+    facts = {**measured, "config": configs}
+    yield Answer(f"{text}\n{numbers_table(measured['variants'])}", facts)
+
+
+def answer_bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
+    """Make the tables of the paper."""
+    methods = paper.DEFAULT_METHODS if options.methods is None else options.methods
+    for name, pairs in _paper_sets(options).items():
+        with progress_on_stderr() as progress:
+            measured = paper.bench_paper(
+                pairs, methods, options.model or [], options.points, progress
+            )
+        published = {"as published": paper.PUBLISHED[name]} if name in paper.PUBLISHED else {}
+        title = f"{name}: {measured['num_pairs']} pairs, {options.points} points drawn"
+        text = numbers_table({**measured["methods"], **published})
+        yield Answer(f"{title}\n{text}\n", {"sets": [{"set": name, **measured}]})
+    yield Answer(facts={"published": paper.PUBLISHED})
+
+
+def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[paper.PaperPair]]:
+    sets: dict[str, Iterable[paper.PaperPair]] = {}
+    for name in ("flyingthings", "kitti"):
+        if (folder := getattr(options, name)) is not None:
+            sets[name] = paper.pairs_of_files(folder, options.pairs)
+    chosen: dict[str, list[tuple[str, int]]] = {}
+    for text in options.data or (() if sets else _UNSEEN):
+        spec, _, keys = text.rpartition("@")
+        if not spec or not all(key.isdecimal() for key in keys.split(",")):
+            raise InputError(f"--data {text}: expected a recording and frames, as street@60,80")
+        kind = "streets" if paper.has_truth(spec) else "against this package's engine"
+        chosen.setdefault(kind, []).extend((spec, int(key)) for key in keys.split(","))
+    for kind, frames in chosen.items():
+        sets[kind] = map(paper.pair_of_recording, *zip(*frames, strict=True))
+    return sets
+
+
+def answer_bench_readme(options: argparse.Namespace) -> Iterator[Answer]:
+    """Make the tables of docs/results.md."""
+    with progress_on_stderr() as progress:
+        for line in tables(options.table, progress):
+            yield Answer(line, {"lines": [line]})

@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: MIT
+"""Answer the verbs of recordings: look into them, simulate them, make sets and scene flow."""
+
+from __future__ import annotations
+
+import argparse
+import textwrap
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from densify.cli.options import (
+    check_new_file,
+    config_of,
+    raise_failures,
+    recording_of,
+    recordings_of,
+    selected_frames,
+)
+from densify.cli.screen import Answer, first_of, log_warnings, percent, progress_on_stderr
+from densify.config import Config, apply_overrides, resolve
+from densify.config.errors import ComputationError, InputError
+from densify.dataset.make import Summary, damaged, make_dataset, status
+from densify.dataset.plan import Gate, Recipe
+from densify.doctor import Diagnosis, Verdict, examine
+from densify.flow.two_clouds import estimate_flow
+from densify.geometry.types import Float
+from densify.learning.labels import Label, label_sweeps, write_label
+from densify.outputs.atomic import write_file
+from densify.outputs.flow_writers import flow_npz, flow_writer
+from densify.outputs.recording_folder import check_recording, default_folder
+from densify.outputs.simulated_street import write_street
+from densify.pipeline.run import flow_steps
+from densify.readers import describe, findings, in_lines, open_sequence
+from densify.readers.point_files import read_table
+from densify.readers.street import Street
+
+_WIDTH = 100
+_FIRST_OF_SET = {
+    "README.txt": "what the set holds and how to read it",
+    "manifest.jsonl": "every key with its files and scores",
+    "dataset.json": "how it was made",
+}
+_SCORES = {"density": "density", "ghost": "ghosts", "outliers": "held-out outliers"}
+_STATES = {"done": "done", "aside": "put aside", "failed": "failed", "left": "to make"}
+_REASON = ("drive", "key", "status", "reason")
+_MOST_REASONS = 20
+
+
+def answer_info(options: argparse.Namespace) -> Iterator[Answer]:
+    """Print what a recording holds."""
+    sequence = open_sequence(recording_of(options))
+    lines, frames, cameras = findings(sequence), [*sequence.frames], [*sequence.cameras]
+    yield Answer(in_lines(lines), {"recording": dict(lines), "frames": frames, "cameras": cameras})
+
+
+def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
+    """Print the findings about a recording."""
+    config, spec = config_of(options), recording_of(options)
+    sequence = open_sequence(spec)
+    diagnosis = examine(sequence, config)
+    facts = {
+        "recording": sequence.name,
+        "worst": str(diagnosis.worst),
+        "findings": [{**asdict(f), "verdict": str(f.verdict)} for f in diagnosis.findings],
+    }
+    yield Answer(f"{describe(sequence)}\n\n{_verdicts(diagnosis)}", facts)
+    wrong = [f.check for f in diagnosis.findings if f.verdict == Verdict.WRONG]
+    if wrong:
+        raise InputError(f"{spec}: wrong: {', '.join(wrong)}; the remedies are above")
+
+
+def _verdicts(diagnosis: Diagnosis) -> str:
+    """Return verdict, check and evidence of each finding, its remedy below, and the counts."""
+    margin = " " * (2 + max(len(str(v)) for v in Verdict))
+    lines = []
+    for finding in diagnosis.findings:
+        evidence = f"{finding.check}: {finding.evidence}"
+        begin = f"{finding.verdict!s:<{len(margin)}}"
+        lines += textwrap.wrap(evidence, _WIDTH, initial_indent=begin, subsequent_indent=margin)
+        if finding.remedy:
+            lines.append(f"{margin}-> {finding.remedy}")
+    counts = {v: sum(f.verdict == v for f in diagnosis.findings) for v in Verdict}
+    return "\n".join([*lines, "", ", ".join(f"{n} {v}" for v, n in counts.items())])
+
+
+def answer_simulate(options: argparse.Namespace) -> Iterator[Answer]:
+    """Write the street and print its path."""
+    street = Street.from_spec(recording_of(options))
+    frames, chosen = list(street.frames), options.frames
+    if chosen is not None and (chosen[0] < frames[0] or chosen[-1] > frames[-1]):
+        raise InputError(
+            f"--frames {chosen.start}:{chosen.stop}: expected frames within "
+            f"{frames[0]}:{frames[-1] + 1}"
+        )
+    frames = frames if chosen is None else list(chosen)
+    with progress_on_stderr() as progress:
+        folder = write_street(
+            options.format,
+            street,
+            options.out,
+            frames,
+            options.camera,
+            progress,
+            overwrite=options.overwrite,
+        )
+    text = f"{len(frames)} frames; open them with --data {folder}"
+    yield Answer(text, {"data": str(folder), "num_frames": len(frames)})
+
+
+def answer_dataset(options: argparse.Namespace) -> Iterator[Answer]:
+    """Make the data set, or report its progress."""
+    yield from _make_set(options) if options.status is None else _check_set(options)
+
+
+def _check_set(options: argparse.Namespace) -> Iterator[Answer]:
+    summary = status(options.status)
+    files = damaged(options.status) if options.verify else []
+    lines = [_describe_set(summary), *(f"damaged: {name}" for name in files)]
+    yield Answer("\n".join(lines), {**_set_facts(summary), "damaged": files})
+    if files:
+        raise ComputationError(
+            f"--verify: {len(files)} damaged or missing files in {options.status}; run the "
+            f"command that made the set again with --verify, which makes them again"
+        )
+
+
+def _recipe(options: argparse.Namespace) -> Recipe:
+    overrides = options.set or []
+    limits = [text for text in overrides if text.strip().startswith("dataset.")]
+    gate = {"dataset": asdict(Gate())}
+    apply_overrides(gate, limits, {"dataset": Gate})
+    return Recipe(
+        window=options.window,
+        method=options.method,
+        layout=options.layout,
+        cameras=None if options.camera is None else tuple(options.camera),
+        gate=Gate(**gate["dataset"]),
+        config=resolve(options.config, [text for text in overrides if text not in limits]),
+    )
+
+
+def _make_set(options: argparse.Namespace) -> Iterator[Answer]:
+    out = options.out
+    if out is None:
+        raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
+    recipe = _recipe(options)
+    with progress_on_stderr() as progress:
+        summary = make_dataset(
+            recordings_of(options),
+            out,
+            options.keys,
+            recipe,
+            num_workers=options.workers,
+            scheduler=options.scheduler,
+            shard=options.shard,
+            verify=options.verify,
+            report=lambda so_far: progress("keys", len(so_far.records), so_far.num_keys),
+        )
+    paths = [out / name for name in _FIRST_OF_SET if (out / name).is_file()]
+    first = first_of(paths, _FIRST_OF_SET)
+    yield Answer(_describe_set(summary), _set_facts(summary), [out], first)
+    log_warnings((w, r.drive, r.key) for r in summary.records.values() for w in r.warnings)
+    if summary.count("failed"):
+        raise ComputationError(f"{summary.count('failed')} of {summary.num_keys} keys not made")
+
+
+def _describe_set(summary: Summary) -> str:
+    """Return the numbers of keys by status, mean scores, and the reasons of missing keys."""
+    facts = _set_facts(summary)
+    numbers = {state: facts[f"num_{state}"] for state in _STATES}
+    counts = [f"{n} {_STATES[state]}" for state, n in numbers.items() if n or state == "done"]
+    lines = [f"{summary.num_keys} keys: {', '.join(counts)}"]
+    if summary.num_made:
+        pace = summary.seconds / summary.num_made
+        lines[0] += f"; {summary.num_made} now, {pace:.2f} s a key"
+    means = [(title, facts["means"][score]) for score, title in _SCORES.items()]
+    lines.append(", ".join(f"{title} {percent(mean)}" for title, mean in means if mean is not None))
+    missing = ["{drive} {key} {status}: {reason}".format(**key) for key in facts["missing"]]
+    lines += missing[:_MOST_REASONS]
+    if len(missing) > _MOST_REASONS:
+        lines.append(f"... and {len(missing) - _MOST_REASONS} more, see the manifest")
+    return "\n".join(line for line in lines if line)
+
+
+def _set_facts(summary: Summary) -> dict[str, Any]:
+    """Return the numbers of `_describe_set`."""
+    missing = [r for r in summary.records.values() if r.status != "done"]
+    return {
+        "num_keys": summary.num_keys,
+        **{f"num_{status}": summary.count(status) for status in ("done", "aside", "failed")},
+        "num_left": summary.num_left,
+        "num_made": summary.num_made,
+        "seconds": summary.seconds,
+        "means": {score: summary.mean(score) for score in _SCORES},
+        "missing": [{name: getattr(record, name) for name in _REASON} for record in missing],
+    }
+
+
+def answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
+    """Estimate scene flow between two point files, or of a recording."""
+    config = config_of(options)
+    asks_for_sweeps = options.all or options.keys is not None
+    if options.target is not None and options.data is None and not asks_for_sweeps:
+        if options.format is not None:
+            raise InputError(f"--format {options.format}: of recordings, got two point files")
+        yield _of_two_files(options, config)
+        return
+    specs = [spec for spec in (options.source, options.data) if spec is not None]
+    if options.target is not None or len(specs) != 1 or options.all == (options.keys is not None):
+        raise InputError(
+            "densify flow: expected SOURCE and TARGET, two point files, or a recording with either "
+            "--all or --keys A:B[:S]; see densify flow --help"
+        )
+    yield from _of_recording(specs[0], options, config)
+
+
+def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
+    out = options.out or Path("densify-out/flow.npz")
+    check_new_file(out, options.overwrite, ".npz")
+    source, target = read_points(Path(options.source)), read_points(options.target)
+    field = estimate_flow(source, target, config)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_file(out, flow_npz(field))
+    num_moving = int(field.moving.sum())
+    facts = {"num_points": len(source), "num_moving": num_moving}
+    return Answer(f"{len(source):,} points, {num_moving:,} moving", facts, [out])
+
+
+def read_points(path: Path) -> Float:
+    """Return the (N,3) float64 points of a file in metres, in the order of the file."""
+    columns = read_table(path).columns
+    if missing := [name for name in "xyz" if name not in columns]:
+        raise InputError(
+            f"{path}: no column {missing[0]}: got {', '.join(columns)}, expected x, y and z"
+        )
+    points = np.column_stack([columns[name].astype(np.float64) for name in "xyz"])
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise InputError(
+            f"{path}: {len(bad)} of {len(points)} points are not finite, the first in row "
+            f"{bad[0]}; remove them"
+        )
+    return points
+
+
+def _of_recording(spec: str, options: argparse.Namespace, config: Config) -> Iterator[Answer]:
+    sequence = open_sequence(spec)
+    out = options.out or default_folder(sequence.name)
+    check_recording(out, sequence.name, spec)
+    frames = selected_frames(sequence, options.keys)
+    folders: dict[Path, None] = {}
+    failures: dict[int, Exception] = {}
+    num_moving = 0
+    with (
+        progress_on_stderr() as progress,
+        flow_writer(options.format or "npz", sequence, out, frames, options.overwrite) as write,
+    ):
+        for frame, flow in flow_steps(sequence, frames, config, progress):
+            if isinstance(flow, Exception):
+                failures[frame] = flow
+                continue
+            folders[write(frame, flow)] = None
+            num_moving += sum(int(field.moving.sum()) for field in flow.steps.values())
+    num_done = len(frames) - len(failures)
+    facts = {"num_sweeps": num_done, "num_moving": num_moving}
+    yield Answer(f"{num_done:,} sweeps, {num_moving:,} points moving", facts, [*folders])
+    raise_failures(failures, len(frames), "sweep")
+
+
+def answer_labels(options: argparse.Namespace) -> Iterator[Answer]:
+    """Label every sweep."""
+    config = resolve(options.config, ["register.source=dataset", *(options.set or [])])
+    sequence = open_sequence(recording_of(options))
+    frames = selected_frames(sequence, options.keys)
+    failures: dict[int, Exception] = {}
+    num_done = num_points = num_moving = num_sure = 0
+    with progress_on_stderr() as progress:
+        for frame, label in label_sweeps(sequence, frames, config, progress):
+            if not isinstance(label, Label):
+                failures[frame] = label
+                continue
+            write_label(options.out, label, options.overwrite)
+            num_done += 1
+            num_points += len(label.sure)
+            num_sure += int(label.sure.sum())
+            num_moving += int(label.field.moving.sum())
+    if not num_done and not failures:
+        raise InputError(
+            f"--data {recording_of(options)}: none of {len(frames)} sweeps has boxes and is "
+            f"followed by one that has; choose others by --keys"
+        )
+    share = num_sure / max(num_points, 1)
+    facts = {"num_sweeps": num_done, "num_moving": num_moving, "share_valid": share}
+    text = f"{num_done:,} sweeps, {num_moving:,} points moving, {100 * share:.1f} % valid"
+    yield Answer(text, facts, [options.out] if num_done else [])
+    raise_failures(failures, len(frames), "sweep")
+
+
+def answer_train_flow(options: argparse.Namespace) -> Iterator[Answer]:
+    """Train a network for scene flow."""
+    from densify.learning.training import Training, train  # loads torch
+
+    check_new_file(options.out, options.overwrite)
+    training = Training(
+        data=tuple(recordings_of(options, default="streets")),
+        teacher=options.teacher,
+        seed=options.seed,
+        steps=options.steps,
+        device=options.device,
+    )
+    with progress_on_stderr() as progress:
+        loss = train(training, options.out, progress)
+    text = f"{training.steps:,} steps, loss {loss:.4g}"
+    yield Answer(text, {"num_steps": training.steps, "loss": loss}, [options.out])

@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: MIT
+"""Answer ``densify run`` and ``compare``, and the verbs of finished runs and of depth maps."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from densify.bench.evaluation import evaluate
+from densify.cli.options import config_of, raise_failures, recording_of, selected_frames
+from densify.cli.screen import (
+    Answer,
+    aligned,
+    first_of,
+    log_warnings,
+    look_up,
+    numbers_table,
+    percent,
+    progress_on_stderr,
+    written,
+)
+from densify.config import as_mapping
+from densify.config.errors import ComputationError, InputError
+from densify.dataset.report import write_comparison_page, write_report
+from densify.geometry.types import METHOD_NAMES, LidarSequence, Result
+from densify.outputs import Export, check_writable, write_comparison, write_result
+from densify.outputs.atomic import plain
+from densify.outputs.export import export_run, facts, open3d_window, rrd
+from densify.outputs.export.finished_run import finished_runs
+from densify.outputs.front_view import front_first
+from densify.outputs.recording_folder import check_recording, default_folder
+from densify.pipeline import run as pipeline
+from densify.pipeline.key_result import COMPARED
+from densify.readers import Spec, open_sequence
+from densify.readers.depth_trees import pair_depth_files
+from densify.readers.timeline import format_frames
+
+_FIRST_OF_RUN = {
+    "report.html": "all of it, in a browser",
+    "figure.png": "what was gained, at a glance",
+    "depth_filled/*.png": "a depth map: 256 x metres",
+    "depth_filled/*/*.png": "a depth map: 256 x metres",
+    "cloud.laz": "the accumulated cloud",
+    "metrics.json": "the scores",
+    "run.yaml": "how it was made",
+}
+_FIRST_OF_COMPARISON = {
+    "compare.html": "all of it, in a browser",
+    "compare.png": "the methods side by side",
+    "compare.json": "their scores",
+    "compare/cloud.laz": "the last method's cloud",
+}
+_SCORES = (
+    ("coverage", "coverage", ".1%"),
+    ("MAE", "mae_m", ".3f m"),
+    ("RMSE", "rmse_m", ".3f m"),
+    ("outliers", "outliers", ".2%"),
+)
+_UNPAIRED = {
+    "without_truth": "predicted without truth",
+    "without_prediction": "truth without prediction",
+    "without_mask": "truth without mask",
+}
+_MOST_NAMED = 5
+
+
+def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
+    """Densify one key or several."""
+    config, spec = config_of(options), Spec.parse(recording_of(options)).absolute()
+    sequence = open_sequence(spec)
+    keys = _keys_of(sequence, options)
+    out = options.out or default_folder(sequence.name)
+    check_recording(out, sequence.name, spec, keys)
+    for key in keys:
+        check_writable(out, key, options.overwrite)
+    failures: dict[int, Exception] = {}
+    warnings: list[tuple[str, str, int]] = []
+    with progress_on_stderr() as progress:
+        results = pipeline.run_keys(
+            sequence,
+            keys,
+            options.window,
+            options.method,
+            options.camera,
+            config,
+            progress,
+            prior=options.prior,
+        )
+        for key, result in results:
+            if isinstance(result, Exception):
+                failures[key] = result
+                yield Answer(facts={"keys": [{"key": key, "error": str(result)}]})
+                continue
+            paths = write_result(
+                result, out, config=as_mapping(config), data=spec, overwrite=options.overwrite
+            )
+            first = first_of(_front_first(paths, result), _FIRST_OF_RUN)
+            yield Answer(_summary(result), {"keys": [_key_facts(result)]}, paths, first)
+            warnings += [(warning, "", key) for warning in result.warnings]
+            if result.depth and not any(maps.filled_m.any() for maps in result.depth.values()):
+                failures[key] = ComputationError(
+                    "every depth map is empty; are calibration and stamps right? densify doctor "
+                    "looks into both"
+                )
+    log_warnings(warnings)
+    if len(keys) == 1 and failures:
+        raise failures[keys[0]]
+    raise_failures(failures, len(keys), "key")
+
+
+def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
+    keys = {*(options.key or [])}
+    if options.keys is not None:
+        keys |= {*selected_frames(sequence, options.keys)}
+    for key in sorted(keys - {*sequence.frames}):
+        frames = format_frames(sequence.frames)
+        raise InputError(f"--key {key}: no such frame in {sequence.name}; it has {frames}")
+    if not keys:
+        raise InputError(
+            "--key K or --keys A:B[:S]: expected the frame or frames to densify; "
+            "see densify run --help"
+        )
+    return sorted(keys)
+
+
+def _front_first(paths: Sequence[Path], result: Result) -> list[Path]:
+    """Return the files of a run, those of the camera that looks ahead first."""
+    names = front_first([*result.depth], result.views, result.T_key_lidar)
+    front = [p for p in paths if names and p.with_suffix("").as_posix().endswith(f"/{names[0]}")]
+    return [*front, *(path for path in paths if path not in front)]
+
+
+def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
+    """Densify one key by several methods."""
+    config, spec = config_of(options), Spec.parse(recording_of(options)).absolute()
+    sequence = open_sequence(spec)
+    out = options.out or default_folder(sequence.name)
+    check_recording(out, sequence.name, spec, [options.key])
+    check_writable(out, options.key, options.overwrite, "compare")
+    with progress_on_stderr() as progress:
+        results = pipeline.compare(
+            sequence,
+            options.key,
+            options.window,
+            options.camera,
+            config,
+            progress,
+            options.methods or COMPARED,
+        )
+    paths = write_comparison(
+        results, out, config=as_mapping(config), data=spec, overwrite=options.overwrite
+    )
+    if config.output.report:
+        paths.append(write_comparison_page(paths[0].parent))
+    scores = {"key": options.key, "methods": {n: _key_facts(r) for n, r in results.items()}}
+    yield Answer(_comparison(results), scores, paths, first_of(paths, _FIRST_OF_COMPARISON))
+    distinct = dict.fromkeys(w for result in results.values() for w in result.warnings)
+    log_warnings((warning, "", options.key) for warning in distinct)
+
+
+def _summary(result: Result) -> str:
+    """Return a few lines of text about one densified key."""
+    cloud = result.cloud
+    moving = f"{np.count_nonzero(cloud.moving):,} on moving objects"
+    if result.movers:
+        num_apart = sum(len(mover.cloud) for mover in result.movers.values())
+        moving = f"{num_apart:,} more apart, on {len(result.movers)} moving objects"
+    method = METHOD_NAMES.get(result.method, result.method)
+    lines = [
+        f"key {result.key}, {method}: {len(cloud):,} points of {len(result.frames)} sweeps "
+        f"({format_frames(result.frames)}), {moving}"
+    ]
+    for name in result.depth:
+        share = {p: percent(s, 1) for p, s in result.metrics["density"][name].items()}
+        line = f"{name}: depth in {share['measured']} of the pixels, {share['filled']} with filled"
+        line += f" ones, {share['full']} with those from the prior" if "full" in share else " ones"
+        lines.append(line)
+        if expected := look_up(result.metrics, "expected_outliers", name):
+            lines.append(
+                f"{name}, expected outliers by confidence: {percent(expected['measured'])} of the "
+                f"measured, {percent(expected['filled'])} of all pixels with a depth"
+            )
+    if ghosts := _beside_icp(result, "ghosts", "all"):
+        lines.append(f"ghosts of the accumulated points: {ghosts}")
+    for name in result.depth:
+        for pixels, where in (("all", ""), ("moving", ", on moving objects")):
+            if outliers := _beside_icp(result, "held_out", name, "measured", pixels, "outliers"):
+                lines.append(f"{name}, key held out: outliers{where}: {outliers}")
+        if unjudged := look_up(result.metrics, "held_out", name, "unjudged"):
+            lines.append(
+                f"{name}, not judged, because the key sweep has no return there: "
+                f"{percent(unjudged['static'])} of static, {percent(unjudged['moving'])} of moving "
+                "pixels"
+            )
+    return "\n".join(lines)
+
+
+def _beside_icp(result: Result, *path: str) -> str:
+    """Return a share as text, with the share of rigid accumulation in brackets; "" for none."""
+    share = look_up(result.metrics, *path)
+    rigid = result.baselines.get("icp")
+    by_icp = look_up(rigid.metrics, *path) if rigid is not None else None
+    beside = "" if by_icp is None else f" ({percent(by_icp)} with rigid accumulation)"
+    return "" if share is None else percent(share) + beside
+
+
+def _key_facts(result: Result) -> dict[str, Any]:
+    """Return the scores of one method's result, as numbers."""
+    metrics = result.metrics
+    return plain(
+        {
+            "key": result.key,
+            "method": result.method,
+            "frames": result.frames,
+            "num_points": len(result.cloud),
+            "num_moving": int(np.count_nonzero(result.cloud.moving)),
+            "seconds": sum(cost.seconds for cost in result.costs),
+            "error": None,
+            "density": metrics.get("density"),
+            "ghosts": look_up(metrics, "ghosts", "all"),
+            **{
+                truth: {c: look_up(metrics, truth, c, "measured", "all") for c in result.depth}
+                for truth in ("held_out", "depth")
+            },
+        }
+    )
+
+
+def _comparison(results: Mapping[str, Result]) -> str:
+    """Return a table with one column per method: points, density, ghost rate, scores of depth."""
+    cameras = list(next(iter(results.values())).depth)
+    rows: list[tuple[str, tuple[str, ...], str]] = [("points", ("num_points",), ",d")]
+    for camera in cameras:
+        for product in ("measured", "filled"):
+            rows.append((f"{camera} density, {product}", ("density", camera, product), ".1%"))
+    rows.append(("ghost rate", ("ghosts", "all"), ".2%"))
+    for camera in cameras:
+        for truth, title in (("held_out", "key held out"), ("depth", "truth")):
+            for pixels in ("all", "moving", "static"):
+                for score, key, form in _SCORES:
+                    score_path = (truth, camera, "measured", pixels, key)
+                    rows.append((f"{camera} {title}, {pixels}, {score}", score_path, form))
+    lines = [["", *(METHOD_NAMES.get(name, name) for name in results)]]
+    for title, path, form in rows:
+        numbers = [look_up(result.metrics, *path) for result in results.values()]
+        if any(number is not None for number in numbers):
+            lines.append([title, *(written(number, form) for number in numbers)])
+    return aligned(lines)
+
+
+def answer_export(options: argparse.Namespace) -> Iterator[Answer]:
+    """Export a finished run."""
+    exported = export_run(
+        options.run,
+        options.to,
+        options.out,
+        min_confidence=options.min_confidence,
+        max_age_ms=options.max_age_ms,
+        cameras=options.camera,
+        overwrite=options.overwrite,
+    )
+    yield Answer(_export_summary(exported), facts(exported), exported.paths)
+
+
+def _export_summary(exported: Export) -> str:
+    """Return a line per camera with its density before and after, and one line for the cloud."""
+    lines = []
+    for camera, products in exported.density.items():
+        measured, filled = (
+            f"{percent(products[p].before, digits=1)} -> {percent(products[p].after, digits=1)}"
+            for p in ("measured", "filled")
+        )
+        lines.append(f"{camera}: depth in {measured} of the pixels, {filled} with filled ones")
+    points = exported.num_points
+    if points is not None:
+        lines.append(f"cloud: {points.after:,} of {points.before:,} points")
+    return "\n".join(lines)
+
+
+def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
+    """Write the page of a folder."""
+    yield Answer(files=write_report(options.dir, options.overwrite))
+
+
+def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
+    """Show finished runs in a viewer."""
+    runs = finished_runs(options.dir, cameras=options.camera)
+    viewers = {"rerun": rrd, "open3d": open3d_window}
+    viewers[vars(options)["with"]].show(runs)
+    keys = [run.key for run in runs]
+    yield Answer(f"shown: key {', '.join(map(str, keys))}", {"keys": keys})
+
+
+def answer_evaluate(options: argparse.Namespace) -> Iterator[Answer]:
+    """Score depth maps against ground truth."""
+    pairs = pair_depth_files(options.predicted, options.truth, options.mask, filled=options.filled)
+    with progress_on_stderr() as progress:
+        scores = evaluate(pairs, options.focal_px, options.baseline_m, progress)
+    num, density = scores["num_images"], scores["density"]
+    lines = [
+        f"{num:,} image{'s' if num != 1 else ''}: predicted {percent(density['predicted'])} of "
+        f"the pixels, truth {percent(density['truth'])}; outliers with fx "
+        f"{scores['focal_px']:g} px, baseline {scores['baseline_m']:g} m"
+    ]
+    for name, title in _UNPAIRED.items():
+        if paths := scores[name]:
+            num_more = len(paths) - _MOST_NAMED
+            more = f", ... and {num_more:,} more" if num_more > 0 else ""
+            lines.append(f"{title}: {len(paths):,}: {', '.join(paths[:_MOST_NAMED])}{more}")
+    columns = {name: column for name, column in scores["parts"].items() if column["num_pixels"]}
+    yield Answer("\n".join([*lines, numbers_table(columns)]), {"scores": scores})

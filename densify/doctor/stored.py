@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: MIT
+"""Check the sweeps as they are stored: files, stamps, point times, unit, axes and intensities."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, finding
+from densify.free_space.sectors import LOST_DEG, blind_sector, by_azimuth, lost_deg
+from densify.free_space.sweep_frame import MAP_FRAME_REMEDY
+from densify.geometry.types import Float, Sweep
+from densify.readers.timeline import format_frames
+
+_SHORT = 0.3  # of the usual size of a file
+_FETCH = "fetch these files again; windows end before sweeps that cannot be read"
+_PERIODS_S = (0.015, 1.1)  # range of existing scanners, 50 Hz to 1 Hz
+_HOLE_PERIODS = 3.1
+_STAMP_UNITS = {
+    "seconds taken for nanoseconds": 1e9,
+    "milliseconds taken for nanoseconds": 1e6,
+    "microseconds taken for nanoseconds": 1e3,
+    "nanoseconds taken for microseconds": 1e-3,
+    "nanoseconds taken for milliseconds": 1e-6,
+    "nanoseconds taken for seconds": 1e-9,
+}
+_WHOLE_SWEEP = (0.5, 1.5)  # plausible time from first to last point, in periods
+_TURN_S = (0.04, 0.25)  # of existing scanners, 25 to 4 Hz
+_WRONG_SPAN = (0.02, 10)  # periods; beyond, the unit of the point times is wrong
+_MEDIAN_RANGE_M = (1.5, 60.0)
+_LENGTH_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
+_FAR_OFF = 10.0  # distance from the origin, as a multiple of the spread of the points
+_UP = {
+    sign + axis: (-1.0 if sign else 1.0) * np.eye(3)["xyz".index(axis)]
+    for axis in "zyx"
+    for sign in ("", "-")
+}
+_UP_MEANS = {
+    "-z": "x forward, y right, z down",
+    "-y": "a camera's axes: x right, y down, z forward",
+    "y": "y up",
+}
+_NEAR_M = 25.0
+_LAYER_M = 0.3
+_LEAST_GROUND, _MOST_BELOW = 0.08, 0.2  # shares of the near returns
+_HIGHEST_M = 0.3  # in a vehicle frame the road is at height 0
+_CLEARLY = 1.5
+
+
+def check_sweep_files(sample: Sample) -> list[Finding]:
+    """Report empty or short sweep files, and sweeps that cannot be read."""
+    findings = []
+    if sample.unreadable:
+        frame, reason = next(iter(sample.unreadable.items()))
+        text = (
+            f"{len(sample.unreadable)} of the sweeps looked at cannot be read: frames "
+            f"{format_frames(sample.unreadable)}; frame {frame}: {reason}"
+        )
+        findings.append(finding("reading", WRONG, text, _FETCH))
+    sequence = sample.sequence
+    sizes = sequence.sweep_bytes() if hasattr(sequence, "sweep_bytes") else {}
+    if sizes:
+        usual = float(np.median(list(sizes.values())))
+        empty = [frame for frame, size in sizes.items() if size == 0]
+        short = [frame for frame, size in sizes.items() if 0 < size < _SHORT * usual]
+        text = f"{len(sizes)} sweeps of {usual / 1e6:.2f} MB, none empty or much shorter"
+        if empty or short:
+            text = (
+                f"empty: {format_frames(empty)}; much shorter than the usual {usual / 1e6:.2f} MB: "
+                f"{format_frames(short)}"
+            )
+        verdict = WRONG if empty else SUSPICIOUS if short else FINE
+        values = {"num_empty": len(empty), "num_short": len(short), "usual_bytes": int(usual)}
+        findings.append(finding("files", verdict, text, _FETCH, **values))
+    return findings
+
+
+def check_stamps(sample: Sample) -> list[Finding]:
+    """Check the sweeps' reference times: order, rate and holes."""
+    timeline = sample.timeline
+    frames, step_ns = timeline.frames, np.diff(timeline.stamp_ns)
+    if timeline.unknown:
+        frame, reason = next(iter(timeline.unknown.items()))
+        text = (
+            f"{len(timeline.unknown)} of {len(frames)} sweeps have no stamp that can be right, the "
+            f"first of them frame {frame} ({reason})"
+        )
+        remedy = "correct the stamps of these sweeps, or remove their files"
+        return [finding("stamps", WRONG, text, remedy)]
+    if len(frames) < 2:
+        return [finding("stamps", UNKNOWN, "one sweep tells no rate")]
+    backward = np.flatnonzero(step_ns <= 0)
+    if len(backward):
+        row = int(backward[0])
+        text = (
+            f"{len(backward)} of {len(step_ns)} steps do not go on in time; the first: the stamp "
+            f"of frame {frames[row + 1]} is {-step_ns[row] * 1e-6:.1f} ms before that of frame "
+            f"{frames[row]}"
+        )
+        remedy = "sort the sweeps by their stamps, or correct the file of stamps"
+        return [finding("stamps", WRONG, text, remedy, num_backward=len(backward))]
+    findings = [_check_rate(timeline.period_ns * 1e-9)]
+    rows = np.flatnonzero(step_ns > _HOLE_PERIODS * timeline.period_ns)
+    if len(rows):
+        longest = int(rows[np.argmax(step_ns[rows])])
+        text = (
+            f"{len(rows)} of more than three periods, the longest of {step_ns[longest] * 1e-9:.1f} "
+            f"s after frame {frames[longest]}; windows end there (after frames "
+            f"{format_frames(frames[row] for row in rows)})"
+        )
+        remedy = "nothing, if the sweeps were never recorded; else fetch them again"
+        findings.append(finding("holes in time", SUSPICIOUS, text, remedy, num_holes=len(rows)))
+    return findings
+
+
+def _check_rate(period_s: float) -> Finding:
+    least_s, most_s = _PERIODS_S
+    if least_s <= period_s <= most_s:
+        return finding("stamps", FINE, f"{1 / period_s:.2f} Hz, ascending", period_s=period_s)
+    text = f"from sweep to sweep {period_s:.3g} s pass, expected {least_s} to {most_s} s"
+    fits = [name for name, f in _STAMP_UNITS.items() if least_s <= period_s * f <= most_s]
+    if fits:
+        text += f"; it would be {1 / (period_s * _STAMP_UNITS[fits[0]]):.1f} Hz with {fits[0]}"
+    verdict = WRONG if fits else SUSPICIOUS
+    return finding("stamps", verdict, text, "correct the unit of the stamps", period_s=period_s)
+
+
+def check_point_times(sample: Sample) -> list[Finding]:
+    """Check that the firing times within a sweep span about one period."""
+    if any(sweep.offset_ns is None for sweep in sample.middles):
+        return [finding("point times", UNKNOWN, "the points have no times")]
+    if len(sample.timeline.frames) < 2:
+        return [finding("point times", UNKNOWN, "one sweep tells no period to compare with")]
+    return [_check_point_times_of(sample, lidar) for lidar in sample.lidars]
+
+
+def _check_point_times_of(sample: Sample, lidar: int) -> Finding:
+    period_s = sample.timeline.period_ns * 1e-9
+    offsets_s = [
+        sweep.offset_ns[sweep.lidar == lidar] * 1e-9
+        for sweep in sample.middles
+        if sweep.offset_ns is not None
+    ]
+    ends_s = [np.percentile(offset_s, [0.1, 99.9]) for offset_s in offsets_s if len(offset_s)]
+    low_s, high_s = np.median(ends_s, axis=0).tolist()
+    span, share_before = (high_s - low_s) / period_s, -low_s / max(high_s - low_s, 1e-12)
+    text = (
+        f"{low_s * 1e3:+.1f} to {high_s * 1e3:+.1f} ms around the stamp, {span:.3g} periods; "
+        f"the stamp is at {round(100 * share_before)} % of the sweep"
+    )
+    verdict, remedy = SUSPICIOUS, "compare the point times with the scanner's rate"
+    if _WHOLE_SWEEP[0] <= span <= _WHOLE_SWEEP[1]:
+        verdict = FINE
+    elif span < 1 and _TURN_S[0] <= high_s - low_s <= _TURN_S[1]:
+        verdict, text = FINE, f"{text}; one of {round(1 / span)} turns of the scanner was kept"
+    elif not _WRONG_SPAN[0] <= span <= _WRONG_SPAN[1]:
+        verdict, remedy = WRONG, "correct the unit of the point times"
+    name = "point times" + f" of scanner {lidar}" * (lidar > 0)
+    return finding(name, verdict, text, remedy, first_s=low_s, last_s=high_s)
+
+
+def check_units(sample: Sample) -> list[Finding]:
+    """Check that the points are in metres and that the scanner is at the origin."""
+    name, (least_m, most_m) = "unit of points", _MEDIAN_RANGE_M
+    middles = [sweep.points for sweep in sample.middles]
+    range_m = float(np.median([_median_range_m(points) for points in middles]))
+    if least_m <= range_m <= most_m:
+        text = f"half of the returns within {range_m:.1f} m"
+        return [finding(name, FINE, text, median_range_m=range_m)]
+    around_m = float(np.median([_median_range_m(p - np.median(p, axis=0)) for p in middles]))
+    fits = [u for u, f in _LENGTH_UNITS.items() if least_m <= range_m * f <= most_m]
+    text = f"half of the returns are farther than {range_m:.4g} m"
+    verdict, remedy = SUSPICIOUS, "scale the points to metres (sweeps: scale_m in densify.yaml)"
+    if least_m <= around_m <= most_m and range_m > _FAR_OFF * around_m:
+        text += f", and within {around_m:.1f} m of each other's middle, as if they were in a map's"
+        text += " coordinates"
+        verdict, remedy = WRONG, MAP_FRAME_REMEDY
+    else:
+        text += f", expected {least_m} to {most_m:.0f} m"
+        if fits:
+            verdict, text = WRONG, f"{text}, as if they were in {fits[0]}"
+    return [finding(name, verdict, text, remedy, median_range_m=range_m)]
+
+
+def _median_range_m(points: Float) -> float:
+    return float(np.median(np.linalg.norm(points, axis=1)))
+
+
+def check_axes(sample: Sample) -> list[Finding]:
+    """Check that z points up: one level layer, the ground, holds most returns, with few below."""
+    share = {
+        name: float(np.median([_ground_share(sweep, up) for sweep in sample.middles]))
+        for name, up in _UP.items()
+    }
+    best = max(share, key=lambda name: share[name])
+    text = (
+        f"{100 * share[best]:.0f} % of the near returns lie in one layer below the scanner if "
+        f"{best} is up" + (f", {100 * max(share['z'], 0):.0f} % if z is" if best != "z" else "")
+    )
+    verdict, remedy = WRONG, "turn the points so that z is up (sweeps: axes in densify.yaml)"
+    if share[best] < _LEAST_GROUND:
+        verdict, text = UNKNOWN, "no ground was found along any axis"
+    elif share["z"] >= _LEAST_GROUND or share[best] < _CLEARLY * share["z"]:
+        verdict = FINE
+    elif best in _UP_MEANS:
+        text += f" ({_UP_MEANS[best]})"
+    values = {f"share_{name}": number for name, number in share.items()}
+    return [finding("axes", verdict, text, remedy, **values)]
+
+
+def _ground_share(sweep: Sweep, up: Float) -> float:
+    """Return the share of near returns in the fullest layer across ``up`` (3,) with few below."""
+    # The layer must not be above the origin. The share counts in excess of an even spread over all
+    # heights.
+    height_m = sweep.points[np.linalg.norm(sweep.points, axis=1) < _NEAR_M] @ up
+    if not len(height_m):
+        return 0.0
+    low_m, high_m = np.percentile(height_m, [0.5, 99.5])
+    edges = np.arange(low_m - _LAYER_M, high_m + 2 * _LAYER_M, 0.5 * _LAYER_M)
+    share = np.histogram(height_m, edges)[0] / len(height_m)
+    layer = share[:-1] + share[1:]
+    below = np.cumsum(share)[:-1] - share[:-1]
+    even = _LAYER_M / max(float(high_m - low_m), _LAYER_M)
+    allowed = (below < _MOST_BELOW) & (edges[:-2] < _HIGHEST_M)
+    return float(layer[allowed].max(initial=0.0)) - even
+
+
+def check_directions(sample: Sample) -> list[Finding]:
+    """Check that sweeps have returns in all directions, as far as the scanner sees."""
+    returns = [np.stack([by_azimuth(s) for s in spot.sweeps]) for spot in sample.spots]
+    width_deg = [float(lost_deg(of_spot).max()) for of_spot in returns]
+    sectors = [blind_sector(of_spot) for of_spot in returns]
+    name, widest_deg = "directions", max(width_deg)
+    if widest_deg >= LOST_DEG:
+        frames = format_frames(s.frame for s in sample.spots[int(np.argmax(width_deg))].sweeps)
+        text = (
+            f"one of the sweeps {frames} lacks {widest_deg:.0f} deg of azimuth that the others "
+            f"measured"
+        )
+        remedy = "lost packets: record with a larger buffer of the socket, or leave sweeps out"
+        return [finding(name, SUSPICIOUS, text, remedy, lost_deg=widest_deg)]
+    if sectors[0] is not None and None not in sectors:
+        text = f"no returns from {sectors[0][0]} to {sectors[0][1]} deg of azimuth in any sweep"
+        remedy = "a blind sector: something covers the scanner, or the sweeps were cropped"
+        return [finding(name, SUSPICIOUS, text, remedy)]
+    return [finding(name, FINE, "returns all around, as far as the scanner sees")]
+
+
+def check_intensity(sample: Sample) -> list[Finding]:
+    """Check that intensities are between 0 and 1."""
+    values = np.concatenate([sweep.intensity for sweep in sample.middles])
+    low, high = float(values.min()), float(values.max())
+    verdict, text = FINE, f"{low:g} to {high:g}"
+    if low < 0 or high > 1:
+        verdict = SUSPICIOUS
+        text += ", expected 0 to 1; only pictures and the clouds' column suffer"
+    remedy = "scale the intensities (sweeps: intensity_scale in densify.yaml)"
+    return [finding("intensity", verdict, text, remedy, lowest=low, highest=high)]
