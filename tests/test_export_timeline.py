@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
 from densify.outputs import export_run, read_cloud, read_depth_png, write_result
-from densify.outputs.export.finished_run import finished_runs, timelines
+from densify.outputs.finished_run import finished_runs
+from densify.outputs.viewers import timelines
 from densify.pipeline.run import run
 from tests.exported import street_result, write_street, write_views
 from tests.small_street import KEY, POSES_GIVEN, one_car
@@ -40,7 +41,7 @@ def test_sweeps_are_where_they_were_measured(street: Path) -> None:
     stamps_ns = [one_car().stamp_ns(frame) for frame in (KEY - 1, KEY, KEY + 1)]
     assert [s.stamp_ns for s in timeline.sweeps] == stamps_ns
     cloud = read_cloud(street / "cloud.laz")
-    (track,) = timeline.run.tracks
+    (track,) = timeline.tracks
     for sweep in timeline.sweeps:  # the box of that sweep is around what moves in it
         assert len(sweep.points.frame) == np.count_nonzero(
             (cloud.frame == sweep.frame) & ~cloud.far
@@ -118,7 +119,7 @@ def test_mcap_of_one_key(topics, street: Path) -> None:
     (timeline,) = timelines(finished_runs(street))
     assert start_ns == timeline.sweeps[0].stamp_ns
     assert [ns for ns, _ in topics["/sweep"]] == [s.stamp_ns for s in timeline.sweeps]
-    (track,) = timeline.run.tracks
+    (track,) = timeline.tracks
     for (_, update), frame in zip(topics["/movers"], track.frames, strict=True):
         (cube,) = update.entities[0].cubes
         T = track.T_key_object[track.frames.index(frame)]
@@ -201,7 +202,7 @@ def test_rrd_of_one_key_and_of_a_drive(street: Path, drive: Path, tmp_path: Path
     times = {n for chunk in found["/world/key/sweep"] for n in chunk.timeline_names}
     assert times == {"time", "frame"}
     centers = values_of(found["/world/key/movers/box"], "centers")
-    np.testing.assert_allclose(centers, timeline.run.tracks[0].T_key_object[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(centers, timeline.tracks[0].T_key_object[:, :3, 3], atol=1e-5)
     assert "/world/key/front/depth" in found
     export_run(drive, "rrd", tmp_path / "b")
     _, second = timelines(finished_runs(drive))

@@ -12,8 +12,8 @@ import numpy as np
 from densify.cli.verbs.run import _front_first
 from densify.geometry.types import CameraView
 from densify.outputs import plots
-from densify.outputs.front_view import front_first
-from densify.outputs.report.key_page import KeyFiles, key_page
+from densify.outputs.plots import front_first
+from densify.outputs.report_page import KeyFiles, key_page
 from tests.exported import camera_of, write_views
 
 NAMES = ["back", "left", "straight"]

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 import densify
 from densify.geometry.types import DepthMap
 from densify.outputs.depth_png import read_depth_png
-from densify.outputs.kitti_tree import FileRecord, drive_folder, split_of, write_key, write_readme
+from densify.outputs.kitti_tree import FileRecord, write_key, write_readme
+from densify.outputs.recording_folder import drive_folder, split_of
 from tests.exported import CAMERAS, map_of, tree
 
 PRODUCTS = ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")

@@ -300,7 +300,9 @@ def test_places_that_cannot_be_written_to(put, tmp_path, monkeypatch):
     one_line(error, f"{tmp_path / 'file'} is not a folder")
     put()
     denied: list[Path] = []
-    monkeypatch.setattr("densify.outputs.store.os.access", lambda path, _: Path(path) not in denied)
+    monkeypatch.setattr(
+        "densify.outputs.key_outputs.os.access", lambda path, _: Path(path) not in denied
+    )
     for place in (tmp_path / "out", tmp_path / "out" / "000120"):
         denied[:] = [place]
         with pytest.raises(InputError) as error:

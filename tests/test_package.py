@@ -109,7 +109,7 @@ def test_the_installed_package_is_tested() -> None:
     assert all(path.parent == home / "configs" for path in presets().values())
     package = CHECKOUT / "densify"
     sources = {p.relative_to(package) for p in package.rglob("*.py")}
-    sources |= {p.relative_to(package) for p in (package / "outputs" / "report" / "page").iterdir()}
+    sources |= {p.relative_to(package) for p in (package / "outputs" / "page").iterdir()}
     missing = sorted(str(path) for path in sources if not (home / path).is_file())
     assert not missing
 
@@ -237,13 +237,13 @@ def test_no_arrow_runs_upward() -> None:
 DOORS: dict[str, str | tuple[str, ...]] = {
     "dask": "densify/dataset/executor.py",
     "distributed": "densify/dataset/executor.py",
-    "foxglove": "densify/outputs/export/mcap.py",
-    "rerun": "densify/outputs/export/rrd.py",
-    "open3d": "densify/outputs/export/open3d_window.py",
+    "foxglove": "densify/outputs/viewers.py",
+    "rerun": "densify/outputs/viewers.py",
+    "open3d": "densify/outputs/viewers.py",
     "matplotlib": "densify/outputs/plots.py",
     "embreex": "densify/street/world.py",
     "kiss_icp": "densify/registration/odometry.py",
-    "laspy": ("densify/readers/decoded_files.py", "densify/outputs/cloud_laz.py"),
+    "laspy": ("densify/readers/decoded_files.py", "densify/outputs/cloud_files.py"),
     "numba": ("densify/geometry/compiled.py",),
     "pickle": ("densify/readers/pickled_frame.py",),
     "simplejpeg": "densify/readers/stray_bytes.py",

@@ -17,7 +17,7 @@ from densify.config.errors import InputError
 from densify.dataset.report import write_report
 from densify.outputs import StoredCloud, read_cloud, write_cloud
 from densify.outputs.depth_png import encode_png, read_stored
-from densify.outputs.report.page_file import Blobs, packed_cloud, page_file, thinned
+from densify.outputs.report_page import Blobs, packed_cloud, page_file, thinned
 from tests.command import refused
 from tests.exported import cloud_of
 from tests.report_runs import write_compared, write_run

@@ -228,32 +228,30 @@ READERS = Table(
 class Form(NamedTuple):
     """An export format."""
 
-    module: str  # module of `densify.outputs.export` with the function ``write_NAME``
+    module: str  # module of `densify.outputs` with the function ``write_NAME``
     owned: tuple[str, ...]  # files and folders that the format writes
     of_drive: bool = False  # True if an export can cover several keys of a drive
 
 
 EXPORTS = {
-    "npy": Form("maps_and_clouds", ("depth", "depth_filled", "confidence")),
-    "exr": Form("maps_and_clouds", ("depth", "depth_filled", "confidence")),
-    "ply": Form("maps_and_clouds", ("cloud.ply",)),
-    "pcd": Form("maps_and_clouds", ("cloud.pcd",)),
+    "npy": Form("export", ("depth", "depth_filled", "confidence")),
+    "exr": Form("export", ("depth", "depth_filled", "confidence")),
+    "ply": Form("export", ("cloud.ply",)),
+    "pcd": Form("export", ("cloud.pcd",)),
     "nerfstudio": Form(
-        "camera_files", ("transforms.json", "images", "depth", "cloud.ply"), of_drive=True
+        "camera_exports", ("transforms.json", "images", "depth", "cloud.ply"), of_drive=True
     ),
-    "colmap": Form("camera_files", ("images", "sparse"), of_drive=True),
+    "colmap": Form("camera_exports", ("images", "sparse"), of_drive=True),
     "splats": Form(
-        "camera_files", ("images", "depths", "sparse", "movers", "tracks.json"), of_drive=True
+        "camera_exports", ("images", "depths", "sparse", "movers", "tracks.json"), of_drive=True
     ),
-    "moge": Form("training_sets", (".index.txt", "keys"), of_drive=True),
-    "wai": Form("training_sets", ("scene_meta.json", "images", "depth"), of_drive=True),
-    "kitti": Form(
-        "maps_and_clouds", ("train", "val", "files.txt", "annotations.json"), of_drive=True
-    ),
+    "moge": Form("camera_exports", (".index.txt", "keys"), of_drive=True),
+    "wai": Form("camera_exports", ("scene_meta.json", "images", "depth"), of_drive=True),
+    "kitti": Form("kitti_tree", ("train", "val", "files.txt", "annotations.json"), of_drive=True),
     "kitti-tracking": Form(
-        "kitti_tracking", ("label_02", "calib", "velodyne", "image_02"), of_drive=True
+        "kitti_tree", ("label_02", "calib", "velodyne", "image_02"), of_drive=True
     ),
-    "rrd": Form("rrd", ("recording.rrd",), of_drive=True),
-    "mcap": Form("mcap", ("recording.mcap",), of_drive=True),
+    "rrd": Form("viewers", ("recording.rrd",), of_drive=True),
+    "mcap": Form("viewers", ("recording.mcap",), of_drive=True),
 }
 """Name of an export format of ``densify export`` -> its writer."""

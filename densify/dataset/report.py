@@ -13,7 +13,7 @@ from densify.config.errors import InputError
 from densify.dataset.manifest import KeyRecord, read_manifests
 from densify.dataset.plan import planned_keys, read_plan
 from densify.outputs.atomic import write_file
-from densify.outputs.report.key_page import KeyFiles, key_page
+from densify.outputs.report_page import KeyFiles, key_page
 
 _STATUSES = ("failed", "aside", "done")
 _PAGE = """<!DOCTYPE html>

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Write the files of a result, each whole or absent, their exports and the report page."""
 
-from densify.outputs.cloud_laz import StoredCloud, read_cloud, write_cloud
+from densify.outputs.cloud_files import StoredCloud, read_cloud, write_cloud
 from densify.outputs.depth_png import (
     read_depth_png,
     read_mask_png,
@@ -10,7 +10,7 @@ from densify.outputs.depth_png import (
     write_depth_png,
 )
 from densify.outputs.export import Export, export_run
-from densify.outputs.store import check_writable, write_comparison, write_result
+from densify.outputs.key_outputs import check_writable, write_comparison, write_result
 
 __all__ = [
     "Export",

@@ -97,10 +97,10 @@ def add_view(commands: Any) -> None:
 
 def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
     """Show finished runs in a viewer."""
-    from densify.outputs.export import open3d_window, rrd
-    from densify.outputs.export.finished_run import finished_runs
+    from densify.outputs.finished_run import Thresholds, finished_runs
+    from densify.outputs.viewers import show_in_open3d, show_in_rerun
 
-    runs = finished_runs(options.place, cameras=options.cameras)
-    (rrd if options.by == "rerun" else open3d_window).show(runs)
+    runs = finished_runs(options.place, Thresholds(cameras=options.cameras))
+    (show_in_rerun if options.by == "rerun" else show_in_open3d)(runs)
     keys = [run.key for run in runs]
     yield Answer(f"shown: key {', '.join(map(str, keys))}", {"keys": keys})

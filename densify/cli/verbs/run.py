@@ -131,7 +131,7 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _front_first(paths: Sequence[Path], result: Result) -> list[Path]:
-    from densify.outputs.front_view import front_first
+    from densify.outputs.plots import front_first
 
     names = front_first([*result.depth], result.views, result.T_key_lidar)
     front = [p for p in paths if names and p.with_suffix("").as_posix().endswith(f"/{names[0]}")]
