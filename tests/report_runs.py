@@ -8,7 +8,7 @@ from pathlib import Path
 
 from densify.config import as_mapping, resolve
 from densify.geometry.types import Result
-from densify.outputs import write_comparison, write_result
+from densify.outputs.key_outputs import write_comparison, write_result
 from densify.pipeline.run import compare
 from tests.small_street import KEY, POSES_GIVEN, one_car
 

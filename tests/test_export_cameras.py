@@ -16,7 +16,10 @@ from scipy.ndimage import map_coordinates
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
 from densify.geometry.types import ObjectTrack, Result
-from densify.outputs import export_run, read_cloud, read_depth_png, write_result
+from densify.outputs.cloud_files import read_cloud
+from densify.outputs.depth_png import read_depth_png
+from densify.outputs.export import export_run
+from densify.outputs.key_outputs import write_result
 from densify.pipeline.run import run as run_key
 from tests.exported import (
     STAMPS_NS,

@@ -13,8 +13,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.outputs import export_run, read_cloud, read_depth_png, write_result
+from densify.outputs.cloud_files import read_cloud
+from densify.outputs.depth_png import read_depth_png
+from densify.outputs.export import export_run
 from densify.outputs.finished_run import finished_runs
+from densify.outputs.key_outputs import write_result
 from densify.outputs.viewers import timelines
 from densify.pipeline.run import run
 from tests.exported import street_result, write_street, write_views

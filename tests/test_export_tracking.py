@@ -12,7 +12,8 @@ import pytest
 
 from densify.geometry import poses
 from densify.geometry.types import Result
-from densify.outputs import export_run, write_result
+from densify.outputs.export import export_run
+from densify.outputs.key_outputs import write_result
 from densify.pipeline.run import run_keys
 from densify.readers.kitti.tracking import KittiTracking, open_recording, read_labels
 from tests.exported import refused, write_street, write_views

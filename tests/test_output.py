@@ -19,19 +19,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from densify.config.errors import InputError
-from densify.outputs import (
-    check_writable,
-    key_outputs,
-    plots,
-    read_cloud,
+from densify.outputs import key_outputs, plots
+from densify.outputs.cloud_files import read_cloud, write_cloud
+from densify.outputs.depth_png import (
     read_depth_png,
     write_age_png,
-    write_cloud,
-    write_comparison,
     write_confidence_png,
     write_depth_png,
-    write_result,
 )
+from densify.outputs.key_outputs import check_writable, write_comparison, write_result
 from tests.exported import CAMERAS, KEY_NS, H, W, cloud_of, result_of, tree
 
 CONFIG = {"objective": {"alpha": 10.0, "radius_m": None}, "register": {"source": "kiss-icp"}}

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from densify.geometry.types import Cloud, Reason, Result
-from densify.outputs import read_cloud, read_depth_png, write_result
+from densify.outputs.cloud_files import read_cloud
+from densify.outputs.depth_png import read_depth_png
+from densify.outputs.key_outputs import write_result
 from densify.pipeline.run import compare, run
 from tests.scenes import ROOM, Arc, Scanner, Scene, TinySequence, World, by_flow
 from tests.small_street import CAR, KEY, POSES_GIVEN, one_car

@@ -15,7 +15,7 @@ import pytest
 
 from densify.config.errors import InputError
 from densify.dataset.report import write_report
-from densify.outputs import StoredCloud, read_cloud, write_cloud
+from densify.outputs.cloud_files import StoredCloud, read_cloud, write_cloud
 from densify.outputs.depth_png import encode_png, read_stored
 from densify.outputs.report_page import Blobs, packed_cloud, page_file, thinned
 from tests.command import refused

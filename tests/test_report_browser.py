@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from densify.dataset.report import write_report
-from densify.outputs import export_run
+from densify.outputs.export import export_run
 from densify.readers.decoded_files import decode_image
 from tests.browser import Opened, chromium
 from tests.report_runs import results, write_run

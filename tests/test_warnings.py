@@ -15,7 +15,7 @@ from densify.depth.confidence import expected_outliers
 from densify.free_space.lone_returns import without_lone
 from densify.geometry import poses
 from densify.geometry.types import Camera
-from densify.outputs import write_result
+from densify.outputs.key_outputs import write_result
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import run
 from densify.pipeline.warnings import of_result

@@ -10,8 +10,8 @@ import numpy as np
 
 from densify.cli.screen import aligned, look_up, percent, written
 from densify.geometry.types import METHOD_NAMES, Result
-from densify.outputs import Export
 from densify.outputs.atomic import plain
+from densify.outputs.export import Export
 from densify.readers.timeline import format_frames
 
 FIRST_OF_RUN = {

@@ -1,22 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Write scene flow of one window, or of a whole recording in the formats of other programs.
 
-NAME is the name of the recording, a row one of the sweep file::
-
-    npz            OUT/000119_000120.npz: flow files, see `densify.readers.flow_files`
-    av2            OUT/NAME/STAMP.feather of the Argoverse 2 scene flow challenge of 2024 (which
-                   takes every fifth sweep, zipped as NAME/0000000005.feather): for each row
-                   is_valid bool, flow_tx_m flow_ty_m flow_tz_m float16, flow to the next sweep
-                   without the vehicle's motion, in the sweep's lidar frame
-    opensceneflow  OUT/NAME.h5 (https://github.com/KTH-RPL/OpenSceneFlow), a group for each sweep,
-                   its stamp in ns: lidar (N,4) deskewed to the stamp, pose (4,4), lidar_id,
-                   ground_mask (all False), row (N,); where flow is known, flow (N,3) with the
-                   vehicle's motion, flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
-    semantickitti  OUT/sequences/NAME/predictions/000120.label of semantic-kitti-api
-                   (https://github.com/PRBonn/semantic-kitti-api, evaluate_mos.py): uint32 for each
-                   row; low 16 bits 251 moving or 9 static, high 16 bits object number, 0 none
-    doc-depth      OUT/NAME, the exchange format of DOC-Depth (de Moreau et al., "DOC-Depth", IV
-                   2025; https://github.com/SimondeMoreau/DOC-Depth, Preprocessing/FORMAT.md)
+docs/formats/flow-files.md describes them: npz; av2 (the Argoverse 2 scene flow challenge of 2024);
+opensceneflow; semantickitti, of semantic-kitti-api (evaluate_mos.py); doc-depth (de Moreau et al.,
+"DOC-Depth", IV 2025, FORMAT.md).
 """
 
 from __future__ import annotations

@@ -1,37 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Write the folder of a key, ``OUT/000120/``, all files or none. `finished_run` reads it.
 
-Fields of metrics.json, null where unknown. compare.json has those from ``frames`` on by method::
-
-    schema_version, key (frame number of the sweep), method
-    frames      frame numbers of the window
-    num_points  number of points in the cloud; num_moving: number of moving points
-    density     camera -> measured, filled: share of the pixels with a depth; with --prior also
-                full (completed map), and prior, the share of pixels that came from the prior
-    ghosts      `densify.scores.cloud_scores.ghost_scores`
-    depth       with ground truth: camera -> measured, filled (full, prior) -> all, moving, static
-                -> `densify.scores.depth_metrics.DepthErrors`
-    measure     map -> z, depth along the camera's axis, or range, distance from the lens
-    held_out    camera -> as depth: map made without the key sweep, against its returns; curve,
-                `precision_density`; reliability, `densify.depth.confidence`;
-                unjudged, share of the filled pixels near which the key sweep has no return
-    reliability with ground truth: map -> the same list against ground truth
-    expected_outliers  map -> measured, filled: the share of outliers that confidence predicts
-    baselines   simpler method on the same registration -> the fields from ``frames`` on
-
-movers.json: objects, by `ObjectTrack`: instance (as in cloud.laz), size_m (length, width, height
-of the completed box), seen_size_m (of the box around its points), sides_seen, and poses at its
-sweeps and the key sweep: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,) without
-ego-motion, in the key sweep's lidar frame.
-
-scene/::
-
-    image/CAMERA.jpg   the image that the map shows
-    none/CAMERA.png, icp/…, truth/…   depth of the simpler methods, and true depth, as in ``depth``
-    sweep/CAMERA.png   uint16, measured pixels: 1 + index of the source sweep in ``sweeps``; 0 none
-    reason/CAMERA.png  uint8 `Reason` that the nearest point of a pixel was rejected
-    scene.json         sweeps: frame, since_key_s, far, T_key_lidar (4,4); views: map -> camera,
-                       T_cam_key (4,4), late_s after the key sweep, image number
+docs/outputs.md describes each file and the fields of the tables.
 """
 
 from __future__ import annotations

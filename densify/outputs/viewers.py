@@ -1,19 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Show one key sweep or a drive in viewers: Foxglove (MCAP), rerun (https://rerun.io), open3d.
 
-Topics of the MCAP file, in Foxglove's schemas, with "key" for the key sweep's lidar frame::
-
-    /tf                FrameTransform: world -> key, key -> vehicle and each camera
-    /cloud, /sweep     PointCloud: accumulated cloud at the key sweep's time; sweeps as measured
-    /movers            SceneUpdate: boxes of moving objects, by time
-    /CAMERA/image, /CAMERA/calibration, /CAMERA/depth, /CAMERA/depth_filled (32FC1, metres)
-
-Time lines for rerun: ``time`` (UNIX, the recording's clock), ``frame``. In ``world/key``, its lidar
-frame::
-
-    cloud/static, cloud/moving, sweep, vehicle    the cloud, each sweep as measured, lidar poses
-    movers/box, movers/path     moving objects; labels give object number and speed
-    CAMERA/{image,depth,depth_filled}    image and metres; with a pinhole for rectified cameras
+docs/formats/writing.md lists the topics and entities.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     """Densify one key or several."""
     config = config_of(options)
     from densify.cli.results import FIRST_OF_RUN, key_facts, summary
-    from densify.outputs import check_writable, write_result
+    from densify.outputs.key_outputs import check_writable, write_result
     from densify.outputs.recording_folder import check_recording, default_folder
     from densify.pipeline import run as pipeline
     from densify.readers import Spec, open_sequence
@@ -160,7 +160,7 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
     config = config_of(options)
     from densify.cli.results import FIRST_OF_COMPARISON, comparison, key_facts
     from densify.dataset.report import write_comparison_page
-    from densify.outputs import check_writable, write_comparison
+    from densify.outputs.key_outputs import check_writable, write_comparison
     from densify.outputs.recording_folder import check_recording, default_folder
     from densify.pipeline import run as pipeline
     from densify.pipeline.key_result import COMPARED
