@@ -26,6 +26,8 @@ from tests.exported import (
     KEY_NS,
     NUM_POINTS,
     STAMPS_NS,
+    H,
+    W,
     refused,
     tree,
     write_street,
@@ -305,3 +307,30 @@ def test_clouds_that_are_damaged_or_missing(run: Path) -> None:
     refused("cloud.laz", run=run, to="ply")
     (run / "cloud.laz").unlink()
     refused("cloud.laz", run=run, to="ply")
+
+
+def test_a_video_has_a_frame_for_each_map_and_a_growing_bar(tmp_path: Path) -> None:
+    folder, _ = write_views(tmp_path, {f"image_02/{n}": "plain" for n in range(3)})
+    export_run(folder, "mp4", tmp_path / "out")
+    video = cv2.VideoCapture(str(tmp_path / "out" / "video" / "image_02.mp4"))
+    frames = [frame for read, frame in iter(video.read, (False, None)) if read]
+    assert len(frames) == 3 and frames[0].shape == (2 * H + 6, W, 3)
+    white_px = [(frame[-3] > 128).all(axis=-1).sum() for frame in frames]
+    assert white_px == sorted(white_px) and white_px[-1] > white_px[0]
+
+
+def test_a_finished_run_gives_back_its_arrays(tmp_path: Path) -> None:
+    folder, result = write_views(tmp_path, {"image_02": "plain"})
+    loaded, expected = densify.load_result(folder), result.depth["image_02"]
+    maps = loaded.depth["image_02"]
+    for depth_m, expected_m in (
+        (maps.depth_m, expected.depth_m),
+        (maps.filled_m, expected.filled_m),
+    ):
+        storable_m = np.where(expected_m < 255.9, expected_m, 0)
+        np.testing.assert_allclose(depth_m, storable_m, atol=1 / 256)
+    seen = maps.filled_m > 0
+    np.testing.assert_allclose(maps.confidence[seen], expected.confidence[seen], atol=1 / 254)
+    assert not maps.confidence[~seen].any() and not maps.age_s[~seen].any()
+    np.testing.assert_allclose(loaded.cloud.points, result.cloud.points, atol=5e-4)
+    assert "key 120" in repr(loaded) and "key 120" in repr(result)

@@ -253,5 +253,6 @@ EXPORTS = {
     ),
     "rrd": Form("viewers", ("recording.rrd",), of_drive=True),
     "mcap": Form("viewers", ("recording.mcap",), of_drive=True),
+    "mp4": Form("video", ("video",), of_drive=True),
 }
 """Name of an export format of ``densify export`` -> its writer."""

@@ -76,10 +76,20 @@ def stored_confidence(confidence: ArrayLike) -> NDArray[np.uint8]:
     return (1 + levels).astype(np.uint8)
 
 
+def confidence_of(stored: NDArray[np.uint8]) -> Float32:
+    """Return (H,W) the confidence 0 to 1 of values of `stored_confidence`, 0 without depth."""
+    return np.maximum(stored.astype(np.float32) - 1, 0) / np.float32(STEPS_OF_CONFIDENCE)
+
+
 def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
     """Return ``1 + rint(1000 * age_s)``. 65535 means 65.5 s or more, 0 means no depth."""
     steps = np.rint(_STEPS_PER_S * np.asarray(age_s, np.float64))
     return (1 + np.minimum(steps, _MAX_VALUE - 1)).astype(np.uint16)
+
+
+def age_of(stored: NDArray[np.uint16]) -> Float32:
+    """Return (H,W) the age in seconds of values of `stored_age`, 0 without depth."""
+    return np.maximum(stored.astype(np.float32) - 1, 0) / np.float32(_STEPS_PER_S)
 
 
 def write_flow_png(path: Path, flow_px: Float32) -> None:

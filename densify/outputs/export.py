@@ -19,7 +19,7 @@ from densify.config.plugins import EXPORTS
 from densify.geometry.types import Float32
 from densify.outputs.atomic import plain
 from densify.outputs.cloud_files import save_ply
-from densify.outputs.depth_png import STEPS_OF_CONFIDENCE, map_path, metres
+from densify.outputs.depth_png import confidence_of, map_path, metres
 from densify.outputs.finished_run import FinishedRun, Kept, Thresholds, finished_runs
 from densify.outputs.key_outputs import writing
 
@@ -137,9 +137,8 @@ def _write_maps(
     """Save the three maps of each camera by a function of path, kind and (H,W) values."""
     for camera in run.cameras:
         maps = run.maps(camera)
-        steps = np.maximum(maps["confidence"].astype(np.float32) - 1, 0)
         values = {kind: metres(maps[kind]) for kind in ("depth", "depth_filled")}
-        values["confidence"] = steps / np.float32(STEPS_OF_CONFIDENCE)
+        values["confidence"] = confidence_of(maps["confidence"])
         for kind, array in values.items():
             path = map_path(folder, kind, camera, suffix)
             path.parent.mkdir(parents=True, exist_ok=True)

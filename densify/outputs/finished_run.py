@@ -23,6 +23,8 @@ from densify.geometry.types import Camera, CameraView, Float, Float32, ObjectTra
 from densify.outputs.cloud_files import StoredCloud, read_cloud
 from densify.outputs.depth_png import (
     PixelType,
+    age_of,
+    confidence_of,
     map_path,
     metres,
     read_stored,
@@ -68,6 +70,58 @@ class SceneFile:
     views: Mapping[str, CameraView]  # name of the depth map -> its camera and pose
     # Frame number of a sweep of the window -> (4,4) pose in the key sweep's lidar frame
     T_key_lidar: Mapping[int, Float]
+
+
+class LoadedMaps(NamedTuple):
+    """The maps of one image; 0 where there is no depth."""
+
+    depth_m: Float32  # (H,W) measured depth in metres
+    filled_m: Float32  # (H,W) measured and filled depth in metres
+    confidence: Float32  # (H,W) 0 to 1
+    age_s: Float32  # (H,W) time from the measurement to the exposure in seconds
+
+
+@dataclass(frozen=True)
+class LoadedResult:
+    """The arrays of a finished run, see `load_result`."""
+
+    folder: Path  # the run's folder
+    key: int  # frame number of the key sweep
+    depth: Mapping[str, LoadedMaps]  # name of the depth map: CAMERA, or CAMERA/NUMBER
+    cloud: StoredCloud  # points at the key sweep's time, in its lidar frame
+    tracks: Sequence[ObjectTrack]  # moving objects, largest first
+    metrics: Mapping[str, Any]  # the content of metrics.json
+
+    def __repr__(self) -> str:
+        return (
+            f"LoadedResult(key {self.key}: depth {', '.join(self.depth)}; "
+            f"{len(self.cloud.points):,} points, {len(self.tracks)} moving objects)"
+        )
+
+
+def load_result(folder: str | Path) -> LoadedResult:
+    """Return the arrays of a finished run from its folder, such as densify-out/street/000120."""
+    run = FinishedRun(Path(folder))
+    with _damage_named(run.folder / "metrics.json"):
+        metrics = read_json(run.folder / "metrics.json")
+    return LoadedResult(
+        folder=run.folder,
+        key=run.key,
+        depth={camera: _loaded(run.maps(camera)) for camera in run.cameras},
+        cloud=StoredCloud.joined([run.cloud(), *run.mover_clouds()]),
+        tracks=run.tracks,
+        metrics=metrics,
+    )
+
+
+def _loaded(maps: Mapping[str, NDArray[Any]]) -> LoadedMaps:
+    """Return the maps in metres, seconds and shares from their stored values."""
+    return LoadedMaps(
+        metres(maps["depth"]),
+        metres(maps["depth_filled"]),
+        confidence_of(maps["confidence"]),
+        age_of(maps["age"]),
+    )
 
 
 class FinishedRun:

@@ -112,7 +112,7 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
         nearest_m = np.where(depth_m > 0, depth_m, _NO_DEPTH_M)
         nearest_m = cv2.erode(nearest_m, kernel).astype(np.float32, copy=False)
         picture = cv2.merge([gray, gray, gray])
-        picture[nearest_m < _NO_DEPTH_M] = _colours(nearest_m)[nearest_m < _NO_DEPTH_M]
+        picture[nearest_m < _NO_DEPTH_M] = coloured(nearest_m)[nearest_m < _NO_DEPTH_M]
         picture = cv2.resize(picture, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_NEAREST)
         strip = np.full((_TITLE_PX, picture.shape[1], 3), 255, np.uint8)
         _write(strip, title, _MARGIN_PX, picture.shape[1] - _MARGIN_PX)
@@ -120,11 +120,13 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
     return np.concatenate([*rows, _scale(rows[0].shape[1])])
 
 
-def _colours(depth_m: Float32) -> Picture:
-    """Return the (h,w,3) colours, as blue, green, red, of depths (h,w) in metres."""
-    share = np.log(depth_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M)
-    levels = np.rint(255 * (1 - np.clip(share, 0, 1))).astype(np.uint8)
-    return cv2.applyColorMap(levels, cv2.COLORMAP_TURBO).astype(np.uint8, copy=False)
+def coloured(depth_m: Float32) -> Picture:
+    """Return the (h,w,3) colours, as blue, green, red, of depths (h,w) in metres; 0 is black."""
+    share = np.log(np.maximum(depth_m, _NEAR_M) / _NEAR_M) / np.log(_FAR_M / _NEAR_M)
+    levels = np.rint(255 * (1 - np.minimum(share, 1))).astype(np.uint8)
+    picture = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO).astype(np.uint8, copy=False)
+    picture[depth_m <= 0] = 0
+    return picture
 
 
 def _scale(width_px: int) -> Picture:
@@ -133,7 +135,7 @@ def _scale(width_px: int) -> Picture:
     left, long_px = width_px // 20, width_px - 2 * (width_px // 20)
     log = np.linspace(np.log(_NEAR_M), np.log(_FAR_M), long_px)
     bar = scale[_MARGIN_PX : _MARGIN_PX + _BAR_PX, left : left + long_px]
-    bar[:] = _colours(np.exp(log).astype(np.float32)[None])
+    bar[:] = coloured(np.exp(log).astype(np.float32)[None])
     for tick_m in _TICKS_M:
         at = left + int(np.searchsorted(log, np.log(tick_m) - 1e-9))
         scale[_MARGIN_PX + _BAR_PX : _MARGIN_PX + _BAR_PX + 4, at - 1 : at + 1] = 0
