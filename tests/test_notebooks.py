@@ -42,9 +42,6 @@ def test_your_data(tmp_path: Path, monkeypatch, capsys) -> None:
     assert ghosts < alone
     assert np.load("depth.npy").shape == (375, 1242)
     assert len(np.load("cloud.npy")) > 100_000
-
-
-def test_its_pictures_are_kept() -> None:
     cells = json.loads(NOTEBOOK.read_text("utf-8"))["cells"]
-    kept = [output for cell in cells for output in cell.get("outputs", ())]
-    assert sum("image/png" in output.get("data", {}) for output in kept) == 1
+    stored = [output for cell in cells for output in cell.get("outputs", ())]
+    assert sum("image/png" in output.get("data", {}) for output in stored) == 1

@@ -44,22 +44,14 @@ _PACKAGES = (
 
 
 def check_writable(
-    out: Path,
-    key: int,
-    overwrite: bool = False,
-    verb: Literal["run", "compare"] = "run",
+    out: Path, key: int, overwrite: bool = False, verb: Literal["run", "compare"] = "run"
 ) -> None:
     """Raise InputError if a result of ``verb`` cannot be written. No file is changed."""
     _check_folder(_key_folder(out, key), _RUN if verb == "run" else _COMPARISON, out, overwrite)
 
 
 def write_result(
-    result: Result,
-    out: Path,
-    *,
-    config: Mapping[str, Any],
-    data: str,
-    overwrite: bool = False,
+    result: Result, out: Path, *, config: Mapping[str, Any], data: str, overwrite: bool = False
 ) -> list[Path]:
     """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
 
