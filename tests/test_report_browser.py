@@ -66,6 +66,28 @@ def test_its_numbers_are_those_of_the_run(opened: Opened, run: Path) -> None:
     assert f"{100 * metrics['depth']['front']['measured']['all']['outliers']:.2f} %" in table
     stages = yaml.safe_load((run / "run.yaml").read_text())["stages"]
     assert all(stage["name"] in opened.text("#costs") for stage in stages)
+    check_pointer(opened)
+
+
+def check_pointer(opened: Opened) -> None:
+    depth = results()["flow"].depth["front"]
+    row, column = np.argwhere((depth.depth_m > 0) & (depth.frame != 3))[40]
+    box = opened.page.locator("#picture").bounding_box()
+    height, width = depth.depth_m.shape
+    opened.page.mouse.move(
+        box["x"] + (column + 0.5) * box["width"] / width,
+        box["y"] + (row + 0.5) * box["height"] / height,
+    )
+    said = opened.text("#reading")
+    assert f"u {column}, v {row}" in said and "measured" in said
+    assert f"{depth.depth_m[row, column]:.2f} m" in said
+    assert re.search(rf"source sweep\s*{depth.frame[row, column]} ", said)
+    assert f"{round(1000 * depth.age_s[row, column])} ms" in said
+    assert f"{depth.confidence[row, column]:.2f}: one in" in said
+    opened.page.locator("#picture").focus()
+    opened.page.keyboard.press("ArrowRight")
+    opened.page.keyboard.press("Shift+ArrowDown")
+    assert f"u {column + 1}, v {min(row + 10, height - 1)}" in opened.text("#reading")
 
 
 def test_sliders_keep_what_export_keeps(opened: Opened, run: Path, tmp_path: Path) -> None:
@@ -94,27 +116,6 @@ def test_the_divider_and_every_layer_change_pixels(opened: Opened) -> None:
     opened.set("palette", "turbo")
     opened.set("left", "filled")
     assert opened.picture("#picture") not in seen
-
-
-def test_what_is_under_the_pointer(opened: Opened, run: Path) -> None:
-    depth = results()["flow"].depth["front"]
-    row, column = np.argwhere((depth.depth_m > 0) & (depth.frame != 3))[40]
-    box = opened.page.locator("#picture").bounding_box()
-    height, width = depth.depth_m.shape
-    opened.page.mouse.move(
-        box["x"] + (column + 0.5) * box["width"] / width,
-        box["y"] + (row + 0.5) * box["height"] / height,
-    )
-    said = opened.text("#reading")
-    assert f"u {column}, v {row}" in said and "measured" in said
-    assert f"{depth.depth_m[row, column]:.2f} m" in said
-    assert re.search(rf"source sweep\s*{depth.frame[row, column]} ", said)
-    assert f"{round(1000 * depth.age_s[row, column])} ms" in said
-    assert f"{depth.confidence[row, column]:.2f}: one in" in said
-    opened.page.locator("#picture").focus()
-    opened.page.keyboard.press("ArrowRight")
-    opened.page.keyboard.press("Shift+ArrowDown")
-    assert f"u {column + 1}, v {min(row + 10, height - 1)}" in opened.text("#reading")
 
 
 def drawn(opened: Opened) -> float:
