@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import datetime
-import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -18,8 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from densify.config.errors import InputError
-from densify.outputs import key_outputs, plots
+import densify
+from densify.outputs import plots
 from densify.outputs.cloud_files import read_cloud, write_cloud
 from densify.outputs.depth_png import (
     read_depth_png,
@@ -28,7 +27,8 @@ from densify.outputs.depth_png import (
     write_depth_png,
 )
 from densify.outputs.key_outputs import check_writable, write_comparison, write_result
-from tests.exported import CAMERAS, KEY_NS, H, W, cloud_of, refusal, result_of, tree
+from densify.outputs.kitti_tree import FileRecord, write_key, write_readme
+from tests.exported import CAMERAS, KEY_NS, H, W, cloud_of, map_of, refusal, result_of, tree
 
 CONFIG = {"objective": {"alpha": 10.0, "radius_m": None}, "register": {"source": "kiss-icp"}}
 MAPS = [f"{k}/{c}.png" for k in ("depth", "depth_filled", "confidence", "age") for c in CAMERAS]
@@ -233,25 +233,6 @@ def test_existing_result_is_kept_or_replaced_with_the_rest_kept(put, tmp_path):
     assert [p.name for p in (folder / "depth").iterdir()] == ["image_02.png"]
 
 
-@pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError(errno.ENOSPC, "No space left")])
-@pytest.mark.parametrize("existing", [False, True])
-def test_a_failure_in_the_middle_leaves_nothing(put, tmp_path, monkeypatch, failure, existing):
-    if existing:
-        put()
-    before = tree(tmp_path)
-
-    def fail(path, *_):
-        path.with_suffix(".half").write_bytes(b"half")
-        raise failure
-
-    monkeypatch.setattr(key_outputs, "write_cloud", fail)
-    with pytest.raises((KeyboardInterrupt, InputError)) as error:
-        put(result_of(seed=9), overwrite=existing)
-    if isinstance(error.value, InputError):
-        assert "No space left" in str(error.value) and str(tmp_path / "out") in str(error.value)
-    assert tree(tmp_path) == before
-
-
 def test_places_that_cannot_be_written_to(put, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with refusal(f"{tmp_path / 'file'} is not a folder"):
@@ -314,3 +295,46 @@ def test_the_figure_is_red_nearby_blue_far_away_and_gray_without_depth():
     assert len({*gray}) == 1 and 0 < gray[0] < 200
     drawn = (panel != gray).any(axis=2)[:, 400:]
     assert drawn.sum() == 9 and drawn[29:32, 99:102].all()  # a measurement covers 3 x 3 pixels
+
+
+# --- KITTI's depth tree, as its own loaders and tools would read it -------------------------------
+
+PRODUCTS = ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")
+FOLDER = "val/2011_09_26_drive_0013_sync"
+
+
+def test_a_kitti_tree_comes_back(tmp_path: Path) -> None:
+    sparse, dense = (
+        {camera: map_of(camera, seed + i) for i, camera in enumerate(CAMERAS)} for seed in (1, 2)
+    )
+    records = write_key(tmp_path, FOLDER, 120, sparse, dense)
+    assert {name: FileRecord.of(data) for name, data in tree(tmp_path).items()} == records
+    for camera in CAMERAS:
+        paths = [f"{FOLDER}/proj_depth/{kind}/{camera}/0000000120.png" for kind in PRODUCTS]
+        assert {*paths} <= {*records} and len(records) == len(PRODUCTS) * len(CAMERAS)
+        raster = [stored(tmp_path / path) for path in paths]
+        maps_m = (sparse[camera].depth_m, dense[camera].depth_m, dense[camera].filled_m)
+        for steps, depth_m in zip(raster, maps_m, strict=False):
+            expected_m = np.where(depth_m < 256, depth_m, 0)  # farther is none in this format
+            # As the README says
+            np.testing.assert_allclose(steps / 256, expected_m, atol=1 / 512)
+            np.testing.assert_array_equal(steps > 0, expected_m > 0)
+        level, has_depth = raster[3], raster[2] > 0
+        assert level.dtype == np.uint8
+        np.testing.assert_array_equal(level > 0, has_depth)
+        confidence = (level.astype(float) - 1)[has_depth] / 254
+        np.testing.assert_allclose(
+            confidence, dense[camera].confidence[has_depth], atol=0.5 / 254 + 1e-6
+        )
+
+
+# README
+
+
+def test_the_readme_says_how_the_set_was_made(tmp_path: Path) -> None:
+    settings = {"gate": {"min_score": np.float64(0.5)}, "config": {"flow": {"braces": "{window}"}}}
+    write_readme(tmp_path, method="flow", window=5, settings=settings)
+    text = (tmp_path / "README.txt").read_text("utf-8")
+    facts = ("flow, window 5", "11 lidar sweeps", *PRODUCTS, "min_score: 0.5", "'{window}'")
+    for part in (densify.__version__, *facts):
+        assert part in text, part

@@ -9,11 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 from densify.config.errors import InputError
 from densify.dataset.plan import Recipe, plan, write_plan
 from densify.outputs.export import export_run
-from densify.outputs.recording_folder import check_recording, default_folder, is_same
+from densify.outputs.recording_folder import (
+    check_recording,
+    default_folder,
+    drive_folder,
+    is_same,
+    split_of,
+)
 from densify.readers.depth_trees import pair_depth_files
 from tests.command import exit_code, files_in, refused
 from tests.dataset_scenes import BORDER, DRIVE, copy_drive
@@ -38,6 +46,31 @@ VERBS = {
 )
 def test_each_recording_has_its_folder(recording: str, folder: str) -> None:
     assert default_folder(recording) == Path("densify-out") / folder
+
+
+def test_the_split_is_that_of_the_benchmark() -> None:
+    official = {"2011_09_26": 9, "2011_09_28": 1, "2011_09_29": 1, "2011_09_30": 1, "2011_10_03": 1}
+    for date, expected in official.items():
+        splits = [split_of(f"{date}_drive_{number:04d}_sync") for number in range(200)]
+        assert splits.count("val") == expected and splits.count("train") == 200 - expected
+    assert split_of("2011_09_26_drive_0013_sync") == split_of("2011_10_03_drive_0047") == "val"
+    for name in ("street:street?seed=0", "", "2011_09_26_drive_0013_synced", "drive_0013_sync"):
+        assert split_of(name) == "train"
+
+
+ODD_NAMES = ["", ".", "..", "../../etc", "a/b", "/", "-rf", ".hidden", "a b", "a  b", "ä", "å"]
+ODD_NAMES += ["x" * 300, "x" * 301, "a\nb", "a\0b"]
+
+
+@given(st.lists(st.text() | st.sampled_from(ODD_NAMES), unique=True, max_size=8))
+def test_any_name_becomes_one_harmless_folder(names: list[str]) -> None:
+    plain = [name for name in names if not set(name) & set(":?=&")]
+    folders = [drive_folder(name) for name in plain]
+    assert len(set(folders)) == len(folders)
+    for folder in (*folders, *map(drive_folder, names)):
+        assert folder.isascii() and len(folder) <= 100
+        assert not set(folder) & set("/\\\0 \n\"'") and folder[0] not in ".-"
+        assert drive_folder(folder) == folder
 
 
 def test_runs_go_there_by_default(border_drive: Path, tmp_path: Path, monkeypatch) -> None:

@@ -28,7 +28,7 @@ from densify import __version__
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry.types import Bool, Float, Int, ObjectTrack
-from densify.outputs.atomic import plain, write_file
+from densify.outputs.atomic import plain
 from densify.outputs.cloud_files import StoredCloud, read_cloud
 from densify.outputs.depth_png import PixelType, read_stored
 from densify.outputs.finished_run import map_names, read_scene, read_tracks
@@ -133,11 +133,6 @@ class KeyFiles:
 def _mapping(value: Any) -> Mapping[str, Any]:
     """Return a value if it is a table, else an empty one."""
     return value if isinstance(value, dict) else {}
-
-
-def write_run_page(folder: Path, shown_folder: str) -> None:
-    """Write ``report.html`` into the folder of a run. ``shown_folder`` as in `key_page`."""
-    write_file(folder / "report.html", key_page(KeyFiles.of_run(folder), shown_folder))
 
 
 def key_page(files: KeyFiles, shown_folder: str) -> bytes:
