@@ -338,13 +338,13 @@ def _logarithmic_png(depth_m: Float32) -> bytes:
     from PIL.PngImagePlugin import PngInfo
 
     known, steps = depth_m > 0, np.zeros(depth_m.shape, np.uint16)
-    near, far = (float(limit(depth_m[known], initial=1.0)) for limit in (np.min, np.max))
-    far = max(far, 1.1 * near)  # near and far must differ
-    share = np.log(depth_m[known] / near) / np.log(far / near)
+    near_m = float(depth_m[known].min(initial=1.0))
+    far_m = max(float(depth_m[known].max(initial=1.0)), 1.1 * near_m)  # they must differ
+    share = np.log(depth_m[known] / near_m) / np.log(far_m / near_m)
     steps[known] = 1 + np.rint(share * _LOG_STEPS)
     info, file = PngInfo(), io.BytesIO()
-    info.add_text("near", repr(near))
-    info.add_text("far", repr(far))
+    info.add_text("near", repr(near_m))
+    info.add_text("far", repr(far_m))
     Image.fromarray(steps).save(file, "PNG", pnginfo=info)
     return file.getvalue()
 

@@ -79,8 +79,7 @@ class StoredCloud:
     @property
     def observed(self) -> Bool:
         """(M,) True for points whose colour a camera observed."""
-        mask: Bool = self.rgb.any(axis=1)
-        return mask
+        return np.asarray(self.rgb.any(axis=1), bool)
 
     @property
     def shown_rgb(self) -> NDArray[np.uint8]:

@@ -21,7 +21,7 @@ import yaml
 from densify import __version__
 from densify.config.errors import InputError
 from densify.geometry.types import Result
-from densify.outputs import flow_writers, plots, report_page
+from densify.outputs import flow_writers, plots
 from densify.outputs.atomic import plain, staged_folder, write_file, write_json
 from densify.outputs.cloud_files import write_cloud
 from densify.outputs.depth_png import (
@@ -34,6 +34,7 @@ from densify.outputs.depth_png import (
     write_flow_png,
 )
 from densify.outputs.recording_folder import check_recording
+from densify.outputs.report_page import KeyFiles, key_page
 
 SCHEMA_VERSION = 1
 """Version of each JSON file. It grows when a field changes its meaning or is removed."""
@@ -44,22 +45,14 @@ _PACKAGES = (
 
 
 def check_writable(
-    out: Path,
-    key: int,
-    overwrite: bool = False,
-    verb: Literal["run", "compare"] = "run",
+    out: Path, key: int, overwrite: bool = False, verb: Literal["run", "compare"] = "run"
 ) -> None:
     """Raise InputError if a result of ``verb`` cannot be written. No file is changed."""
     _check_folder(_key_folder(out, key), _RUN if verb == "run" else _COMPARISON, out, overwrite)
 
 
 def write_result(
-    result: Result,
-    out: Path,
-    *,
-    config: Mapping[str, Any],
-    data: str,
-    overwrite: bool = False,
+    result: Result, out: Path, *, config: Mapping[str, Any], data: str, overwrite: bool = False
 ) -> list[Path]:
     """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
 
@@ -69,12 +62,12 @@ def write_result(
     with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:
         for write in _WRITERS.values():
             write(result, folder)
-        text = yaml.safe_dump(
-            plain(_record(result, config, data)), sort_keys=False, allow_unicode=True
-        )
+        record = plain(_record(result, config, data))
+        text = yaml.safe_dump(record, sort_keys=False, allow_unicode=True)
         write_file(folder / "run.yaml", text.encode())
         if config.get("output", {}).get("report"):
-            report_page.write_run_page(folder, f"{result.key:06d}")
+            page = key_page(KeyFiles.of_run(folder), f"{result.key:06d}")
+            write_file(folder / "report.html", page)
     return _written(_key_folder(out, result.key), _RUN)
 
 

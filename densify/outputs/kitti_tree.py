@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,16 +94,16 @@ def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
     files.txt has a line for each map: paths of image, measured and filled depth. annotations.json
     adds ``cam_in`` (fx fy cx cy) and ``depth_scale``, for Metric3D.
     """
-    files: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     for run in runs:
         if not run.recording:
             raise InputError(f"{run.folder}/run.yaml: recording: expected the recording's name")
         drive = folder / split_of(run.recording) / drive_folder(run.recording)
         for map_name in run.cameras:
-            files += _write_map(run, map_name, drive, folder)
-    lines = [f"{file['rgb']} {file['depth']} {file['depth_filled']}\n" for file in files]
+            entries += _write_map(run, map_name, drive, folder)
+    lines = [f"{entry['rgb']} {entry['depth']} {entry['depth_filled']}\n" for entry in entries]
     write_file(folder / "files.txt", "".join(lines).encode())
-    write_json(folder / "annotations.json", {"files": files})
+    write_json(folder / "annotations.json", {"files": entries})
 
 
 def _write_map(run: FinishedRun, name: str, drive: Path, root: Path) -> list[dict[str, Any]]:
@@ -296,7 +297,8 @@ def _sized(track: ObjectTrack, of_object: Sequence[ObjectTrack]) -> ObjectTrack:
 
 def write_readme(root: Path, method: str, window: int, settings: Mapping[str, Any]) -> None:
     """Write ``README.txt``, which describes the files beside it and how they were made."""
-    text = _README.format(
+    template = (files("densify.outputs") / "kitti_readme.txt").read_text("utf-8")
+    text = template.format(
         version=__version__,
         method=method,
         window=window,
@@ -304,38 +306,3 @@ def write_readme(root: Path, method: str, window: int, settings: Mapping[str, An
         settings=yaml.safe_dump(plain(settings), sort_keys=False, allow_unicode=True).rstrip(),
     )
     write_file(root / README, text.encode())
-
-
-_README = """\
-Depth maps for training, made by densify {version}
-{method}, window {window}: each moment from up to {sweeps} lidar sweeps
-
-The folders and files are those of KITTI's depth completion benchmark, whose loaders read them:
-
-  <train|val>/<drive>/proj_depth/<product>/<camera>/<frame, 10 digits>.png
-
-  velodyne_raw        input: depth of the sweep of that frame alone
-  groundtruth         target: depth measured by all the sweeps. Method flow moves moving points to
-                      the exposure; icp leaves them where they were measured
-  groundtruth_filled  groundtruth, and pixels interpolated between measured ones
-  confidence          of groundtruth_filled, and so of groundtruth too
-
-val holds KITTI's 13 validation drives, train every other recording.
-
-Depth is a 16-bit gray PNG, metres along the camera's optical axis, 0 is none:
-depth_m = cv2.imread(path, cv2.IMREAD_UNCHANGED) / 256.0. Confidence is an 8-bit gray PNG: 255 is
-most certain, 0 is no depth. With c = (value - 1) / 254, one pixel in 10^(5 c) is expected to be
-wrong by KITTI's rule: more than 3 px of disparity and 5 %.
-
-All maps show the moment in which their own image was exposed (the middle of the sweep, where the
-settings say "at: sweep"). velodyne_raw is densify's own projection and differs from KITTI's files.
-
-The images stay with the recordings, whose licences go on holding for the maps. KITTI is CC BY-NC-SA
-3.0: name its authors, no commercial use, share alike. dataset.json says which recordings these are,
-and has the cameras' calibration. manifest.jsonl (or manifest-1of4.jsonl and so on) has one line for
-every key: whether it is here, is missing and why, and size and SHA-256 of its files.
-
-Settings:
-
-{settings}
-"""

@@ -42,9 +42,7 @@ _SIDE = re.compile(r"left|right|side|rear|back", re.IGNORECASE)
 
 
 def front_first(
-    names: Sequence[str],
-    views: Mapping[str, CameraView],
-    T_key_lidar: Mapping[int, Float],
+    names: Sequence[str], views: Mapping[str, CameraView], T_key_lidar: Mapping[int, Float]
 ) -> list[str]:
     """Return the names of maps, that of the camera which looks ahead first, the others in order.
 
@@ -153,13 +151,6 @@ def _write(strip: Picture, text: str, left_px: int, right_px: int, centred: bool
     cv2.putText(strip, text, at, _FONT, shrink * _FONT_SCALE, (0, 0, 0), 1, cv2.LINE_AA)
 
 
-def write_plot(path: Path, figure: Figure) -> None:
-    """Write a matplotlib figure as PNG. Equal figures give equal bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    write_file(path, buffer.getvalue())
-
-
 def write_curve(result: Result, folder: Path) -> None:
     """Write ``curve.png`` of all cameras, if a method has scores with the key sweep held out.
 
@@ -174,7 +165,10 @@ def write_curve(result: Result, folder: Path) -> None:
         curve = precision_density(result.depth[name], truth_m, camera)
         curves[f"{name}, ground truth"] = {result.method: curve}
     if curves:
-        write_plot(folder / "curve.png", draw_curves(curves))
+        buffer = io.BytesIO()
+        # Without the name of the program, equal figures give equal bytes.
+        draw_curves(curves).savefig(buffer, format="png", metadata={"Software": None})
+        write_file(folder / "curve.png", buffer.getvalue())
 
 
 def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:

@@ -28,7 +28,7 @@ from densify import __version__
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry.types import Bool, Float, Int, ObjectTrack
-from densify.outputs.atomic import plain, write_file
+from densify.outputs.atomic import plain
 from densify.outputs.cloud_files import StoredCloud, read_cloud
 from densify.outputs.depth_png import PixelType, read_stored
 from densify.outputs.finished_run import map_names, read_scene, read_tracks
@@ -57,7 +57,7 @@ _COLOUR_MAPS = {
     "inferno": cv2.COLORMAP_INFERNO,
     "turbo": cv2.COLORMAP_TURBO,
 }
-_TRIAL_LEVEL, _LEVEL = 1, 7  # of compression
+_TRIAL_EFFORT, _EFFORT = 1, 7  # of compression
 _SOURCE_BITS = 17  # above the bits of a pixel's age (16) and of measured or filled (1)
 _MAX_UINT16 = 65535
 _ZERO_DISPLACED = 32768  # the middle of 16 bits
@@ -135,11 +135,6 @@ def _mapping(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def write_run_page(folder: Path, shown_folder: str) -> None:
-    """Write ``report.html`` into the folder of a run. ``shown_folder`` as in `key_page`."""
-    write_file(folder / "report.html", key_page(KeyFiles.of_run(folder), shown_folder))
-
-
 def key_page(files: KeyFiles, shown_folder: str) -> bytes:
     """Return the HTML page.
 
@@ -214,10 +209,10 @@ class Blobs:
         """
         array = array.astype(np.min_scalar_type(int(array.max(initial=0))))
         steps = np.diff(array, axis=-1, prepend=array.dtype.type(0))
-        plain_size, step_size = (len(_deflated(v, _TRIAL_LEVEL)) for v in (array, steps))
+        plain_size, step_size = (len(_deflated(v, _TRIAL_EFFORT)) for v in (array, steps))
         is_delta = step_size < plain_size
         return {
-            "blob": self._keep(_deflated(steps if is_delta else array, _LEVEL)),
+            "blob": self._keep(_deflated(steps if is_delta else array, _EFFORT)),
             "bytes": array.dtype.itemsize,
             "shape": list(array.shape),
             "delta": is_delta,
@@ -233,18 +228,15 @@ class Blobs:
         return name
 
 
-def _deflated(array: NDArray[Any], level: int) -> bytes:
+def _deflated(array: NDArray[Any], effort: int) -> bytes:
     """Return an array as bytes sorted by significance, compressed."""
     values = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     planes = values.view(np.uint8).reshape(-1, array.dtype.itemsize).T
-    return zlib.compress(planes.tobytes(), level)
+    return zlib.compress(planes.tobytes(), effort)
 
 
 def _packed_camera(
-    blobs: Blobs,
-    maps: Mapping[str, NDArray[Any]],
-    jpeg: bytes | None,
-    focal_px: float | None,
+    blobs: Blobs, maps: Mapping[str, NDArray[Any]], jpeg: bytes | None, focal_px: float | None
 ) -> dict[str, Any]:
     """Pack the maps of `KeyFiles.camera` into ``blobs`` and return the camera's entry in the page.
 
@@ -308,17 +300,17 @@ def packed_cloud(
     }
 
 
-def thinned(points: Float, moving: Bool, most: int) -> Int:
-    """Return (K,) ascending indices of at most ``most`` points, drawn with a fixed random seed.
+def thinned(points: Float, moving: Bool, max_points: int) -> Int:
+    """Return (K,) ascending indices of at most ``max_points`` points, drawn with a fixed seed.
 
     The probability grows with squared distance from the origin, for equal density in angle.
     """
-    if len(points) <= most:
+    if len(points) <= max_points:
         return np.arange(len(points))
     weight = np.maximum((points**2).sum(axis=1), _NEAR_M**2)
     weight[moving] *= _MOVING_WEIGHT
     order = np.argsort(np.random.default_rng(0).exponential(size=len(points)) / weight)
-    return np.sort(order[:most])
+    return np.sort(order[:max_points])
 
 
 def _colours(cloud: StoredCloud) -> NDArray[np.uint8]:
@@ -343,7 +335,7 @@ def page_file(title: str, data: Mapping[str, Any], blobs: Blobs) -> bytes:
         f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; "
         f"img-src data: blob:; base-uri 'none'; form-action 'none'"
     )
-    parts = {
+    blanks = {
         "csp": policy,
         "title": html.escape(title),
         "style": style,
@@ -354,7 +346,7 @@ def page_file(title: str, data: Mapping[str, Any], blobs: Blobs) -> bytes:
             for name, text in blobs.texts.items()
         ),
     }
-    filled = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _source("key.html"))
+    filled = re.sub(r"\{\{(\w+)\}\}", lambda match: blanks[match[1]], _source("key.html"))
     return filled.encode("utf-8", "backslashreplace")
 
 

@@ -1,18 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Write frames of the simulated street as KITTI raw drive or plain folder, with ground truth.
 
-The files, with timestamps of the KITTI drive for each frame of the whole street::
-
-    OUT/2026_06_12/calib_cam_to_cam.txt calib_velo_to_cam.txt calib_imu_to_velo.txt
-    OUT/2026_06_12/2026_06_12_drive_0001_sync/
-        velodyne_points/{data/0000000120.bin, timestamps.txt, timestamps_start.txt, ..._end.txt}
-        image_02/{data/0000000120.png, timestamps.txt}  image_03/...
-        oxts/{data/0000000120.txt, timestamps.txt}  truth/ (`densify.readers.truth_files`)
-
-    OUT/street/densify.yaml timestamps.txt (s since 1970) poses.txt (lidar poses, TUM format)
-    OUT/street/truth/  numbered from 0
-    OUT/street/sweeps/000000.bin, ...  float32 x y z intensity time lidar, s since the stamp
-    OUT/street/images/CAMERA/1781258406000000000.png, ...  named by exposure times in ns
+docs/formats/reading.md lists the files.
 """
 
 from __future__ import annotations
@@ -152,21 +141,19 @@ def _numbered(frames: Sequence[int], progress: Progress) -> Iterator[tuple[int, 
 
 def _write_truth(folder: Path, excerpt: Excerpt, bodies: Bodies, renumbered: bool) -> None:
     """Write the ground truth folder, numbered from 0 if ``renumbered``, else by frame number."""
-    street, frames = excerpt.street, excerpt.frames
+    street = excerpt.street
     write_bodies(folder, bodies)
-    for number, frame in enumerate(frames) if renumbered else zip(frames, frames, strict=True):
+    for number, frame in enumerate(excerpt.frames):
         returns = street.returns(frame)
         points = street.simulator.in_bodies(frame, returns)
-        write_points(folder, number, returns.body, returns.instance, points)
+        written = number if renumbered else frame
+        write_points(folder, written, returns.body, returns.instance, points)
     for camera in excerpt.cameras:
-        images = (
-            enumerate(excerpt.image_numbers(camera))
-            if renumbered
-            else zip(frames, frames, strict=True)
-        )
-        for number, image in images:
+        images = excerpt.image_numbers(camera) if renumbered else excerpt.frames
+        for number, image in enumerate(images):
             depth_m = street.truth.depth_m(camera, image)
-            write_depth(folder, camera, number, depth_m, street.truth.moving_mask(camera, image))
+            moving = street.truth.moving_mask(camera, image)
+            write_depth(folder, camera, number if renumbered else image, depth_m, moving)
 
 
 def _write_folder(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
