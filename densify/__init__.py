@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from densify.config.errors import InputError as InputError
     from densify.dataset.loader import DepthDataset as DepthDataset
     from densify.dataset.make import make_dataset as make_dataset
+    from densify.dataset.manifest import manifest as manifest
     from densify.dataset.plan import Gate as Gate
     from densify.dataset.plan import Recipe as Recipe
     from densify.flow.two_clouds import estimate_flow as estimate_flow
@@ -36,8 +37,10 @@ if TYPE_CHECKING:
     from densify.geometry.types import LidarSequence as LidarSequence
     from densify.geometry.types import Result as Result
     from densify.geometry.types import Sweep as Sweep
+    from densify.outputs.finished_run import load_result as load_result
     from densify.pipeline.run import compare as compare
     from densify.pipeline.run import run as run
+    from densify.pipeline.run import run_keys as run_keys
     from densify.readers import open_sequence as open_sequence
     from densify.scores.depth_metrics import outlier_probability as outlier_probability
 
@@ -49,6 +52,9 @@ _HOME = {
     "compare": "densify.pipeline.run",
     "estimate_flow": "densify.flow.two_clouds",
     "make_dataset": "densify.dataset.make",
+    "manifest": "densify.dataset.manifest",
+    "load_result": "densify.outputs.finished_run",
+    "run_keys": "densify.pipeline.run",
     "Recipe": "densify.dataset.plan",
     "outlier_probability": "densify.scores.depth_metrics",
     "Gate": "densify.dataset.plan",

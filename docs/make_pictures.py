@@ -29,9 +29,9 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
 from densify.cli import main as densify
-from densify.outputs.cloud_laz import read_cloud
+from densify.outputs import report_page
+from densify.outputs.cloud_files import read_cloud
 from densify.outputs.depth_png import read_stored
-from densify.outputs.report import page_file
 from densify.scores.depth_metrics import is_outlier_depth
 
 DOCS = Path(__file__).resolve().parent
@@ -298,7 +298,7 @@ def make_street(runs: Path, pandaset: Path | None) -> None:
 
 def make_reports(runs: Path, pandaset: Path | None) -> None:
     """Write two pages to turn around, with fewer points than `densify report` has."""
-    page_file._MOST_POINTS = REPORT_POINTS
+    report_page._MOST_POINTS = REPORT_POINTS
     REPORTS.mkdir(exist_ok=True)
     for key in STREETS[:2]:
         folder = key.run(runs, None)

@@ -35,7 +35,7 @@ hypothesis.settings.load_profile("densify")
 LONGEST = (
     *("examples", "street", "fuzz", "gate", "dataset", "recording", "learning_training"),
     *("bench", "registration", "pipeline", "far", "executor", "cli"),
-    *("doctor", "report_browser", "groups", "labels", "notebooks"),
+    *("doctor", "report", "groups", "labels"),
     *("bench_paper", "reader_pandaset", "flow_sets"),
 )
 """Files of tests that take long begin, so that no process works on one while the others wait at the

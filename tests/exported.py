@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -15,8 +17,9 @@ from scipy.spatial.transform import Rotation
 from densify.config.errors import InputError
 from densify.depth.views import with_ages
 from densify.geometry.types import Camera, CameraView, Cloud, DepthMap, Result, StageCost
-from densify.outputs import export_run, write_result
-from densify.pipeline.run import run
+from densify.outputs.export import export_run
+from densify.outputs.key_outputs import write_result
+from densify.pipeline.run import run, run_keys
 from tests.small_street import KEY, POSES_GIVEN, one_car
 
 H, W = 12, 20
@@ -125,11 +128,19 @@ def street_result() -> Result:
     return run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": {"score": True}})
 
 
-def write_street(out: Path) -> Path:
-    """The folder of `street_result`."""
-    result = street_result()
-    write_result(result, out, config={}, data="tiny street")
-    return out / f"{KEY:06d}"
+@cache
+def drive_results() -> dict[int, Result]:
+    """Two neighbouring keys of that street."""
+    results = dict(run_keys(one_car(), [KEY, KEY + 1], 1, config=POSES_GIVEN))
+    assert all(isinstance(result, Result) for result in results.values())
+    return results  # type: ignore[return-value]
+
+
+def write_drive(out: Path) -> Path:
+    """The folder with the keys of `drive_results`."""
+    for result in drive_results().values():
+        write_result(result, out, config={}, data="tiny street")
+    return out
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -138,13 +149,20 @@ def tree(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
-def refused(*parts: object, run: Path, **arguments: Any) -> None:
-    """The export fails in one line that names these parts, and the run stays as it was."""
-    before = tree(run)
+@contextmanager
+def refusal(*parts: object) -> Iterator[None]:
+    """The block fails in one line that names these parts."""
     with pytest.raises(InputError) as error:
-        export_run(run, **arguments)
+        yield
     message = str(error.value)
     assert "\n" not in message
     for part in parts:
         assert str(part) in message, message
+
+
+def refused(*parts: object, run: Path, **arguments: Any) -> None:
+    """The export fails in one line that names these parts, and the run stays as it was."""
+    before = tree(run)
+    with refusal(*parts):
+        export_run(run, **arguments)
     assert tree(run) == before

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from densify.outputs import plots
-from densify.outputs.key_outputs import Context
 from tests.exported import CAMERAS, result_of
 
 
@@ -54,13 +53,13 @@ def test_the_curves_of_a_result_are_of_all_cameras_and_methods(tmp_path) -> None
     scores = {name: {"curve": GOOD} for name in CAMERAS}
     none, icp = result_of("none", held_out=None), result_of("icp", held_out=scores)
     flow = replace(result_of("flow", held_out=scores), baselines={"none": none, "icp": icp})
-    plots.write_curve(flow, Context({}, "street"), tmp_path)
+    plots.write_curve(flow, tmp_path)
     picture = (tmp_path / "curve.png").read_bytes()
     assert cv2.imread(str(tmp_path / "curve.png")).shape == (480, 1720, 3)
-    plots.write_curve(flow, Context({}, "street"), tmp_path)
+    plots.write_curve(flow, tmp_path)
     assert (tmp_path / "curve.png").read_bytes() == picture
 
 
 def test_without_a_held_out_key_there_is_no_curve(tmp_path) -> None:
-    plots.write_curve(result_of("none", held_out=None), Context({}, "street"), tmp_path)
+    plots.write_curve(result_of("none", held_out=None), tmp_path)
     assert not list(tmp_path.iterdir())

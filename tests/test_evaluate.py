@@ -15,7 +15,7 @@ import pytest
 from densify.bench.evaluation import evaluate
 from densify.cli import main
 from densify.config.errors import InputError
-from densify.outputs import read_depth_png, write_depth_png
+from densify.outputs.depth_png import read_depth_png, write_depth_png
 from densify.readers.depth_trees import DepthPair, pair_depth_files
 from densify.scores.depth_metrics import depth_errors
 

@@ -15,8 +15,9 @@ from plyfile import PlyData
 
 import densify
 from densify.config.plugins import EXPORTS
-from densify.outputs import export_run, read_cloud, read_depth_png
-from densify.outputs.depth_png import stored_age, stored_confidence
+from densify.outputs.cloud_files import read_cloud
+from densify.outputs.depth_png import read_depth_png, stored_age, stored_confidence
+from densify.outputs.export import export_run
 from densify.readers.depth_trees import pair_depth_files
 from tests.command import exit_code
 from tests.command import refused as refused_command
@@ -25,9 +26,11 @@ from tests.exported import (
     KEY_NS,
     NUM_POINTS,
     STAMPS_NS,
+    H,
+    W,
     refused,
+    result_of,
     tree,
-    write_street,
     write_views,
 )
 
@@ -89,66 +92,52 @@ def test_a_package_that_is_not_installed_is_named(to: str, run: Path, monkeypatc
     refused(f"pip install 'densify-lidar[{EXTRAS.get(to, to)}]'", run=run, to=to)
 
 
-def test_the_record(run: Path) -> None:
-    exported = export_run(run, "npy", min_confidence=0.5, max_age_ms=100)
-    record = yaml.safe_load((run / "export" / "npy" / "export.yaml").read_text())
-    density = {
-        camera: {product: kept._asdict() for product, kept in products.items()}
-        for camera, products in exported.density.items()
-    }
-    assert record == {
-        "run": str(run),
-        "to": "npy",
-        "min_confidence": 0.5,
-        "max_age_ms": 100.0,
-        "density": density,
-        "version": densify.__version__,
-    }
-    assert all(0 < p["after"] < p["before"] < 1 for c in density.values() for p in c.values())
-
-
-def test_the_command(run: Path, capsys) -> None:
-    command = ["export", run, "--to", "ply", "--min-confidence", "0.5"]
-    assert exit_code(*command) == 0
+def test_the_command_and_the_record(run: Path, capsys) -> None:
+    assert exit_code("export", run, "--to", "ply", "--min-confidence", "0.5") == 0
     line, *paths = capsys.readouterr().out.splitlines()
     kept = (read_cloud(run / "cloud.laz").confidence >= 0.499).sum()
     assert abs(int(line.split()[1]) - kept) <= 2 and line.endswith(f"of {NUM_POINTS} points")
     folder = run / "export" / "ply"
     assert paths == [str(folder / "cloud.ply"), str(folder / "export.yaml")]
     assert "expected one of npy" in refused_command(capsys, 2, "export", run, "--to", "obj")
-    assert exit_code("export", run, "--to", "npy", "--camera", "image_03") == 0
+    options = ["--camera", "image_03", "--min-confidence", "0.5", "--max-age-ms", "100"]
+    assert exit_code("export", run, "--to", "npy", *options) == 0
     named = [line for line in capsys.readouterr().out.splitlines() if line.endswith(".npy")]
     assert len(named) == 3 and all("image_03" in name for name in named)
+    record = yaml.safe_load((run / "export" / "npy" / "export.yaml").read_text())
+    density = record.pop("density")
+    assert [*density] == ["image_03"]
+    assert all(0 < p["after"] < p["before"] < 1 for p in density["image_03"].values())
+    asked = {"to": "npy", "min_confidence": 0.5, "max_age_ms": 100.0}
+    assert record == {"run": str(run), **asked, "version": densify.__version__}
 
 
 # --- maps -----------------------------------------------------------------------------------------
 
 
-def read_map(path: Path) -> np.ndarray:
-    if path.suffix == ".npy":
-        return np.load(path, allow_pickle=False)
-    channels = pytest.importorskip("OpenEXR").File(str(path)).channels()
-    assert set(channels) == {"Y" if "confidence" in path.parts else "Z"}
-    return next(iter(channels.values())).pixels
-
-
 @pytest.mark.parametrize("to", ["npy", "exr"])
 def test_maps_of_floats_are_exact(to: str, run: Path) -> None:
-    pytest.importorskip(PACKAGES.get(to, "numpy"))
+    exr = pytest.importorskip("OpenEXR") if to == "exr" else None
     export_run(run, to)
-    for camera in CAMERAS:
-        for product in ("depth", "depth_filled", "confidence"):
-            values = read_map(run / "export" / to / product / f"{camera}.{to}")
-            assert values.dtype == np.float32 and values.any()
-            if product == "confidence":
-                levels = np.maximum(stored(run, product, camera).astype(np.float32) - 1, 0)
-                np.testing.assert_array_equal(values, levels / np.float32(254))
-            else:
-                depth_m = read_depth_png(run / product / f"{camera}.png")
-                np.testing.assert_array_equal(values, depth_m)
+    for product in ("depth", "depth_filled", "confidence"):
+        path = run / "export" / to / product / f"image_03.{to}"
+        if exr is None:
+            values = np.load(path, allow_pickle=False)
+        else:
+            ((channel, pixels),) = exr.File(str(path)).channels().items()
+            values = pixels.pixels
+            assert channel == ("Y" if product == "confidence" else "Z")
+        expected = read_depth_png(run / "depth" / "image_03.png")
+        if product == "depth_filled":
+            expected = read_depth_png(run / product / "image_03.png")
+        elif product == "confidence":
+            steps = np.maximum(stored(run, product, "image_03").astype(np.float32) - 1, 0)
+            expected = steps / np.float32(254)
+        assert values.dtype == np.float32 and values.any()
+        np.testing.assert_array_equal(values, expected)
 
 
-@pytest.mark.parametrize(("confidence", "age_ms"), [(0.5, None), (0.8, 100.0), (0.0, 10)])
+@pytest.mark.parametrize(("confidence", "age_ms"), [(0.5, None), (0.3, 100.0)])
 def test_thresholds_leave_exactly_these_pixels(run: Path, confidence: float, age_ms) -> None:
     exported = export_run(run, "npy", min_confidence=confidence, max_age_ms=age_ms)
     for camera in CAMERAS:
@@ -164,52 +153,37 @@ def test_thresholds_leave_exactly_these_pixels(run: Path, confidence: float, age
 
 
 def test_kitti_is_what_readers_of_the_benchmark_expect(tmp_path: Path) -> None:
-    run, result = write_views(tmp_path, {"image_02": "plain", "image_03/0000000241": "bent"})
+    """files.txt as Depth-Anything V2 (metric_depth/dataset/kitti.py), UniDepth and Marigold (with
+    the filled map third) split it; annotations.json as Metric3D (mono/utils/custom_data.py)."""
+    lenses = {"image_02": "plain", "image_03/0000000241": "bent"}
+    single = {"none": result_of("none", 7, cameras=(*lenses,))}
+    run, result = write_views(tmp_path, lenses, baselines=single)
     name = "2011_09_26_drive_0013_sync"
     record = run / "run.yaml"
     record.write_text(record.read_text().replace("data: street", f"data: /some/where/{name}/"))
     export_run(run, "kitti", tmp_path / "a")
-    drive = tmp_path / "a" / "val" / name
-    pairs = pair_depth_files(run, tmp_path / "a", None, filled=False)
+    out = tmp_path / "a"
+    pairs = pair_depth_files(run, out, None, filled=False)
     assert len(pairs.pairs) == 2
     assert [len(pairs.without_truth), len(pairs.without_prediction)] == [0, 0]
-    for view, file in (("image_02", "0000000120"), ("image_03/0000000241", "0000000241")):
-        camera = view.partition("/")[0]
-        mine = read_depth_png(run / "depth_filled" / f"{view}.png")
-        theirs = drive / "proj_depth" / "groundtruth_filled" / camera / f"{file}.png"
-        np.testing.assert_array_equal(read_depth_png(theirs), mine)
-        image = cv2.imread(str(drive / camera / "data" / f"{file}.png"))
-        np.testing.assert_array_equal(image, cv2.imread(str(run / f"scene/image/{view}.jpg")))
-        K = np.loadtxt(drive / "intrinsics" / camera / f"{file}.txt").reshape(3, 3)
-        np.testing.assert_allclose(K, result.views[view].camera.K, atol=1e-6)
-
-
-def test_lists_by_the_readers_of_depth_networks(run: Path) -> None:
-    """files.txt as Depth-Anything V2 (metric_depth/dataset/kitti.py), UniDepth and Marigold (with
-    the filled map third) split it; annotations.json as Metric3D (mono/utils/custom_data.py)."""
-    export_run(run, "kitti")
-    folder = run / "export" / "kitti"
-    lines = (folder / "files.txt").read_text().splitlines()
-    files = json.loads((folder / "annotations.json").read_text())["files"]
-    for line, entry, camera in zip(lines, files, CAMERAS, strict=True):
+    lines = (out / "files.txt").read_text().splitlines()
+    entries = json.loads((out / "annotations.json").read_text())["files"]
+    views = (("image_02", "0000000120"), ("image_03/0000000241", "0000000241"))
+    for (view, file), line, entry in zip(views, lines, entries, strict=True):
+        camera, known = view.partition("/")[0], result.views[view].camera
         image, depth, filled = line.split(" ")
-        assert [entry["rgb"], entry["depth"]] == [image, depth]
-        assert len(image.split("/")) >= 3  # Metric3D takes the third from the right
+        assert image == f"val/{name}/{camera}/data/{file}.png" == entry["rgb"]
+        assert entry["depth"] == depth and entry["cam_in"] == [17.25, 18.5, 9.125, 5.75]
         for path, product in ((depth, "depth"), (filled, "depth_filled")):
-            stored = cv2.imread(str(folder / path), cv2.IMREAD_UNCHANGED).astype("float32")
-            depth_m = read_depth_png(run / product / f"{camera}.png")
-            np.testing.assert_array_equal(stored / 256.0, depth_m)
-            np.testing.assert_array_equal(stored / entry["depth_scale"], depth_m)
-        assert cv2.imread(str(folder / image)).shape == (*stored.shape, 3)
-        assert entry["cam_in"] == [17.25, 18.5, 9.125, 5.75]
-
-
-def test_kitti_has_the_key_sweep_alone(tmp_path: Path) -> None:
-    street = write_street(tmp_path / "run")
-    export_run(street, "kitti", tmp_path / "a")
-    (raw,) = (tmp_path / "a" / "train").glob("tiny*/proj_depth/velodyne_raw/*/*.png")
-    (alone,) = (street / "scene" / "none").glob("*.png")
-    assert raw.read_bytes() == alone.read_bytes()
+            steps = cv2.imread(str(out / path), cv2.IMREAD_UNCHANGED).astype("float32")
+            depth_m = read_depth_png(run / product / f"{view}.png")
+            np.testing.assert_array_equal(steps / entry["depth_scale"], depth_m)
+        raw = out / f"val/{name}/proj_depth/velodyne_raw/{camera}/{file}.png"
+        assert raw.read_bytes() == (run / f"scene/none/{view}.png").read_bytes()
+        shown = cv2.imread(str(run / f"scene/image/{view}.jpg"))
+        np.testing.assert_array_equal(cv2.imread(str(out / image)), shown)
+        K = np.loadtxt(out / f"val/{name}/intrinsics/{camera}/{file}.txt").reshape(3, 3)
+        np.testing.assert_allclose(K, known.K, atol=1e-6)
 
 
 # --- clouds ---------------------------------------------------------------------------------------
@@ -245,7 +219,7 @@ def test_pcd_by_pypcd4(run: Path) -> None:
         np.testing.assert_array_equal(packed >> bits & 255, column)
 
 
-@pytest.mark.parametrize(("confidence", "age_ms"), [(0.5, None), (0.0, 95), (0.3, 0.0)])
+@pytest.mark.parametrize(("confidence", "age_ms"), [(0.5, None), (0.3, 95)])
 def test_thresholds_leave_exactly_these_points(run: Path, confidence: float, age_ms) -> None:
     exported = export_run(run, "ply", min_confidence=confidence, max_age_ms=age_ms)
     cloud = read_cloud(run / "cloud.laz")
@@ -279,7 +253,7 @@ def test_arguments_out_of_range(arguments, words: str, run: Path, monkeypatch) -
     refused(words, **{"run": run, "to": "npy", **arguments})
 
 
-@pytest.mark.parametrize("product", ["depth", "depth_filled", "confidence", "age"])
+@pytest.mark.parametrize("product", ["depth", "confidence"])
 def test_maps_that_are_damaged_or_missing_or_of_another_run(product: str, run: Path) -> None:
     path = run / product / "image_03.png"
     values, data = stored(run, product, "image_03"), path.read_bytes()
@@ -287,20 +261,37 @@ def test_maps_that_are_damaged_or_missing_or_of_another_run(product: str, run: P
     refused(path, "not a complete image", run=run, to="npy")
     cv2.imwrite(str(path), values[:, :-1])
     refused("does not belong to the others", run=run, to="npy")
-    other = np.uint16 if product == "confidence" else np.uint8
-    cv2.imwrite(str(path), values.astype(other))
+    cv2.imwrite(str(path), values.astype(np.uint16 if product == "confidence" else np.uint8))
     refused(path, f"expected a map of {product}", run=run, to="npy")
-    if product in ("confidence", "age"):
+    if product == "confidence":
         cv2.imwrite(str(path), np.where(values > 0, 0, values))
         refused(path, "does not belong to the others", run=run, to="npy")
-    path.unlink()
-    if product != "depth":
+        path.unlink()
         refused(path, run=run, to="npy")
 
 
-def test_clouds_that_are_damaged_or_missing(run: Path) -> None:
-    whole = (run / "cloud.laz").read_bytes()
-    (run / "cloud.laz").write_bytes(whole[: len(whole) // 2])
-    refused("cloud.laz", run=run, to="ply")
-    (run / "cloud.laz").unlink()
-    refused("cloud.laz", run=run, to="ply")
+def test_a_video_has_a_frame_for_each_map_and_a_growing_bar(tmp_path: Path) -> None:
+    folder, _ = write_views(tmp_path, {f"image_02/{n}": "plain" for n in range(3)})
+    export_run(folder, "mp4", tmp_path / "out")
+    video = cv2.VideoCapture(str(tmp_path / "out" / "video" / "image_02.mp4"))
+    frames = [frame for read, frame in iter(video.read, (False, None)) if read]
+    assert len(frames) == 3 and frames[0].shape == (2 * H + 6, W, 3)
+    white_px = [(frame[-3] > 128).all(axis=-1).sum() for frame in frames]
+    assert white_px == sorted(white_px) and white_px[-1] > white_px[0]
+
+
+def test_a_finished_run_gives_back_its_arrays(tmp_path: Path) -> None:
+    folder, result = write_views(tmp_path, {"image_02": "plain"})
+    loaded, expected = densify.load_result(folder), result.depth["image_02"]
+    maps = loaded.depth["image_02"]
+    for depth_m, expected_m in (
+        (maps.depth_m, expected.depth_m),
+        (maps.filled_m, expected.filled_m),
+    ):
+        storable_m = np.where(expected_m < 255.9, expected_m, 0)
+        np.testing.assert_allclose(depth_m, storable_m, atol=1 / 256)
+    seen = maps.filled_m > 0
+    np.testing.assert_allclose(maps.confidence[seen], expected.confidence[seen], atol=1 / 254)
+    assert not maps.confidence[~seen].any() and not maps.age_s[~seen].any()
+    np.testing.assert_allclose(loaded.cloud.points, result.cloud.points, atol=5e-4)
+    assert "key 120" in repr(loaded) and "key 120" in repr(result)

@@ -16,18 +16,11 @@ from scipy.ndimage import map_coordinates
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
 from densify.geometry.types import ObjectTrack, Result
-from densify.outputs import export_run, read_cloud, read_depth_png, write_result
-from densify.pipeline.run import run as run_key
-from tests.exported import (
-    STAMPS_NS,
-    H,
-    W,
-    refused,
-    street_result,
-    write_street,
-    write_views,
-)
-from tests.small_street import KEY, POSES_GIVEN, one_car
+from densify.outputs.cloud_files import read_cloud
+from densify.outputs.depth_png import read_depth_png
+from densify.outputs.export import export_run
+from tests.exported import STAMPS_NS, H, W, refused, write_drive, write_views
+from tests.small_street import KEY, one_car
 
 TWO = {"image_02": "plain", "image_03": "bent"}
 
@@ -38,8 +31,13 @@ def put(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory) -> Path:
-    return write_street(tmp_path_factory.mktemp("street"))
+def drive(tmp_path_factory) -> Path:
+    return write_drive(tmp_path_factory.mktemp("drive"))
+
+
+@pytest.fixture(scope="module")
+def street(drive) -> Path:
+    return drive / f"{KEY:06d}"
 
 
 def colmap(run: Path, to: str = "colmap", **arguments):
@@ -47,11 +45,6 @@ def colmap(run: Path, to: str = "colmap", **arguments):
     pycolmap = pytest.importorskip("pycolmap")
     export_run(run, to, **arguments)
     return pycolmap.Reconstruction(str(run / "export" / to / "sparse" / "0"))
-
-
-def transforms(run: Path, **arguments) -> dict:
-    export_run(run, "nerfstudio", **arguments)
-    return json.loads((run / "export" / "nerfstudio" / "transforms.json").read_text())
 
 
 def places_of(model) -> np.ndarray:
@@ -86,13 +79,6 @@ def test_a_model_by_colmaps_own_reader(put, lens: str) -> None:
     np.testing.assert_array_equal(colours, cloud.rgb[observed])
 
 
-@pytest.mark.parametrize("lens", ["prism", "mei"])
-def test_lenses_that_colmap_lacks(put, lens: str) -> None:
-    run, _ = put({"image_02": "plain", "image_03": lens})
-    refused("image_03: its lens", "--camera", run=run, to="colmap")
-    assert len(colmap(run, cameras=["image_02"]).images) == 1
-
-
 def test_points_land_on_their_depth_by_colmaps_own_camera(street: Path) -> None:
     """Pixel centres, axes and poses at once: what COLMAP projects is where our maps have it."""
     model = colmap(street)
@@ -121,49 +107,50 @@ def check_depth(run: Path, uv: np.ndarray, z_m: np.ndarray) -> None:
 # --- nerfstudio -----------------------------------------------------------------------------------
 
 
-def test_nerfstudio_frames(put) -> None:
-    run, result = put()
-    table = transforms(run)
-    folder = run / "export" / "nerfstudio"
-    assert table["camera_model"] == "OPENCV" and len(table["frames"]) == 2
+@pytest.mark.parametrize("to", ["nerfstudio", "wai"])
+def test_frames_by_the_formats_of_nerfstudio_and_map_anything(put, to: str) -> None:
+    """As nerfstudio's get_depth_image_from_path reads depth with its usual scale, and as
+    data_processing/README.md of map-anything describes scene_meta.json."""
+    exr = pytest.importorskip("OpenEXR")
+    run, result = put({"image_02": "plain", "image_03": "plain" if to == "wai" else "bent"})
+    export_run(run, to)
+    folder = run / "export" / to
+    (path,) = folder.glob("*.json")
+    table = json.loads(path.read_text())
+    assert table["camera_model"] == ("PINHOLE" if to == "wai" else "OPENCV")
+    axes = np.eye(4) if to == "wai" else np.diag([1, -1, -1, 1])  # OpenGL: x right, y up, z back
     for frame, (name, view) in zip(table["frames"], result.views.items(), strict=True):
         assert cv2.imread(str(folder / frame["file_path"])).shape == (frame["h"], frame["w"], 3)
-        lens = [*view.camera.distortion, 0, 0, 0, 0][:4]
-        assert [frame[k] for k in ("k1", "k2", "p1", "p2")] == lens and frame["k3"] == 0
         assert [frame[k] for k in ("fl_x", "fl_y", "cx", "cy")] == [17.25, 18.5, 9.625, 6.25]
-        # OpenGL's camera: x right, y up, z back
-        T_cam_world = np.diag([1, -1, -1, 1]) @ np.linalg.inv(frame["transform_matrix"])
+        T_cam_world = axes @ np.linalg.inv(frame["transform_matrix"])
         np.testing.assert_allclose(T_cam_world, view.T_cam_key, atol=1e-12)
-        # As nerfstudio's get_depth_image_from_path reads it with its usual scale
-        depth_m = np.load(folder / frame["depth_file_path"]) * 1e-3
+        if to == "wai":
+            channels = exr.File(str(folder / frame["depth"])).channels()
+            (depth_m,) = (channel.pixels for channel in channels.values())
+        else:
+            depth_m = np.load(folder / frame["depth_file_path"]) * 1e-3
+            lens = [*view.camera.distortion, 0, 0, 0, 0][:4]
+            assert [frame[k] for k in ("k1", "k2", "p1", "p2")] == lens and frame["k3"] == 0
         np.testing.assert_allclose(depth_m, read_depth_png(run / "depth" / f"{name}.png"), 1e-7)
+    if to == "wai":
+        assert table["camera_convention"] == "opencv"
+        assert table["frame_modalities"]["depth"] == {"frame_key": "depth", "format": "depth"}
+        return
     vertex = PlyData.read(folder / table["ply_file_path"])["vertex"].data
     assert vertex.dtype.names == ("x", "y", "z", "red", "green", "blue")
-    assert len(vertex) == read_cloud(run / "cloud.laz").rgb.any(axis=1).sum()
+    assert len(vertex) == read_cloud(run / "cloud.laz").observed.sum()
 
 
 def test_points_land_on_their_depth_by_opengls_camera(street: Path) -> None:
-    (frame,) = transforms(street)["frames"]
+    export_run(street, "nerfstudio")
+    table = json.loads((street / "export" / "nerfstudio" / "transforms.json").read_text())
+    (frame,) = table["frames"]
     vertex = PlyData.read(street / "export" / "nerfstudio" / "cloud.ply")["vertex"].data
     points = np.stack([vertex[a] for a in "xyz"] + [np.ones(len(vertex))], axis=1)
     x, y, back, _ = (points.astype(float) @ np.linalg.inv(frame["transform_matrix"]).T).T
     u = frame["cx"] - frame["fl_x"] * x / back
     v = frame["cy"] + frame["fl_y"] * y / back
     check_depth(street, np.stack([u, v], axis=1), -back)
-
-
-@pytest.mark.parametrize(
-    ("lenses", "measure", "words"),
-    [
-        ({"image_02": "plain", "image_03": "fisheye"}, "z", "one camera model"),
-        ({"image_02": "bent8"}, "z", "no lens with k4, k5, k6"),
-        ({"image_02": "mei"}, "z", "its lens (mei"),
-        ({"image_02": "fisheye"}, "range", "image_02: its depth is the range"),
-    ],
-)
-def test_cameras_that_nerfstudio_lacks(put, lenses, measure: str, words: str) -> None:
-    run, _ = put(lenses, measure=measure)
-    refused(words, "--camera" if measure == "z" else "project.depth=z", run=run, to="nerfstudio")
 
 
 # --- splats ---------------------------------------------------------------------------------------
@@ -244,23 +231,6 @@ def test_depths_by_the_reader_of_gaussian_splatting(put) -> None:
 # --- training sets --------------------------------------------------------------------------------
 
 
-def test_a_scene_by_the_format_of_map_anything(put) -> None:
-    """As data_processing/README.md of map-anything describes scene_meta.json."""
-    exr = pytest.importorskip("OpenEXR")
-    run, result = put({"image_02": "plain", "image_03": "plain"})
-    export_run(run, "wai")
-    folder = run / "export" / "wai"
-    meta = json.loads((folder / "scene_meta.json").read_text())
-    assert (meta["camera_model"], meta["camera_convention"]) == ("PINHOLE", "opencv")
-    assert meta["frame_modalities"]["depth"] == {"frame_key": "depth", "format": "depth"}
-    for frame, (name, view) in zip(meta["frames"], result.views.items(), strict=True):
-        assert cv2.imread(str(folder / frame["file_path"])).shape == (frame["h"], frame["w"], 3)
-        T_cam_world = np.linalg.inv(frame["transform_matrix"])
-        np.testing.assert_allclose(T_cam_world, view.T_cam_key, atol=1e-12)
-        (depth_m,) = (c.pixels for c in exr.File(str(folder / frame["depth"])).channels().values())
-        np.testing.assert_array_equal(depth_m, read_depth_png(run / "depth" / f"{name}.png"))
-
-
 def test_a_set_by_the_reader_of_moge(put) -> None:
     """As read_depth of its moge/utils/io.py: 16 bit, logarithmic from near to far, 0 unknown."""
     image = pytest.importorskip("PIL.Image")
@@ -282,24 +252,11 @@ def test_a_set_by_the_reader_of_moge(put) -> None:
         assert (folder / place / "image.jpg").is_file()
 
 
-@pytest.mark.parametrize("to", ["wai", "moge", "nerfstudio", "splats"])
-def test_training_sets_take_camera_z(put, to: str) -> None:
-    pytest.importorskip("OpenEXR")
-    run, _ = put({"image_02": "plain"}, measure="range")
-    refused("image_02: its depth is the range", "project.depth=z", run=run, to=to)
-    if to in ("wai", "moge"):
-        bent, _ = write_views(run.parent / "bent", {"image_02": "bent"})
-        refused("image_02: --to", "without distortion", run=bent, to=to)
-
-
 @pytest.mark.parametrize("to", ["nerfstudio", "splats", "wai", "moge"])
-def test_several_keys_share_one_world(street: Path, tmp_path: Path, to: str) -> None:
+def test_several_keys_share_one_world(drive: Path, tmp_path: Path, to: str) -> None:
     pytest.importorskip("OpenEXR")
-    second = run_key(one_car(), KEY + 1, 1, "icp", config=POSES_GIVEN)
-    for result in (street_result(), second):
-        write_result(result, tmp_path / "set", config={}, data="tiny street")
-    export_run(tmp_path / "set", to, tmp_path / "out")
     out = tmp_path / "out"
+    export_run(drive, to, out)
     if to == "moge":
         assert len((out / ".index.txt").read_text().split()) == 2
         return
@@ -316,7 +273,31 @@ def test_several_keys_share_one_world(street: Path, tmp_path: Path, to: str) -> 
     np.testing.assert_allclose(np.linalg.inv(T_world_cam[0]) @ T_world_cam[1], moved, atol=0.02)
 
 
-# --- damaged runs ---------------------------------------------------------------------------------
+# --- what a format lacks, and damaged runs --------------------------------------------------------
+
+BENT = "image_02: --to wai takes images without distortion"
+RANGE = "image_02: its depth is the range"
+
+
+@pytest.mark.parametrize(
+    ("to", "lenses", "measure", "words"),
+    [
+        ("colmap", {"image_02": "plain", "image_03": "prism"}, "z", "image_03: its lens"),
+        ("colmap", {"image_02": "plain", "image_03": "mei"}, "z", "image_03: its lens (mei"),
+        ("nerfstudio", {"image_02": "plain", "image_03": "fisheye"}, "z", "one camera model"),
+        ("nerfstudio", {"image_02": "bent8"}, "z", "no lens with k4, k5, k6"),
+        ("wai", {"image_02": "bent"}, "z", BENT),
+        ("moge", {"image_02": "bent"}, "z", BENT.replace("wai", "moge")),
+        *((to, {"image_02": "plain"}, "range", RANGE) for to in ("wai", "moge", "splats")),
+        ("nerfstudio", {"image_02": "fisheye"}, "range", RANGE),
+    ],
+)
+def test_what_a_format_lacks(put, to: str, lenses: dict, measure: str, words: str) -> None:
+    pytest.importorskip("OpenEXR")
+    run, _ = put(lenses, measure=measure)
+    refused(words, "--camera" if measure == "z" else "project.depth=z", run=run, to=to)
+    if "image_03" in lenses:
+        export_run(run, to, cameras=["image_02"])
 
 
 def test_runs_without_images_or_scene(put) -> None:
@@ -335,16 +316,16 @@ def test_runs_without_images_or_scene(put) -> None:
 
 def test_damaged_tables_are_named(tracked) -> None:
     run, _ = tracked
-    for file, old, new in (
-        ("scene/scene.json", '"pinhole"', '"cone"'),
-        ("scene/scene.json", '"width_px": 20', '"width_px": 0'),
-        ("movers.json", '"frame": 120', '"frame": 7'),
+    for file, damages in (
+        ("scene/scene.json", (('"pinhole"', '"cone"'), ('"width_px": 20', '"width_px": 0'))),
+        ("movers.json", (('"frame": 120', '"frame": 7'), ('"poses": [', '"poses": [], "p": ['))),
     ):
         path = run / file
         whole = path.read_text()
-        assert old in whole
-        path.write_text(whole.replace(old, new, 1))
-        refused(path, "densify", run=run, to="splats")
+        for old, new in damages:
+            assert old in whole
+            path.write_text(whole.replace(old, new, 1))
+            refused(path, "densify the key again", run=run, to="splats")
         path.write_text("{")
         refused(path, "not a whole JSON file", run=run, to="splats")
         path.write_text(whole)

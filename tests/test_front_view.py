@@ -8,54 +8,52 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from densify.cli.runs import _front_first
 from densify.geometry.types import CameraView
 from densify.outputs import plots
-from densify.outputs.front_view import front_first
-from densify.outputs.report.key_page import KeyFiles, key_page
+from densify.outputs.plots import front_first
+from densify.outputs.report_page import KeyFiles, key_page
 from tests.exported import camera_of, write_views
 
 NAMES = ["back", "left", "straight"]
 AXES = {"back": [-1, 0, 0], "left": [0, 1, 0], "straight": [1, 0, 0]}  # in the key frame
+VIEWS = {}
+for _name, _axis in AXES.items():
+    _T_cam_key = np.eye(4)
+    _T_cam_key[:3, :3] = [np.cross(_axis, [0, 0, 1]), [0, 0, -1], _axis]
+    VIEWS[_name] = CameraView(camera_of(_name, "plain"), _T_cam_key, 0.0, None)
 
 
-def views() -> dict[str, CameraView]:
-    found = {}
-    for name, axis in AXES.items():
-        T_cam_key = np.eye(4)
-        T_cam_key[:3, :3] = [np.cross(axis, [0, 0, 1]), [0, 0, -1], axis]
-        found[name] = CameraView(camera_of(name, "plain"), T_cam_key, 0.0, None)
-    return found
-
-
-def way(x_m: float, y_m: float) -> dict[int, np.ndarray]:
+def travel(x_m: float, y_m: float) -> dict[int, np.ndarray]:
     poses = {frame: np.eye(4) for frame in (119, 120, 121)}
     poses[119][:2, 3], poses[121][:2, 3] = (-x_m / 2, -y_m / 2), (x_m / 2, y_m / 2)
     return poses
 
 
-def test_the_way_of_the_vehicle_decides() -> None:
-    assert front_first(NAMES, views(), way(5, 0.5)) == ["straight", "back", "left"]
-    assert front_first(NAMES, views(), way(0.3, 5)) == ["left", "back", "straight"]  # y forward
-    at_rest = front_first(["image_02", "image_03"], {}, way(0.1, 0.2))
-    assert at_rest == ["image_02", "image_03"]
-    assert front_first(["left", "other"], views(), way(-5, 0)) == ["left", "other"]
-    assert front_first([], {}, {}) == []
-
-
-def test_at_rest_the_name_decides() -> None:
-    names = ["CAM_BACK", "CAM_FRONT_LEFT", "CAM_FRONT"]
-    assert front_first(names, {}, {}) == ["CAM_FRONT", "CAM_BACK", "CAM_FRONT_LEFT"]
-    assert front_first(["ring_rear_left", "ring_front_left"], {}, {})[0] == "ring_front_left"
+@pytest.mark.parametrize(
+    ("names", "poses", "expected"),
+    [
+        (NAMES, travel(5, 0.5), ["straight", "back", "left"]),
+        (NAMES, travel(0.3, 5), ["left", "back", "straight"]),  # y forward
+        (["image_02", "image_03"], travel(0.1, 0.2), ["image_02", "image_03"]),  # at rest
+        (["left", "other"], travel(-5, 0), ["left", "other"]),
+        ([], {}, []),
+        (["BACK", "FRONT_LEFT", "FRONT"], {}, ["FRONT", "BACK", "FRONT_LEFT"]),
+        (["rear_left", "front_left"], {}, ["front_left", "rear_left"]),
+    ],
+)
+def test_travel_decides_or_at_rest_the_name(names, poses, expected) -> None:
+    assert front_first(names, VIEWS, poses) == expected
 
 
 def test_figure_page_and_screen_begin_with_it(tmp_path: Path, monkeypatch) -> None:
     titles: list[str] = []
-    drawn = plots.draw_figure
-    monkeypatch.setattr(plots, "draw_figure", lambda i, p: titles.extend(p) or drawn(i, p))
+    draw = plots.draw_figure
+    monkeypatch.setattr(plots, "draw_figure", lambda i, p: titles.extend(p) or draw(i, p))
     lenses = dict.fromkeys(NAMES, "plain")
-    run, result = write_views(tmp_path, lenses, views=views(), T_key_lidar=way(5, 0))
+    run, result = write_views(tmp_path, lenses, views=VIEWS, T_key_lidar=travel(5, 0))
     assert [title.partition(":")[0] for title in titles] == ["scene flow, straight"]
     page = key_page(KeyFiles.of_run(run), "").decode()
     assert re.search(r'"cameras":\s*{\s*"straight":', page)

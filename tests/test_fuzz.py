@@ -30,7 +30,7 @@ from densify.config.errors import ComputationError, InputError
 from densify.config.file_content import gunzipped, read_bytes, read_json
 from densify.dataset.plan import read_plan
 from densify.geometry.types import Camera
-from densify.outputs import read_cloud
+from densify.outputs.cloud_files import read_cloud
 from densify.readers import Spec, describe, open_sequence
 from densify.readers.decoded_files import read_array, read_arrays, read_image
 from densify.readers.flow_files import load_flow_file

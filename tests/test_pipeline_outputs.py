@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from densify.geometry.types import Cloud, Reason, Result
-from densify.outputs import read_cloud, read_depth_png, write_result
+from densify.outputs.cloud_files import read_cloud
+from densify.outputs.depth_png import read_depth_png
+from densify.outputs.key_outputs import write_result
 from densify.pipeline.run import compare, run
 from tests.scenes import ROOM, Arc, Scanner, Scene, TinySequence, World, by_flow
 from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
@@ -28,7 +30,8 @@ NPZ = {"output": {"flow": "npz"}}
 @pytest.fixture(scope="module")
 def kept() -> Result:
     """With its baselines."""
-    return run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": {"score": True}})
+    output = {"score": True, "rejected": True}
+    return run(one_car(), KEY, 1, config=POSES_GIVEN | {"output": output})
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +82,8 @@ def test_everything_asked_for_is_written(apart, tmp_path):
     for instance, mover in apart.movers.items():
         where = folder / "movers" / f"{instance:04d}"
         assert len(read_cloud(where / "cloud.laz").points) == len(mover.cloud)
-        found = read_depth_png(where / "depth" / "front.png")
-        np.testing.assert_allclose(found, mover.depth["front"].depth_m, atol=1 / 512)
+        stored_m = read_depth_png(where / "depth" / "front.png")
+        np.testing.assert_allclose(stored_m, mover.depth["front"].depth_m, atol=1 / 512)
     image = cv2.imread(str(folder / "optical_flow" / "next" / "front.png"), cv2.IMREAD_UNCHANGED)
     known = np.isfinite(apart.optical_flow["front"]["next"]).all(axis=2)
     assert np.array_equal(image[..., 0] == 1, known)
@@ -140,17 +143,15 @@ def test_flow_predicts_movers_better_than_registration(kept):
 # --- what is left out -----------------------------------------------------------------------------
 
 
-def test_every_point_is_accounted_for_and_a_map_says_what_was_left_out(tmp_path):
-    settings = POSES_GIVEN | {"output": {"rejected": True}}
-    result = by_flow(one_car(), KEY, 1, config=settings)
-    counts, maps = result.metrics["rejected"]["front"], result.depth["front"]
-    assert sum(counts.values()) == len(result.cloud)
+def test_every_point_is_accounted_for_and_a_map_says_what_was_left_out(kept, tmp_path):
+    counts, maps = kept.metrics["rejected"]["front"], kept.depth["front"]
+    assert sum(counts.values()) == len(kept.cloud)
     assert 0 < counts["kept"] <= (maps.depth_m > 0).sum()  # a spot may cover several pixels
-    left_out = result.rejected["front"]
+    left_out = kept.rejected["front"]
     shown = {Reason(r).name.lower() for r in np.unique(left_out) if r}
     assert shown and shown <= {"hidden", "unsupported", "edge"}
     for name in shown:
         assert (left_out == Reason[name.upper()]).sum() <= counts[name]
-    write_result(result, tmp_path, config=NPZ, data="street")
+    write_result(kept, tmp_path, config=NPZ, data="street")
     path = tmp_path / f"{KEY:06d}" / "scene" / "reason" / "front.png"
     assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), left_out)

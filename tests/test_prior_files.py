@@ -16,8 +16,8 @@ import yaml
 import densify
 from densify.config.errors import InputError
 from densify.geometry.types import Camera
-from densify.outputs import read_depth_png, write_result
-from densify.outputs.depth_png import read_stored
+from densify.outputs.depth_png import read_depth_png, read_stored
+from densify.outputs.key_outputs import write_result
 from densify.readers.prior_files import PriorFiles
 from tests.small_street import KEY, POSES_GIVEN, one_car
 

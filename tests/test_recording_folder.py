@@ -9,10 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 from densify.config.errors import InputError
+from densify.dataset.plan import Recipe, plan, write_plan
 from densify.outputs.export import export_run
-from densify.outputs.recording_folder import check_recording, default_folder, is_same
+from densify.outputs.recording_folder import (
+    check_recording,
+    default_folder,
+    drive_folder,
+    is_same,
+    split_of,
+)
 from densify.readers.depth_trees import pair_depth_files
 from tests.command import exit_code, files_in, refused
 from tests.dataset_scenes import BORDER, DRIVE, copy_drive
@@ -27,14 +36,41 @@ VERBS = {
 }
 
 
-def test_each_recording_has_its_folder() -> None:
-    names = {
-        "street:street?seed=0&sensor=hdl64": "street",
-        "street:street?seed=1&sensor=hdl64": "street-street_seed-1_sensor-hdl64",
-        DRIVE: DRIVE,
-    }
-    for name, folder in names.items():
-        assert default_folder(name) == Path("densify-out") / folder
+@pytest.mark.parametrize(
+    ("recording", "folder"),
+    [
+        ("street:street?seed=0&sensor=hdl64", "street"),
+        ("street:street?seed=1&sensor=hdl64", "street-street_seed-1_sensor-hdl64"),
+        (DRIVE, DRIVE),
+    ],
+)
+def test_each_recording_has_its_folder(recording: str, folder: str) -> None:
+    assert default_folder(recording) == Path("densify-out") / folder
+
+
+def test_the_split_is_that_of_the_benchmark() -> None:
+    official = {"2011_09_26": 9, "2011_09_28": 1, "2011_09_29": 1, "2011_09_30": 1, "2011_10_03": 1}
+    for date, expected in official.items():
+        splits = [split_of(f"{date}_drive_{number:04d}_sync") for number in range(200)]
+        assert splits.count("val") == expected and splits.count("train") == 200 - expected
+    assert split_of("2011_09_26_drive_0013_sync") == split_of("2011_10_03_drive_0047") == "val"
+    for name in ("street:street?seed=0", "", "2011_09_26_drive_0013_synced", "drive_0013_sync"):
+        assert split_of(name) == "train"
+
+
+ODD_NAMES = ["", ".", "..", "../../etc", "a/b", "/", "-rf", ".hidden", "a b", "a  b", "ä", "å"]
+ODD_NAMES += ["x" * 300, "x" * 301, "a\nb", "a\0b"]
+
+
+@given(st.lists(st.text() | st.sampled_from(ODD_NAMES), unique=True, max_size=8))
+def test_any_name_becomes_one_harmless_folder(names: list[str]) -> None:
+    plain = [name for name in names if not set(name) & set(":?=&")]
+    folders = [drive_folder(name) for name in plain]
+    assert len(set(folders)) == len(folders)
+    for folder in (*folders, *map(drive_folder, names)):
+        assert folder.isascii() and len(folder) <= 100
+        assert not set(folder) & set("/\\\0 \n\"'") and folder[0] not in ".-"
+        assert drive_folder(folder) == folder
 
 
 def test_runs_go_there_by_default(border_drive: Path, tmp_path: Path, monkeypatch) -> None:
@@ -50,22 +86,20 @@ def test_runs_go_there_by_default(border_drive: Path, tmp_path: Path, monkeypatc
 
 
 @pytest.mark.parametrize("verb", VERBS)
-@pytest.mark.parametrize("held", ["run.yaml", "compare.json", "dataset.json"])
-def test_a_folder_of_another_recording_is_refused(
-    verb: str, held: str, tmp_path: Path, capsys
-) -> None:
-    out = tmp_path / "out"
-    table = {"recording": DRIVE, "data": "/data/kitti"}
-    path = out / "000007" / held
-    if held == "dataset.json":
-        path, table = out / held, {"drives": {DRIVE: {"data": "/data/kitti"}}}
-    path.parent.mkdir(parents=True)
-    path.write_text(yaml.safe_dump(table) if held == "run.yaml" else json.dumps(table))
-    before = files_in(out)
-    line = refused(capsys, 2, verb, STREET, *VERBS[verb], "--out", out)
-    assert str(out) in line and files_in(out) == before
-    if verb != "dataset":  # which takes no folder of runs at all
-        assert DRIVE in line and "/data/kitti" in line and "another recording" in line
+def test_a_folder_of_another_recording_is_refused(verb: str, tmp_path: Path, capsys) -> None:
+    for stored in ("run.yaml", "compare.json", "dataset.json"):
+        out = tmp_path / stored
+        table = {"recording": DRIVE, "data": "/data/kitti"}
+        path = out / "000007" / stored
+        if stored == "dataset.json":
+            path, table = out / stored, {"drives": {DRIVE: {"data": "/data/kitti"}}}
+        path.parent.mkdir(parents=True)
+        path.write_text(yaml.safe_dump(table) if stored == "run.yaml" else json.dumps(table))
+        before = files_in(out)
+        line = refused(capsys, 2, verb, STREET, *VERBS[verb], "--out", out)
+        assert str(out) in line and files_in(out) == before
+        if verb != "dataset":  # which takes no folder of runs at all
+            assert DRIVE in line and "/data/kitti" in line and "another recording" in line
 
 
 def test_flow_files_name_their_recording(tmp_path: Path, capsys) -> None:
@@ -78,9 +112,8 @@ def test_which_recordings_are_the_same(tmp_path: Path) -> None:
     first, second = tmp_path / "a" / "drive", tmp_path / "b" / "drive"
     for folder in (first, second):
         (folder / "sweeps").mkdir(parents=True)
-    assert is_same("drive", str(first), "drive", str(first / "sweeps"))
-    assert is_same("drive", str(first), "drive", f"folder:{first}")
-    assert is_same("drive", str(first), "drive", str(tmp_path / "moved" / "drive"))
+    for data in (first / "sweeps", f"folder:{first}", tmp_path / "moved" / "drive"):
+        assert is_same("drive", str(first), "drive", str(data))
     assert not is_same("drive", str(first), "drive", str(second))
     assert not is_same("drive", str(first), "other", str(first))
 
@@ -94,11 +127,10 @@ def test_damaged_files_and_older_results_do_not_hinder(tmp_path: Path) -> None:
 
 
 def test_a_set_goes_on_with_its_recording_alone(border_drive: Path, tmp_path: Path, capsys):
-    out, options = tmp_path / "out", ["--method", "none", "--keys", "39:40"]
-    assert exit_code("dataset", border_drive, *options, "--out", out) == 0
-    capsys.readouterr()
+    out = tmp_path / "out"
+    write_plan(out, Recipe(), plan([str(border_drive)], None, Recipe()))
     same = copy_drive(border_drive, tmp_path / "2011_09_26")
-    line = refused(capsys, 2, "dataset", same, *options, "--out", out)
+    line = refused(capsys, 2, "dataset", same, "--out", out)
     assert str(border_drive) in line and str(same) in line
 
 

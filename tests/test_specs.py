@@ -9,10 +9,9 @@ import pytest
 
 import densify
 from densify.config.errors import InputError
-from densify.dataset.plan import Recipe, plan, read_plan
+from densify.dataset.plan import Recipe, plan
 from densify.readers import Spec
-from tests.command import exit_code
-from tests.dataset_scenes import DRIVE, FRAMES, maps_in, statuses
+from tests.dataset_scenes import DRIVE, FRAMES
 
 
 @pytest.mark.parametrize(
@@ -47,7 +46,7 @@ def test_a_folder_with_a_number_sign(tmp_path: Path) -> None:
     assert Spec.parse(f"kitti:{tmp_path}/run#3#4") == ("kitti", f"{tmp_path}/run#3", "4")
 
 
-def test_a_scene_of_a_place_whose_reader_is_guessed(border_drive: Path, tmp_path: Path) -> None:
+def test_a_scene_of_a_place_whose_reader_is_guessed(border_drive: Path) -> None:
     parts = (None, f"{border_drive}", "night")
     assert Spec.parse(f"{border_drive}#night") == parts
     assert Spec.parse(Spec.parse(f"{border_drive}#night").absolute()) == parts
@@ -55,9 +54,7 @@ def test_a_scene_of_a_place_whose_reader_is_guessed(border_drive: Path, tmp_path
         densify.open_sequence(f"{border_drive}#night")
 
 
-def test_a_set_of_a_recording_with_its_reader(
-    border_drive: Path, tmp_path: Path, monkeypatch
-) -> None:
+def test_a_set_of_a_recording_with_its_reader(border_drive: Path, monkeypatch) -> None:
     """The processes that make it, and those that read it, may work in other folders."""
     monkeypatch.chdir(border_drive.parent)
     (planned,) = plan([f"kitti:{DRIVE}"], None, Recipe())
@@ -65,13 +62,3 @@ def test_a_set_of_a_recording_with_its_reader(
     assert planned.data == f"kitti:{border_drive}"
     assert planned.folder == as_path.folder == f"val/{DRIVE}"
     assert planned.keys == as_path.keys == tuple(FRAMES)
-
-    out = tmp_path / "out"
-    options = ["--method", "none", "--keys", "39:41", "--out", out]
-    assert exit_code("dataset", "--data", f"kitti:{DRIVE}", *options) == 0
-    assert statuses(out) == {39: "done", 40: "done"}
-    assert {name.split("/")[1] for name in maps_in(out)} == {DRIVE}
-    assert read_plan(out)["drives"][DRIVE]["data"] == f"kitti:{border_drive}"
-    monkeypatch.chdir(tmp_path)
-    sample = densify.DepthDataset(out)[1]
-    assert (sample["drive"], sample["frame"]) == (DRIVE, 40)

@@ -14,7 +14,7 @@ from densify.config import resolve
 from densify.depth.confidence import expected_outliers
 from densify.free_space.lone_returns import without_lone
 from densify.geometry import poses
-from densify.outputs import write_result
+from densify.outputs.key_outputs import write_result
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import run
 from densify.pipeline.warnings import of_result

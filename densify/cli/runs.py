@@ -27,12 +27,13 @@ from densify.config import as_mapping
 from densify.config.errors import ComputationError, InputError
 from densify.dataset.report import write_comparison_page, write_report
 from densify.geometry.types import METHOD_NAMES, LidarSequence, Result
-from densify.outputs import Export, check_writable, write_comparison, write_result
 from densify.outputs.atomic import plain
-from densify.outputs.export import export_run, facts, open3d_window, rrd
-from densify.outputs.export.finished_run import finished_runs
-from densify.outputs.front_view import front_first
+from densify.outputs.export import Export, export_run, facts
+from densify.outputs.finished_run import Thresholds, finished_runs
+from densify.outputs.key_outputs import check_writable, write_comparison, write_result
+from densify.outputs.plots import front_first
 from densify.outputs.recording_folder import check_recording, default_folder
+from densify.outputs.viewers import show_in_open3d, show_in_rerun
 from densify.pipeline import run as pipeline
 from densify.pipeline.key_result import COMPARED
 from densify.readers import Spec, open_sequence
@@ -288,9 +289,9 @@ def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
 
 def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
     """Show finished runs in a viewer."""
-    runs = finished_runs(options.dir, cameras=options.camera)
-    viewers = {"rerun": rrd, "open3d": open3d_window}
-    viewers[vars(options)["with"]].show(runs)
+    runs = finished_runs(options.dir, Thresholds(cameras=options.camera))
+    viewers = {"rerun": show_in_rerun, "open3d": show_in_open3d}
+    viewers[vars(options)["with"]](runs)
     keys = [run.key for run in runs]
     yield Answer(f"shown: key {', '.join(map(str, keys))}", {"keys": keys})
 

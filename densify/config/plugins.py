@@ -231,24 +231,25 @@ READERS = Table(
 class Form(NamedTuple):
     """An export format."""
 
-    module: str  # module of `densify.outputs.export` with the function ``write_NAME``
+    module: str  # module of `densify.outputs` with the function ``write_NAME``
     owned: tuple[str, ...]  # files and folders that the format writes
     of_drive: bool = True  # True if an export can cover several keys of a drive
 
 
 EXPORTS = {
-    "npy": Form("maps_and_clouds", ("depth", "depth_filled", "confidence"), of_drive=False),
-    "exr": Form("maps_and_clouds", ("depth", "depth_filled", "confidence"), of_drive=False),
-    "ply": Form("maps_and_clouds", ("cloud.ply",), of_drive=False),
-    "pcd": Form("maps_and_clouds", ("cloud.pcd",), of_drive=False),
-    "nerfstudio": Form("camera_files", ("transforms.json", "images", "depth", "cloud.ply")),
-    "colmap": Form("camera_files", ("images", "sparse")),
-    "splats": Form("camera_files", ("images", "depths", "sparse", "movers", "tracks.json")),
-    "moge": Form("training_sets", (".index.txt", "keys")),
-    "wai": Form("training_sets", ("scene_meta.json", "images", "depth")),
-    "kitti": Form("maps_and_clouds", ("train", "val", "files.txt", "annotations.json")),
-    "kitti-tracking": Form("kitti_tracking", ("label_02", "calib", "velodyne", "image_02")),
-    "rrd": Form("rrd", ("recording.rrd",)),
-    "mcap": Form("mcap", ("recording.mcap",)),
+    "npy": Form("export", ("depth", "depth_filled", "confidence"), of_drive=False),
+    "exr": Form("export", ("depth", "depth_filled", "confidence"), of_drive=False),
+    "ply": Form("export", ("cloud.ply",), of_drive=False),
+    "pcd": Form("export", ("cloud.pcd",), of_drive=False),
+    "nerfstudio": Form("camera_exports", ("transforms.json", "images", "depth", "cloud.ply")),
+    "colmap": Form("camera_exports", ("images", "sparse")),
+    "splats": Form("camera_exports", ("images", "depths", "sparse", "movers", "tracks.json")),
+    "moge": Form("camera_exports", (".index.txt", "keys")),
+    "wai": Form("camera_exports", ("scene_meta.json", "images", "depth")),
+    "kitti": Form("kitti_tree", ("train", "val", "files.txt", "annotations.json")),
+    "kitti-tracking": Form("kitti_tree", ("label_02", "calib", "velodyne", "image_02")),
+    "rrd": Form("viewers", ("recording.rrd",)),
+    "mcap": Form("viewers", ("recording.mcap",)),
+    "mp4": Form("video", ("video",)),
 }
 """Name of an export format of ``densify export`` -> its writer."""

@@ -20,8 +20,8 @@ from densify.config.errors import ComputationError, InputError, OutputError, is_
 from densify.dataset.manifest import KeyRecord
 from densify.dataset.plan import Recipe
 from densify.geometry.types import Result
+from densify.outputs.key_outputs import write_result
 from densify.outputs.kitti_tree import FileRecord, write_key
-from densify.outputs.store import write_result
 from densify.pipeline import run as pipeline
 from densify.pipeline.key_result import looks_around, methods_of_run
 from densify.pipeline.recording import Recording

@@ -93,6 +93,10 @@ class DepthDataset(Dataset[dict[str, Any]]):
                 f"{', '.join(there)}; let densify dataset finish some"
             )
 
+    def __repr__(self) -> str:
+        drives = {drive for drive, *_ in self._samples}
+        return f"DepthDataset({self._root}: {len(self)} samples of {len(drives)} recordings)"
+
     def __len__(self) -> int:
         return len(self._samples)
 

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from densify.config.errors import InputError, OutputError
-from densify.config.file_content import parse_json, read_bytes
+from densify.config.file_content import needed, parse_json, read_bytes
 from densify.outputs.atomic import plain, write_file
 from densify.outputs.kitti_tree import FileRecord
 
@@ -87,6 +87,25 @@ class KeyRecord:
             )
         except Exception as error:  # damaged text raises errors of any type
             raise ValueError(f"no record of a key: {error!r}") from error
+
+
+def manifest(folder: str | Path) -> Any:
+    """Return a training set's manifest as a pandas.DataFrame, a row for each key sweep.
+
+    Columns are ``drive``, ``key``, ``status``, ``reason``, ``seconds``, ``num_sweeps``,
+    ``warnings``, and the scores, those of cameras as ``density.image_02``.
+    """
+    pandas = needed("pandas", "pandas", "tables of a manifest")
+    rows = []
+    for record in read_manifests(Path(folder)).values():
+        row = {name: getattr(record, name) for name in ("drive", "key", "status", "reason")}
+        row |= {"seconds": record.seconds, "num_sweeps": len(record.frames)}
+        row["warnings"] = "; ".join(record.warnings)
+        for name, score in record.scores.items():
+            by_camera = score if isinstance(score, Mapping) else {"": score}
+            row |= {f"{name}.{camera}".rstrip("."): value for camera, value in by_camera.items()}
+        rows.append(row)
+    return pandas.DataFrame(rows)
 
 
 def read_manifests(root: Path) -> dict[Key, KeyRecord]:

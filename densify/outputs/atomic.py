@@ -19,6 +19,7 @@ import numpy as np
 from densify.config.errors import OutputError
 
 LEFT_AFTER_S = 600.0  # longer than the writing of any file
+_MOST_LETTERS = 100  # of a name: with the random letters it stays below the file system's 255
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -42,10 +43,10 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
     On an error ``folder`` is as before. Of its entries, only ``owned`` are replaced or removed.
     """
     folder = Path(os.path.realpath(folder))
-    missing = [place for place in folder.parents if not place.exists()]
+    missing_parents = [parent for parent in folder.parents if not parent.exists()]
 
-    def skip(place: str, names: list[str]) -> Collection[str]:
-        return owned if Path(place) == folder else ()
+    def skip(copied: str, names: list[str]) -> Collection[str]:
+        return owned if Path(copied) == folder else ()
 
     try:
         with _hidden_folder(folder) as hidden:
@@ -62,9 +63,9 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
                     os.rename(hidden / "old", folder)
                 raise
     except BaseException:
-        for place in missing:  # from the deepest folder up
+        for parent in missing_parents:  # from the deepest folder up
             with suppress(OSError):  # another process may have written into the folder
-                place.rmdir()
+                parent.rmdir()
         raise
 
 
@@ -81,13 +82,14 @@ def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
 
 @contextmanager
 def _hidden_folder(path: Path) -> Iterator[Path]:
-    prefix = f".{path.name[:100]}."
+    """Yield a temporary folder beside ``path``, on the same disk, and remove it afterwards."""
+    prefix = f".{path.name[:_MOST_LETTERS]}."
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(
             ".tmp", prefix, path.parent, ignore_cleanup_errors=True
-        ) as place:
-            yield Path(place)
+        ) as folder:
+            yield Path(folder)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ Picture = NDArray[np.uint8]
 
 # KITTI's depth completion benchmark: Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017
 _STEPS_PER_M = 256.0
-_STEPS_OF_CONFIDENCE = 254.0
+STEPS_OF_CONFIDENCE = 254.0
 _STEPS_PER_S = 1000.0
 _STEPS_PER_PX = 64.0
 _MAX_VALUE = np.iinfo(np.uint16).max
@@ -52,30 +53,43 @@ def write_depth_png(path: Path, depth_m: Float32) -> None:
 
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
     """Write an (H,W) map by `stored_confidence`, 0 where `write_depth_png` stores no depth."""
-    levels = np.zeros(depth_m.shape, np.uint8)
-    has_depth = _quantised(depth_m) > 0
-    levels[has_depth] = stored_confidence(confidence[has_depth])
-    write_file(path, encode_png(levels))
+    _write_where_depth(path, depth_m, confidence, stored_confidence)
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
     """Write an (H,W) map by `stored_age`, 0 where `write_depth_png` stores no depth."""
-    steps = np.zeros(depth_m.shape, np.uint16)
+    _write_where_depth(path, depth_m, age_s, stored_age)
+
+
+def _write_where_depth(
+    path: Path, depth_m: Float32, values: Float32, stored: Callable[[Float32], NDArray[Any]]
+) -> None:
+    """Write the stored form of (H,W) values at pixels whose depth is stored, 0 elsewhere."""
     has_depth = _quantised(depth_m) > 0
-    steps[has_depth] = stored_age(age_s[has_depth])
-    write_file(path, encode_png(steps))
+    pixels = stored(np.where(has_depth, values, np.float32(0)))
+    write_file(path, encode_png(pixels * has_depth))
 
 
 def stored_confidence(confidence: ArrayLike) -> NDArray[np.uint8]:
     """Return ``1 + rint(254 * confidence)``: 1 to 255 for confidence 0 to 1. 0 means no depth."""
-    levels = np.rint(_STEPS_OF_CONFIDENCE * np.asarray(confidence, np.float64))
+    levels = np.rint(STEPS_OF_CONFIDENCE * np.asarray(confidence, np.float64))
     return (1 + levels).astype(np.uint8)
+
+
+def confidence_of(stored: NDArray[np.uint8]) -> Float32:
+    """Return (H,W) the confidence 0 to 1 of values of `stored_confidence`, 0 without depth."""
+    return np.maximum(stored.astype(np.float32) - 1, 0) / np.float32(STEPS_OF_CONFIDENCE)
 
 
 def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
     """Return ``1 + rint(1000 * age_s)``. 65535 means 65.5 s or more, 0 means no depth."""
     steps = np.rint(_STEPS_PER_S * np.asarray(age_s, np.float64))
     return (1 + np.minimum(steps, _MAX_VALUE - 1)).astype(np.uint16)
+
+
+def age_of(stored: NDArray[np.uint16]) -> Float32:
+    """Return (H,W) the age in seconds of values of `stored_age`, 0 without depth."""
+    return np.maximum(stored.astype(np.float32) - 1, 0) / np.float32(_STEPS_PER_S)
 
 
 def write_flow_png(path: Path, flow_px: Float32) -> None:
@@ -101,13 +115,16 @@ def read_depth_png(path: Path) -> Float32:
     return metres(read_stored(path, np.uint16, "a depth map"))
 
 
-def read_stored(path: Path, kind: type[np.uint8] | type[np.uint16], what: str) -> NDArray[Any]:
-    """Return the (H,W) pixel values as stored; ``kind`` is their type, ``what`` names the map."""
+PixelType = type[np.uint8] | type[np.uint16]
+
+
+def read_stored(path: Path, kind: PixelType, map_name: str) -> NDArray[Any]:
+    """Return the (H,W) pixel values as stored; ``kind`` is their type, ``map_name`` for errors."""
     image = read_image(path, as_stored=True)
     if image.dtype != kind or image.ndim != 2:
         got = f"{image.dtype} of shape {image.shape}"
         bits = 8 * np.dtype(kind).itemsize
-        raise InputError(f"{path}: got {got}, expected {what} (PNG, {bits} bit, one channel)")
+        raise InputError(f"{path}: got {got}, expected {map_name} (PNG, {bits} bit, one channel)")
     return image
 
 

@@ -1,29 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Write scene flow of one window, or of a whole recording in the formats of other programs.
 
-NAME is the name of the recording, a row one of the sweep file::
-
-    npz            OUT/000119_000120.npz: flow files, see `densify.readers.flow_files`
-    av2            OUT/NAME/STAMP.feather of the Argoverse 2 scene flow challenge of 2024 (which
-                   takes every fifth sweep, zipped as NAME/0000000005.feather): for each row
-                   is_valid bool, flow_tx_m flow_ty_m flow_tz_m float16, flow to the next sweep
-                   without the vehicle's motion, in the sweep's lidar frame
-    opensceneflow  OUT/NAME.h5 (https://github.com/KTH-RPL/OpenSceneFlow), a group for each sweep,
-                   its stamp in ns: lidar (N,4) deskewed to the stamp, pose (4,4), lidar_id,
-                   ground_mask (all False), row (N,); where flow is known, flow (N,3) with the
-                   vehicle's motion, flow_is_valid, flow_instance_id (0 none), ego_motion (4,4)
-    semantickitti  OUT/sequences/NAME/predictions/000120.label of semantic-kitti-api
-                   (https://github.com/PRBonn/semantic-kitti-api, evaluate_mos.py): uint32 for each
-                   row; low 16 bits 251 moving or 9 static, high 16 bits object number, 0 none
-    doc-depth      OUT/NAME, the exchange format of DOC-Depth (de Moreau et al., "DOC-Depth", IV
-                   2025; https://github.com/SimondeMoreau/DOC-Depth, Preprocessing/FORMAT.md)
+docs/formats/flow-files.md describes them: npz; av2 (the Argoverse 2 scene flow challenge of 2024);
+opensceneflow; semantickitti, of semantic-kitti-api (evaluate_mos.py); doc-depth (de Moreau et al.,
+"DOC-Depth", IV 2025, FORMAT.md).
 """
 
 from __future__ import annotations
 
 import io
+from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -34,21 +22,12 @@ from densify.config.errors import InputError
 from densify.config.file_content import needed
 from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.geometry import poses
-from densify.geometry.types import (
-    Float,
-    FlowField,
-    Int,
-    LidarSequence,
-    Result,
-    Stretch,
-    StretchFlow,
-)
+from densify.geometry.types import Float, FlowField, Int, LidarSequence, Stretch, StretchFlow
 from densify.outputs.atomic import file_aside, write_file, write_json
-from densify.outputs.export.maps_and_clouds import save_ply
-from densify.outputs.key_outputs import Context
+from densify.outputs.cloud_files import save_ply
 from densify.readers.recorded_poses import PoseTrack
 
-MOVING, STATIC = 251, 9
+_MOVING, _STATIC = 251, 9  # SemanticKITTI's labels
 _GROUND, _STANDING, _DYNAMIC = 0, 50, 100  # DOC-Depth's classes: ground, static, moving
 
 FlowWriter = Callable[[int, StretchFlow], Path]
@@ -58,28 +37,93 @@ The arguments are the sweep's frame number, and its flow to the next sweep. The 
 flow to the previous sweep instead."""
 
 
-def write_flow(result: Result, context: Context, folder: Path) -> None:
-    """Write the flow files ``flow/*.npz`` if ``output.flow`` asks for flow."""
-    if result.flow is not None:
-        write_flow_npz(folder / "flow", result.flow, result.recording)
+@contextmanager
+def flow_writer(
+    form: str, sequence: LidarSequence, out: Path, frames: Sequence[int], overwrite: bool
+) -> Iterator[FlowWriter]:
+    """Yield a function that writes the flow of one sweep, ``form`` by the module's docstring."""
+    paths = {frame: _path_of(form, sequence, out, frame) for frame in frames}
+    if form == "av2":
+        needed("pyarrow.feather", "argoverse", "Argoverse 2's flow files")
+    present = sorted({path.name for path in paths.values() if path.exists()})
+    if present and not overwrite:
+        raise InputError(
+            f"--out {out}: {present[0]} already there and kept ({len(present)} such files); give "
+            f"--overwrite to replace them or another --out DIR"
+        )
+    T_world_lidar: dict[int, Float] = {}
+    groups = _open_groups(paths[frames[0]]) if form == "opensceneflow" else nullcontext()
+    with groups as file:
+
+        def write(frame: int, flow: StretchFlow) -> Path:
+            path = paths[frame]
+            T_world_lidar[frame] = _chained_pose(T_world_lidar, frame, flow.stretch)
+            to_next = StretchFlow(
+                flow.stretch, {s: f for s, f in flow.steps.items() if s[0] < s[1]}
+            )
+            if form == "opensceneflow":
+                _add_sweep(file, frame, to_next, T_world_lidar[frame])
+            elif form == "av2":
+                _write_feather(path, sequence, frame, to_next)
+            elif form == "semantickitti":
+                _write_labels(path, sequence, frame, flow)
+            elif form == "doc-depth":
+                _write_classes(path, frame, flow)
+            else:
+                write_flow_npz(out, to_next, sequence.name)
+            return path.parent.parent if form == "doc-depth" else path.parent
+
+        yield write
+    if form == "doc-depth" and T_world_lidar:
+        _write_paths(paths[frames[0]].parent.parent, sequence, T_world_lidar)
 
 
-def write_flow_npz(folder: Path, flow: StretchFlow, recording: str) -> list[Path]:
-    """Write a file, such as ``folder/000119_000120.npz``, for each step, and return the paths."""
-    paths = []
+def _path_of(form: str, sequence: LidarSequence, out: Path, frame: int) -> Path:
+    """Return the path of the file with a sweep's flow. As npz, the last sweep's is not written."""
+    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)
+    if form == "av2":
+        return out / name / f"{sequence.stamp_ns(frame)}.feather"
+    if form == "opensceneflow":
+        return out / f"{name}.h5"
+    if form == "semantickitti":
+        return out / "sequences" / name / "predictions" / f"{frame:06d}.label"
+    if form == "doc-depth":
+        return out / name / "frames" / f"frame_{frame:06d}.ply"
+    following = sequence.frames[bisect_right(sequence.frames, frame) :][:1]
+    return _npz_path(out, frame, following[0] if following else frame)
+
+
+def _npz_path(folder: Path, frame: int, target: int) -> Path:
+    return folder / f"{frame:06d}_{target:06d}.npz"
+
+
+def write_flow_npz(folder: Path, flow: StretchFlow, recording: str) -> None:
+    """Write a file, such as ``folder/000119_000120.npz``, for each step."""
     for (frame, target), field in flow.steps.items():
-        sweep = flow.stretch[frame].sweep
-        total_flow = _total_flow(flow, frame, target)
         data = flow_npz(
             field,
-            row=sweep.row,
-            total_flow=total_flow,
+            row=flow.stretch[frame].sweep.row,
+            total_flow=_total_flow(flow, frame, target),
             object=field.instance,
             recording=np.array(recording),
         )
-        paths.append(folder / f"{frame:06d}_{target:06d}.npz")
-        write_file(paths[-1], data)
-    return paths
+        write_file(_npz_path(folder, frame, target), data)
+
+
+def flow_npz(field: FlowField, **more_arrays: Any) -> bytes:
+    """Return the bytes of a .npz file with a flow field of N points and more arrays.
+
+    ``residual_flow`` (N,3) is in metres, without ego-motion. Floats are float32.
+    """
+    arrays: dict[str, Any] = {"residual_flow": field.displacement}
+    arrays |= {name: getattr(field, name) for name in ("moving", "instance", "lost")} | more_arrays
+    if field.to_reference is not None:
+        arrays["to_reference"] = field.to_reference
+    for name, array in arrays.items():
+        arrays[name] = array.astype(np.float32) if array.dtype == np.float64 else array
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return buffer.getvalue()
 
 
 def _total_flow(flow: StretchFlow, frame: int, target: int) -> np.ndarray:
@@ -90,34 +134,25 @@ def _total_flow(flow: StretchFlow, frame: int, target: int) -> np.ndarray:
     return poses.transform(T, points + field.total) - points
 
 
-def flow_npz(field: FlowField, **beside: Any) -> bytes:
-    """Return the bytes of a .npz file with a flow field of N points and the arrays of ``beside``.
-
-    ``residual_flow`` (N,3) is in metres, without ego-motion. Floats are float32.
-    """
-    arrays: dict[str, Any] = {"residual_flow": field.displacement}
-    arrays |= {name: getattr(field, name) for name in ("moving", "instance", "lost")} | beside
-    if field.to_reference is not None:
-        arrays["to_reference"] = field.to_reference
-    for name, array in arrays.items():
-        arrays[name] = array.astype(np.float32) if array.dtype == np.float64 else array
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    return buffer.getvalue()
-
-
-def _followed(known: dict[int, Float], frame: int, stretch: Stretch) -> Float:
-    """Return the (4,4) world pose of a sweep, chained to the last earlier one in ``known``."""
-    before = next((f for f in reversed(known) if f in stretch.frames), None)
-    if before is None:
+def _chained_pose(earlier: dict[int, Float], frame: int, stretch: Stretch) -> Float:
+    """Return the (4,4) world pose of a sweep, chained to the last of the ``earlier`` ones."""
+    previous = next((f for f in reversed(earlier) if f in stretch.frames), None)
+    if previous is None:
         return stretch[frame].T_world_lidar
-    return known[before] @ stretch.T_target_source(before, frame)
+    return earlier[previous] @ stretch.T_target_source(previous, frame)
 
 
-def _add_sweep(file: Any, frame: int, flow: StretchFlow, T_world_lidar: Float) -> None:
+@contextmanager
+def _open_groups(path: Path) -> Iterator[Any]:
+    """Yield a new HDF5 file."""
+    h5py = needed("h5py", "opensceneflow", "OpenSceneFlow's files")
+    with file_aside(path) as aside, h5py.File(aside, "w") as file:
+        yield file
+
+
+def _add_sweep(file: Any, frame: int, to_next: StretchFlow, T_world_lidar: Float) -> None:
     """Add a sweep to an open HDF5 file, with the flow to the next sweep if known."""
-    registered = flow.stretch[frame]
-    sweep = registered.sweep
+    sweep, stretch = to_next.stretch[frame].sweep, to_next.stretch
     arrays = {
         "lidar": np.column_stack([sweep.points, 255 * sweep.intensity]).astype(np.float32),
         "pose": T_world_lidar,
@@ -125,73 +160,16 @@ def _add_sweep(file: Any, frame: int, flow: StretchFlow, T_world_lidar: Float) -
         "ground_mask": np.zeros(len(sweep), bool),
         "row": sweep.row,
     }
-    for (here, following), field in flow.steps.items():
-        if here == frame < following:
-            arrays |= {
-                "flow": _total_flow(flow, frame, following).astype(np.float32),
-                "flow_is_valid": ~field.lost,
-                "flow_instance_id": (field.instance + 1).astype(np.int16),
-                "ego_motion": flow.stretch.T_target_source(following, frame).astype("f4"),
-            }
+    for (_, target), field in to_next.steps.items():
+        arrays |= {
+            "flow": _total_flow(to_next, frame, target).astype(np.float32),
+            "flow_is_valid": ~field.lost,
+            "flow_instance_id": (field.instance + 1).astype(np.int16),
+            "ego_motion": stretch.T_target_source(target, frame).astype(np.float32),
+        }
     group = file.create_group(str(sweep.stamp_ns))
     for name, array in arrays.items():
         group.create_dataset(name, data=array)
-
-
-@contextmanager
-def flow_writer(
-    form: str, sequence: LidarSequence, out: Path, frames: Sequence[int], overwrite: bool
-) -> Iterator[FlowWriter]:
-    """Yield a function that writes the flow of one sweep, ``form`` by the module's docstring."""
-    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)
-    following = dict(zip(sequence.frames[:-1], sequence.frames[1:], strict=True))
-    labels = out / "sequences" / name / "predictions"
-    if form == "av2":
-        paths = {f: out / name / f"{sequence.stamp_ns(f)}.feather" for f in frames}
-        needed("pyarrow.feather", "argoverse", "Argoverse 2's flow files")
-    elif form == "opensceneflow":
-        paths = dict.fromkeys(frames, out / f"{name}.h5")
-    elif form == "semantickitti":
-        paths = {f: labels / f"{f:06d}.label" for f in frames}
-    elif form == "doc-depth":
-        paths = {f: out / name / "frames" / f"frame_{f:06d}.ply" for f in frames}
-    else:
-        paths = {f: out / f"{f:06d}_{following[f]:06d}.npz" for f in frames if f in following}
-    there = sorted({path.name for path in paths.values() if path.exists()})
-    if there and not overwrite:
-        raise InputError(
-            f"--out {out}: {there[0]} already there and kept ({len(there)} such files); give "
-            f"--overwrite to replace them or another --out DIR"
-        )
-    T_world_lidar: dict[int, Float] = {}
-    with ExitStack() as stack:
-        if form == "opensceneflow":
-            h5py = needed("h5py", "opensceneflow", "OpenSceneFlow's files")
-            aside = stack.enter_context(file_aside(out / f"{name}.h5"))
-            file = stack.enter_context(h5py.File(aside, "w"))
-
-        def write(frame: int, flow: StretchFlow) -> Path:
-            T_world_lidar[frame] = _followed(T_world_lidar, frame, flow.stretch)
-            ahead = StretchFlow(flow.stretch, {p: f for p, f in flow.steps.items() if p[1] > p[0]})
-            if form == "opensceneflow":
-                _add_sweep(file, frame, ahead, T_world_lidar[frame])
-            elif form == "av2":
-                _write_feather(paths[frame], sequence, frame, ahead)
-            elif form == "semantickitti":
-                _write_labels(paths[frame], sequence, frame, flow)
-            elif form == "doc-depth":
-                _write_classes(paths[frame], frame, flow)
-            else:
-                write_flow_npz(out, ahead, sequence.name)
-            return paths[frame].parent if form == "semantickitti" else _place(form, out, name)
-
-        yield write
-    if form == "doc-depth" and T_world_lidar:
-        _write_paths(out / name, sequence, T_world_lidar)
-
-
-def _place(form: str, out: Path, name: str) -> Path:
-    return out / name if form in ("av2", "doc-depth") else out
 
 
 def _num_rows(sequence: LidarSequence, frame: int) -> int:
@@ -199,21 +177,34 @@ def _num_rows(sequence: LidarSequence, frame: int) -> int:
     return sequence.num_rows(frame) if hasattr(sequence, "num_rows") else len(sequence[frame])
 
 
+def _write_feather(path: Path, sequence: LidarSequence, frame: int, to_next: StretchFlow) -> None:
+    """Write the flow of one sweep. Rows of the sweep file without a valid return have flow 0."""
+    arrow, feather = (needed(m, "argoverse", "") for m in ("pyarrow", "pyarrow.feather"))
+    num_rows = _num_rows(sequence, frame)
+    residual = np.zeros((num_rows, 3), np.float16)
+    for field in to_next.steps.values():
+        residual[to_next.stretch[frame].sweep.row] = field.displacement
+    columns = {"is_valid": np.ones(num_rows, bool)}
+    columns |= dict(zip(("flow_tx_m", "flow_ty_m", "flow_tz_m"), residual.T.copy(), strict=True))
+    with file_aside(path) as aside:
+        feather.write_feather(arrow.table(columns), aside)
+
+
 def _write_labels(path: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> None:
     """Write a label for each row of the sweep file. Rows without a usable return are static."""
-    label = np.full(_num_rows(sequence, frame), STATIC, np.uint32)
+    labels = np.full(_num_rows(sequence, frame), _STATIC, np.uint32)
     for field in flow.steps.values():
-        own = np.where(field.moving, MOVING | (field.instance.astype(np.int64) + 1) << 16, STATIC)
-        label[flow.stretch[frame].sweep.row] = own
-    write_file(path, label.astype("<u4").tobytes())
+        moving = _MOVING | (field.instance.astype(np.int64) + 1) << 16
+        labels[flow.stretch[frame].sweep.row] = np.where(field.moving, moving, _STATIC)
+    write_file(path, labels.astype("<u4").tobytes())
 
 
 def _write_classes(path: Path, frame: int, flow: StretchFlow) -> None:
     """Write the deskewed points of a sweep, each with its DOC-Depth class."""
     registered = flow.stretch[frame]
     points = registered.sweep.points
-    on_world = poses.transform(registered.T_world_lidar, points)
-    height_m = ground(flow.stretch).above(on_world)
+    points_world = poses.transform(registered.T_world_lidar, points)
+    height_m = ground(flow.stretch).above(points_world)
     classes = np.where(height_m < ABOVE_GROUND_M, _GROUND, _STANDING)
     for field in flow.steps.values():
         classes[field.moving] = _DYNAMIC
@@ -237,25 +228,11 @@ def _write_paths(folder: Path, sequence: LidarSequence, T_world_lidar: dict[int,
 
 
 def _save_path(path: Path, track: PoseTrack, stamps_ns: Int, numbers: Sequence[int]) -> None:
+    """Write the poses of a track at (n,) times, each with its number, as PLY."""
     T = np.stack([track.at(int(ns)) for ns in stamps_ns]) if len(stamps_ns) else np.zeros((0, 4, 4))
-    turns = Rotation.from_matrix(T[:, :3, :3]).as_quat().T if len(T) else np.zeros((4, 0))
+    quaternions = Rotation.from_matrix(T[:, :3, :3]).as_quat().T if len(T) else np.zeros((4, 0))
     columns = dict(zip("xyz", T[:, :3, 3].T, strict=True))
     for names in (("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w")):
-        columns |= dict(zip(names, turns, strict=True))
-    save_ply(
-        path,
-        {**columns, "timestamp": stamps_ns * 1e-9, "indices": np.array(numbers, np.int32)},
-    )
-
-
-def _write_feather(path: Path, sequence: LidarSequence, frame: int, flow: StretchFlow) -> None:
-    """Write the flow of one sweep. Rows of the sweep file without a valid return have flow 0."""
-    arrow, feather = (needed(m, "argoverse", "") for m in ("pyarrow", "pyarrow.feather"))
-    num_rows = _num_rows(sequence, frame)
-    residual = np.zeros((num_rows, 3), np.float16)
-    for field in flow.steps.values():
-        residual[flow.stretch[frame].sweep.row] = field.displacement
-    columns = {"is_valid": np.ones(num_rows, bool)}
-    columns |= dict(zip(("flow_tx_m", "flow_ty_m", "flow_tz_m"), residual.T.copy(), strict=True))
-    with file_aside(path) as aside:
-        feather.write_feather(arrow.table(columns), aside)
+        columns |= dict(zip(names, quaternions, strict=True))
+    columns |= {"timestamp": stamps_ns * 1e-9, "indices": np.array(numbers, np.int32)}
+    save_ply(path, columns)

@@ -1,56 +1,29 @@
 # SPDX-License-Identifier: MIT
-"""Write the files of one densified sweep: depth maps, cloud, metrics.json, movers.json, scene/.
+"""Write the folder of a key, ``OUT/000120/``, all files or none. `finished_run` reads it.
 
-Fields of metrics.json, null where unknown. compare.json has those from ``frames`` on by method::
-
-    schema_version, key (frame number of the sweep), method
-    frames      frame numbers of the window
-    num_points  number of points in the cloud; num_moving: number of moving points
-    density     camera -> measured, filled: share of the pixels with a depth; with --prior also
-                full (completed map), and prior, the share of pixels that came from the prior
-    ghosts      `densify.scores.cloud_scores.ghost_scores`
-    depth       with ground truth: camera -> measured, filled (full, prior) -> all, moving, static
-                -> `densify.scores.depth_metrics.DepthErrors`
-    measure     map -> z, depth along the camera's axis, or range, distance from the lens
-    held_out    camera -> as depth: map made without the key sweep, against its returns; curve,
-                `precision_density`; reliability, `densify.depth.confidence`;
-                unjudged, share of the filled pixels near which the key sweep has no return
-    reliability with ground truth: map -> the same list against ground truth
-    expected_outliers  map -> measured, filled: the share of outliers that confidence predicts
-    baselines   simpler method on the same registration -> the fields from ``frames`` on
-
-movers.json: objects, by `ObjectTrack`: instance (as in cloud.laz), size_m (length, width, height
-of the completed box), seen_size_m (of the box around its points), sides_seen, and poses at its
-sweeps and the key sweep: frame, stamp_ns, num_points, T_key_object (4,4), velocity_m_s (3,) without
-ego-motion, in the key sweep's lidar frame.
-
-scene/::
-
-    image/CAMERA.jpg   the image that the map shows
-    none/CAMERA.png, icp/…, truth/…   depth of the simpler methods, and true depth, as in ``depth``
-    sweep/CAMERA.png   uint16, measured pixels: 1 + index of the source sweep in ``sweeps``; 0 none
-    reason/CAMERA.png  uint8 `Reason` that the nearest point of a pixel was rejected
-    scene.json         sweeps: frame, since_key_s, far, T_key_lidar (4,4); views: map -> camera,
-                       T_cam_key (4,4), late_s after the key sweep, image number
+docs/outputs.md describes each file and the fields of the tables.
 """
 
 from __future__ import annotations
 
+import os
 import platform
-from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
 
 from densify import __version__
+from densify.config.errors import InputError
 from densify.geometry.types import Result
-from densify.outputs.atomic import plain, write_file, write_json
-from densify.outputs.cloud_laz import write_cloud
+from densify.outputs import flow_writers, plots
+from densify.outputs.atomic import plain, staged_folder, write_file, write_json
+from densify.outputs.cloud_files import write_cloud
 from densify.outputs.depth_png import (
     encode_jpeg,
     encode_png,
@@ -60,6 +33,8 @@ from densify.outputs.depth_png import (
     write_depth_png,
     write_flow_png,
 )
+from densify.outputs.recording_folder import check_recording
+from densify.outputs.report_page import KeyFiles, key_page
 
 SCHEMA_VERSION = 1
 """Version of each JSON file. It grows when a field changes its meaning or is removed."""
@@ -69,19 +44,106 @@ _PACKAGES = (
 )
 
 
-@dataclass(frozen=True)
-class Context:
-    """Describe how a result was asked for. Each output function gets it beside the result."""
+def check_writable(
+    out: Path, key: int, overwrite: bool = False, verb: Literal["run", "compare"] = "run"
+) -> None:
+    """Raise InputError if a result of ``verb`` cannot be written. No file is changed."""
+    _check_folder(_key_folder(out, key), _RUN if verb == "run" else _COMPARISON, out, overwrite)
 
-    config: Mapping[str, Any]  # the merged configuration as plain mappings, by section
-    data: str  # specification of the recording, as the user gave it
 
+def write_result(
+    result: Result, out: Path, *, config: Mapping[str, Any], data: str, overwrite: bool = False
+) -> list[Path]:
+    """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
 
-def write_depth(result: Result, context: Context, folder: Path) -> None:
-    """Write the maps ``depth``, ``depth_filled``, ``confidence`` and ``age`` of each camera.
-
-    Age is the time from exposure to the sweep that measured the pixel or, if filled, the nearest.
+    ``config`` is the merged configuration, ``data`` the recording as the user named it.
     """
+    check_recording(out, result.recording, data, [result.key])
+    with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:
+        for write in _WRITERS.values():
+            write(result, folder)
+        record = plain(_record(result, config, data))
+        text = yaml.safe_dump(record, sort_keys=False, allow_unicode=True)
+        write_file(folder / "run.yaml", text.encode())
+        if config.get("output", {}).get("report"):
+            page = key_page(KeyFiles.of_run(folder), f"{result.key:06d}")
+            write_file(folder / "report.html", page)
+    return _written(_key_folder(out, result.key), _RUN)
+
+
+def write_comparison(
+    results: Mapping[str, Result],
+    out: Path,
+    *,
+    config: Mapping[str, Any],
+    data: str,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write compare.json and compare.png of several methods, and return the paths of the files.
+
+    The folder ``compare/`` has the files of the last method. Other arguments as in `write_result`.
+    """
+    last = list(results.values())[-1]
+    table = {
+        "schema_version": SCHEMA_VERSION,
+        **_record(last, config, data),
+        "methods": {m: {"frames": r.frames, **r.metrics} for m, r in results.items()},
+        "warnings": list(dict.fromkeys(w for r in results.values() for w in r.warnings)),
+    }
+    check_recording(out, last.recording, data, [last.key])
+    with writing(_key_folder(out, last.key), _COMPARISON, out, overwrite) as folder:
+        write_json(folder / "compare.json", table)
+        plots.write_figure(folder / "compare.png", results)
+        for write in (_write_maps, _write_cloud, _write_tracks, _write_scene):
+            write(last, folder / "compare")
+    return _written(_key_folder(out, last.key), _COMPARISON)
+
+
+@contextmanager
+def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
+    """Yield a folder for the entries ``owned`` (as `staged_folder`), after all checks."""
+    _check_folder(folder, owned, out, overwrite)
+    with staged_folder(folder, owned) as staging:
+        yield staging
+
+
+def _check_folder(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> None:
+    """Raise InputError unless the entries ``owned`` can be written into a folder below ``out``."""
+    existing = folder
+    while not os.path.lexists(existing):
+        existing = existing.parent
+    if not existing.is_dir():
+        raise InputError(
+            f"--out {out}: {existing} is not a folder; choose another one with --out DIR"
+        )
+    # An existing folder is renamed, and a new folder beside it takes its place.
+    parents = [Path(os.path.realpath(existing)).parent] if existing == folder else []
+    for touched in (existing, *parents):
+        if not os.access(touched, os.W_OK | os.X_OK):
+            raise InputError(
+                f"--out {out}: no permission to write in {touched}; choose another one with --out"
+            )
+    present = [name for name in owned if (folder / name).exists()]
+    if present and not overwrite:
+        raise InputError(
+            f"{folder}: {', '.join(present)} already there and kept; "
+            f"give --overwrite to replace them or another --out DIR"
+        )
+
+
+def _key_folder(out: Path, key: int) -> Path:
+    return out / f"{key:06d}"
+
+
+def _written(folder: Path, owned: Sequence[str]) -> list[Path]:
+    """Return the paths of all files in the entries ``owned`` of a folder."""
+    entries = [folder / name for name in owned]
+    paths = [path for entry in entries for path in (entry, *sorted(entry.rglob("*")))]
+    return [path for path in paths if path.is_file()]
+
+
+def _write_maps(result: Result, folder: Path) -> None:
+    """Write the maps ``depth``, ``depth_filled``, ``confidence`` and ``age`` of each camera."""
     for camera, depth in result.depth.items():
         if depth.age_s is None:
             raise ValueError(f"depth map of {camera}: expected ages (with_ages)")
@@ -92,7 +154,7 @@ def write_depth(result: Result, context: Context, folder: Path) -> None:
         write_age_png(map_path(folder, "age", camera), depth.age_s, depth.filled_m)
 
 
-def write_full(result: Result, context: Context, folder: Path) -> None:
+def _write_full(result: Result, folder: Path) -> None:
     """Write ``depth_full``, depth completed with the user's prior, and ``confidence_full``."""
     for camera, full in result.full.items():
         write_depth_png(map_path(folder, "depth_full", camera), full.depth_m)
@@ -101,29 +163,35 @@ def write_full(result: Result, context: Context, folder: Path) -> None:
         write_confidence_png(path, full.confidence, full.depth_m)
 
 
-def write_optical_flow(result: Result, context: Context, folder: Path) -> None:
+def _write_optical_flow(result: Result, folder: Path) -> None:
     """Write ``optical_flow/previous`` and ``optical_flow/next`` of maps with optical flow."""
     for camera, flows in result.optical_flow.items():
-        for other, flow_px in flows.items():
-            write_flow_png(map_path(folder / "optical_flow", other, camera), flow_px)
+        for direction, flow_px in flows.items():
+            write_flow_png(map_path(folder / "optical_flow", direction, camera), flow_px)
 
 
-def write_cloud_laz(result: Result, context: Context, folder: Path) -> None:
+def _write_cloud(result: Result, folder: Path) -> None:
     """Write the accumulated cloud as ``cloud.laz``."""
     write_cloud(folder / "cloud.laz", result.cloud, result.stamp_ns)
 
 
-def write_movers(result: Result, context: Context, folder: Path) -> None:
+def _write_flow(result: Result, folder: Path) -> None:
+    """Write the flow files ``flow/*.npz`` if ``output.flow`` asks for flow."""
+    if result.flow is not None:
+        flow_writers.write_flow_npz(folder / "flow", result.flow, result.recording)
+
+
+def _write_movers(result: Result, folder: Path) -> None:
     """Write cloud and depth maps of each separated object to ``movers/0007/``."""
     for instance, mover in result.movers.items():
         # others: moving points without an object
-        place = folder / "movers" / (f"{instance:04d}" if instance >= 0 else "others")
+        mover_folder = folder / "movers" / (f"{instance:04d}" if instance >= 0 else "others")
         for name, maps in mover.depth.items():
-            write_depth_png(map_path(place, "depth", name), maps.depth_m)
-        write_cloud(place / "cloud.laz", mover.cloud, result.stamp_ns)
+            write_depth_png(map_path(mover_folder, "depth", name), maps.depth_m)
+        write_cloud(mover_folder / "cloud.laz", mover.cloud, result.stamp_ns)
 
 
-def write_metrics(result: Result, context: Context, folder: Path) -> None:
+def _write_metrics(result: Result, folder: Path) -> None:
     """Write ``metrics.json``, the scores of the result and of its baselines."""
     table = {
         "schema_version": SCHEMA_VERSION,
@@ -136,7 +204,7 @@ def write_metrics(result: Result, context: Context, folder: Path) -> None:
     write_json(folder / "metrics.json", table)
 
 
-def write_tracks(result: Result, context: Context, folder: Path) -> None:
+def _write_tracks(result: Result, folder: Path) -> None:
     """Write ``movers.json``, the poses of moving objects, if the sweeps are registered."""
     if not result.T_key_lidar:
         return
@@ -153,13 +221,7 @@ def write_tracks(result: Result, context: Context, folder: Path) -> None:
     write_json(folder / "movers.json", table)
 
 
-def write_run_yaml(result: Result, context: Context, folder: Path) -> None:
-    """Write ``run.yaml``, the content of `record`."""
-    text = yaml.safe_dump(plain(record(result, context)), sort_keys=False, allow_unicode=True)
-    write_file(folder / "run.yaml", text.encode())
-
-
-def record(result: Result, context: Context) -> dict[str, Any]:
+def _record(result: Result, config: Mapping[str, Any], data: str) -> dict[str, Any]:
     """Return how a result was made: recording, key, configuration, cost of each stage, versions."""
     versions: dict[str, str | None] = {"densify": __version__, "python": platform.python_version()}
     versions["platform"] = platform.platform()
@@ -169,7 +231,7 @@ def record(result: Result, context: Context) -> dict[str, Any]:
             versions[package] = version(package)
     return {
         "recording": result.recording,
-        "data": context.data,
+        "data": data,
         "key": result.key,
         "stamp_ns": result.stamp_ns,
         "method": result.method,
@@ -178,47 +240,43 @@ def record(result: Result, context: Context) -> dict[str, Any]:
         "far_left_out": result.far_left_out,
         "cameras": list(result.depth),
         "prior": {
-            name: {
-                "source": full.source,
-                **asdict(full.fit),
-                "share": float(full.from_prior.mean()),
-            }
+            name: {"source": full.source, **asdict(full.fit), "share": full.from_prior.mean()}
             for name, full in result.full.items()
         },
         "warnings": result.warnings,
-        "config": context.config,
+        "config": config,
         "stages": [
             {
-                "name": cost.name,
-                "seconds": round(cost.seconds, 3),
-                "peak_memory_mb": round(cost.peak_memory_mb, 1),
+                "name": c.name,
+                "seconds": round(c.seconds, 3),
+                "peak_memory_mb": round(c.peak_memory_mb, 1),
             }
-            for cost in result.costs
+            for c in result.costs
         ],
         "versions": versions,
     }
 
 
-def write_scene(result: Result, context: Context, folder: Path) -> None:
+def _write_scene(result: Result, folder: Path) -> None:
     """Write the folder ``scene/`` if the sweeps are registered."""
     if not result.T_key_lidar:
         return
-    place = folder / "scene"
+    scene = folder / "scene"
     sweeps = _sweeps(result)
     row_of = {sweep["frame"]: row for row, sweep in enumerate(sweeps)}
     for name, maps in result.depth.items():
         if name in result.images:
-            path = map_path(place, "image", name, ".jpg")
+            path = map_path(scene, "image", name, ".jpg")
             write_file(path, encode_jpeg(result.images[name]))
         for method, baseline in result.baselines.items():
-            write_depth_png(map_path(place, method, name), baseline.depth[name].depth_m)
+            write_depth_png(map_path(scene, method, name), baseline.depth[name].depth_m)
         if name in result.truth_m:
-            write_depth_png(map_path(place, "truth", name), result.truth_m[name])
+            write_depth_png(map_path(scene, "truth", name), result.truth_m[name])
         lookup = np.zeros(max(row_of) + 2, np.uint16)
         lookup[[*row_of]] = 1 + np.arange(len(row_of))
-        write_file(map_path(place, "sweep", name), encode_png(lookup[maps.frame]))
+        write_file(map_path(scene, "sweep", name), encode_png(lookup[maps.frame]))
         if name in result.rejected:
-            write_file(map_path(place, "reason", name), encode_png(result.rejected[name]))
+            write_file(map_path(scene, "reason", name), encode_png(result.rejected[name]))
     table = {
         "schema_version": SCHEMA_VERSION,
         "key": result.key,
@@ -228,7 +286,7 @@ def write_scene(result: Result, context: Context, folder: Path) -> None:
             for name, view in result.views.items()
         },
     }
-    write_json(place / "scene.json", table)
+    write_json(scene / "scene.json", table)
 
 
 def _sweeps(result: Result) -> list[dict[str, Any]]:
@@ -245,3 +303,24 @@ def _sweeps(result: Result) -> list[dict[str, Any]]:
         }
         for frame in sorted({*since_s, *result.T_key_lidar})
     ]
+
+
+_WRITERS: Mapping[tuple[str, ...], Callable[[Result, Path], None]] = {
+    ("depth", "depth_filled", "confidence", "age"): _write_maps,
+    ("depth_full", "confidence_full"): _write_full,
+    ("flow",): _write_flow,
+    ("movers",): _write_movers,
+    ("movers.json",): _write_tracks,
+    ("optical_flow",): _write_optical_flow,
+    ("cloud.laz",): _write_cloud,
+    ("scene",): _write_scene,
+    ("metrics.json",): _write_metrics,
+    ("figure.png",): plots.write_key_figure,
+    ("curve.png",): plots.write_curve,
+}
+"""Names of the entries in the folder of a key sweep, and the function that writes them.
+
+A function writes no entry if the result lacks its content. Equal results give equal bytes."""
+
+_RUN = (*(name for names in _WRITERS for name in names), "run.yaml", "report.html")
+_COMPARISON = ("compare.json", "compare.png", "compare", "compare.html")

@@ -1,29 +1,47 @@
 # SPDX-License-Identifier: MIT
-"""Write depth maps as a KITTI depth tree (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017).
+"""Write KITTI's folders: depth completion (training sets, exports), and tracking (exports).
 
-Loaders of KITTI depth completion read ``SPLIT/DRIVE/proj_depth/KIND/CAMERA/0000000120.png``. KIND
-is velodyne_raw (single sweep) or groundtruth. groundtruth_filled and confidence are additions.
+Loaders of KITTI depth completion (Uhrig et al., "Sparsity Invariant CNNs", 3DV 2017) read
+``SPLIT/DRIVE/proj_depth/KIND/CAMERA/0000000120.png``. KIND is velodyne_raw (single sweep) or
+groundtruth. groundtruth_filled and confidence are additions.
 """
 
 from __future__ import annotations
 
 import hashlib
-import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
 
 from densify import __version__
-from densify.geometry.types import DepthMap
-from densify.outputs.atomic import plain, write_file
-from densify.outputs.depth_png import write_confidence_png, write_depth_png
-
-Split = Literal["train", "val"]
+from densify.config.errors import InputError
+from densify.depth.object_boxes import corners_of, grown
+from densify.geometry import cameras, poses
+from densify.geometry.types import CameraView, DepthMap, Float, ObjectTrack
+from densify.outputs.atomic import plain, write_file, write_json
+from densify.outputs.cloud_files import StoredCloud
+from densify.outputs.depth_png import (
+    encode_png,
+    map_path,
+    write_confidence_png,
+    write_depth_png,
+)
+from densify.outputs.finished_run import FinishedRun
+from densify.outputs.recording_folder import drive_folder, split_of
+from densify.readers.decoded_files import decode_image
 
 README = "README.txt"
+
+_KIND_OF = {"depth": "groundtruth", "depth_filled": "groundtruth_filled"}
+_UNKNOWN = 3  # occluded: unknown
+_TALL_M, _CAR_M, _WIDE_M, _WALKER_M = 2.2, 6.0, 1.4, 1.2
+_ENDS = (("rear", "front"), ("right", "left"))  # sides of a box, by axis
 
 
 @dataclass(frozen=True)
@@ -37,35 +55,6 @@ class FileRecord:
     def of(data: bytes) -> FileRecord:
         """Return the record of a file with this content."""
         return FileRecord(len(data), hashlib.sha256(data).hexdigest())
-
-
-_VALIDATION = {
-    *(f"2011_09_26_drive_{n:04d}" for n in (2, 5, 13, 20, 23, 36, 79, 95, 113)),
-    *("2011_09_28_drive_0037", "2011_09_29_drive_0026", "2011_09_30_drive_0016"),
-    "2011_10_03_drive_0047",
-}
-_KITTI_DRIVE = re.compile(r"(\d{4}_\d\d_\d\d_drive_\d{4})(?:_sync|_extract)?", re.ASCII)
-_PUNCTUATION = str.maketrans({":": "-", "?": "_", "=": "-", "&": "_"})
-_DEFAULT_STREET = "street:street?seed=0&sensor=hdl64"
-_FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
-
-
-def split_of(drive: str) -> Split:
-    """Return "val" for the 13 validation drives of KITTI's depth benchmark, else "train"."""
-    match = _KITTI_DRIVE.fullmatch(drive)
-    return "val" if match and match[1] in _VALIDATION else "train"
-
-
-def drive_folder(name: str) -> str:
-    """Return a valid, unique folder name. A valid name, such as KITTI's names, is kept."""
-    # street:highway?seed=0&sensor=hdl64 -> street-highway_seed-0_sensor-hdl64
-    if name == _DEFAULT_STREET:
-        return "street"
-    folder = name.translate(_PUNCTUATION)
-    if _FOLDER_NAME.fullmatch(folder):
-        return folder
-    readable = re.sub(r"[^A-Za-z0-9_.]+", "-", folder)[:80].strip(".-") or "drive"
-    return f"{readable}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def write_key(
@@ -83,8 +72,8 @@ def write_key(
     paths = []
     for camera, maps in dense.items():
         raw, measured, filled, confidence = (
-            root / folder / "proj_depth" / product / camera / f"{frame:010d}.png"
-            for product in ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")
+            _map_path(root / folder, kind, camera, f"{frame:010d}")
+            for kind in ("velodyne_raw", *_KIND_OF.values(), "confidence")
         )
         write_depth_png(raw, sparse[camera].depth_m)
         write_depth_png(measured, maps.depth_m)
@@ -94,9 +83,222 @@ def write_key(
     return {p.relative_to(root).as_posix(): FileRecord.of(p.read_bytes()) for p in paths}
 
 
+def _map_path(drive: Path, kind: str, camera: str, number: str) -> Path:
+    return map_path(drive / "proj_depth" / kind, camera, number)
+
+
+def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
+    """Write a depth completion tree with images ``SPLIT/DRIVE/CAMERA/data/0000000120.png``.
+
+    K is in ``intrinsics/CAMERA/0000000120.txt``. Recordings unknown to the benchmark are in train.
+    files.txt has a line for each map: paths of image, measured and filled depth. annotations.json
+    adds ``cam_in`` (fx fy cx cy) and ``depth_scale``, for Metric3D.
+    """
+    entries: list[dict[str, Any]] = []
+    for run in runs:
+        if not run.recording:
+            raise InputError(f"{run.folder}/run.yaml: recording: expected the recording's name")
+        drive = folder / split_of(run.recording) / drive_folder(run.recording)
+        for map_name in run.cameras:
+            entries += _write_map(run, map_name, drive, folder)
+    lines = [f"{entry['rgb']} {entry['depth']} {entry['depth_filled']}\n" for entry in entries]
+    write_file(folder / "files.txt", "".join(lines).encode())
+    write_json(folder / "annotations.json", {"files": entries})
+
+
+def _write_map(run: FinishedRun, name: str, drive: Path, root: Path) -> list[dict[str, Any]]:
+    """Write the files of a map and return its annotations.json entries, none without an image."""
+    camera, _, number = name.partition("/")
+    number, maps = number or f"{run.key:010d}", run.maps(name)
+    paths = {kind: _map_path(drive, tree, camera, number) for kind, tree in _KIND_OF.items()}
+    for kind, path in paths.items():
+        write_file(path, encode_png(maps[kind]))
+    write_file(_map_path(drive, "confidence", camera, number), encode_png(maps["confidence"]))
+    single_sweep = map_path(run.folder / "scene", "none", name)
+    if single_sweep.is_file():
+        write_file(_map_path(drive, "velodyne_raw", camera, number), single_sweep.read_bytes())
+    if name in run.views:
+        K = run.views[name].camera.K
+        text = " ".join(f"{value:.6f}" for value in K.ravel())
+        write_file(map_path(drive / "intrinsics", camera, number, ".txt"), f"{text}\n".encode())
+    if (jpeg := run.jpeg(name)) is None:
+        return []
+    image = map_path(drive / camera, "data", number)
+    write_file(image, encode_png(decode_image(jpeg, name)))
+    relative = {n: p.relative_to(root).as_posix() for n, p in {"rgb": image, **paths}.items()}
+    cam_in = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    return [{**relative, "cam_in": cam_in, "depth_scale": 256.0}]
+
+
+class _KeyObjects(NamedTuple):
+    """The objects of one key."""
+
+    run: FinishedRun
+    tracks: dict[int, ObjectTrack]  # number of the object over the sequence -> its track
+
+
+def write_kitti_tracking(runs: Sequence[FinishedRun], folder: Path) -> None:
+    """Write labels, calibration, key sweeps (deskewed) and images of one camera.
+
+    The labels are those of Geiger, Lenz, Urtasun, CVPR 2012; `densify.readers.kitti` reads
+    the tree. A sequence is a recording, a frame is a key. A box is where the key sweep measured the
+    object. Its type follows from the size. ``occluded`` is 3, unknown. ``truncated`` is 1 at the
+    image's border. Objects out of view are left out.
+    """
+    for number, (_, sequence) in enumerate(groupby(runs, key=lambda run: run.folder.parent)):
+        name, lines = f"{number:04d}", list[str]()
+        for key in _numbered(list(sequence)):
+            lines += _write_frame(key, folder, name)
+        write_file(folder / "label_02" / f"{name}.txt", "".join(lines).encode())
+
+
+def _write_frame(key: _KeyObjects, folder: Path, sequence: str) -> list[str]:
+    """Write the files of a key, and return its label lines; ``sequence`` is the sequence's name."""
+    run, file = key.run, f"{key.run.key:06d}"
+    map_name = run.cameras[0]
+    view = run.views[map_name]
+    if not view.camera.is_rectified:
+        raise InputError(
+            f"{map_name}: its images have distortion, and KITTI's are rectified; name a rectified "
+            f"camera with --camera"
+        )
+    cloud = StoredCloud.joined([run.cloud(), *run.mover_clouds()]).sweep(run.key)
+    table = np.column_stack([cloud.rigid_points, cloud.intensity]).astype("<f4")
+    write_file(folder / "velodyne" / sequence / f"{file}.bin", table.tobytes())
+    if (jpeg := run.jpeg(map_name)) is not None:
+        image = encode_png(decode_image(jpeg, run.folder))
+        write_file(folder / "image_02" / sequence / f"{file}.png", image)
+    write_file(folder / "calib" / f"{sequence}.txt", _calibration(view).encode())
+    lines = []
+    for number, track in key.tracks.items():
+        T_cam_object = view.camera.T_cam_lidar @ _measured_pose(track, run.key, cloud)
+        if label := _label(track.size_m, T_cam_object, view):
+            lines.append(f"{run.key} {number} {label}\n")
+    return lines
+
+
+def _calibration(view: CameraView) -> str:
+    """Return the calibration file of a camera, which is rectified camera 0 and image_02 too."""
+    P = np.hstack([view.camera.K, np.zeros((3, 1))])
+    entries = {f"P{n}": P for n in range(4)}
+    entries |= {"R_rect": np.eye(3), "Tr_velo_cam": view.camera.T_cam_lidar[:3]}
+    entries |= {"Tr_imu_velo": np.eye(4)[:3]}
+    return "".join(
+        f"{name}: {' '.join(f'{x:.12e}' for x in np.ravel(values))}\n"
+        for name, values in entries.items()
+    )
+
+
+def _measured_pose(track: ObjectTrack, key: int, cloud: StoredCloud) -> Float:
+    """Return ``T_key_object`` (4,4) where the key sweep, whose points these are, measured it."""
+    T_key_object = track.T_key_object[track.frames.index(key)].copy()
+    of_track = cloud.moving & (cloud.instance == track.instance)
+    if of_track.any():
+        T_key_object[:3, 3] -= np.median(cloud.displacement[of_track], axis=0)
+    return T_key_object
+
+
+def _label(size_m: Float, T_cam_object: Float, view: CameraView) -> str:
+    """Return type and values of an object's label line, "" if it is out of view."""
+    corners = poses.transform(T_cam_object, corners_of(size_m))
+    if (corners[:, 2] < cameras.NEAREST_M).any():
+        return ""
+    uv = corners[:, :2] / corners[:, 2:] @ view.camera.K[:2, :2].T + view.camera.K[:2, 2]
+    last_px = np.array([view.camera.width_px, view.camera.height_px]) - 1
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    if (high <= 0).any() or (low >= last_px).any():
+        return ""
+    truncated = int((low < 0).any() or (high > last_px).any())
+    x, y, z = T_cam_object[:3, 3]
+    length_m, width_m, height_m = size_m
+    turn = -np.arctan2(T_cam_object[2, 0], T_cam_object[0, 0])
+    alpha = (turn - np.arctan2(x, z) + np.pi) % (2 * np.pi) - np.pi
+    box_px = [*np.clip(low, 0, last_px), *np.clip(high, 0, last_px)]
+    bottom = [x, y + height_m / 2, z]
+    values = [alpha, *box_px, height_m, width_m, length_m, *bottom, turn]
+    text = " ".join(f"{value:.6f}" for value in values)
+    return f"{_type_of(size_m)} {truncated} {_UNKNOWN} {text}"
+
+
+def _type_of(size_m: Float) -> str:
+    """Return KITTI's type for a box of (3,) length, width and height."""
+    length_m, width_m, height_m = size_m
+    if width_m < _WIDE_M:
+        return "Pedestrian" if length_m < _WALKER_M else "Cyclist"
+    return "Truck" if length_m > _CAR_M or height_m > _TALL_M else "Car"
+
+
+def _numbered(runs: Sequence[FinishedRun]) -> list[_KeyObjects]:
+    """Return the objects of each key, with track numbers and sizes of the whole sequence."""
+    keys = list[_KeyObjects]()
+    tracks_of: dict[int, list[ObjectTrack]] = {}
+    for run in runs:
+        earlier_numbers = _earlier_numbers(run, keys)
+        tracks = dict[int, ObjectTrack]()
+        for row, track in enumerate(run.tracks):
+            number = earlier_numbers.get(row, len(tracks_of))
+            tracks[number] = track
+            tracks_of.setdefault(number, []).append(track)
+        keys.append(_KeyObjects(run, tracks))
+    return [
+        _KeyObjects(run, {n: _sized(track, tracks_of[n]) for n, track in tracks.items()})
+        for run, tracks in keys
+    ]
+
+
+def _earlier_numbers(run: FinishedRun, keys: Sequence[_KeyObjects]) -> dict[int, int]:
+    """Return index of a track of the run -> number of the same object in earlier keys."""
+    candidates: list[tuple[float, int, int]] = []
+    for key in keys:  # tracks must overlap in time and space
+        T_now, T_then = run.scene.T_key_lidar, key.run.scene.T_key_lidar
+        shared = sorted(T_now.keys() & T_then.keys())
+        if not shared:
+            continue
+        frame = shared[len(shared) // 2]
+        T_run_key = T_now[frame] @ poses.inverse(T_then[frame])
+        for row, track in enumerate(run.tracks):
+            for number, earlier in key.tracks.items():
+                distance_m = _distance_m(track, earlier, T_run_key)
+                diagonal_m = min(float(np.hypot(*t.size_m[:2])) for t in (track, earlier))
+                if distance_m < diagonal_m / 2:
+                    candidates.append((distance_m, row, number))
+    numbers = dict[int, int]()
+    for _, row, number in sorted(candidates):
+        if row not in numbers and number not in numbers.values():
+            numbers[row] = number
+    return numbers
+
+
+def _distance_m(track: ObjectTrack, earlier: ObjectTrack, T_track_earlier: Float) -> float:
+    """Return the median distance seen from above of two tracks in common sweeps, inf for none."""
+    frames = sorted({*track.frames} & {*earlier.frames})
+    if not frames:
+        return np.inf
+    centres, earlier_centres = (
+        np.stack([t.T_key_object[t.frames.index(frame), :3, 3] for frame in frames])
+        for t in (track, earlier)
+    )
+    offset = centres - poses.transform(T_track_earlier, earlier_centres)
+    return float(np.median(np.linalg.norm(offset[:, :2], axis=1)))
+
+
+def _sized(track: ObjectTrack, of_object: Sequence[ObjectTrack]) -> ObjectTrack:
+    """Return a track with the length and width that its object has in all keys (``of_object``)."""
+    # Keys that saw both ends count, else the longest box. A side that was seen keeps its place.
+    for axis, ends in enumerate(_ENDS):
+        whole = [t.size_m[axis] for t in of_object if {*ends} <= {*t.sides_seen}]
+        size_m = float(np.median(whole)) if whole else max(float(t.size_m[axis]) for t in of_object)
+        missing_m = size_m - track.size_m[axis]
+        unseen = np.array([end not in track.sides_seen for end in ends])
+        share = unseen if unseen.any() and not unseen.all() else np.array([0.5, 0.5])
+        track = grown(track, axis, *(missing_m * share))
+    return track
+
+
 def write_readme(root: Path, method: str, window: int, settings: Mapping[str, Any]) -> None:
     """Write ``README.txt``, which describes the files beside it and how they were made."""
-    text = _README.format(
+    template = (files("densify.outputs") / "kitti_readme.txt").read_text("utf-8")
+    text = template.format(
         version=__version__,
         method=method,
         window=window,
@@ -104,38 +306,3 @@ def write_readme(root: Path, method: str, window: int, settings: Mapping[str, An
         settings=yaml.safe_dump(plain(settings), sort_keys=False, allow_unicode=True).rstrip(),
     )
     write_file(root / README, text.encode())
-
-
-_README = """\
-Depth maps for training, made by densify {version}
-{method}, window {window}: each moment from up to {sweeps} lidar sweeps
-
-The folders and files are those of KITTI's depth completion benchmark, whose loaders read them:
-
-  <train|val>/<drive>/proj_depth/<product>/<camera>/<frame, 10 digits>.png
-
-  velodyne_raw        input: depth of the sweep of that frame alone
-  groundtruth         target: depth measured by all the sweeps. Method flow moves moving points to
-                      the exposure; icp leaves them where they were measured
-  groundtruth_filled  groundtruth, and pixels interpolated between measured ones
-  confidence          of groundtruth_filled, and so of groundtruth too
-
-val holds KITTI's 13 validation drives, train every other recording.
-
-Depth is a 16-bit gray PNG, metres along the camera's optical axis, 0 is none:
-depth_m = cv2.imread(path, cv2.IMREAD_UNCHANGED) / 256.0. Confidence is an 8-bit gray PNG: 255 is
-most certain, 0 is no depth. With c = (value - 1) / 254, one pixel in 10^(5 c) is expected to be
-wrong by KITTI's rule: more than 3 px of disparity and 5 %.
-
-All maps show the moment in which their own image was exposed (the middle of the sweep, where the
-settings say "at: sweep"). velodyne_raw is densify's own projection and differs from KITTI's files.
-
-The images stay with the recordings, whose licences go on holding for the maps. KITTI is CC BY-NC-SA
-3.0: name its authors, no commercial use, share alike. dataset.json says which recordings these are,
-and has the cameras' calibration. manifest.jsonl (or manifest-1of4.jsonl and so on) has one line for
-every key: whether it is here, is missing and why, and size and SHA-256 of its files.
-
-Settings:
-
-{settings}
-"""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Draw figure.png and compare.png (depth over the image), and curve.png (outliers over density)."""
+"""Draw depth over the image (figure.png, compare.png) and outliers over density (curve.png)."""
 
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,11 +12,9 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from densify.geometry.types import METHOD_NAMES, Float32, Result
+from densify.geometry.types import METHOD_NAMES, CameraView, Float, Float32, Result
 from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import Picture, encode_png
-from densify.outputs.front_view import front_first
-from densify.outputs.key_outputs import Context
 from densify.scores.depth_metrics import precision_density
 
 if TYPE_CHECKING:
@@ -35,10 +34,37 @@ _MIN_WIDTH_PX = 480
 _POINT_SIZE_PX = 3
 _TITLE_PX, _SCALE_PX, _BAR_PX, _MARGIN_PX = 36, 60, 15, 12
 _FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.6
+_AXES_INCH = (8.6, 4.8)
 _FEWEST_OUTLIERS = 1e-4  # the axis is linear below this share and logarithmic above
+_MIN_TRAVEL_M = 1.0
+"""A shorter way may be noise of the registration, of a vehicle at rest."""
+_SIDE = re.compile(r"left|right|side|rear|back", re.IGNORECASE)
 
 
-def write_key_figure(result: Result, context: Context, folder: Path) -> None:
+def front_first(
+    names: Sequence[str], views: Mapping[str, CameraView], T_key_lidar: Mapping[int, Float]
+) -> list[str]:
+    """Return the names of maps, that of the camera which looks ahead first, the others in order.
+
+    Ahead is where the vehicle goes in the window. At rest it is the camera called front.
+    ``T_key_lidar`` has (4,4) lidar poses in the key frame by frame number. ``views`` may lack maps.
+    """
+    frames = sorted(T_key_lidar)
+    travel_m = np.zeros(3)
+    if frames:
+        travel_m = T_key_lidar[frames[-1]][:3, 3] - T_key_lidar[frames[0]][:3, 3]
+    if np.linalg.norm(travel_m) >= _MIN_TRAVEL_M:
+        # Row z of a camera's rotation is its optical axis in the key frame.
+        ahead = [
+            float(views[n].T_cam_key[2, :3] @ travel_m) if n in views else -np.inf for n in names
+        ]
+    else:
+        ahead = [float("front" in n.lower()) - 0.5 * bool(_SIDE.search(n)) for n in names]
+    first = int(np.argmax(ahead)) if len(names) else 0
+    return [*names[first : first + 1], *names[:first], *names[first + 1 :]]
+
+
+def write_key_figure(result: Result, folder: Path) -> None:
     """Write ``figure.png``: the maps of the baselines from top to bottom, then the result's."""
     write_figure(folder / "figure.png", {**result.baselines, result.method: result})
 
@@ -52,19 +78,14 @@ def write_figure(path: Path, results: Mapping[str, Result]) -> None:
     panels = [(METHOD_NAMES.get(m, m), r, "measured") for m, r in results.items()]
     if camera in last.full:
         panels.append((f"{METHOD_NAMES.get(method, method)} and prior", last, "full"))
-    drawn = {}
+    maps_m = {}
+    camera_name = f", {camera}" if len(last.depth) > 1 else ""
     for title, result, product in panels:
         depth_m = (result.full if product == "full" else result.depth)[camera].depth_m
-        named = f", {camera}" * (len(last.depth) > 1)
-        text = f"{title}{named}: {np.count_nonzero(depth_m) / depth_m.size:.1%} of pixels"
-        drawn[text + _error(result, camera, product)] = depth_m
-    write_file(path, encode_png(draw_figure(_image(last, camera), drawn)))
-
-
-def _image(result: Result, camera: str) -> Picture:
-    """Return the (H,W,3) RGB image of a camera, black if the recording has no image."""
-    shape = (*result.depth[camera].depth_m.shape, 3)
-    return result.images.get(camera, np.zeros(shape, np.uint8))
+        text = f"{title}{camera_name}: {np.count_nonzero(depth_m) / depth_m.size:.1%} of pixels"
+        maps_m[text + _error(result, camera, product)] = depth_m
+    black = np.zeros((*last.depth[camera].depth_m.shape, 3), np.uint8)
+    write_file(path, encode_png(draw_figure(last.images.get(camera, black), maps_m)))
 
 
 def _error(result: Result, camera: str, product: str) -> str:
@@ -84,24 +105,26 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
     """
     kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
     gray = (_BRIGHTNESS * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8)
-    enlarge, parts = max(1.0, _MIN_WIDTH_PX / image.shape[1]), []
+    enlarge, rows = max(1.0, _MIN_WIDTH_PX / image.shape[1]), []
     for title, depth_m in panels.items():
         nearest_m = np.where(depth_m > 0, depth_m, _NO_DEPTH_M)
         nearest_m = cv2.erode(nearest_m, kernel).astype(np.float32, copy=False)
         picture = cv2.merge([gray, gray, gray])
-        picture[nearest_m < _NO_DEPTH_M] = _colours(nearest_m)[nearest_m < _NO_DEPTH_M]
+        picture[nearest_m < _NO_DEPTH_M] = coloured(nearest_m)[nearest_m < _NO_DEPTH_M]
         picture = cv2.resize(picture, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_NEAREST)
         strip = np.full((_TITLE_PX, picture.shape[1], 3), 255, np.uint8)
         _write(strip, title, _MARGIN_PX, picture.shape[1] - _MARGIN_PX)
-        parts += [strip, picture]
-    return np.concatenate([*parts, _scale(parts[0].shape[1])])
+        rows += [strip, picture]
+    return np.concatenate([*rows, _scale(rows[0].shape[1])])
 
 
-def _colours(depth_m: Float32) -> Picture:
-    """Return the (h,w,3) colours, as blue, green, red, of depths (h,w) in metres."""
-    far = np.log(depth_m / _NEAR_M) / np.log(_FAR_M / _NEAR_M)
-    levels = np.rint(255 * (1 - np.clip(far, 0, 1))).astype(np.uint8)
-    return cv2.applyColorMap(levels, cv2.COLORMAP_TURBO).astype(np.uint8, copy=False)
+def coloured(depth_m: Float32) -> Picture:
+    """Return the (h,w,3) colours, as blue, green, red, of depths (h,w) in metres; 0 is black."""
+    share = np.log(np.maximum(depth_m, _NEAR_M) / _NEAR_M) / np.log(_FAR_M / _NEAR_M)
+    levels = np.rint(255 * (1 - np.minimum(share, 1))).astype(np.uint8)
+    picture = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO).astype(np.uint8, copy=False)
+    picture[depth_m <= 0] = 0
+    return picture
 
 
 def _scale(width_px: int) -> Picture:
@@ -110,7 +133,7 @@ def _scale(width_px: int) -> Picture:
     left, long_px = width_px // 20, width_px - 2 * (width_px // 20)
     log = np.linspace(np.log(_NEAR_M), np.log(_FAR_M), long_px)
     bar = scale[_MARGIN_PX : _MARGIN_PX + _BAR_PX, left : left + long_px]
-    bar[:] = _colours(np.exp(log).astype(np.float32)[None])
+    bar[:] = coloured(np.exp(log).astype(np.float32)[None])
     for tick_m in _TICKS_M:
         at = left + int(np.searchsorted(log, np.log(tick_m) - 1e-9))
         scale[_MARGIN_PX + _BAR_PX : _MARGIN_PX + _BAR_PX + 4, at - 1 : at + 1] = 0
@@ -128,14 +151,7 @@ def _write(strip: Picture, text: str, left_px: int, right_px: int, centred: bool
     cv2.putText(strip, text, at, _FONT, shrink * _FONT_SCALE, (0, 0, 0), 1, cv2.LINE_AA)
 
 
-def write_plot(path: Path, figure: Figure) -> None:
-    """Write a matplotlib figure as PNG. Equal figures give equal bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    write_file(path, buffer.getvalue())
-
-
-def write_curve(result: Result, context: Context, folder: Path) -> None:
+def write_curve(result: Result, folder: Path) -> None:
     """Write ``curve.png`` of all cameras, if a method has scores with the key sweep held out.
 
     If there is ground truth, the result is drawn against it too.
@@ -146,12 +162,13 @@ def write_curve(result: Result, context: Context, folder: Path) -> None:
             curves.setdefault(f"{camera}, key held out", {})[method] = scores["curve"]
     for name, truth_m in result.truth_m.items() if curves else ():
         camera = result.views[name].camera
-        of_name: dict[str, Curve] = {
-            result.method: precision_density(result.depth[name], truth_m, camera)
-        }
-        curves[f"{name}, ground truth"] = of_name
+        curve = precision_density(result.depth[name], truth_m, camera)
+        curves[f"{name}, ground truth"] = {result.method: curve}
     if curves:
-        write_plot(folder / "curve.png", draw_curves(curves))
+        buffer = io.BytesIO()
+        # Without the name of the program, equal figures give equal bytes.
+        draw_curves(curves).savefig(buffer, format="png", metadata={"Software": None})
+        write_file(folder / "curve.png", buffer.getvalue())
 
 
 def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
@@ -162,25 +179,16 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
     from matplotlib.figure import Figure
 
     columns, rows = min(2, len(curves)), -(-len(curves) // 2)
-    figure = Figure(figsize=(8.6 * columns, 4.8 * rows), dpi=_DPI, layout="constrained")
-    for place, (camera, methods) in enumerate(curves.items(), 1):
-        axes = figure.add_subplot(rows, columns, place)
-        last = [*methods][-1]
-        for number, (method, curve) in enumerate(methods.items()):
-            for kind, width in (("measured", 1.0), ("filled", 2.5)):  # thin and thick lines
-                known = [p for p in curve if p[f"outliers_{kind}"] is not None]
-                density = [100 * p[f"density_{kind}"] for p in known]
-                outliers = [100 * p[f"outliers_{kind}"] for p in known]
-                label = f"{METHOD_NAMES.get(method, method)}, {kind}"
-                if known:
-                    label += f": {density[0]:.1f} % of pixels, {outliers[0]:.2f} % outliers"
-                line = axes.plot(density, outliers, "o-", color=f"C{number}", label=label)[0]
-                line.set(linewidth=width, markersize=1 + 2 * width)
-                if kind == "filled" and known and method == last:
-                    expected = [100 * p[f"expected_{kind}"] for p in known]
-                    axes.plot(density, expected, "k--", label="expected by confidence")
-        axes.set(title=camera, xlabel="pixels with a depth, %")
-        axes.set_ylabel("outliers, %")
+    size_inch = (_AXES_INCH[0] * columns, _AXES_INCH[1] * rows)
+    figure = Figure(figsize=size_inch, dpi=_DPI, layout="constrained")
+    for number, (title, methods) in enumerate(curves.items(), 1):
+        axes = figure.add_subplot(rows, columns, number)
+        for color, (method, curve) in enumerate(methods.items()):
+            _draw_curve(axes, method, curve, f"C{color}")
+        last = [*methods.values()][-1]
+        if expected := _percentages(last, "filled", "expected"):
+            axes.plot(*zip(*expected, strict=True), "k--", label="expected by confidence")
+        axes.set(title=title, xlabel="pixels with a depth, %", ylabel="outliers, %")
         axes.set_yscale("symlog", linthresh=100 * _FEWEST_OUTLIERS)
         axes.yaxis.set_major_formatter("{x:g}")
         axes.set_xlim(left=0)
@@ -188,3 +196,21 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
     return figure
+
+
+def _draw_curve(axes: Any, method: str, curve: Curve, color: str) -> None:
+    """Draw a method's outliers over density: a thin line if measured, a thick one if filled."""
+    for product, width in (("measured", 1.0), ("filled", 2.5)):
+        points = _percentages(curve, product, "outliers")
+        label = f"{METHOD_NAMES.get(method, method)}, {product}"
+        if points:
+            density, outliers = points[0]
+            label += f": {density:.1f} % of pixels, {outliers:.2f} % outliers"
+        x_y = zip(*points, strict=True) if points else ((), ())
+        axes.plot(*x_y, "o-", color=color, label=label, linewidth=width, markersize=1 + 2 * width)
+
+
+def _percentages(curve: Curve, product: str, score: str) -> list[tuple[float, float]]:
+    """Return (density, score) in percent of the points of a curve whose outliers are known."""
+    known = [point for point in curve if point[f"outliers_{product}"] is not None]
+    return [(100 * p[f"density_{product}"], 100 * p[f"{score}_{product}"]) for p in known]

@@ -1,29 +1,61 @@
 # SPDX-License-Identifier: MIT
-"""Keep the results of different recordings in different folders."""
+"""Name the folder of each recording, and keep results of different recordings apart."""
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from densify.config.errors import InputError
 from densify.config.file_content import read_json, read_yaml
-from densify.outputs.kitti_tree import drive_folder
 from densify.readers import Spec
 from densify.readers.decoded_files import read_arrays
 
 RESULTS = Path("densify-out")
 """The folder of all results for which the user names no folder."""
 
+Split = Literal["train", "val"]
 
-class Stored(NamedTuple):
+_VALIDATION = {
+    *(f"2011_09_26_drive_{n:04d}" for n in (2, 5, 13, 20, 23, 36, 79, 95, 113)),
+    *("2011_09_28_drive_0037", "2011_09_29_drive_0026", "2011_09_30_drive_0016"),
+    "2011_10_03_drive_0047",
+}
+_KITTI_DRIVE = re.compile(r"(\d{4}_\d\d_\d\d_drive_\d{4})(?:_sync|_extract)?", re.ASCII)
+_DEFAULT_STREET = "street:street?seed=0&sensor=hdl64"
+_PUNCTUATION = str.maketrans({":": "-", "?": "_", "=": "-", "&": "_"})
+_FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
+_MOST_READABLE = 80  # letters of a name that a hash makes unique
+
+
+class _Stored(NamedTuple):
     """The recording of a result, as its file says."""
 
     file: Path  # file that names the recording
     recording: str  # name of the recording
     data: str  # text of ``--data``, "" if the file lacks it
+
+
+def split_of(recording: str) -> Split:
+    """Return "val" for the 13 validation drives of KITTI's depth benchmark, else "train"."""
+    match = _KITTI_DRIVE.fullmatch(recording)
+    return "val" if match and match[1] in _VALIDATION else "train"
+
+
+def drive_folder(recording: str) -> str:
+    """Return a valid, unique folder name. A valid name, such as KITTI's names, is kept."""
+    # street:highway?seed=0&sensor=hdl64 -> street-highway_seed-0_sensor-hdl64
+    if recording == _DEFAULT_STREET:
+        return "street"
+    folder = recording.translate(_PUNCTUATION)
+    if _FOLDER_NAME.fullmatch(folder):
+        return folder
+    readable = re.sub(r"[^A-Za-z0-9_.]+", "-", folder)[:_MOST_READABLE].strip(".-") or "drive"
+    return f"{readable}-{hashlib.sha256(recording.encode()).hexdigest()[:8]}"
 
 
 def default_folder(recording: str) -> Path:
@@ -37,9 +69,9 @@ def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = 
     Results without the name of a recording are not compared. ``recording`` and ``data`` (text of
     ``--data``) are of the results to be written, for the frame numbers ``keys``.
     """
-    for stored_here in _stored_in(out, keys):
-        if not any(is_same(recording, data, s.recording, s.data) for s in stored_here):
-            stored = stored_here[0]
+    for result in _stored_results(out, keys):
+        if not any(is_same(recording, data, s.recording, s.data) for s in result):
+            stored = result[0]
             source = f" ({stored.data})" if stored.data else ""
             raise InputError(
                 f"--out {out}: {stored.file.relative_to(out)} is of another recording, "
@@ -47,19 +79,19 @@ def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = 
             )
 
 
-def is_same(recording: str, data: str, other: str, other_data: str) -> bool:
+def is_same(recording: str, data: str, stored_recording: str, stored_data: str) -> bool:
     """Return True if two names and texts of ``--data`` are of one recording, moved or not."""
-    if drive_folder(recording) != drive_folder(other):
+    if drive_folder(recording) != drive_folder(stored_recording):
         return False
-    path, other_path = (Spec.parse(text).path.resolve() for text in (data, other_data))
-    if not (data and other_data and path.exists() and other_path.exists()):
+    path, stored_path = (Spec.parse(text).path.resolve() for text in (data, stored_data))
+    if not (data and stored_data and path.exists() and stored_path.exists()):
         return True
     # A file in the recording is the same recording.
-    return path.is_relative_to(other_path) or other_path.is_relative_to(path)
+    return path.is_relative_to(stored_path) or stored_path.is_relative_to(path)
 
 
-def _stored_in(out: Path, keys: Iterable[int]) -> Iterator[list[Stored]]:
-    """Yield the recordings of the results in a folder: a training set, keys, files of flow."""
+def _stored_results(out: Path, keys: Iterable[int]) -> Iterator[list[_Stored]]:
+    """Yield the recordings of each result in a folder: a training set, keys, files of flow."""
     drives = _mapping(out / "dataset.json").get("drives")
     if isinstance(drives, Mapping) and drives:
         yield [_stored(out / "dataset.json", name, drive) for name, drive in drives.items()]
@@ -72,12 +104,13 @@ def _stored_in(out: Path, keys: Iterable[int]) -> Iterator[list[Stored]]:
     for path in sorted(out.glob("[0-9]*_[0-9]*.npz"))[:1]:
         with suppress(InputError):
             if "recording" in (arrays := read_arrays(path, ("recording",))):
-                yield [Stored(path, str(arrays["recording"]), "")]
+                yield [_Stored(path, str(arrays["recording"]), "")]
 
 
-def _stored(path: Path, name: Any, table: Any) -> Stored:
+def _stored(path: Path, name: Any, table: Any) -> _Stored:
+    """Return the recording that a file names; ``table`` holds the text of ``--data``."""
     data = table.get("data") if isinstance(table, Mapping) else None
-    return Stored(path, str(name), str(data or ""))
+    return _Stored(path, str(name), str(data or ""))
 
 
 def _mapping(path: Path) -> Mapping[str, Any]:

@@ -1,18 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Write frames of the simulated street as KITTI raw drive or plain folder, with ground truth.
 
-The files, with timestamps of the KITTI drive for each frame of the whole street::
-
-    OUT/2026_06_12/calib_cam_to_cam.txt calib_velo_to_cam.txt calib_imu_to_velo.txt
-    OUT/2026_06_12/2026_06_12_drive_0001_sync/
-        velodyne_points/{data/0000000120.bin, timestamps.txt, timestamps_start.txt, ..._end.txt}
-        image_02/{data/0000000120.png, timestamps.txt}  image_03/...
-        oxts/{data/0000000120.txt, timestamps.txt}  truth/ (`densify.readers.truth_files`)
-
-    OUT/street/densify.yaml timestamps.txt (s since 1970) poses.txt (lidar poses, TUM format)
-    OUT/street/truth/  numbered from 0
-    OUT/street/sweeps/000000.bin, ...  float32 x y z intensity time lidar, s since the stamp
-    OUT/street/images/CAMERA/1781258406000000000.png, ...  named by exposure times in ns
+docs/formats/reading.md lists the files.
 """
 
 from __future__ import annotations
@@ -20,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -27,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.types import Float, Float32, Int, Progress
+from densify.geometry.types import Camera, Float, Float32, Int, Progress
 from densify.outputs.atomic import staged_folder
 from densify.outputs.depth_png import encode_png
 from densify.readers import checks
@@ -44,6 +34,7 @@ FORMATS = ("kitti", "folder")
 _DATE = np.datetime64(EPOCH_NS, "ns").astype("datetime64[D]").astype(str).replace("-", "_")
 _DRIVE = f"{_DATE}_drive_0001_sync"
 _CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
+_KITTI = (_DRIVE, *_CALIBRATION)
 _FOLDER = (NAME, "sweeps", "timestamps.txt", "poses.txt", "images", "truth")
 _POSE_STEP_NS = 5_000_000
 _MARGIN_NS = 150_000_000  # poses start this long before the first sweep and end after the last
@@ -52,6 +43,7 @@ T_LEVEL_IMU[:3, :3] = Rotation.from_rotvec([0.012, -0.003, -0.001]).as_matrix()
 T_LEVEL_IMU[:3, 3] = [-0.81, 0.32, -0.80]
 _LATITUDE_DEG, _LONGITUDE_DEG, _ALTITUDE_M = 49.0, 8.4, 115.0
 _EARTH_RADIUS_M = 6_378_137.0
+_NUM_MOTIONS = 17  # velocities, accelerations and turn rates of an oxts record
 
 
 def write_street(
@@ -75,14 +67,14 @@ def write_street(
         )
     for name in excerpt.cameras if is_kitti else ():
         checks.camera_named({usual: CAMERAS[usual] for usual in USUAL}, name, out)
-    place, owned = (_DATE, (_DRIVE, *_CALIBRATION)) if is_kitti else ("street", _FOLDER)
+    folder, owned = (out / _DATE, _KITTI) if is_kitti else (out / "street", _FOLDER)
     for name in owned:
-        if (out / place / name).exists() and not overwrite:
-            raise InputError(f"{out / place / name}: exists; give --overwrite to replace it")
+        if (folder / name).exists() and not overwrite:
+            raise InputError(f"{folder / name}: exists; give --overwrite to replace it")
     write = _write_kitti if is_kitti else _write_folder
-    with staged_folder(out / place, owned) as folder:
-        write(excerpt, folder, progress or (lambda *_: None))
-    return out / place / _DRIVE if is_kitti else out / place
+    with staged_folder(folder, owned) as staging:
+        write(excerpt, staging, progress or (lambda *_: None))
+    return folder / _DRIVE if is_kitti else folder
 
 
 @dataclass(frozen=True)
@@ -140,6 +132,7 @@ def put(path: Path, data: bytes | str) -> None:
 
 
 def _numbered(frames: Sequence[int], progress: Progress) -> Iterator[tuple[int, int]]:
+    """Yield (number from 0, frame number) and report the progress."""
     for number, frame in enumerate(frames):
         progress("simulate", number, len(frames))
         yield number, frame
@@ -152,10 +145,8 @@ def _write_truth(folder: Path, excerpt: Excerpt, bodies: Bodies, renumbered: boo
     write_bodies(folder, bodies)
     for number, frame in enumerate(excerpt.frames):
         returns = street.returns(frame)
-        points, written = (
-            street.simulator.in_bodies(frame, returns),
-            number if renumbered else frame,
-        )
+        points = street.simulator.in_bodies(frame, returns)
+        written = number if renumbered else frame
         write_points(folder, written, returns.body, returns.instance, points)
     for camera in excerpt.cameras:
         images = excerpt.image_numbers(camera) if renumbered else excerpt.frames
@@ -171,8 +162,7 @@ def _write_folder(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
     for number, frame in _numbered(excerpt.frames, progress):
         returns = street.returns(frame)
         columns = [returns.points, returns.intensity, returns.offset_ns * 1e-9, returns.lidar]
-        table = np.column_stack(columns).astype("<f4")
-        put(folder / "sweeps" / f"{number:06d}.bin", table.tobytes())
+        put(folder / f"sweeps/{number:06d}.bin", np.column_stack(columns).astype("<f4").tobytes())
     put(folder / "timestamps.txt", "".join(f"{_seconds(ns)}\n" for ns in stamps_ns))
     lines = ["# time x y z qx qy qz qw: the lidar's pose in the world\n"]
     track = excerpt.poses()
@@ -184,47 +174,49 @@ def _write_folder(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
     for name in excerpt.cameras:
         exposed_ns = street.image_stamps_ns(name)
         for image in excerpt.image_numbers(name):
-            path = folder / "images" / name / f"{exposed_ns[image]}.png"
+            path = folder / f"images/{name}/{exposed_ns[image]}.png"
             put(path, excerpt.png_image(name, image))
     put(folder / NAME, config_text(excerpt))
     _write_truth(folder / "truth", excerpt, street.simulator.bodies_at(stamps_ns), renumbered=True)
 
 
 def _seconds(time_ns: int) -> str:
+    """Return a time in seconds with every digit."""
     return f"{time_ns // 10**9}.{time_ns % 10**9:09d}"
 
 
 def config_text(excerpt: Excerpt) -> str:
     """Return the text of densify.yaml for the excerpt."""
-    sensor = excerpt.street.simulator.sensor
-    columns = ["x", "y", "z", "intensity", "time", "lidar"]
-    cameras = {}
-    for name in excerpt.cameras:
-        camera = excerpt.street.cameras[name]
-        cameras[name] = {
-            **{"files": f"images/{name}", "stamps": "names", "stamps_unit": "ns"},
-            **{key: getattr(camera, key) for key in ("model", "max_angle_deg", "row_time_s")},
-            "size": [camera.width_px, camera.height_px],
-            "K": camera.K.tolist(),
-            "distortion": list(camera.distortion),
-            "T_cam_lidar": camera.T_cam_lidar.tolist(),
-        }
+    sweeps = {
+        "files": "sweeps",
+        "columns": ["x", "y", "z", "intensity", "time", "lidar"],
+        "intensity_scale": 1.0,
+        "time_unit": "s",
+        "time_is": "relative",
+        "stamps": "timestamps.txt",
+        "stamps_unit": "s",
+        "scanner_origins": excerpt.street.simulator.sensor.origins_m.tolist(),
+    }
+    cameras = {name: _camera_table(excerpt.street.cameras[name]) for name in excerpt.cameras}
     config = {
-        "sweeps": {
-            "files": "sweeps",
-            "columns": columns,
-            "intensity_scale": 1.0,
-            "time_unit": "s",
-            "time_is": "relative",
-            "stamps": "timestamps.txt",
-            "stamps_unit": "s",
-            "scanner_origins": sensor.origins_m.tolist(),
-        },
+        "sweeps": sweeps,
         "poses": {"file": "poses.txt", "stamps_unit": "s"},
         "cameras": cameras,
     }
     text = yaml.safe_dump(config, sort_keys=False, default_flow_style=None, width=100)
     return f"# What the other files of this folder do not say.\n{text}"
+
+
+def _camera_table(camera: Camera) -> dict[str, Any]:
+    """Return the entry of a camera in densify.yaml."""
+    return {
+        **{"files": f"images/{camera.name}", "stamps": "names", "stamps_unit": "ns"},
+        **{key: getattr(camera, key) for key in ("model", "max_angle_deg", "row_time_s")},
+        "size": [camera.width_px, camera.height_px],
+        "K": camera.K.tolist(),
+        "distortion": list(camera.distortion),
+        "T_cam_lidar": camera.T_cam_lidar.tolist(),
+    }
 
 
 def _write_kitti(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
@@ -238,16 +230,18 @@ def _write_kitti(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
     for name, text in zip(_CALIBRATION, calibration, strict=True):
         put(folder / name, text)
     for _, frame in _numbered(excerpt.frames, progress):
-        put(drive / "velodyne_points" / "data" / f"{frame:010d}.bin", sweep_data(street, frame))
+        put(drive / f"velodyne_points/data/{frame:010d}.bin", sweep_data(street, frame))
         for name in excerpt.cameras:
-            put(drive / name / "data" / f"{frame:010d}.png", excerpt.png_image(name, frame))
-        record = oxts_line(street, frame, excerpt.frames[0])
-        put(drive / "oxts" / "data" / f"{frame:010d}.txt", record)
-    centre = np.array([street.stamp_ns(frame) for frame in street.frames])
-    half = street.simulator.period_ns // 2
-    stamps = {"oxts/timestamps": centre, "velodyne_points/timestamps": centre}
-    stamps["velodyne_points/timestamps_start"] = centre - half
-    stamps["velodyne_points/timestamps_end"] = centre + half
+            put(drive / f"{name}/data/{frame:010d}.png", excerpt.png_image(name, frame))
+        put(drive / f"oxts/data/{frame:010d}.txt", oxts_line(street, frame, excerpt.frames[0]))
+    middle_ns = np.array([street.stamp_ns(frame) for frame in street.frames])
+    half_ns = street.simulator.period_ns // 2
+    stamps = {
+        "oxts/timestamps": middle_ns,
+        "velodyne_points/timestamps": middle_ns,
+        "velodyne_points/timestamps_start": middle_ns - half_ns,
+        "velodyne_points/timestamps_end": middle_ns + half_ns,
+    }
     for name in excerpt.cameras:
         exposed_ns = np.array(list(street.image_stamps_ns(name).values()))
         stamps[f"{name}/timestamps"] = exposed_ns + KITTI_TRIGGER_LATENCY_NS
@@ -269,8 +263,9 @@ def projections(key: str) -> str:
     lines = ""
     for number in range(4):  # gray cameras 0 and 1 share the poses of colour cameras 2 and 3
         camera = CAMERAS[f"image_0{2 + number % 2}"]
-        away = (camera.T_cam_lidar - T_RECTIFIED_LIDAR)[:3, 3]
-        lines += f"{key.format(number)}: {numbers(camera.K @ np.column_stack([np.eye(3), away]))}\n"
+        offset_m = (camera.T_cam_lidar - T_RECTIFIED_LIDAR)[:3, 3]
+        P = camera.K @ np.column_stack([np.eye(3), offset_m])
+        lines += f"{key.format(number)}: {numbers(P)}\n"
     return lines
 
 
@@ -295,15 +290,17 @@ def T_lidar_imu(tilt_deg: float) -> Float:
 def oxts_line(street: Street, frame: int, first: int) -> str:
     """Return an oxts record of the true pose. Velocities, accelerations and turn rates are 0."""
     # Readers take the Mercator scale from the latitude of frame ``first``, which is fixed.
-    T_lidar = T_lidar_imu(street.simulator.tilt_deg)
-    here, start = (
-        street.simulator.T_world_lidar_at(street.stamp_ns(f)) @ T_lidar for f in (frame, first)
+    T_lidar_ego = T_lidar_imu(street.simulator.tilt_deg)
+    T_world_now, T_world_first = (
+        street.simulator.T_world_lidar_at(street.stamp_ns(f)) @ T_lidar_ego for f in (frame, first)
     )
-    east_north_up = here[:3, 3] - start[:3, 3]
+    east_m, north_m, up_m = T_world_now[:3, 3] - T_world_first[:3, 3]
     scale_m = np.cos(np.radians(_LATITUDE_DEG)) * _EARTH_RADIUS_M
-    lon_deg = _LONGITUDE_DEG + np.degrees(east_north_up[0] / scale_m)
-    mercator = np.log(np.tan(np.radians(90 + _LATITUDE_DEG) / 2)) + east_north_up[1] / scale_m
-    lat_deg = np.degrees(2 * np.arctan(np.exp(mercator))) - 90
-    yaw, pitch, roll = Rotation.from_matrix(here[:3, :3]).as_euler("ZYX")
-    place = [lat_deg, lon_deg, _ALTITUDE_M + east_north_up[2], roll, pitch, yaw]
-    return f"{numbers(np.array([*place, *[0.0] * 17, 0.05, 0.02]))} 4 10 4 4 0\n"
+    longitude_deg = _LONGITUDE_DEG + np.degrees(east_m / scale_m)
+    mercator = np.log(np.tan(np.radians(90 + _LATITUDE_DEG) / 2)) + north_m / scale_m
+    latitude_deg = np.degrees(2 * np.arctan(np.exp(mercator))) - 90
+    yaw, pitch, roll = Rotation.from_matrix(T_world_now[:3, :3]).as_euler("ZYX")
+    pose = [latitude_deg, longitude_deg, _ALTITUDE_M + up_m, roll, pitch, yaw]
+    accuracies = [0.05, 0.02]  # of position (m) and velocity (m/s)
+    values = np.array([*pose, *[0.0] * _NUM_MOTIONS, *accuracies])
+    return f"{numbers(values)} 4 10 4 4 0\n"

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.config.file_content import described_in, read_bytes
 from densify.geometry.types import Camera, Float, Float32, Int, Sweep, Truth
+from densify.geometry.types.recordings import in_one_line
 from densify.readers import checks
 from densify.readers.decoded_files import stated_size_px
 
@@ -68,6 +69,9 @@ class FileSequence(ABC):
             raise InputError(
                 f"{where}: all {len(self._files)} files of sweeps are empty; fetch them again"
             )
+
+    def __repr__(self) -> str:
+        return in_one_line(self)
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep without reading its points."""

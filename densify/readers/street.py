@@ -24,6 +24,7 @@ from densify.config.cache import Cache, kept, own_folder
 from densify.config.errors import InputError
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
+from densify.geometry.types.recordings import in_one_line
 from densify.street.cameras import CAMERAS, USUAL, Picture, cameras_beside
 from densify.street.lidar import Returns
 from densify.street.sensors import SENSORS
@@ -104,6 +105,9 @@ class Street:
     def keep_nothing(self) -> None:
         """Disable the cache folder, for a street that is rendered only once."""
         self._cache = None
+
+    def __repr__(self) -> str:
+        return in_one_line(self)
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep (ns)."""

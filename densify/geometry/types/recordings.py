@@ -70,6 +70,13 @@ class LidarSequence(Protocol):
         ...
 
 
+def in_one_line(sequence: LidarSequence) -> str:
+    """Return what a recording holds, for its ``repr``."""
+    frames, cameras = sequence.frames, ", ".join(sequence.cameras) or "none"
+    span = f" from {frames[0]} to {frames[-1]}" if len(frames) else ""
+    return f"<{sequence.name}: {len(frames)} sweeps{span}; cameras: {cameras}>"
+
+
 @dataclass(frozen=True)
 class BoxView:
     """The camera image in which an annotator drew the boxes."""

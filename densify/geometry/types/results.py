@@ -152,3 +152,14 @@ class Result:
     T_key_lidar: Mapping[int, Float] = field(default_factory=dict)
     tracks: tuple[ObjectTrack, ...] = ()
     recording: str = ""
+
+    def __repr__(self) -> str:
+        maps = ", ".join(
+            f"{name} {np.count_nonzero(depth.depth_m) / depth.depth_m.size:.1%}"
+            for name, depth in self.depth.items()
+        )
+        return (
+            f"Result({self.method}, key {self.key} of {len(self.frames)} sweeps; "
+            f"{len(self.cloud.points):,} points; measured depth: {maps or 'no camera'}; "
+            f"{len(self.tracks)} moving objects)"
+        )

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Write the accumulated cloud as LAZ (LAS 1.4, point format 7) for CloudCompare, PDAL and QGIS."""
+"""Write and read the cloud as LAZ (LAS 1.4, point format 7), and write any points as PLY."""
 
 from __future__ import annotations
 
 import datetime
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
+from densify.geometry.arrays import table
 from densify.geometry.types import Bool, Cloud, Float, Float32, Int
 from densify.outputs.atomic import write_file
 from densify.readers.decoded_files import read_las
 
 _SCALE_M = 0.001
+_MOST_LEVEL = 65535  # of the 16 bits of intensity and colours
+_TO_16_BITS = 257  # 255 becomes 65535
 _UNIX_DAY_0, _DAY_NS = datetime.date(1970, 1, 1), 86400 * 10**9
 _LAS_EPOCH_NS = (315_964_800 + 10**9) * 10**9  # 1980-01-06, and the offset of LAS
 _MAX_COORDINATE_M = _SCALE_M * np.iinfo(np.int32).max
@@ -34,7 +37,10 @@ _EXTRA_DIMENSIONS = (
     ("displaced_z", "float32", "m"),
 )
 _DISPLACED = ("displaced_x", "displaced_y", "displaced_z")
-_STANDARD_DIMENSIONS = {"intensity", "gps_time", "red", "green", "blue"}
+_COLOURS = ("red", "green", "blue")
+_STANDARD_DIMENSIONS = {"intensity", "gps_time", *_COLOURS}
+_PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar", "u2": "ushort"}
+_UNOBSERVED = np.array([140, 140, 140], np.uint8)  # gray
 
 
 @dataclass(frozen=True)
@@ -54,10 +60,11 @@ class StoredCloud:
     gps_time: Float  # (M,) reference time of the source sweep in seconds, see `write_cloud`
 
     @staticmethod
-    def joined(parts: Sequence[StoredCloud]) -> StoredCloud:
+    def joined(clouds: Sequence[StoredCloud]) -> StoredCloud:
         """Return one cloud with the points of all clouds, in the given order."""
-        columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(StoredCloud)}
-        return StoredCloud(**{name: np.concatenate(part) for name, part in columns.items()})
+        names = [field.name for field in fields(StoredCloud)]
+        columns = {n: np.concatenate([getattr(cloud, n) for cloud in clouds]) for n in names}
+        return StoredCloud(**columns)
 
     @property
     def rigid_points(self) -> Float:
@@ -69,6 +76,20 @@ class StoredCloud:
         """(M,) int64 reference time of each point's source sweep, ns since 1970, exact to 1 µs."""
         return np.rint(self.gps_time * 1e6).astype(np.int64) * 1000 + _LAS_EPOCH_NS
 
+    @property
+    def observed(self) -> Bool:
+        """(M,) True for points whose colour a camera observed."""
+        return np.asarray(self.rgb.any(axis=1), bool)
+
+    @property
+    def shown_rgb(self) -> NDArray[np.uint8]:
+        """The (M,3) colours, gray for points that no camera observed."""
+        return np.where(self.observed[:, None], self.rgb, _UNOBSERVED)
+
+    def sweep(self, frame: int) -> StoredCloud:
+        """Return the points of one sweep of the window."""
+        return self.select((self.frame == frame) & ~self.far)
+
     def select(self, keep: Bool | Int) -> StoredCloud:
         """Return a cloud with only the points of a mask (M,), or of an array of point indices."""
         return StoredCloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
@@ -79,7 +100,7 @@ class StoredCloud:
         return {  # float32 keeps 1 mm up to 8 km
             **dict(zip("xyz", self.points.T.astype(np.float32), strict=True)),
             **dict(zip(_DISPLACED, self.displacement.T, strict=True)),
-            **dict(zip(("red", "green", "blue"), self.rgb.T, strict=True)),
+            **dict(zip(_COLOURS, self.rgb.T, strict=True)),
             **{name: getattr(self, name) for name in names},
             **{name: getattr(self, name).astype(np.uint8) for name in ("moving", "far")},
         }
@@ -109,8 +130,8 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header))
     las.xyz = cloud.points
     las.gps_time = (stamp_ns - _LAS_EPOCH_NS + cloud.since_key_ns) * 1e-9
-    las.intensity = np.rint(65535 * np.clip(cloud.intensity, 0, 1)).astype(np.uint16)
-    las.red, las.green, las.blue = (cloud.rgb.astype(np.uint16) * 257).T
+    las.intensity = np.rint(_MOST_LEVEL * np.clip(cloud.intensity, 0, 1)).astype(np.uint16)
+    las.red, las.green, las.blue = (cloud.rgb.astype(np.uint16) * _TO_16_BITS).T
     las.return_number = np.ones(len(cloud), np.uint8)
     las.number_of_returns = np.ones(len(cloud), np.uint8)
     for axis, name in enumerate(_DISPLACED):
@@ -132,14 +153,32 @@ def read_cloud(path: Path) -> StoredCloud:
             f"{path}: no dimension {', '.join(sorted(missing))}; expected a cloud of this version "
             f"of densify; densify the key again"
         )
-    own: dict[str, Any] = {n: np.array(las[n], kind) for n, kind, _ in _EXTRA_DIMENSIONS}
-    displacement = np.stack([own.pop(name) for name in _DISPLACED], axis=1)
+    columns: dict[str, Any] = {n: np.array(las[n], kind) for n, kind, _ in _EXTRA_DIMENSIONS}
+    displacement = np.stack([columns.pop(name) for name in _DISPLACED], axis=1)
+    masks = {name: columns.pop(name) > 0 for name in ("moving", "far")}
+    rgb = np.stack([las[colour] for colour in _COLOURS], axis=1) // _TO_16_BITS
     return StoredCloud(
         points=np.array(las.xyz),
-        intensity=np.array(las.intensity, np.float32) / np.float32(65535),
-        rgb=(np.stack([las.red, las.green, las.blue], axis=1) // 257).astype(np.uint8),
+        intensity=np.array(las.intensity, np.float32) / np.float32(_MOST_LEVEL),
+        rgb=rgb.astype(np.uint8),
         gps_time=np.array(las.gps_time),
         displacement=displacement,
-        **{name: own.pop(name) > 0 for name in ("moving", "far")},
-        **own,
+        **masks,
+        **columns,
     )
+
+
+def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write (N,) columns by name as vertices of PLY (Turk, 1994), binary, little-endian."""
+    rows = table(columns)
+    rows = rows.astype(rows.dtype.newbyteorder("<"), copy=False)
+    kinds = {name: _PLY_TYPES[rows.dtype[name].str.lstrip("<|")] for name in columns}
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment densify, metres",
+        f"element vertex {len(rows)}",
+        *(f"property {kind} {name}" for name, kind in kinds.items()),
+        "end_header",
+    ]
+    write_file(path, "\n".join(header).encode("ascii") + b"\n" + rows.tobytes())

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: MIT
+"""Write a finished run in the formats of other tools, listed in `config.plugins.EXPORTS`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from densify import __version__
+from densify.config.errors import InputError, did_you_mean
+from densify.config.file_content import needed
+from densify.config.plugins import EXPORTS
+from densify.geometry.types import Float32
+from densify.outputs.atomic import plain
+from densify.outputs.cloud_files import save_ply
+from densify.outputs.depth_png import confidence_of, map_path, metres
+from densify.outputs.finished_run import FinishedRun, Kept, Thresholds, finished_runs
+from densify.outputs.key_outputs import writing
+
+# Fields: run, to (format), min_confidence, max_age_ms (null for any age), density (camera ->
+# measured, filled -> before, after the thresholds: shares of the pixels), num_points, version
+_RECORD = "export.yaml"
+
+
+@dataclass(frozen=True)
+class Export:
+    """The written files, and the pixels and points within the thresholds."""
+
+    paths: list[Path]  # paths of the files
+    # Camera -> ``measured`` and ``filled`` -> share of the pixels with a depth, for formats with
+    # maps
+    density: Mapping[str, Mapping[str, Kept]]
+    num_points: Kept | None = None  # number of points, for formats with a cloud
+
+
+def export_run(
+    run: Path,
+    to: str,
+    out: Path | None = None,
+    *,
+    min_confidence: float = 0.0,
+    max_age_ms: float | None = None,
+    cameras: Sequence[str] | None = None,
+    overwrite: bool = False,
+) -> Export:
+    """Write a finished run in another format, from its files alone.
+
+    Args:
+        run: Folder of one key sweep, or of several for formats of whole drives.
+        to: Name of a format in `densify.config.plugins.EXPORTS`.
+        out: Folder to write into, None for ``RUN/export/FORMAT``.
+        min_confidence: As in `Thresholds`, and so are ``max_age_ms`` and ``cameras``.
+        overwrite: Replace an earlier export.
+    """
+    if not 0 <= min_confidence <= 1:
+        raise InputError(f"--min-confidence {min_confidence}: expected a number from 0 to 1")
+    if max_age_ms is not None and not 0 <= max_age_ms < np.inf:
+        raise InputError(f"--max-age-ms {max_age_ms}: expected a number from 0 up")
+    if to not in EXPORTS:
+        hint = did_you_mean(to, EXPORTS)
+        raise InputError(f"--to: got {to!r}, {hint}expected one of {', '.join(EXPORTS)}")
+    form, thresholds = EXPORTS[to], Thresholds(min_confidence, max_age_ms, cameras)
+    runs = finished_runs(run, thresholds) if form.of_drive else [FinishedRun(run, thresholds)]
+    folder = out or run / "export" / to
+    if (folder / "run.yaml").exists():
+        raise InputError(f"--out {folder}: holds a run and is kept; choose another folder")
+    module = import_module(f"densify.outputs.{form.module}")
+    write = getattr(module, f"write_{to.replace('-', '_')}")
+    with writing(folder, (*form.owned, _RECORD), folder, overwrite) as staging:
+        write(runs if form.of_drive else runs[0], staging)
+        export = Export([], runs[0].density if len(runs) == 1 else {}, _total(runs))
+        record = {
+            "run": str(run),
+            "to": to,
+            "min_confidence": float(min_confidence),
+            "max_age_ms": max_age_ms,
+            **facts(export),
+            "version": __version__,
+        }
+        (staging / _RECORD).write_text(yaml.safe_dump(plain(record), sort_keys=False), "utf-8")
+        files = sorted(path.relative_to(staging) for path in staging.rglob("*") if path.is_file())
+    return replace(export, paths=[folder / path for path in files])
+
+
+def facts(export: Export) -> dict[str, Any]:
+    """Return the fields ``density`` and ``num_points`` of export.yaml, without unknown values."""
+    density = {
+        camera: {product: kept._asdict() for product, kept in products.items()}
+        for camera, products in export.density.items()
+    }
+    num_points = export.num_points and export.num_points._asdict()
+    values = {"density": density, "num_points": num_points}
+    return {name: value for name, value in values.items() if value}
+
+
+def _total(runs: Sequence[FinishedRun]) -> Kept | None:
+    """Return the number of points in all clouds that were read, None if none was read."""
+    counts = [run.num_points for run in runs if run.num_points is not None]
+    if not counts:
+        return None
+    return Kept(sum(kept.before for kept in counts), sum(kept.after for kept in counts))
+
+
+def write_npy(run: FinishedRun, folder: Path) -> None:
+    """Write (H,W) float32 .npy: depth, depth_filled (metres, 0 none) and confidence (0 to 1)."""
+    _write_maps(run, folder, ".npy", lambda path, _, values: np.save(path, values))
+
+
+def write_exr(run: FinishedRun, folder: Path) -> None:
+    """Write the maps of `write_npy` as 32-bit OpenEXR, channel Z for depth, Y for confidence."""
+    save = exr_writer()
+    channels = {"depth": "Z", "depth_filled": "Z", "confidence": "Y"}
+    _write_maps(run, folder, ".exr", lambda path, kind, map_: save(path, channels[kind], map_))
+
+
+def exr_writer() -> Callable[[Path, str, Float32], None]:
+    """Return a function that writes a channel by name, (H,W) float32, as an OpenEXR file."""
+    library = needed("OpenEXR", "exr", "EXR files")
+    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
+
+    def write(path: Path, channel: str, values: Float32) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        library.File(header, {channel: values}).write(str(path))
+
+    return write
+
+
+def _write_maps(
+    run: FinishedRun, folder: Path, suffix: str, save: Callable[[Path, str, Float32], None]
+) -> None:
+    """Save the three maps of each camera by a function of path, kind and (H,W) values."""
+    for camera in run.cameras:
+        maps = run.maps(camera)
+        values = {kind: metres(maps[kind]) for kind in ("depth", "depth_filled")}
+        values["confidence"] = confidence_of(maps["confidence"])
+        for kind, array in values.items():
+            path = map_path(folder, kind, camera, suffix)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save(path, kind, array)
+
+
+def write_ply(run: FinishedRun, folder: Path) -> None:
+    """Write ``cloud.ply`` with every column of cloud.laz (`StoredCloud.columns`)."""
+    save_ply(folder / "cloud.ply", run.cloud().columns())
+
+
+def write_pcd(run: FinishedRun, folder: Path) -> None:
+    """Write ``cloud.pcd``, binary PCD 0.7 with the same columns, colour as one float ``rgb``."""
+    from pypcd4 import Encoding, PointCloud
+
+    columns = run.cloud().columns()
+    rgb = np.stack([columns.pop(name) for name in ("red", "green", "blue")], axis=1)
+    columns["rgb"] = PointCloud.encode_rgb(rgb)
+    types = [column.dtype.type for column in columns.values()]
+    cloud = PointCloud.from_points(list(columns.values()), list(columns), types)
+    cloud.save(folder / "cloud.pcd", Encoding.BINARY)

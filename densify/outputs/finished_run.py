@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: MIT
+"""Read the folder of a densified key, with thresholds on confidence and age.
+
+`densify.outputs.key_outputs` writes the files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.config.errors import InputError, brief
+from densify.config.file_content import read_bytes, read_json, read_yaml
+from densify.geometry import poses
+from densify.geometry.types import Camera, CameraView, Float, Float32, ObjectTrack
+from densify.outputs.cloud_files import StoredCloud, read_cloud
+from densify.outputs.depth_png import (
+    PixelType,
+    age_of,
+    confidence_of,
+    map_path,
+    metres,
+    read_stored,
+    stored_age,
+    stored_confidence,
+)
+from densify.readers import checks
+from densify.readers.decoded_files import decode_image
+
+_KINDS: Mapping[str, PixelType] = {
+    "depth": np.uint16,
+    "depth_filled": np.uint16,
+    "confidence": np.uint8,
+    "age": np.uint16,
+}
+
+
+class Thresholds(NamedTuple):
+    """The pixels and points of a run that are read."""
+
+    min_confidence: float = 0.0  # least confidence, 0 to 1
+    # Greatest time from the source sweep to the image's exposure (pixels) or the key sweep
+    # (points), None for any. A filled pixel has the age of the nearest measured pixel.
+    max_age_ms: float | None = None
+    cameras: Sequence[str] | None = None  # names of the cameras, None for all
+
+
+EVERYTHING = Thresholds()
+
+
+class Kept(NamedTuple):
+    """A share of pixels with a depth, or a number of points, and how much the thresholds keep."""
+
+    before: float  # value without thresholds on confidence and age
+    after: float  # value within the thresholds
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """The content of scene.json."""
+
+    table: Mapping[str, Any]  # the parsed JSON of the whole file
+    views: Mapping[str, CameraView]  # name of the depth map -> its camera and pose
+    # Frame number of a sweep of the window -> (4,4) pose in the key sweep's lidar frame
+    T_key_lidar: Mapping[int, Float]
+
+
+class LoadedMaps(NamedTuple):
+    """The maps of one image; 0 where there is no depth."""
+
+    depth_m: Float32  # (H,W) measured depth in metres
+    filled_m: Float32  # (H,W) measured and filled depth in metres
+    confidence: Float32  # (H,W) 0 to 1
+    age_s: Float32  # (H,W) time from the measurement to the exposure in seconds
+
+
+@dataclass(frozen=True)
+class LoadedResult:
+    """The arrays of a finished run, see `load_result`."""
+
+    folder: Path  # the run's folder
+    key: int  # frame number of the key sweep
+    depth: Mapping[str, LoadedMaps]  # name of the depth map: CAMERA, or CAMERA/NUMBER
+    cloud: StoredCloud  # points at the key sweep's time, in its lidar frame
+    tracks: Sequence[ObjectTrack]  # moving objects, largest first
+    metrics: Mapping[str, Any]  # the content of metrics.json
+
+    def __repr__(self) -> str:
+        return (
+            f"LoadedResult(key {self.key}: depth {', '.join(self.depth)}; "
+            f"{len(self.cloud.points):,} points, {len(self.tracks)} moving objects)"
+        )
+
+
+def load_result(folder: str | Path) -> LoadedResult:
+    """Return the arrays of a finished run from its folder, such as densify-out/street/000120."""
+    run = FinishedRun(Path(folder))
+    with _damage_named(run.folder / "metrics.json"):
+        metrics = read_json(run.folder / "metrics.json")
+    return LoadedResult(
+        folder=run.folder,
+        key=run.key,
+        depth={camera: _loaded(run.maps(camera)) for camera in run.cameras},
+        cloud=StoredCloud.joined([run.cloud(), *run.mover_clouds()]),
+        tracks=run.tracks,
+        metrics=metrics,
+    )
+
+
+def _loaded(maps: Mapping[str, NDArray[Any]]) -> LoadedMaps:
+    """Return the maps in metres, seconds and shares from their stored values."""
+    return LoadedMaps(
+        metres(maps["depth"]),
+        metres(maps["depth_filled"]),
+        confidence_of(maps["confidence"]),
+        age_of(maps["age"]),
+    )
+
+
+class FinishedRun:
+    """The folder of one densified key sweep. Files are read on demand and may raise InputError."""
+
+    def __init__(self, folder: Path, thresholds: Thresholds = EVERYTHING) -> None:
+        """Open a folder."""
+        path = folder / "run.yaml"
+        if not path.is_file():
+            raise InputError(
+                f"{folder}: {_without_run(folder)}; expected the folder of a finished run and "
+                f"key, such as densify-out/street/000120"
+            )
+        with _damage_named(path):
+            record = read_yaml(path)[0]
+            # stamp_ns: the key sweep's reference time in ns since 1970; data: text of --data
+            self.key, self.stamp_ns = int(record["key"]), int(record["stamp_ns"])
+            data = str(record["data"])
+            self.recording = str(record.get("recording") or data.rstrip("/").rpartition("/")[2])
+        self.folder, self._cameras = folder, thresholds.cameras
+        max_age_ms = np.inf if thresholds.max_age_ms is None else thresholds.max_age_ms
+        self._min_confidence = stored_confidence(thresholds.min_confidence)
+        self._max_age = stored_age(max_age_ms / 1000)
+        # Camera -> measured, filled -> share of pixels, for the maps read so far
+        self.density: dict[str, dict[str, Kept]] = {}
+        self._num_points: dict[Path, Kept] = {}
+
+    @cached_property
+    def cameras(self) -> list[str]:
+        """The names of the chosen maps: CAMERA, or CAMERA/NUMBER of one image."""
+        names = map_names(self.folder / "depth")
+        if not names:
+            raise InputError(f"{self.folder}: no depth maps in it; run densify with a camera first")
+        existing = sorted({name.partition("/")[0] for name in names})
+        if unknown := {*(self._cameras or ())} - {*existing}:
+            raise InputError(f"--camera {min(unknown)}: expected one of {', '.join(existing)}")
+        return [n for n in names if n.partition("/")[0] in (self._cameras or existing)]
+
+    @cached_property
+    def scene(self) -> SceneFile:
+        """The content of scene.json."""
+        return read_scene(self.folder / "scene" / "scene.json")
+
+    @cached_property
+    def views(self) -> dict[str, CameraView]:
+        """The camera and pose of each chosen map, by name."""
+        return {name: view for name, view in self.scene.views.items() if name in self.cameras}
+
+    @cached_property
+    def tracks(self) -> list[ObjectTrack]:
+        """The tracks of moving objects, each with a pose at the key sweep."""
+        return read_tracks(self.folder / "movers.json")
+
+    @property
+    def num_points(self) -> Kept | None:
+        """The number of points in the clouds read so far, None before the first cloud."""
+        counts = self._num_points.values()
+        return Kept(sum(k.before for k in counts), sum(k.after for k in counts)) if counts else None
+
+    def measure(self, camera: str) -> str:
+        """Return ``z`` (depth along the camera's axis) or ``range`` (distance from the lens)."""
+        path = self.folder / "metrics.json"
+        with _damage_named(path):
+            return str(read_json(path)["measure"][camera])
+
+    def require_z(self, camera: str) -> None:
+        """Raise InputError unless a map has depth along the camera's axis."""
+        if self.measure(camera) != "z":
+            raise InputError(
+                f"{camera}: its depth is the range from the lens, and the form takes camera z; "
+                f"densify it with --set project.depth=z, or leave it out by naming the others with "
+                f"--camera"
+            )
+
+    def jpeg(self, camera: str) -> bytes | None:
+        """Return the bytes of a map's image file, None if the run has no image."""
+        path = map_path(self.folder / "scene", "image", camera, ".jpg")
+        if camera not in self.scene.views or not path.is_file():
+            return None
+        expected, data = self.scene.views[camera].camera, read_bytes(path)
+        height, width = decode_image(data, path).shape[:2]
+        if (width, height) != (expected.width_px, expected.height_px):
+            raise InputError(
+                f"{path}: got {width} x {height} px, expected {expected.width_px} x "
+                f"{expected.height_px} as scene.json says; densify the key again"
+            )
+        return data
+
+    def maps(self, camera: str) -> dict[str, NDArray[Any]]:
+        """Return kind (as in `_KINDS`) -> (H,W) stored values, 0 beyond a threshold."""
+        maps: dict[str, NDArray[Any]] = {}
+        for kind, dtype in _KINDS.items():
+            path = map_path(self.folder, kind, camera)
+            maps[kind] = read_stored(path, dtype, f"a map of {kind}")
+            is_same = maps[kind].shape == maps["depth"].shape
+            if is_same and kind in ("confidence", "age"):
+                is_same = np.array_equal(maps[kind] > 0, maps["depth_filled"] > 0)
+            if not is_same:
+                raise InputError(f"{path}: does not belong to the others; densify the key again")
+        keep = (maps["confidence"] >= self._min_confidence) & (maps["age"] <= self._max_age)
+        self.density[camera] = {
+            product: Kept(float((maps[kind] > 0).mean()), float(((maps[kind] > 0) & keep).mean()))
+            for product, kind in (("measured", "depth"), ("filled", "depth_filled"))
+        }
+        return {kind: stored * keep for kind, stored in maps.items()}
+
+    def full_m(self, camera: str) -> Float32:
+        """Return (H,W) filled depth in metres, completed with a prior if present, 0 for none."""
+        stored = self.maps(camera)["depth_filled"]
+        path = map_path(self.folder, "depth_full", camera)
+        if path.is_file():
+            full = read_stored(path, np.uint16, "a map of depth_full")
+            stored = np.where(stored > 0, stored, full)
+        return metres(stored)
+
+    def cloud(self) -> StoredCloud:
+        """Return the accumulated points within the thresholds."""
+        return self._read(self.folder / "cloud.laz")
+
+    def mover_clouds(self) -> list[StoredCloud]:
+        """Return a cloud for each separated object (``movers=separate``), within the thresholds."""
+        return [self._read(path) for path in sorted(self.folder.glob("movers/*/cloud.laz"))]
+
+    def _read(self, path: Path) -> StoredCloud:
+        cloud = read_cloud(path)
+        age = stored_age(1e-9 * np.abs(cloud.stamp_ns - self.stamp_ns))
+        is_sure = stored_confidence(cloud.confidence) >= self._min_confidence
+        keep = is_sure & (age <= self._max_age)
+        self._num_points[path] = Kept(len(keep), int(keep.sum()))
+        return cloud.select(keep)
+
+
+def finished_runs(folder: Path, thresholds: Thresholds = EVERYTHING) -> list[FinishedRun]:
+    """Return the run in a folder, or the runs below it by parent folder and frame number."""
+    paths = [path for depth in ("*", "*/*") for path in folder.glob(f"{depth}/run.yaml")]
+    folders = sorted(path.parent for path in paths)
+    if (folder / "run.yaml").is_file() or not folders:
+        folders = [folder]
+    runs = [FinishedRun(folder, thresholds) for folder in folders]
+    return sorted(runs, key=lambda run: (run.folder.parent, run.key))
+
+
+def key_poses(runs: Sequence[FinishedRun]) -> Iterator[Float]:
+    """Yield ``T_world_key`` (4,4) of each run. The world is the first key sweep's lidar frame."""
+    T_world_key = np.eye(4)
+    for previous, run in zip([None, *runs], runs, strict=False):
+        if previous is not None:
+            T_world_key = T_world_key @ _relative_pose(previous, run)
+        yield T_world_key
+
+
+def _relative_pose(run: FinishedRun, next_run: FinishedRun) -> Float:
+    """Return the (4,4) pose of the next run's key sweep in the lidar frame of the key sweep."""
+    if next_run.key in run.scene.T_key_lidar:
+        return run.scene.T_key_lidar[next_run.key]
+    if run.key in next_run.scene.T_key_lidar:
+        return poses.inverse(next_run.scene.T_key_lidar[run.key])
+    raise InputError(
+        f"{next_run.folder}: neither key {next_run.key} nor {run.key} is in the other's window, "
+        f"and their relative pose is unknown; densify keys nearer to each other"
+    )
+
+
+def map_names(*folders: Path) -> list[str]:
+    """Return the names of the maps in folders: CAMERA, or CAMERA/NUMBER of one image."""
+    paths = {path.relative_to(folder) for folder in folders for path in folder.rglob("*.png")}
+    return sorted(path.with_suffix("").as_posix() for path in paths)
+
+
+def _without_run(folder: Path) -> str:
+    """Return what a folder without run.yaml is, as a clause for an error."""
+    if (folder / "dataset.json").is_file():
+        return (
+            "holds a training set of maps alone (--layout kitti-depth), and the other formats need "
+            "clouds, ages and images; make the set with --layout densify to export it"
+        )
+    return "no run.yaml in it"
+
+
+def read_scene(path: Path) -> SceneFile:
+    """Read and check scene.json."""
+    with _damage_named(path):
+        table = read_json(path)
+        T_key_lidar = {sweep["frame"]: sweep["T_key_lidar"] for sweep in table["sweeps"]}
+        return SceneFile(
+            table,
+            {name: _view(view) for name, view in table["views"].items()},
+            {f: checks.rigid(T, "T_key_lidar") for f, T in T_key_lidar.items() if T is not None},
+        )
+
+
+def read_tracks(path: Path) -> list[ObjectTrack]:
+    """Read and check the tracks of moving objects in movers.json."""
+    with _damage_named(path):
+        table = read_json(path)
+        tracks = [_track(entry) for entry in table["objects"]]
+        if any(table["key"] not in track.frames for track in tracks):
+            raise ValueError("an object has no pose at the key")
+        return tracks
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """Turn errors by unexpected file content within the block into InputError with the path."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
+        if str(error).startswith(str(path)):
+            raise
+        reason = brief(f"{type(error).__name__}: {error}")
+        raise InputError(
+            f"{path}: damaged, or of another version ({reason}); densify the key again"
+        ) from error
+
+
+def _view(entry: Mapping[str, Any]) -> CameraView:
+    """Return the camera and pose of an entry in scene.json."""
+    values = {field.name: entry[field.name] for field in fields(Camera)} | {
+        "K": _array(entry["K"], 3, 3),
+        "T_cam_lidar": checks.rigid(entry["T_cam_lidar"], "T_cam_lidar"),
+        "distortion": tuple(map(float, entry["distortion"])),
+    }
+    camera = Camera(**values)
+    is_known = camera.model in ("pinhole", "fisheye", "mei")
+    if not is_known or not min(camera.width_px, camera.height_px, camera.K[0, 0]) > 0:
+        raise ValueError(f"camera {camera.name}: size, model or K")
+    T_cam_key = checks.rigid(entry["T_cam_key"], "T_cam_key")
+    return CameraView(camera, T_cam_key, float(entry["late_s"]), entry["number"])
+
+
+def _track(entry: Mapping[str, Any]) -> ObjectTrack:
+    """Return the track of an entry in movers.json."""
+    columns = {name: [pose[name] for pose in entry["poses"]] for name in entry["poses"][0]}
+    T_key_object = [checks.rigid(T, "T_key_object") for T in columns["T_key_object"]]
+    return ObjectTrack(
+        instance=int(entry["instance"]),
+        size_m=_array(entry["size_m"], 3),
+        frames=tuple(map(int, columns["frame"])),
+        stamp_ns=np.array(columns["stamp_ns"], np.int64),
+        T_key_object=np.stack(T_key_object),
+        velocity_m_s=_array(columns["velocity_m_s"], len(T_key_object), 3),
+        num_points=np.array(columns["num_points"], np.int64),
+        seen_size_m=_array(entry["seen_size_m"], 3),
+        sides_seen=tuple(map(str, entry["sides_seen"])),
+    )
+
+
+def _array(value: Any, *shape: int) -> Float:
+    """Return an array of finite numbers of this shape; raise ValueError for any other."""
+    array = np.array(value, np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"expected {' x '.join(map(str, shape))} numbers")
+    return array
