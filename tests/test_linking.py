@@ -8,7 +8,7 @@ import pytest
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist
 
-from densify.geometry.linking import close_to_seeds, link
+from densify.geometry.nearest import close_to_seeds, link
 
 DISTANCE_M = 0.6
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.free_space import range_image
 from densify.free_space.range_image import RangeImage
-from densify.free_space.rings import Aimed, aimed, find_rings, fires_by_azimuth
+from densify.free_space.rays import Aimed, aimed, find_rings, fires_by_azimuth
 from densify.free_space.sensor import SensorModel, Sensors
 from densify.geometry.types import RegisteredSweep
 from densify.readers import checks

@@ -330,7 +330,7 @@ class _Moved(Recording):
         self._still, self._seed = still, seed
         super().__init__(sequence, still.settings, _WINDOW, [key], looks_around=True)
 
-    def _registration(self, number: int) -> Registration:
+    def registration(self, number: int) -> Registration:
         registration = self._still.registration(number)
         rng = np.random.default_rng(self._seed)
         pieces = tuple(_jittered(piece, rng) for piece in registration.pieces)

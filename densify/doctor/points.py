@@ -10,9 +10,16 @@ import numpy as np
 from densify.doctor.findings import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, finding
 from densify.doctor.sample import Sample, Spot
 from densify.free_space.ground import HeightMap, find_upright
-from densify.free_space.sectors import LOST_DEG, blind_sector, by_azimuth, lost_deg
+from densify.free_space.raw_sweeps import (
+    LOST_DEG,
+    MAP_FRAME_REMEDY,
+    blind_sector,
+    by_azimuth,
+    is_still,
+    lost_deg,
+    way_in_map,
+)
 from densify.free_space.sensor import Sensors
-from densify.free_space.sweep_frame import MAP_FRAME_REMEDY, is_still, way_in_map
 from densify.geometry.types import Float
 from densify.readers.timeline import format_frames, in_range
 

@@ -11,7 +11,7 @@ import numpy as np
 from densify.config import Config
 from densify.config.errors import InputError
 from densify.depth.exposure import Shot
-from densify.free_space.sectors import LOST_DEG, blind_sector, lost_deg
+from densify.free_space.raw_sweeps import LOST_DEG, blind_sector, lost_deg
 from densify.geometry import poses
 from densify.geometry.types import LidarSequence, Result, Stretch, Sweep
 from densify.pipeline.key_result import METHODS, looks_around

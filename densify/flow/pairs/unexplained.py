@@ -7,8 +7,7 @@ import numpy as np
 
 from densify.flow.pairs.surface import MISSING, PairCloud, Surface
 from densify.flow.tracking.candidates import LINK_M, cluster_around
-from densify.geometry.linking import link
-from densify.geometry.nearest import is_near, tree_of
+from densify.geometry.nearest import is_near, link, tree_of
 from densify.geometry.types import Bool, Float, Float32, Int
 
 _EXPLAINED_M = 0.1  # a closer point is a counterpart

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from densify.flow.tracking.candidates import LINK_M
-from densify.geometry.arrays import bulk
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import Kernel
-from densify.geometry.nearest import nearest, tree_of
+from densify.geometry.nearest import bulk, nearest, tree_of
 from densify.geometry.types import Float, Int
 
 Bytes = NDArray[np.uint8]
