@@ -20,9 +20,7 @@ def regular(hz: float, num: int = 61) -> Clock:
     return Clock(np.rint(np.arange(num) * 1e9 / hz).astype(np.int64))
 
 
-@pytest.mark.parametrize(
-    ("hz", "num_each_side"), [(2, 2), (5, 5), (9.66, 10), (10, 10), (10.3, 10), (20, 10), (25, 10)]
-)
+@pytest.mark.parametrize(("hz", "num_each_side"), [(2, 2), (9.66, 10), (10.3, 10), (25, 10)])
 def test_a_second_around_is_asked_to_the_nearest_sweep_and_evenly(hz, num_each_side):
     clock, i = regular(hz), 30
     around = clock.around(i, REACH_S, 10)

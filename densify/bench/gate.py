@@ -39,8 +39,8 @@ from densify.geometry.types import (
     Truth,
 )
 from densify.outputs.atomic import write_file
-from densify.pipeline.costs import Watch
 from densify.pipeline.key_result import METHODS, see
+from densify.pipeline.process import Watch
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import scene_of
 from densify.readers import open_sequence

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from densify import __version__
 from densify.config import Config, as_mapping
 from densify.config.errors import InputError
 from densify.config.file_content import read_json
@@ -33,6 +32,7 @@ from densify.outputs.recording_folder import is_same
 from densify.pipeline.sweeps import Cut
 from densify.readers import Spec, open_sequence
 from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, runs
+from densify.version import __version__
 
 SCHEMA_VERSION = 1
 _KNOWN = {

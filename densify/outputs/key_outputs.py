@@ -47,7 +47,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from densify import __version__
 from densify.geometry.types import Result
 from densify.outputs.atomic import plain, write_file, write_json
 from densify.outputs.cloud_laz import write_cloud
@@ -60,6 +59,7 @@ from densify.outputs.depth_png import (
     write_depth_png,
     write_flow_png,
 )
+from densify.version import __version__
 
 SCHEMA_VERSION = 1
 """Version of each JSON file. It grows when a field changes its meaning or is removed."""

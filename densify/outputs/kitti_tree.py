@@ -16,10 +16,10 @@ from typing import Any, Literal
 
 import yaml
 
-from densify import __version__
 from densify.geometry.types import DepthMap
 from densify.outputs.atomic import plain, write_file
 from densify.outputs.depth_png import write_confidence_png, write_depth_png
+from densify.version import __version__
 
 Split = Literal["train", "val"]
 

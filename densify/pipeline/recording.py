@@ -48,7 +48,7 @@ from densify.geometry.types import (
     Sweep,
     Trajectory,
 )
-from densify.pipeline.costs import Watch
+from densify.pipeline.process import Watch
 from densify.pipeline.road import Road
 from densify.pipeline.sweeps import Cut, Sweeps
 from densify.readers.timeline import (

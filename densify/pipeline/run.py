@@ -7,7 +7,7 @@
     accumulate rigidly, or with flow   recording.moment   (free space, ground, motion)
     find static surfaces beyond it     recording.standing
     see, project, fill, score          densify.pipeline.key_result, method by method
-    complete with a prior              densify.pipeline.prior
+    complete with a prior              densify.pipeline.key_result
     warn                               densify.pipeline.warnings
 """
 
@@ -33,15 +33,16 @@ from densify.flow.engines import check_engine
 from densify.free_space.range_image import RangeImage
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Cloud, LidarSequence, Progress, Result, StretchFlow
-from densify.pipeline.costs import Watch
 from densify.pipeline.key_result import (
     COMPARED,
     METHODS,
     KeyScene,
+    complete_with_prior,
     looks_around,
     methods_of_run,
     result_of_method,
 )
+from densify.pipeline.process import Watch
 from densify.pipeline.recording import Beyond, Moment, Recording
 from densify.pipeline.warnings import add_warnings
 from densify.readers.timeline import choose_cameras
@@ -212,8 +213,6 @@ def densify(
         bare_results = list(pool.map(make, methods, filled))
 
     if priors is not None:
-        from densify.pipeline.prior import complete_with_prior
-
         with watch.stage("prior"):
             kind = settings.prior.kind
             bare_results[-1] = complete_with_prior(

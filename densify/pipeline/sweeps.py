@@ -13,7 +13,7 @@ from densify.config.cache import Cache, digest, kept
 from densify.config.errors import InputError
 from densify.free_space.raw_sweeps import by_azimuth
 from densify.geometry.types import Float, Int, LidarSequence, Sweep
-from densify.pipeline.costs import Watch
+from densify.pipeline.process import Watch
 from densify.readers.timeline import Timeline, check_key, check_window, read_sweep
 
 BLOCK_S = 2.0

@@ -12,9 +12,9 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from densify import __version__
 from densify.cli.verbs import bench, dataset, evaluate, finished, flow, recordings, run, train
 from densify.config.errors import brief, did_you_mean
+from densify.version import __version__
 
 _USUAL = (
     *(recordings.add_info, recordings.add_doctor, run.add_run, run.add_compare, dataset.add),

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from densify import __version__
 from densify.config.errors import InputError, did_you_mean
 from densify.config.plugins import EXPORTS
 from densify.outputs.atomic import plain
 from densify.outputs.export.finished_run import FinishedRun, Kept, finished_runs
 from densify.outputs.store import writing
+from densify.version import __version__
 
 # Fields: run, to (format), min_confidence, max_age_ms (null for any age), density (camera ->
 # measured, filled -> before, after the thresholds: shares of the pixels), num_points, version

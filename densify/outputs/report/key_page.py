@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from densify import __version__
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry.types import ObjectTrack, Result
@@ -26,6 +25,7 @@ from densify.outputs.key_outputs import Context
 from densify.outputs.report.page_file import Blobs, packed_camera, packed_cloud, page_file
 from densify.outputs.scene_file import read_scene, read_tracks
 from densify.readers.decoded_files import decode_image
+from densify.version import __version__
 
 T = TypeVar("T")
 _MAPS: Mapping[str, type[np.uint8] | type[np.uint16]] = {
