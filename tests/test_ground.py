@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.free_space import ground as module
 from densify.free_space.ground import HeightMap, ground
 from densify.geometry import poses
 from densify.geometry.types import Stretch
@@ -102,16 +101,6 @@ def test_many_and_few_returns_find_the_same_ground():
     near_m, far_m = found[x[:, 0] < -1], found[x[:, 0] > 1]
     assert abs(near_m.mean()) < 0.005 and abs(far_m.mean()) < 0.01
     assert abs(near_m.mean() - far_m.mean()) < 0.01
-
-
-def test_the_slope_limit_against_a_slow_twin():
-    rng = np.random.default_rng(2)
-    heights = rng.uniform(0, 3, (9, 12))
-    at = np.argwhere(np.ones_like(heights))
-    steps = np.sort(np.abs(at[:, None] - at[None]), axis=2)
-    distance = steps[..., 1] - steps[..., 0] + np.sqrt(2) * steps[..., 0]  # straight and diagonal
-    expected = (heights.ravel() + 0.15 * distance).min(1).reshape(heights.shape)
-    np.testing.assert_allclose(module._slope_limited(heights, 0.15), expected, atol=1e-12)
 
 
 def test_under_a_vehicle_that_never_left_its_place_is_the_ground_around_it():

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -43,9 +42,7 @@ def test_free_in_front_of_a_wall_not_on_it_nor_behind_nor_beside_the_beams(room)
         assert not room.sees_through(outside, 0, 0).any()
 
 
-def test_wraps_behind_the_scanner(room):
-    azimuth = 180 + np.linspace(-3, 3, 601)
-    assert room.sees_through(on_sphere(azimuth, 1.0, 8.0), *MARGIN, min_filled=8).all()
+def test_wraps_behind_the_scanner():
     # a mast behind the scanner blocks across the seam
     mast = Box((0.8, 0.8, 5), Arc(-6.0, 0.0))
     image = RangeImage.of(standing_sweep((*ROOM, mast)))
@@ -268,36 +265,6 @@ def sweep_of(name: str, moving: bool, frame: int = 0, world: World = POSTS) -> R
 
 
 UNORDERED = ["panda", "rosette"]
-
-
-@pytest.mark.parametrize("name", UNORDERED)
-def test_each_cell_has_a_time_of_its_own(name):
-    registered = sweep_of(name, moving=False)
-    images = RangeImage.of(registered).scanners
-    assert 1 < len(images) <= 5
-    sizes = [image.nearest_m.shape for image in images]
-    for (rows, columns), (half_rows, half_columns) in pairwise(sizes):
-        assert half_rows == pytest.approx(rows / 2, abs=1)
-        assert half_columns == pytest.approx(columns / 2, abs=1) or columns < 200
-    for image in images:
-        assert image.offset_s.shape == image.spread_s.shape == image.nearest_m.shape
-        asked = registered.sweep.points[::7]
-        first, last = when_around(image, asked)
-        offset_s = registered.sweep.offset_ns[::7] * 1e-9
-        # a return on the edge of a cell may fall on either side
-        assert np.mean((first - 1e-6 <= offset_s) & (offset_s <= last + 1e-6)) > 0.99
-
-
-def when_around(image: ScannerImage, points) -> tuple[np.ndarray, np.ndarray]:
-    """First and last time at which the cells around each point's were looked at."""
-    x, y, z = (points - image.origin_m).T
-    rows, columns = image.nearest_m.shape
-    row = np.searchsorted(image.row_edges_rad, np.arctan2(z, np.hypot(x, y))) - 1
-    column = ((np.arctan2(y, x) + np.pi) / (2 * np.pi) * columns).astype(int) % columns
-    middle, spread = (
-        t[np.clip(row, 0, rows - 1), column] for t in (image.offset_s, image.spread_s)
-    )
-    return middle - spread, middle + spread
 
 
 @pytest.mark.parametrize("name", UNORDERED)

@@ -202,14 +202,6 @@ def test_a_cache_gives_the_same_bytes_and_saves_the_work(
             assert_same_maps(made[-1].depth, made[0].depth)
 
 
-def test_each_key_has_its_costs(long_street) -> None:
-    results = dict(pipeline.run_keys(long_street, [4, 5, 6], 1, "icp", config=GIVEN))
-    stages = [{cost.name for cost in results[key].costs} for key in (4, 5, 6)]
-    # Registration serves all keys; it counts for the first.
-    assert "register" in stages[0] and "register" not in stages[1] | stages[2]
-    assert "project" in stages[0] & stages[1] & stages[2]
-
-
 def test_of_two_sweeps_the_pair_alone_tells_what_moves() -> None:
     """A track shows itself in three."""
 

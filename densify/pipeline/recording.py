@@ -49,7 +49,7 @@ from densify.geometry.types import (
     Trajectory,
 )
 from densify.pipeline.process import Watch
-from densify.pipeline.road import Road
+from densify.pipeline.road import Road, views_of
 from densify.pipeline.sweeps import Cut, Sweeps
 from densify.readers.timeline import (
     Timeline,
@@ -385,18 +385,18 @@ class Recording:
     @_latest
     def _far(self, piece: Piece) -> StandingWorld:
         """Return the static surfaces along the road of a piece, in the piece's world."""
-        cameras = list(self.sequence.cameras.values())
-        far_m, settings = self.settings.accumulate.far_m, self.settings.register
-        road = Road(self.timeline, self._sweeps, cameras, settings, far_m)
         # Sweeps of the block outside the windows belong to the far range.
         inside = self._in_windows(piece.number)
         in_windows = tuple(f for f in piece.frames if f in inside) or piece.frames
 
         def make() -> StandingWorld:
             keys = [k for k in self.cut.keys_of(piece.number) if k in in_windows]
-            stretch = self._stretch(piece, in_windows)
+            window, cameras = self._stretch(piece, in_windows), self.sequence.cameras.values()
             with self._watch.stage("far"):
-                return road.find_standing(stretch, keys, with_window=len(keys) > 1)
+                views, far_m = views_of(cameras, window, keys), self.settings.accumulate.far_m
+                register = self.settings.register
+                road = Road(self.timeline, self._sweeps, register, far_m, window, views)
+                return road.find_standing(with_window=len(keys) > 1)
 
         # Processes of one run share the result. A digest would read every sweep of the road.
         shared = self._cache if self._run is not None else None
