@@ -7,8 +7,7 @@ returns (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for free space).
 
 A scanner that does not fire in order of azimuth (solid state, rosettes) faces a cell at several
 times. The cell keeps their middle and their spread, which widens the margin. The density of such
-rays varies. Therefore several images are made, each with cells twice as large, and each is used
-where enough of its cells are filled.
+rays varies. Therefore several images are made, each with cells twice as large.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ _SETTLED = 0.1  # share of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
 _DENSEST = 10  # percent of the returns of an unordered scanner that set its finest cells
 MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
-_VOUCHED, _MAX_SIZES = 0.8, 5  # share of returns with enough filled cells; number of cell sizes
+_NUM_SIZES = 4  # of the cells of an unordered scanner
 _HIDES = 1000  # penalty of a hiding return, above the number of cells of all images added up
 _PI, _ZERO = np.float32(np.pi), np.float32(0)
 
@@ -69,14 +68,6 @@ class ScannerImage(NamedTuple):
     twists: Float32  # (2,6) float32 twist of the lidar before and after the reference time
     from_m: float  # least range at which the image is used
     to_m: float  # greatest range at which the image is used
-
-    def in_range(self, points: Float32) -> Bool:
-        """Return (N,) True for points (N,3), lidar frame, at whose range the image is used."""
-        if self.from_m == 0 and self.to_m == np.inf:
-            return np.ones(len(points), bool)
-        from_scanner = points - self.origin_m
-        range_m2 = np.einsum("ij,ij->i", from_scanner, from_scanner)
-        return np.asarray((range_m2 >= self.from_m**2) & (range_m2 < self.to_m**2))
 
 
 @dataclass(frozen=True)
@@ -134,20 +125,14 @@ class RangeImage:
         several sweeps may be added. Points and velocities are as in `sees_through`.
         """
         points32 = np.ascontiguousarray(points, np.float32)
-        is_static = velocity_m_s is None
-        velocity = np.zeros((1, 3)) if is_static else velocity_m_s
+        velocity = np.zeros((1, 3)) if velocity_m_s is None else velocity_m_s
         velocity32 = np.ascontiguousarray(velocity, np.float32)
         margins = np.array(margins_m, np.float32)
         beyond = np.zeros((len(self.scanners), len(points)), np.int16)
         for scanner, scanner_beyond in zip(self.scanners, beyond, strict=True):
-            used = scanner.in_range(points32)
-            queries, velocities = points32, velocity32
-            if not used.all():
-                queries = points32[used]
-                velocities = velocity32 if is_static else velocity32[used]
-            num = np.zeros(len(queries), np.int16)
-            _see_beyond.over_rows(len(num), queries, velocities, scanner, margins, min_filled, num)
-            scanner_beyond[used] = num
+            _see_beyond.over_rows(
+                len(points), points32, velocity32, scanner, margins, min_filled, scanner_beyond
+            )
         return beyond
 
 
@@ -159,7 +144,6 @@ class _Cells(NamedTuple):
     from_m: float = 0.0
     to_m: float = np.inf
     lone: bool = False  # every other row is a single ring, and the rows between hold no ring
-    coarser: bool = False  # used only where the previous image has too many empty cells
 
 
 def _images(
@@ -167,12 +151,8 @@ def _images(
 ) -> list[ScannerImage]:
     """Return the images of scanner ``lidar``, finest first; arguments as in `RangeImage.of`."""
     rays = aimed(registered, lidar)
-    images: list[ScannerImage] = []
-    for cells in _cells(rays, num_together, by_ring):
-        if cells.coarser and images and _share_vouched(images[-1], rays) >= _VOUCHED:
-            break
-        images.append(_image(registered, lidar, rays, cells))
-    return images
+    cells_of_images = _cells(rays, num_together, by_ring)
+    return [_image(registered, lidar, rays, cells) for cells in cells_of_images]
 
 
 def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) -> ScannerImage:
@@ -239,12 +219,6 @@ def _offset_per_column(column: Int, offset_s: Float32, num_columns: int) -> Floa
     return mean_s.astype(np.float32)
 
 
-def _share_vouched(image: ScannerImage, rays: Aimed) -> float:
-    """Return the share of rays with enough filled cells around them."""
-    row, column = _cell_of(rays, image.row_edges_rad, image.num_filled.shape[1])
-    return float((image.num_filled[np.maximum(row, 0), column] >= MIN_FILLED).mean())
-
-
 def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     """Choose the cells of one scanner's images, finest first; arguments as in `RangeImage.of`."""
     if len(rays.azimuth) < FEW_POINTS:
@@ -260,8 +234,8 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
     flatten = float(np.cos(np.median(rays.elevation)))
     return [
-        _grid(_uniform_edges(rays.elevation, size), size / flatten)._replace(coarser=True)
-        for size in finest * 2.0 ** np.arange(_MAX_SIZES)
+        _grid(_uniform_edges(rays.elevation, size), size / flatten)
+        for size in finest * 2.0 ** np.arange(_NUM_SIZES)
     ]
 
 
@@ -395,6 +369,8 @@ def _see_beyond(begin, end, points, velocity, image, margins, min_filled, beyond
             if r < 0 or image.num_filled[r, c] < min_filled:
                 continue
             range_m = np.sqrt(horizontal_m * horizontal_m + z[k] * z[k])
+            if range_m < image.from_m or range_m >= image.to_m:
+                continue
             margin_m = max(margins[0], margins[1] * range_m)
             away_s = abs(image.offset_s[0 if by_azimuth else r, c] - time_s[k])
             if by_azimuth:

@@ -18,7 +18,6 @@ from densify.geometry.types import Bool, Float, Stretch
 
 REACH_S = 1.0
 """Greatest time between a sweep and the sweeps that are tested against its points."""
-_MOST_TESTED = 10  # number of sweeps on each side; more sweeps cost time and find nothing more
 FREE_MARGIN = 0.4, 0.015  # m, share of the range: the larger tolerates errors of registration
 
 
@@ -51,8 +50,11 @@ class FreeSpace:
 
     def others(self, i: int) -> list[int]:
         """Return the indices of the sweeps, one of each other batch, to test against sweep i."""
-        around = self.clock.around(i, REACH_S, _MOST_TESTED * max(map(len, self.batches)))
-        return sorted({self._batch_of[j][0] for j in around} - {self._batch_of[i][0]})
+        return [
+            batch[0]
+            for batch in self.batches
+            if i not in batch and any(self.clock.near(i, j, REACH_S) for j in batch)
+        ]
 
     @cached_property
     def _batch_of(self) -> dict[int, tuple[int, ...]]:
