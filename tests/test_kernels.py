@@ -109,5 +109,5 @@ def test_errors_come_through_once_all_are_done(shared_out, where):
             raise ValueError("here")
 
     with pytest.raises(ValueError, match="here"):
-        kernels.over_rows(fail, 300)
+        kernels.Kernel.over_rows(fail, 300)
     assert len(done) == 3

@@ -37,7 +37,6 @@ from densify.geometry.types import (
     Cloud,
     Float,
     FlowField,
-    Int,
     LidarSequence,
     Motion,
     ObjectTrack,
@@ -149,10 +148,9 @@ class Recording:
         self._num_lead_in = max(_MIN_LEAD_IN, timeline.num_in(_LEAD_IN_S - around_s))
         self._run = run
         num_raw = max(map(len, self.cut.blocks), default=0) + self._num_lead_in
-        self._sweeps = Sweeps(
+        self.sweeps = Sweeps(
             sequence, timeline, settings.register, num_raw, cache, run, self._watch
         )
-        self.forget_raw = self._sweeps.read.cache_clear
         self._results: dict[str, tuple[tuple[Any, ...], Any]] = {}  # of `_latest`, by method
 
     def _look_around(self, keys: Collection[int]) -> tuple[float, float]:
@@ -189,14 +187,6 @@ class Recording:
     def window(self, key: int) -> Stretch:
         """Return the registered, deskewed sweeps of a key's window. Raises as `window_frames`."""
         return self._stretch(self._piece(key), self.window_frames(key).frames)
-
-    def raw(self, frame: int) -> Sweep:
-        """Return a raw sweep (not deskewed), without returns of the own vehicle."""
-        return self._sweeps.read(frame)
-
-    def returns(self, frames: Sequence[int]) -> Int:
-        """Return the (n,360) number of returns of raw sweeps in each degree of azimuth."""
-        return np.stack([self._sweeps.returns_by_azimuth(frame) for frame in frames])
 
     def around(self, key: int) -> Stretch:
         """Return the registered sweeps, within and around a key's window, searched for motion."""
@@ -285,12 +275,12 @@ class Recording:
         frames = self._registered_together(number)
 
         def make() -> Registration:
-            self._sweeps.prepare(frames)
+            self.sweeps.prepare(frames)
             sweeps, bad, pieces = {}, {}, []
             for frame in frames:
                 try:
-                    self._sweeps.recorded_pose(frame)
-                    sweeps[frame] = self._sweeps.read(frame)
+                    self.sweeps.recorded_pose(frame)
+                    sweeps[frame] = self.sweeps.read(frame)
                 except InputError as error:
                     bad[frame] = LeftOut(str(error), unreadable=True)
             remaining = self.timeline.runs(sweeps)
@@ -345,7 +335,7 @@ class Recording:
         """Return deskewed sweeps of a piece, in its world."""
         for frame in frames:
             if frame not in piece.deskewed:
-                sweep = self._sweeps.read(frame)
+                sweep = self.sweeps.read(frame)
                 with self._watch.stage("deskew"):
                     piece.deskewed[frame] = deskew([sweep], piece.poses).sweeps[0]
         return Stretch(tuple(piece.deskewed[frame] for frame in frames))
@@ -395,7 +385,7 @@ class Recording:
             with self._watch.stage("far"):
                 views, far_m = views_of(cameras, window, keys), self.settings.accumulate.far_m
                 register = self.settings.register
-                road = Road(self.timeline, self._sweeps, register, far_m, window, views)
+                road = Road(self.timeline, self.sweeps, register, far_m, window, views)
                 return road.find_standing(with_window=len(keys) > 1)
 
         # Processes of one run share the result. A digest would read every sweep of the road.
@@ -419,7 +409,7 @@ class Recording:
         """Return the result of ``make``, or the cached result for the same sweeps and settings."""
 
         def inputs() -> Any:
-            content = [(f, self._sweeps.content(f)) for f in frames]
+            content = [(f, self.sweeps.content(f)) for f in frames]
             code, period_ns = code_digest(), self.timeline.period_ns
             return [code, self.settings.register, period_ns, content, list(settings)]
 

@@ -43,7 +43,7 @@ from densify.pipeline.key_result import (
     result_of_method,
 )
 from densify.pipeline.process import Watch
-from densify.pipeline.recording import Beyond, Moment, Recording
+from densify.pipeline.recording import Beyond, Recording
 from densify.pipeline.warnings import add_warnings
 from densify.readers.timeline import choose_cameras
 
@@ -201,10 +201,14 @@ def densify(
     with ThreadPoolExecutor(num_threads()) as pool:
         wants_far = any(METHODS[name].far for name in methods)
         far = pool.submit(recording.standing, key) if wants_far else None
-        moments = _moments(recording, key, methods)
+        with_flow = settings.output.flow != "none"
+        moments = {
+            name: recording.moment(key, METHODS[name].all_sweeps, METHODS[name].engine, with_flow)
+            for name in methods
+        }
         beyond = far.result() if far is not None else None
         if key == max(recording.cut.number_of):  # no later key needs them
-            recording.forget_raw()
+            recording.sweeps.read.cache_clear()
         scene = scene_of(
             recording, key, shots, images, beyond, moments[methods[-1]].cloud, with_images, watch
         )
@@ -225,15 +229,6 @@ def densify(
             result, costs=costs, baselines=dict(results), recording=sequence.name
         )
     return add_warnings(results, recording, key, shots)
-
-
-def _moments(recording: Recording, key: int, methods: Sequence[str]) -> dict[str, Moment]:
-    """Return the points at the key's time by method, as each method accumulates them."""
-    moments, with_flow = {}, recording.settings.output.flow != "none"
-    for name in methods:
-        method = METHODS[name]
-        moments[name] = recording.moment(key, method.all_sweeps, method.engine, with_flow)
-    return moments
 
 
 def scene_of(

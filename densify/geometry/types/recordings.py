@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Protocol
 
@@ -86,16 +86,11 @@ class Trajectory:
 
     def part(self, frames: Sequence[int], origin: int) -> Trajectory:
         """Return the poses of some frames in the levelled lidar frame of the sweep ``origin``."""
-        rows = [self.frames.index(f) for f in frames]
-        T_new_lidar = np.eye(4)
+        rows, T_new_lidar = [self.frames.index(f) for f in frames], np.eye(4)
         T_new_lidar[:3, :3] = self.R_level_lidar
         T_new_old = T_new_lidar @ inverse(self.T_world_lidar[self.frames.index(origin)])
-        return replace(
-            self,
-            frames=tuple(frames),
-            stamp_ns=self.stamp_ns[rows],
-            T_world_lidar=T_new_old @ self.T_world_lidar[rows],
-        )
+        T_new = T_new_old @ self.T_world_lidar[rows]
+        return Trajectory(tuple(frames), self.stamp_ns[rows], T_new, self.R_level_lidar)
 
 
 @dataclass(frozen=True)
@@ -122,16 +117,9 @@ class RegisteredSweep:
     @staticmethod
     def without_points(trajectory: Trajectory, frame: int) -> RegisteredSweep:
         """Return the pose and time of a frame of the trajectory as a sweep without points."""
-        i, nothing = trajectory.frames.index(frame), np.zeros(0)
-        sweep = Sweep(
-            frame=frame,
-            stamp_ns=int(trajectory.stamp_ns[i]),
-            points=np.zeros((0, 3)),
-            intensity=nothing.astype(np.float32),
-            offset_ns=None,
-            lidar=nothing.astype(np.uint8),
-            row=nothing.astype(np.int64),
-        )
+        i, lidar, row = trajectory.frames.index(frame), np.zeros(0, np.uint8), np.zeros(0, np.int64)
+        points, intensity = np.zeros((0, 3)), np.zeros(0, np.float32)
+        sweep = Sweep(frame, int(trajectory.stamp_ns[i]), points, intensity, None, lidar, row)
         return RegisteredSweep(sweep, trajectory.T_world_lidar[i], np.zeros(6), np.zeros(6))
 
 
@@ -191,12 +179,9 @@ class FlowField:
     @staticmethod
     def zero(num_points: int) -> FlowField:
         """Return the flow of ``num_points`` points that are all static."""
-        return FlowField(
-            displacement=np.zeros((num_points, 3)),
-            moving=np.zeros(num_points, bool),
-            instance=np.full(num_points, -1, np.int32),
-            lost=np.zeros(num_points, bool),
-        )
+        displacement, instance = np.zeros((num_points, 3)), np.full(num_points, -1, np.int32)
+        moving, lost = np.zeros((2, num_points), bool)
+        return FlowField(displacement, moving, instance, lost)
 
 
 class Motion(Protocol):
