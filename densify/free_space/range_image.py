@@ -7,7 +7,8 @@ returns (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for free space).
 
 A scanner that does not fire in order of azimuth (solid state, rosettes) faces a cell at several
 times. The cell keeps their middle and their spread, which widens the margin. The density of such
-rays varies. Therefore several images are made, each with cells twice as large.
+rays varies. Therefore several images are made, each with cells twice as large, and each is used
+where enough of its cells are filled.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _SETTLED = 0.1  # share of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
 _DENSEST = 10  # percent of the returns of an unordered scanner that set its finest cells
 MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
-_NUM_SIZES = 4  # of the cells of an unordered scanner
+_VOUCHED, _MAX_SIZES = 0.8, 5  # share of returns with enough filled cells; number of cell sizes
 _HIDES = 1000  # penalty of a hiding return, above the number of cells of all images added up
 _PI, _ZERO = np.float32(np.pi), np.float32(0)
 
@@ -144,6 +145,7 @@ class _Cells(NamedTuple):
     from_m: float = 0.0
     to_m: float = np.inf
     lone: bool = False  # every other row is a single ring, and the rows between hold no ring
+    coarser: bool = False  # used only where the previous image has too many empty cells
 
 
 def _images(
@@ -151,8 +153,12 @@ def _images(
 ) -> list[ScannerImage]:
     """Return the images of scanner ``lidar``, finest first; arguments as in `RangeImage.of`."""
     rays = aimed(registered, lidar)
-    cells_of_images = _cells(rays, num_together, by_ring)
-    return [_image(registered, lidar, rays, cells) for cells in cells_of_images]
+    images: list[ScannerImage] = []
+    for cells in _cells(rays, num_together, by_ring):
+        if cells.coarser and images and _share_vouched(images[-1], rays) >= _VOUCHED:
+            break  # still larger cells would call the gaps between posts free
+        images.append(_image(registered, lidar, rays, cells))
+    return images
 
 
 def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) -> ScannerImage:
@@ -219,6 +225,12 @@ def _offset_per_column(column: Int, offset_s: Float32, num_columns: int) -> Floa
     return mean_s.astype(np.float32)
 
 
+def _share_vouched(image: ScannerImage, rays: Aimed) -> float:
+    """Return the share of rays with enough filled cells around them."""
+    row, column = _cell_of(rays, image.row_edges_rad, image.num_filled.shape[1])
+    return float((image.num_filled[np.maximum(row, 0), column] >= MIN_FILLED).mean())
+
+
 def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     """Choose the cells of one scanner's images, finest first; arguments as in `RangeImage.of`."""
     if len(rays.azimuth) < FEW_POINTS:
@@ -234,8 +246,8 @@ def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
     finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
     flatten = float(np.cos(np.median(rays.elevation)))
     return [
-        _grid(_uniform_edges(rays.elevation, size), size / flatten)
-        for size in finest * 2.0 ** np.arange(_NUM_SIZES)
+        _grid(_uniform_edges(rays.elevation, size), size / flatten)._replace(coarser=True)
+        for size in finest * 2.0 ** np.arange(_MAX_SIZES)
     ]
 
 
