@@ -34,9 +34,9 @@ def select_rows(container: T, keep: Bool | Int | slice, columns: Sequence[str] =
 
 def joined_rows(containers: Iterable[T]) -> T:
     """Return one dataclass or named tuple, all of whose fields are columns, of several."""
-    parts = list(containers)
-    names = _field_names(parts[0])
-    return _replaced(parts[0], {n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+    pieces = list(containers)
+    names = _field_names(pieces[0])
+    return _replaced(pieces[0], {n: np.concatenate([getattr(p, n) for p in pieces]) for n in names})
 
 
 def _field_names(container: Any) -> Sequence[str]:

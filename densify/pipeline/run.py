@@ -218,10 +218,8 @@ def densify(
 
     if priors is not None:
         with watch.stage("prior"):
-            kind = settings.prior.kind
-            bare_results[-1] = complete_with_prior(
-                bare_results[-1], priors, shots, scene.truth, kind
-            )
+            completed = bare_results[-1], priors, shots, scene.truth, settings.prior.kind
+            bare_results[-1] = complete_with_prior(*completed)
     results: dict[str, Result] = {}
     costs = watch.costs()
     for result in bare_results:
