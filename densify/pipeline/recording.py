@@ -186,7 +186,8 @@ class Recording:
 
     def window(self, key: int) -> Stretch:
         """Return the registered, deskewed sweeps of a key's window. Raises as `window_frames`."""
-        return self._stretch(self._piece(key), self.window_frames(key).frames)
+        frames = self.window_frames(key).frames  # raises first
+        return self._stretch(self._piece(key), frames)
 
     def around(self, key: int) -> Stretch:
         """Return the registered sweeps, within and around a key's window, searched for motion."""
