@@ -19,6 +19,7 @@ from densify.geometry.types import Float, Float32, Int, RegisteredSweep
 
 FEW_POINTS = 200  # too few to measure anything
 _DEFAULT_RAD = tuple(np.deg2rad([0.18, 0.40]))  # of a 64-beam scanner, along and between its rings
+_MANY_POINTS, _SECTOR_RAD = 15_000, np.deg2rad(5.0)  # of these, every fourth sector is enough
 
 # Bins of elevation in which rings and lines are found; cells of direction, and columns of azimuth
 _RING_BIN_RAD, _LINE_BIN_RAD, _CELL_RAD = np.deg2rad([0.02, 0.5, 1.0])
@@ -197,12 +198,13 @@ def measure(sweeps: Sequence[Aimed]) -> Layout:
         return Layout(
             None, False, step, RayTable.by_elevation(0.0, 1.0, np.array([step]), np.array([along]))
         )
-    rings = find_rings(np.concatenate([rays.elevation for rays in sweeps]))
+    sampled = [_some_sectors(rays) for rays in sweeps]
+    rings = find_rings(np.concatenate([rays.elevation for rays in sampled]))
     if rings is not None:
-        step = float(np.median([_step_along(rays, rings) for rays in sweeps]))
+        step = float(np.median([_step_along(rays, rings) for rays in sampled]))
         return Layout(rings, False, step, _table_of_rings(rings, step))
-    step, even_share = np.median([_even_step(rays) for rays in sweeps], axis=0).tolist()
-    if even_share >= _MIN_EVEN_SHARE and fires_by_azimuth(sweeps[0]):
+    step, even_share = np.median([_even_step(rays) for rays in sampled], axis=0).tolist()
+    if even_share >= _MIN_EVEN_SHARE and fires_by_azimuth(sampled[0]):
         return Layout(None, False, step, _table_of_lines(sweeps, step))
     table = _table_of_density(sweeps)
     step = float(np.median(table.at(sweeps[0].azimuth, sweeps[0].elevation)[:, 0]))
@@ -258,6 +260,15 @@ def fires_by_azimuth(rays: Aimed) -> bool:
     square = np.bincount(column, (rays.offset_s - mean_s[column]) ** 2)
     spread_s = np.sqrt(square / np.maximum(num, 1))[num >= _MIN_PER_COLUMN]
     return not len(spread_s) or bool(np.mean(spread_s < _AT_ONCE * duration_s) > 0.5)
+
+
+def _some_sectors(rays: Aimed) -> Aimed:
+    """Return every fourth sector of an all-round view, which is enough evidence."""
+    if len(rays.azimuth) > _MANY_POINTS:
+        in_sector = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
+        if in_sector.mean() > 0.1:
+            return Aimed(*(column[in_sector] for column in rays))
+    return rays
 
 
 def _in_groups(group: NDArray[Any], angle: Float32) -> Float:
