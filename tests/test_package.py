@@ -207,6 +207,7 @@ def test_no_file_can_have_code_run() -> None:
 
 
 FLOORS = (
+    ("version",),
     ("config",),
     ("geometry",),
     ("free_space",),
