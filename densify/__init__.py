@@ -20,6 +20,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from densify.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from densify.config import Config as Config
     from densify.config.errors import ComputationError as ComputationError
@@ -43,8 +45,6 @@ if TYPE_CHECKING:
     from densify.pipeline.run import run_keys as run_keys
     from densify.readers import open_sequence as open_sequence
     from densify.scores.depth_metrics import outlier_probability as outlier_probability
-
-__version__ = "0.1.0"
 
 _HOME = {
     "open_sequence": "densify.readers",

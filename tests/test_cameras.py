@@ -110,11 +110,8 @@ def test_rays_are_the_inverse(camera):
     # at the rim of a rational lens its tangential part folds over a point or two
     assert (off < 1e-9).mean() > 0.99 and off.max() < 0.01
 
-
-@pytest.mark.parametrize("camera", ALL, ids=lambda c: f"{c.model}-{len(c.distortion)}")
-def test_pixels_per_metre_are_the_differences(camera):
-    points = anywhere(400)
-    points = points[image_points(camera, points)[1]]
+    # the Jacobian by its differences
+    points = points[seen][:200]
     change = pixels_per_metre(camera, points)
     for axis in np.eye(3):
         there, back = (image_points(camera, points + s * 1e-4 * axis)[0] for s in (1, -1))
@@ -124,9 +121,6 @@ def test_pixels_per_metre_are_the_differences(camera):
         np.testing.assert_allclose(
             (change @ axis)[known], difference[known], atol=1e-4 * np.abs(change).max()
         )
-
-
-# --- what the lens does not see -------------------------------------------------------------------
 
 
 def test_far_off_axis_points_do_not_fold_back_into_the_image():
@@ -161,14 +155,10 @@ def test_a_fisheye_sees_behind_its_image_plane():
     narrow = replace(camera, max_angle_deg=95.0)
     assert image_points(narrow, at_angles(angles))[1].tolist() == [True] * 4 + [False] * 2
     assert image_points(camera, np.array([[0, 0, -3.0], [0.05, 0, 0.0]]))[1].tolist() == [False] * 2
-
-
-def test_the_polynomial_of_a_fisheye_does_not_fold_back():
-    k1 = -1 / (3 * np.radians(100) ** 2)  # grows up to 100 degrees
-    camera = make_camera((k1, 0.0, 0.0, 0.0), "fisheye", 2000, 2000, 300.0)
-    assert image_points(camera, at_angles([95, 99.9, 100.1, 150]))[1].tolist() == [
-        *(True, True, False, False)
-    ]
+    k1 = -1 / (3 * np.radians(100) ** 2)  # the polynomial grows up to 100 degrees
+    bent = replace(camera, distortion=(k1, 0.0, 0.0, 0.0))
+    seen = image_points(bent, at_angles([95, 99.9, 100.1, 150]))[1]
+    assert seen.tolist() == [True, True, False, False]
 
 
 @pytest.mark.parametrize("xi, ends_deg", [(2.0, 120.0), (0.5, 120.0), (0.0, 90.0)])
@@ -187,8 +177,8 @@ def test_the_sphere_of_mei_ends_where_its_radius_does(xi, ends_deg):
 
 @pytest.mark.parametrize(
     "lens",
-    [(0.1,), (0.1,) * 6, (np.nan,) * 4, (0.1,) * 12],
-    ids=["one", "six", "nan", "thin prism"],
+    [(0.1,), (np.nan,) * 4, (0.1,) * 12],
+    ids=["one", "nan", "thin prism"],
 )
 def test_bad_distortion_is_named(lens):
     with pytest.raises(InputError, match="camera cam: distortion: expected 0 or 4 or 5 or 8"):

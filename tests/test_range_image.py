@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -32,34 +31,24 @@ def room() -> RangeImage:
     return RangeImage.of(standing_sweep())
 
 
-# --- a wall ---------------------------------------------------------------------------------------
-
-
-def test_free_in_front_of_a_wall_not_on_it_nor_behind(room):
+def test_free_in_front_of_a_wall_not_on_it_nor_behind_nor_beside_the_beams(room):
     y = np.linspace(-8, 8, 50)
     for x, expected in ((5, True), (15, True), (19, True), (20, False), (20.5, False), (30, False)):
         points = np.stack([np.full(50, float(x)), y, np.zeros(50)], 1)
         assert (room.sees_through(points, *MARGIN) == expected).all(), x
+    assert not room.sees_through(standing_sweep().sweep.points, 0.0, 1e-4).any()
+    for elevation_deg in (-40.0, -17.0, 17.0, 40.0, 90.0):
+        outside = on_sphere(np.arange(0, 360, 5.0), elevation_deg, 1.2)
+        assert not room.sees_through(outside, 0, 0).any()
 
 
-def test_the_sweeps_own_returns_are_never_seen_through():
-    registered = standing_sweep()
-    image = RangeImage.of(registered)
-    assert not image.sees_through(registered.sweep.points, 0.0, 1e-4).any()
-
-
-def test_wraps_behind_the_scanner(room):
-    azimuth = 180 + np.linspace(-3, 3, 601)
-    assert room.sees_through(on_sphere(azimuth, 1.0, 8.0), *MARGIN, min_filled=8).all()
+def test_wraps_behind_the_scanner():
     # a mast behind the scanner blocks across the seam
     mast = Box((0.8, 0.8, 5), Arc(-6.0, 0.0))
     image = RangeImage.of(standing_sweep((*ROOM, mast)))
     free = image.sees_through(on_sphere(180 + np.linspace(-3, 3, 61), 1.0, 8.0), *MARGIN)
     assert not free.any()
     assert image.sees_through(on_sphere([170, 190], 1.0, 8.0), *MARGIN).all()
-
-
-# --- ignorance ------------------------------------------------------------------------------------
 
 
 def test_empty_directions_say_nothing():
@@ -74,16 +63,6 @@ def test_empty_directions_say_nothing():
     assert free[(around < 29) | (around > 61)].all()
 
 
-def test_nothing_is_known_above_and_below_the_beams(room):
-    for elevation_deg in (-40.0, -17.0, 17.0, 40.0, 90.0):
-        assert not room.sees_through(
-            on_sphere(np.arange(0, 360, 5.0), elevation_deg, 1.2), 0, 0
-        ).any()
-
-
-# --- rolling shutter ------------------------------------------------------------------------------
-
-
 def blocks(ego: Arc) -> Scene:
     """Deep blocks with gaps on both sides, before a far wall: depth jumps everywhere."""
     boxes = [Box((200.0, 2.0, 9.0), Arc(0, side * 30)) for side in (-1, 1)]
@@ -91,18 +70,11 @@ def blocks(ego: Arc) -> Scene:
     return Scene(World(tuple(boxes)), ego, Scanner(num_azimuths=1200))
 
 
-def seen_through_elsewhere(scene: Scene, first: int, other: int, twists=1.0) -> np.ndarray:
+def seen_through_elsewhere(scene: Scene, first: int, other: int) -> np.ndarray:
     """(K,3) points of the blocks within 40 m, as the first sweep measured them, that the other
     sweep sees through; in its lidar frame."""
     stretch = scene.stretch((first + other) // 2, abs(other - first))
-    image = RangeImage.of(
-        replace(
-            stretch[other],
-            twist_before=twists * stretch[other].twist_before,
-            twist_after=twists * stretch[other].twist_after,
-        )
-    )
-    scan = scene.scan(first)
+    image, scan = RangeImage.of(stretch[other]), scene.scan(first)
     on_block = (scan.box >= 0) & (np.linalg.norm(scan.sweep.points, axis=1) < 40)
     assert on_block.sum() > 5000
     T_other_first = stretch.T_target_source(other, first)
@@ -115,23 +87,17 @@ def fast() -> Scene:
     return blocks(Arc(0, 0, 0, 25.0, -0.3))
 
 
-@pytest.mark.parametrize(("first", "other"), [(2, 3), (2, 5), (5, 2)])
+@pytest.mark.parametrize(("first", "other"), [(2, 3), (5, 2)])
 def test_a_static_wall_is_never_free_however_fast_the_scanner_drives(fast, first, other):
     assert len(seen_through_elsewhere(fast, first, other)) == 0
 
 
-@pytest.mark.parametrize("turn_rad_s", [0.5, -0.5])
-@pytest.mark.parametrize(("first", "other"), [(2, 3), (2, 5)])
-def test_the_sector_that_a_turning_scanner_skips_is_not_free(turn_rad_s, first, other):
+@pytest.mark.parametrize(("turn_rad_s", "other"), [(0.5, 3), (0.5, 5), (-0.5, 5)])
+def test_the_sector_that_a_turning_scanner_skips_is_not_free(turn_rad_s, other):
     """A clockwise scanner that turns left covers less than a full circle: where one sweep ends and
     began, behind, is a sector that no ray has crossed."""
     turning = blocks(Arc(0, 0, 0, 8.0, turn_rad_s))
-    free = seen_through_elsewhere(turning, first, other)
-    azimuth_deg = np.rad2deg(np.arctan2(free[:, 1], free[:, 0]))
-    assert len(free) == 0, f"{len(free)} points at azimuths {np.unique(azimuth_deg.round(1))} deg"
-
-
-# --- a slow twin ----------------------------------------------------------------------------------
+    assert len(seen_through_elsewhere(turning, 2, other)) == 0
 
 
 def look(scanner: ScannerImage, point, velocity, margin_m, margin_fraction, min_filled):
@@ -169,10 +135,9 @@ def look(scanner: ScannerImage, point, velocity, margin_m, margin_fraction, min_
 
 
 @pytest.mark.parametrize("moving", [False, True])
-@pytest.mark.parametrize("turn_rad_s", [0.5])
-def test_lookup_against_a_slow_twin(turn_rad_s, moving):
+def test_lookup_against_a_slow_twin(moving):
     """Rolling shutter, velocity, the seam behind and an origin of its own."""
-    registered = blocks(Arc(0, 0, 0, 20.0, turn_rad_s)).stretch(2, 0).sweeps[0]
+    registered = blocks(Arc(0, 0, 0, 20.0, 0.5)).stretch(2, 0).sweeps[0]
     origins = np.array([[0.3, -0.2, 0.1]])
     sweep = replace(registered.sweep, scanner_origins=origins)
     image = RangeImage.of(replace(registered, sweep=sweep))
@@ -191,10 +156,7 @@ def test_lookup_against_a_slow_twin(turn_rad_s, moving):
     assert 0.1 < fast[sure].mean() < 0.9 and 0.1 < fast[:300].mean() < 0.9
 
 
-# --- odd input ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("num_points", [1, 199, 201])
+@pytest.mark.parametrize("num_points", [1, 201])
 def test_tiny_sweeps_know_little_and_never_fail(num_points):
     registered = standing_sweep()
     few = np.arange(len(registered.sweep)) < num_points
@@ -203,7 +165,10 @@ def test_tiny_sweeps_know_little_and_never_fail(num_points):
     assert image.sees_through(hung, *MARGIN).mean() < 0.2
 
 
-# --- rings one by one ----------------------------------------------------------------------------
+def share(image: RangeImage, elevation_deg: float, range_m: float) -> float:
+    """Share of points hung up ahead that are seen through."""
+    hung = on_sphere(np.linspace(-4, 4, 50), elevation_deg, range_m)
+    return float(image.sees_through(hung, *MARGIN).mean())
 
 
 def test_far_away_dense_rings_tell_of_a_slit_between_them():
@@ -218,17 +183,12 @@ def test_far_away_dense_rings_tell_of_a_slit_between_them():
     assert len(near.row_edges_rad) == len(usual.scanners[0].row_edges_rad) < len(far.row_edges_rad)
     assert near.to_m == far.from_m == pytest.approx(0.1 / (1.5 * np.deg2rad(30 / 127)), rel=0.02)
 
-    def share(image: RangeImage, elevation_deg: float, range_m: float, azimuth_deg: float) -> float:
-        azimuths_deg = np.linspace(-azimuth_deg, azimuth_deg, 50)
-        hung = on_sphere(azimuths_deg, elevation_deg, range_m)
-        return float(image.sees_through(hung, *MARGIN).mean())
-
-    assert share(finer, 0.4, 17.0, 4) == 1 and share(usual, 0.4, 17.0, 4) == 0
-    assert share(finer, 0.4, 10.0, 4) == 0  # a slight error of registration is more than two rings
-    assert share(finer, 3.0, 10.0, 4) == share(usual, 3.0, 10.0, 4) == 1
+    assert share(finer, 0.4, 17.0) == 1 and share(usual, 0.4, 17.0) == 0
+    assert share(finer, 0.4, 10.0) == 0  # a slight error of registration is more than two rings
+    assert share(finer, 3.0, 10.0) == share(usual, 3.0, 10.0) == 1
     highest_deg = 7.5 * 30 / 127  # of the rings that meet what stands there
     for off_m in (-0.05, 0.0, 0.05):  # badly registered
-        assert share(finer, highest_deg + np.rad2deg(off_m / 17.8), 17.8, 4) == 0
+        assert share(finer, highest_deg + np.rad2deg(off_m / 17.8), 17.8) == 0
 
 
 def test_a_ring_far_from_all_others_tells_of_what_is_on_its_rays():
@@ -237,18 +197,10 @@ def test_a_ring_far_from_all_others_tells_of_what_is_on_its_rays():
     sweep = Scene(World(ROOM), Arc(0, 0), scanner).stretch(2, 0).sweeps[0]
     usual, by_ring = RangeImage.of(sweep), RangeImage.of(sweep, by_ring=True)
     road_m = LIDAR_HEIGHT_M / np.sin(np.deg2rad(5.0))
-
-    def share(image: RangeImage, elevation_deg: float, range_m: float) -> float:
-        hung = on_sphere(np.linspace(-10, 10, 50), elevation_deg, range_m)
-        return float(image.sees_through(hung, *MARGIN).mean())
-
     assert share(by_ring, -5.0, road_m - 1.5) == 1 and share(usual, -5.0, road_m - 1.5) == 0
     assert share(by_ring, -5.0, road_m - 0.1) == share(by_ring, -5.0, road_m + 1.0) == 0
     assert share(by_ring, -4.5, road_m - 1.5) == share(usual, -4.5, road_m - 1.5) == 0
     assert share(by_ring, 4.0, 8.0) == share(usual, 4.0, 8.0) == 1
-
-
-# --- two scanners ---------------------------------------------------------------------------------
 
 
 def two_scanners(origins, pillar) -> RegisteredSweep:
@@ -292,8 +244,6 @@ def test_free_space_is_what_either_of_two_scanners_saw():
     assert image.sees_through(inside, *MARGIN).all()
 
 
-# --- scanners whose firing time does not go with the azimuth: raster and rosette -----------------
-
 FAST = np.array([0.0, 0.0, 0.2, 15.0, 0.0, 0.0])
 WALL = World((Box((1.0, 200.0, 40.0), Arc(40.0, 0.0), base_m=-20.0),))
 POSTS = World(
@@ -315,36 +265,6 @@ def sweep_of(name: str, moving: bool, frame: int = 0, world: World = POSTS) -> R
 
 
 UNORDERED = ["panda", "rosette"]
-
-
-@pytest.mark.parametrize("name", UNORDERED)
-def test_each_cell_has_a_time_of_its_own(name):
-    registered = sweep_of(name, moving=False)
-    images = RangeImage.of(registered).scanners
-    assert 1 < len(images) <= 5
-    sizes = [image.nearest_m.shape for image in images]
-    for (rows, columns), (half_rows, half_columns) in pairwise(sizes):
-        assert half_rows == pytest.approx(rows / 2, abs=1)
-        assert half_columns == pytest.approx(columns / 2, abs=1) or columns < 200
-    for image in images:
-        assert image.offset_s.shape == image.spread_s.shape == image.nearest_m.shape
-        asked = registered.sweep.points[::7]
-        first, last = when_around(image, asked)
-        offset_s = registered.sweep.offset_ns[::7] * 1e-9
-        # a return on the edge of a cell may fall on either side
-        assert np.mean((first - 1e-6 <= offset_s) & (offset_s <= last + 1e-6)) > 0.99
-
-
-def when_around(image: ScannerImage, points) -> tuple[np.ndarray, np.ndarray]:
-    """First and last time at which the cells around each point's were looked at."""
-    x, y, z = (points - image.origin_m).T
-    rows, columns = image.nearest_m.shape
-    row = np.searchsorted(image.row_edges_rad, np.arctan2(z, np.hypot(x, y))) - 1
-    column = ((np.arctan2(y, x) + np.pi) / (2 * np.pi) * columns).astype(int) % columns
-    middle, spread = (
-        t[np.clip(row, 0, rows - 1), column] for t in (image.offset_s, image.spread_s)
-    )
-    return middle - spread, middle + spread
 
 
 @pytest.mark.parametrize("name", UNORDERED)

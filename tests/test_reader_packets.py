@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from densify.config.errors import InputError
-from densify.free_space.rings import find_rings
+from densify.free_space.rays import find_rings
 from densify.readers import open_sequence
 from densify.readers.packets import MODELS, Ouster, Velodyne, lost_and_doubled
 from tests.reader_checks import check_refused

@@ -24,20 +24,15 @@ def fence(y, z):
     return np.mod(y, STEP_M) < PICKET_M
 
 
-def board(y, z):
-    return np.abs(y) < 1.5
-
-
 def pole(y, z):
     return np.abs(y) < 0.06
 
 
-def scanned(solid, of_others=None):
+def scanned(solid):
     """What eleven sweeps see of what is ``solid`` (y, z -> bool) in the plane x = 12 m before the
-    wall in x = 20 m, placed with 2 cm of error; and where the scanner stood. of_others: what is
-    solid for all but the key sweep; what is moves then."""
+    wall in x = 20 m, placed with 2 cm of error; and where the scanner stood."""
     rng = np.random.default_rng(3)
-    points, frames, origins, sweeps, moving = [], [], {}, [], []
+    points, frames, origins, sweeps = [], [], {}, []
     for frame in range(KEY - 5, KEY + 6):
         origin = np.array([0.7 * (frame - KEY), 0.15 * (frame - KEY), 0.0])
         azimuth = np.deg2rad(np.arange(-25, 25, 0.17) + rng.uniform(0, 0.17))
@@ -45,8 +40,7 @@ def scanned(solid, of_others=None):
         a, e = (g.ravel() for g in np.meshgrid(azimuth, elevation))
         ray = np.stack([np.ones_like(a), np.tan(a), np.tan(e) / np.cos(a)], axis=1)
         at = origin + ray * (FRONT_M - origin[0])
-        stops = (solid if frame == KEY else of_others or solid)(at[:, 1], at[:, 2])
-        moving.append(stops)
+        stops = solid(at[:, 1], at[:, 2])
         at[~stops] = (origin + ray * (WALL_M - origin[0]))[~stops]
         points.append(at + rng.normal(0, 0.02, 3))
         frames.append(np.full(len(at), frame))
@@ -54,7 +48,6 @@ def scanned(solid, of_others=None):
         pose[:3, 3] = origin
         sweeps.append(fired(frame, at, pose, np.zeros(6)))
     cloud = make_cloud(np.vstack(points), np.concatenate(frames))
-    cloud.moving[:] = np.concatenate(moving) & (of_others is not None)
     return cloud, origins, Rays(Stretch(tuple(sweeps)), KEY)
 
 
@@ -80,9 +73,8 @@ def maps(solid, **knobs):
     return before, project(cloud, exposure.sees(cloud), SETTINGS, surface, rays=rays), solid(y, z)
 
 
-@pytest.mark.parametrize("measure", ["z", "range"])
-def test_gaps_of_a_fence_are_not_closed(measure):
-    before, after, solid = maps(fence, measure=measure)
+def test_gaps_of_a_fence_are_not_closed():
+    before, after, solid = maps(fence, measure="range")
     middle = 0.5 * (FRONT_M + WALL_M)
     closed = [((m.filled_m > 0) & (m.filled_m < middle) & ~solid).sum() for m in (before, after)]
     pickets = [((m.filled_m > 0) & (m.filled_m < middle) & solid).sum() for m in (before, after)]
@@ -97,9 +89,8 @@ def test_gaps_of_a_fence_are_not_closed(measure):
     assert np.array_equal(after.frame >= 0, after.depth_m > 0)
 
 
-@pytest.mark.parametrize("solid", [board, pole])
-def test_solid_things_stay_though_sweeps_saw_what_is_behind_them(solid):
-    before, after, there = maps(solid)
+def test_a_pole_stays_though_sweeps_saw_what_is_behind_it():
+    before, after, there = maps(pole)
     assert (before.depth_m[there] > 0).mean() > 0.1
     lost = (before.filled_m > 0) & (after.filled_m == 0)
     assert lost[there].mean() < 0.001
@@ -129,7 +120,6 @@ def test_rays_cross_a_surface_where_geometry_says(measure):
         known = [np.all((p > 0) & (p < [300, CAMERA.height_px - 1])) for p in (uv, ends)]
         num_known += all(known)
         num_found += all(known) and len(found) == 1
-        assert len(found) == 0 or np.all((uv > -0.6) & (uv < [301, CAMERA.height_px - 0.4]))
     assert num_known > 12 and num_found >= 0.95 * num_known
     before_it = start + 0.99 * share * (end - start)
     assert len(crossings(surface_m, start, before_it, exposure)) == 0

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from densify.free_space import range_image
 from densify.free_space.range_image import RangeImage
-from densify.free_space.rings import Aimed, aimed, find_rings, fires_by_azimuth
+from densify.free_space.rays import aimed, find_rings, fires_by_azimuth
 from densify.free_space.sensor import SensorModel, Sensors
-from densify.geometry.types import RegisteredSweep
+from densify.geometry.types import RegisteredSweep, Sweep
 from densify.readers import checks
 from densify.street.sensors import SENSORS, Spinning
 from tests.fired import fired
@@ -42,9 +41,6 @@ def sensors_of(name: str) -> Sensors:
 
 def pattern_of(name: str, number: int = 0):
     return SENSORS[name].scanners[number].pattern
-
-
-# --- where scanners stand, and lean ---------------------------------------------------------------
 
 
 def in_another_frame(registered: RegisteredSweep, R: np.ndarray) -> RegisteredSweep:
@@ -80,9 +76,6 @@ def test_the_axes_of_the_frame_do_not_matter():
         for s, p in ((here, points), (there, points @ R.T))
     ]
     assert free[0].mean() > 0.2 and (free[0] == free[1]).mean() > 0.995
-    azimuth = [m.directions(p) for m, p in ((model, points), (turned, points @ R.T))]
-    for ours, theirs in zip(*azimuth, strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-9)
 
 
 def test_a_scanner_that_hangs_upside_down_has_axes_with_z_upwards():
@@ -93,9 +86,6 @@ def test_a_scanner_that_hangs_upside_down_has_axes_with_z_upwards():
     axes = checks.scanner_axes(T)
     np.testing.assert_allclose(axes[0] @ tilt, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(axes[1], axes[0], atol=1e-12)
-
-
-# --- rings ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("name", "number"), SPINNING)
@@ -134,9 +124,6 @@ def test_lasers_that_share_no_origin_make_lines():
         assert np.median(found) == pytest.approx(spacing_deg, rel=0.35)
 
 
-# --- no rings -------------------------------------------------------------------------------------
-
-
 def spacing_by_neighbours(rays, at: int, num: int) -> float:
     """The side of a square as large as each of the nearest rays has to itself."""
     direction = on_sphere(np.rad2deg(rays.azimuth), np.rad2deg(rays.elevation), 1.0)
@@ -167,63 +154,22 @@ def test_a_scanner_that_looks_ahead_sees_nothing_else():
     assert model.sees(azimuth, elevation).tolist() == [True] * 3 + [False] * 5
 
 
-# --- cells of range images ------------------------------------------------------------------------
-
-TABLES = {
-    name: np.sort(SENSORS[name].scanners[0].pattern.elevation_deg)
-    for name in ("hdl64", "hdl32", "vlp16", "dual32")
-}
-TABLES["128 beams"] = np.concatenate([np.arange(-25, -6, 0.5), np.arange(-6, 5.25, 0.125)])
-
-
-def on_rings(elevation_deg, noise_deg=0.01, num_columns=600, seed=0):
-    """(3,N) azimuth and elevation (rad) of returns, each ring with a share of its own missing."""
-    rng = np.random.default_rng(seed)
-    azimuth = np.tile(np.arange(num_columns) * 360 / num_columns - 180, len(elevation_deg))
-    elevation = np.repeat(elevation_deg, num_columns) + rng.normal(0, noise_deg, len(azimuth))
-    heard = rng.random(len(azimuth)) < np.repeat(
-        rng.uniform(0.2, 1, len(elevation_deg)), num_columns
-    )
-    return np.deg2rad(azimuth[heard], dtype=np.float32), np.deg2rad(
-        elevation[heard], dtype=np.float32
-    )
-
-
-def cells(azimuth, elevation):
-    """Edges of the rows and number of columns of the finest image."""
-    nothing = np.zeros(len(azimuth), np.float32)
-    found, *_ = range_image._cells(Aimed(azimuth, elevation, nothing, nothing), 1, by_ring=False)
-    return found.row_edges_rad, found.num_columns
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_rings_are_found_wherever_the_beams_point(name):
-    azimuth, elevation = on_rings(TABLES[name])
-    found = find_rings(elevation)
-    np.testing.assert_allclose(np.rad2deg(found), TABLES[name], atol=0.03)
-    edges, num_columns = cells(azimuth, elevation)
-    assert 600 / 1.5 < num_columns <= 600
-    rows = np.diff(np.rad2deg(edges))
-    assert rows.min() > 0.44
-    lone = np.flatnonzero(np.gradient(TABLES[name]) > 1.0)  # a row each, half the way to the next
-    row_of = np.searchsorted(np.rad2deg(edges), TABLES[name])
-    assert all((row_of == row_of[ring]).sum() == 1 for ring in lone)
-
-
 def test_where_there_are_no_rings_rows_are_uniform():
     rng = np.random.default_rng(0)
-    smeared = on_rings(TABLES["vlp16"], noise_deg=0.6)
-    anywhere = rng.uniform(-3, 3, 30000), rng.uniform(-0.4, 0.1, 30000)
-    sparse = rng.uniform(-3, 3, 600), rng.uniform(-0.4, 0.1, 600)
-    for azimuth, elevation in (smeared, anywhere, sparse):
-        azimuth, elevation = azimuth.astype(np.float32), elevation.astype(np.float32)
-        assert find_rings(elevation) is None
-        edges, _ = cells(azimuth, elevation)
+    for num in (600, 30000):
+        azimuth, elevation = rng.uniform(-3, 3, num), rng.uniform(-0.4, 0.1, num)
+        assert find_rings(elevation.astype(np.float32)) is None
+        ray = on_sphere(np.rad2deg(azimuth), np.rad2deg(elevation), 8.0)
+        nothing = np.zeros(num, np.float32)
+        lidar, row = np.zeros(num, np.uint8), np.arange(num)
+        sweep = Sweep(0, 0, ray, nothing, None, lidar, row)
+        still = RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6))
+        edges = RangeImage.of(still).scanners[0].row_edges_rad
         np.testing.assert_allclose(np.diff(edges), np.diff(edges)[0], rtol=1e-3)
         assert edges[0] <= elevation.min() and edges[-1] > elevation.max()
 
 
-@pytest.mark.parametrize(("num_beams", "num_azimuths"), [(16, 1800), (32, 450), (64, 900)])
+@pytest.mark.parametrize(("num_beams", "num_azimuths"), [(16, 1800), (64, 900)])
 def test_cells_follow_the_sensor(num_beams, num_azimuths):
     scanner = Scanner(num_beams, num_azimuths, elevation_deg=(-15.0, 15.0))
     image = RangeImage.of(Scene(World(ROOM), Arc(0, 0), scanner).stretch(2, 0).sweeps[0])

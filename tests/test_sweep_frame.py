@@ -10,7 +10,7 @@ import pytest
 
 from densify.config import resolve
 from densify.config.errors import InputError
-from densify.free_space.sweep_frame import are_placed, is_still, share_behind, way_in_map
+from densify.free_space.raw_sweeps import are_placed, is_still, share_behind, way_in_map
 from densify.geometry import poses
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence

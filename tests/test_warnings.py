@@ -12,7 +12,7 @@ import yaml
 import densify
 from densify.config import resolve
 from densify.depth.confidence import expected_outliers
-from densify.free_space.lone_returns import without_lone
+from densify.free_space.raw_sweeps import without_lone
 from densify.geometry import poses
 from densify.outputs.key_outputs import write_result
 from densify.pipeline.recording import Recording

@@ -20,8 +20,8 @@ from densify.config.errors import InputError
 from densify.depth.exposure import key_shots
 from densify.geometry.types import Camera, Float32, LidarSequence, Progress, Result
 from densify.pipeline import run as pipeline
-from densify.pipeline.costs import Watch
 from densify.pipeline.key_result import METHODS, looks_around
+from densify.pipeline.process import Watch
 from densify.pipeline.recording import Recording
 from densify.readers.timeline import choose_cameras
 from densify.scores.depth_metrics import image_density

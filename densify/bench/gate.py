@@ -39,8 +39,8 @@ from densify.geometry.types import (
     Truth,
 )
 from densify.outputs.atomic import write_file
-from densify.pipeline.costs import Watch
 from densify.pipeline.key_result import METHODS, see
+from densify.pipeline.process import Watch
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import scene_of
 from densify.readers import open_sequence
@@ -330,7 +330,7 @@ class _Moved(Recording):
         self._still, self._seed = still, seed
         super().__init__(sequence, still.settings, _WINDOW, [key], looks_around=True)
 
-    def _registration(self, number: int) -> Registration:
+    def registration(self, number: int) -> Registration:
         registration = self._still.registration(number)
         rng = np.random.default_rng(self._seed)
         pieces = tuple(_jittered(piece, rng) for piece in registration.pieces)

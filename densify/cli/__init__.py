@@ -16,11 +16,11 @@ import traceback
 from collections.abc import Sequence
 from typing import NoReturn, TextIO
 
-from densify import __version__
 from densify.cli.commands import parse
 from densify.cli.screen import Screen, screen
 from densify.config.errors import ComputationError, InputError, is_out_of_memory
-from densify.pipeline.heap import keep_freed_memory
+from densify.pipeline.process import keep_freed_memory
+from densify.version import __version__
 
 # FAILED: computation or bug (traceback in a file); BAD_INPUT: arguments, input, system errors
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130

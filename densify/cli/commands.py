@@ -13,11 +13,11 @@ from collections.abc import Iterable, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
-from densify import __version__
 from densify.cli.options import add_options
 from densify.config import presets
 from densify.config.errors import brief, did_you_mean
 from densify.config.plugins import ENGINES, EXPORTS, READERS
+from densify.version import __version__
 
 if TYPE_CHECKING:
     from densify.cli.screen import Answer

@@ -25,8 +25,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import platformdirs
 
-from densify import __version__
 from densify.config.errors import InputError
+from densify.version import __version__
 
 T = TypeVar("T")
 _log = logging.getLogger("densify")

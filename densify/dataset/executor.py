@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from densify.config.errors import ComputationError, InputError, OutputError, how_to_install
-from densify.pipeline.heap import keep_freed_memory
+from densify.pipeline.process import keep_freed_memory
 
 Item = TypeVar("Item")
 _CONNECT_S = 10

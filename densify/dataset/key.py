@@ -13,7 +13,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from densify import __version__
 from densify.config import as_mapping
 from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError, OutputError, is_out_of_memory
@@ -26,6 +25,7 @@ from densify.pipeline import run as pipeline
 from densify.pipeline.key_result import looks_around, methods_of_run
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
+from densify.version import __version__
 
 _log = logging.getLogger("densify")
 

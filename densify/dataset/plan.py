@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from densify import __version__
 from densify.config import Config, Section, as_mapping, one_of, within
 from densify.config.errors import InputError
 from densify.config.file_content import read_json
@@ -31,6 +30,7 @@ from densify.outputs.recording_folder import drive_folder, is_same, split_of
 from densify.pipeline.sweeps import Cut
 from densify.readers import Spec, open_sequence
 from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, runs
+from densify.version import __version__
 
 SCHEMA_VERSION = 1
 _KNOWN = {

@@ -27,8 +27,8 @@ from densify.doctor.sample import (
     finding,
 )
 from densify.free_space.ground import HeightMap, find_upright
+from densify.free_space.raw_sweeps import MAP_FRAME_REMEDY, is_still, way_in_map
 from densify.free_space.sensor import Sensors
-from densify.free_space.sweep_frame import MAP_FRAME_REMEDY, is_still, way_in_map
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 from densify.readers.recorded_poses import PoseTrack

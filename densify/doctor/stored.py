@@ -6,8 +6,13 @@ from __future__ import annotations
 import numpy as np
 
 from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, finding
-from densify.free_space.sectors import LOST_DEG, blind_sector, by_azimuth, lost_deg
-from densify.free_space.sweep_frame import MAP_FRAME_REMEDY
+from densify.free_space.raw_sweeps import (
+    LOST_DEG,
+    MAP_FRAME_REMEDY,
+    blind_sector,
+    by_azimuth,
+    lost_deg,
+)
 from densify.geometry.types import Float, Sweep
 from densify.readers.timeline import format_frames
 

@@ -25,7 +25,7 @@ from densify.flow.pair_groups import MIN_MOTION_M, PairCloud, RigidMotion, judge
 from densify.flow.tracking.candidates import LINK_M
 from densify.free_space.ground import ABOVE_GROUND_M
 from densify.geometry import poses
-from densify.geometry.linking import link
+from densify.geometry.nearest import link
 from densify.geometry.types import Float, FlowField, Motion
 
 

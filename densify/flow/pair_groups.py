@@ -31,8 +31,7 @@ from densify.flow.tracking.following import (
     Group,
 )
 from densify.free_space.ground import HeightMap
-from densify.geometry.linking import link
-from densify.geometry.nearest import is_near, thinned, tree_of
+from densify.geometry.nearest import is_near, link, thinned, tree_of
 from densify.geometry.types import Bool, Float, Float32, Int
 
 SURFACE_M = 1.0

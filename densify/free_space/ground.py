@@ -11,7 +11,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from densify.geometry import poses
-from densify.geometry.arrays import bulk
+from densify.geometry.nearest import bulk
 from densify.geometry.types import Bool, Float, Float32, Int, Stretch, Sweep
 
 ABOVE_GROUND_M = 0.2

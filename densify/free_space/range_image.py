@@ -20,8 +20,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.free_space.rays import see_beyond
-from densify.free_space.rings import FEW_POINTS, Aimed, aimed, fires_by_azimuth, measure
+from densify.free_space.rays import (
+    BLOCK,
+    FEW_POINTS,
+    Aimed,
+    aimed,
+    at_time,
+    azimuth_of,
+    fires_by_azimuth,
+    from_scanner,
+    measure,
+)
+from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
 
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
@@ -36,7 +46,8 @@ _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
 _DENSEST = 10  # percent of the returns of an unordered scanner that set its finest cells
 MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
 _VOUCHED, _MAX_SIZES = 0.8, 5  # share of returns with enough filled cells; number of cell sizes
-_PI = np.float32(np.pi)
+_HIDES = 1000  # penalty of a hiding return, above the number of cells of all images added up
+_PI, _ZERO = np.float32(np.pi), np.float32(0)
 
 
 class ScannerImage(NamedTuple):
@@ -58,14 +69,6 @@ class ScannerImage(NamedTuple):
     twists: Float32  # (2,6) float32 twist of the lidar before and after the reference time
     from_m: float  # least range at which the image is used
     to_m: float  # greatest range at which the image is used
-
-    def in_range(self, points: Float32) -> Bool:
-        """Return (N,) True for points (N,3), lidar frame, at whose range the image is used."""
-        if self.from_m == 0 and self.to_m == np.inf:
-            return np.ones(len(points), bool)
-        from_scanner = points - self.origin_m
-        range_m2 = np.einsum("ij,ij->i", from_scanner, from_scanner)
-        return np.asarray((range_m2 >= self.from_m**2) & (range_m2 < self.to_m**2))
 
 
 @dataclass(frozen=True)
@@ -123,19 +126,14 @@ class RangeImage:
         several sweeps may be added. Points and velocities are as in `sees_through`.
         """
         points32 = np.ascontiguousarray(points, np.float32)
-        velocity = np.zeros((0, 3), np.float32)
-        if velocity_m_s is not None:
-            velocity = np.ascontiguousarray(velocity_m_s, np.float32)
+        velocity = np.zeros((1, 3)) if velocity_m_s is None else velocity_m_s
+        velocity32 = np.ascontiguousarray(velocity, np.float32)
         margins = np.array(margins_m, np.float32)
         beyond = np.zeros((len(self.scanners), len(points)), np.int16)
         for scanner, scanner_beyond in zip(self.scanners, beyond, strict=True):
-            used = scanner.in_range(points32)
-            queries, velocities = points32, velocity
-            if not used.all():
-                queries, velocities = points32[used], velocity[used[: len(velocity)]]
-            num = np.zeros(len(queries), np.int16)
-            see_beyond.over_rows(len(num), queries, velocities, scanner, margins, min_filled, num)
-            scanner_beyond[used] = num
+            _see_beyond.over_rows(
+                len(points), points32, velocity32, scanner, margins, min_filled, scanner_beyond
+            )
         return beyond
 
 
@@ -158,7 +156,7 @@ def _images(
     images: list[ScannerImage] = []
     for cells in _cells(rays, num_together, by_ring):
         if cells.coarser and images and _share_vouched(images[-1], rays) >= _VOUCHED:
-            break
+            break  # still larger cells would call the gaps between posts free
         images.append(_image(registered, lidar, rays, cells))
     return images
 
@@ -185,9 +183,8 @@ def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) 
         np.maximum.at(last.reshape(-1), cell, rays.offset_s[inside])
         first, last = _over_3x3(np.minimum, first, np.inf), _over_3x3(np.maximum, last, -np.inf)
         known, half = np.isfinite(first), np.float32(0.5)
-        first, last = np.where(known, first, half), np.where(known, last, half)
-        offset_s = np.where(known, half * (first + last), np.float32(0))
-        spread_s = np.where(known, half * (last - first), np.float32(0))
+        first, last = np.where(known, first, _ZERO), np.where(known, last, _ZERO)
+        offset_s, spread_s = half * (first + last), half * (last - first)
     return ScannerImage(
         offset_s=offset_s,
         spread_s=spread_s,
@@ -291,3 +288,112 @@ def _uniform_edges(elevation: Float32, step: float) -> NDArray[np.floating]:
     low = float(elevation.min(initial=0.0)) - 0.5 * step
     num_rows = int((float(elevation.max(initial=0.0)) - low) / step) + 1
     return low + step * np.arange(num_rows + 1)
+
+
+@inlined
+def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
+    """Return the column of an azimuth, 0 for NaN. Columns start behind the scanner."""
+    if not abs(azimuth) <= _PI:
+        return np.int32(0)
+    # 32 bits, because more of them fit into a vector instruction.
+    column = np.int32((azimuth + _PI) * (np.float32(num_columns) / (_PI + _PI)))
+    return column - np.int32(num_columns) if column >= num_columns else column
+
+
+@inlined
+def _rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
+    """Fill ``row`` with the interval of the ascending edges of each elevation, -1 outside."""
+    # a binary search of many elevations at once, with the steps as the outer loop
+    last, step = np.int32(len(edges) - 1), np.int32(1)
+    row[:size] = 0
+    while 2 * step < last:
+        step *= np.int32(2)
+    while step > 0:
+        for k in range(size):
+            at = min(row[k] + step, last)
+            row[k] = at if elevation[k] >= edges[at] else row[k]
+        step //= np.int32(2)
+    for k in range(size):
+        inside = elevation[k] >= edges[0] and elevation[k] < edges[last]
+        row[k] = row[k] if inside else np.int32(-1)
+
+
+@inlined
+def _speed(point, velocity, twist):  # type: ignore[no-untyped-def]
+    """Return the speed in m/s of a point relative to the lidar."""
+    vx = velocity[0] - (twist[3] + twist[1] * point[2] - twist[2] * point[1])
+    vy = velocity[1] - (twist[4] + twist[2] * point[0] - twist[0] * point[2])
+    vz = velocity[2] - (twist[5] + twist[0] * point[1] - twist[1] * point[0])
+    return np.sqrt(vx * vx + vy * vy + vz * vz)
+
+
+@inlined
+def _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column):  # type: ignore[no-untyped-def]
+    """Move ``size`` points to the time at which the scanner faced them, which is found too."""
+    # Two rounds from the position at the reference time converge.
+    num_columns, by_azimuth = image.nearest_m.shape[1], len(image.offset_s) == 1
+    time_s[:size] = _ZERO
+    for round in range(3):
+        for k in range(size):
+            i, t = start + k, time_s[k]
+            j = min(i, len(velocity) - 1)
+            x[k], y[k], z[k] = at_time(
+                points[i, 0] + t * velocity[j, 0], points[i, 1] + t * velocity[j, 1],
+                points[i, 2] + t * velocity[j, 2], t, image.twists,
+            )  # fmt: skip
+        from_scanner(x, y, z, size, image.origin_m, image.axes)
+        for k in range(size):
+            column[k] = _column(azimuth_of(x[k], y[k]), num_columns)
+        if round == 2 or not by_azimuth:
+            for k in range(size):
+                elevation[k] = azimuth_of(np.sqrt(x[k] * x[k] + y[k] * y[k]), z[k])
+            _rows(elevation, size, image.row_edges_rad, row)
+        if round < 2:
+            for k in range(size):
+                time_s[k] = image.offset_s[0 if by_azimuth else max(row[k], 0), column[k]]
+
+
+@Kernel
+def _see_beyond(begin, end, points, velocity, image, margins, min_filled, beyond):  # type: ignore[no-untyped-def]
+    """Add to ``beyond`` (N,) int16 the number of returns of one scanner beyond each point.
+
+    Counted are the filled cells among the 3 x 3 cells around a point, if they are at least
+    ``min_filled``. If any of their returns is not beyond the point, `_HIDES` is subtracted instead.
+    All other arrays are float32.
+
+    Args:
+        points: (N,3) positions in metres, lidar frame at the reference time.
+        velocity: (N,3) velocities in m/s, or (1,3) for all points.
+        image: Range image, `ScannerImage`.
+        margins: (2,) least distance of a return beyond a point: metres and share of the range.
+    """
+    by_azimuth = len(image.offset_s) == 1
+    settled_s = np.float32(image.settled_s)
+    x, y, z, time_s, elevation = np.empty((5, BLOCK), np.float32)
+    row, column = np.empty((2, BLOCK), np.int32)
+    # Each point needs a long chain of steps. A block of points takes every step in parallel.
+    for start in range(begin, end, BLOCK):
+        size = min(BLOCK, end - start)
+        _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column)
+        for k in range(size):
+            i, horizontal_m = start + k, np.sqrt(x[k] * x[k] + y[k] * y[k])
+            r, c = row[k], column[k]
+            if r < 0 or image.num_filled[r, c] < min_filled:
+                continue
+            range_m = np.sqrt(horizontal_m * horizontal_m + z[k] * z[k])
+            if range_m < image.from_m or range_m >= image.to_m:
+                continue
+            margin_m = max(margins[0], margins[1] * range_m)
+            away_s = abs(image.offset_s[0 if by_azimuth else r, c] - time_s[k])
+            if by_azimuth:
+                # Between two turns a spinning scanner skips or repeats a sector.
+                if away_s > settled_s:
+                    continue
+            else:
+                away_s += image.spread_s[r, c]
+                twist = image.twists[0 if time_s[k] < _ZERO else 1]
+                margin_m += away_s * _speed(points[i], velocity[min(i, len(velocity) - 1)], twist)
+            if image.nearest_m[r, c] > range_m + margin_m:
+                beyond[i] += image.num_filled[r, c]
+            else:
+                beyond[i] -= _HIDES

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -13,48 +12,36 @@ import numpy as np
 from densify.free_space.range_image import MIN_FILLED, RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
-from densify.geometry.clock import Clock, num_in_batch
+from densify.geometry.clock import Clock
 from densify.geometry.compiled import num_threads
-from densify.geometry.types import Bool, Float, RegisteredSweep, Stretch
+from densify.geometry.types import Bool, Float, Stretch
 
 REACH_S = 1.0
 """Greatest time between a sweep and the sweeps that are tested against its points."""
-_MOST_TESTED = 10  # number of sweeps on each side; more sweeps cost time and find nothing more
 FREE_MARGIN = 0.4, 0.015  # m, share of the range: the larger tolerates errors of registration
-
-
-def range_images(sweeps: Sequence[RegisteredSweep], num_together: int) -> list[RangeImage]:
-    """Return the sweeps' range images, ``num_together`` in a batch, by rings where that is safe."""
-    image = partial(RangeImage.of, num_together=num_together, by_ring=True)
-    with ThreadPoolExecutor(num_threads()) as pool:
-        return list(pool.map(image, sweeps))
 
 
 @dataclass(frozen=True)
 class FreeSpace:
     """The free space that each of the W sweeps of a window observed."""
 
-    images: tuple[RangeImage, ...]  # w range images
-    # W transforms (4,4) from the world to the lidar at the reference time
-    T_lidar_world: tuple[Float, ...]
+    images: tuple[RangeImage, ...]  # W range images
+    T_lidar_world: tuple[Float, ...]  # W transforms (4,4) at the reference times
     clock: Clock  # reference times of the sweeps
     sensors: Sensors  # scanners, with the angles between their rays
     # Indices of consecutive sweeps that are tested together, see `Clock.batches`
     batches: tuple[tuple[int, ...], ...]
 
     @staticmethod
-    def of(stretch: Stretch, images: Sequence[RangeImage] | None = None) -> FreeSpace:
-        """Return the free space of a window of sweeps, from their `range_images` if given."""
+    def of(stretch: Stretch) -> FreeSpace:
+        """Return the free space of a window of sweeps."""
         clock = Clock.of(stretch)
-        if images is None:
-            images = range_images(stretch.sweeps, num_in_batch(clock.period_ns * 1e-9))
-        return FreeSpace(
-            tuple(images),
-            tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps),
-            clock,
-            Sensors.of(stretch.sweeps),
-            clock.batches(),
-        )
+        batches = clock.batches()
+        image = partial(RangeImage.of, num_together=max(map(len, batches)), by_ring=True)
+        with ThreadPoolExecutor(num_threads()) as pool:
+            images = tuple(pool.map(image, stretch.sweeps))
+        T_lidar_world = tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps)
+        return FreeSpace(images, T_lidar_world, clock, Sensors.of(stretch.sweeps), batches)
 
     def gap_m(self, position: Float, i: int) -> float:
         """Return the metres between neighbouring rings of sweep i at a (3,) world position."""
@@ -63,8 +50,11 @@ class FreeSpace:
 
     def others(self, i: int) -> list[int]:
         """Return the indices of the sweeps, one of each other batch, to test against sweep i."""
-        around = self.clock.around(i, REACH_S, _MOST_TESTED * max(map(len, self.batches)))
-        return sorted({self._batch_of[j][0] for j in around} - {self._batch_of[i][0]})
+        return [
+            batch[0]
+            for batch in self.batches
+            if i not in batch and any(self.clock.near(i, j, REACH_S) for j in batch)
+        ]
 
     @cached_property
     def _batch_of(self) -> dict[int, tuple[int, ...]]:

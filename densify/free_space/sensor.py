@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.free_space.rings import Layout, aimed, measure
-from densify.geometry.arrays import Bool, Float, Float32
-from densify.geometry.types import RegisteredSweep
+from densify.free_space.rays import Layout, aimed, measure
+from densify.geometry.types import Bool, Float, Float32, RegisteredSweep
 
 _NUM_SWEEPS = 3  # number of sweeps in which a scanner is measured
 _BEAM_RAD = np.deg2rad(1 / 6)  # 3 mrad, the width of most beams
@@ -34,8 +33,7 @@ class SensorModel(Layout):
     """One scanner, with its pattern of rays."""
 
     origin_m: Float  # (3,) origin of its rays, lidar frame
-    # (3,3) rotation from the lidar frame to the scanner's axes, in which angles are measured
-    axes: Float
+    axes: Float  # (3,3) rotation from the lidar frame to the scanner's axes
     elevation_rad: tuple[float, float]  # (2,) elevations of the lowest and the highest ray
     # (2,) azimuths of the rightmost and the leftmost ray: -pi and pi for an all-round view, right >
     # left if the view includes the backward direction

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Name the array types used everywhere, and make tables of columns."""
+"""Name the array types used everywhere, and select, join and tabulate columns of rows."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,38 @@ Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+T = TypeVar("T")
 
-_SHARES = (0.9999, 0.999, 0.99)  # of the points that stay in a grid
+
+def select_rows(container: T, keep: Bool | Int | slice, columns: Sequence[str] = ()) -> T:
+    """Return a dataclass or named tuple with only some rows of its columns.
+
+    Args:
+        keep: Mask of the rows, array of row numbers, or slice.
+        columns: Names of the fields with an array of rows, or None; by default all fields.
+    """
+    names = columns or _field_names(container)
+    arrays = {name: getattr(container, name) for name in names}
+    rows = np.arange(len(arrays[names[0]]))[keep]  # once for all columns
+    return _replaced(
+        container, {n: None if a is None else a.take(rows, axis=0) for n, a in arrays.items()}
+    )
+
+
+def joined_rows(containers: Iterable[T]) -> T:
+    """Return one dataclass or named tuple, all of whose fields are columns, of several."""
+    pieces = list(containers)
+    names = _field_names(pieces[0])
+    return _replaced(pieces[0], {n: np.concatenate([getattr(p, n) for p in pieces]) for n in names})
+
+
+def _field_names(container: Any) -> Sequence[str]:
+    return getattr(container, "_fields", None) or [f.name for f in fields(container)]
+
+
+def _replaced(container: Any, columns: Mapping[str, Any]) -> Any:
+    is_tuple = isinstance(container, tuple)
+    return container._replace(**columns) if is_tuple else replace(container, **columns)
 
 
 def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
@@ -26,25 +56,3 @@ def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
     for name, column in columns.items():
         rows[name] = column
     return rows
-
-
-def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
-    """Return (N,) True for the points (N,D) around which a grid fits into memory.
-
-    These are all points if the box around them has at most ``most_cells`` cells of side ``cell``.
-    Otherwise up to 1 % of them, the farthest from their median, are left out, such as a few stray
-    returns. If their box is still too large, the points are spread out, and none is left out.
-    """
-    all_points = np.ones(len(points), bool)
-    if not len(points) or _num_cells(points, cell) <= most_cells:
-        return all_points
-    distance = np.abs(points - np.median(points, axis=0)).max(axis=1)
-    for share in _SHARES:
-        kept = distance <= np.quantile(distance, share)
-        if _num_cells(points[kept], cell) <= most_cells:
-            return kept
-    return all_points
-
-
-def _num_cells(points: NDArray[Any], cell: float) -> float:
-    return math.prod(float(np.ptp(coordinate)) / cell + 1 for coordinate in points.T)

@@ -11,7 +11,7 @@ import numpy as np
 
 from densify.geometry.types import Float, Int, Stretch
 
-_BATCH_S = 0.1
+_BATCH_S = 0.1  # time of a sweep at the usual rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,8 @@ class Clock:
 
     def near(self, i: int, j: int, reach_s: float) -> bool:
         """Return True if sweeps i and j are at most ``reach_s`` plus half a period apart."""
-        return bool(abs(self.time_ns[i] - self.time_ns[j]) <= self._slack_ns(reach_s))
+        slack_ns = reach_s * 1e9 + 0.5 * self.period_ns
+        return bool(abs(self.time_ns[i] - self.time_ns[j]) <= slack_ns)
 
     def num_in(self, duration_s: float) -> int:
         """Return the number of sweep periods in a duration, rounded, at least 1."""
@@ -60,17 +61,6 @@ class Clock:
                 groups.append([j])
         return tuple(map(tuple, groups))
 
-    def around(self, i: int, reach_s: float, max_per_side: int) -> list[int]:
-        """Return the sweeps within ``reach_s`` plus half a period of sweep i, without i, ascending.
-
-        More than ``max_per_side`` sweeps on a side are thinned out evenly.
-        """
-        within_ns = self._slack_ns(reach_s)
-        first = int(np.searchsorted(self.time_ns, self.time_ns[i] - within_ns))
-        end = int(np.searchsorted(self.time_ns, self.time_ns[i] + within_ns, side="right"))
-        before, after = range(i - 1, first - 1, -1), range(i + 1, end)
-        return sorted(_thinned(before, max_per_side) + _thinned(after, max_per_side))
-
     def at(self, i: int, later_s: float) -> int | None:
         """Return the sweep nearest to ``later_s`` after sweep i, None if no sweep is on that side.
 
@@ -88,17 +78,3 @@ class Clock:
         """Return the seconds from sweep i to the first or the last sweep, whichever is nearer."""
         from_end_ns = min(self.time_ns[i] - self.time_ns[0], self.time_ns[-1] - self.time_ns[i])
         return float(from_end_ns) / 1e9
-
-    def _slack_ns(self, reach_s: float) -> float:
-        return reach_s * 1e9 + 0.5 * self.period_ns
-
-
-def num_in_batch(period_s: float) -> int:
-    """Return the number of sweeps in one batch of `Clock.batches` at this sweep period."""
-    return max(1, int(np.ceil(_BATCH_S / period_s + 0.5)) - 1)
-
-
-def _thinned(side: range, max_sweeps: int) -> list[int]:
-    if len(side) <= max_sweeps:
-        return list(side)
-    return [side[k] for k in np.rint(np.linspace(0, len(side) - 1, max_sweeps)).astype(int)]

@@ -138,8 +138,23 @@ class Kernel:
         return self._compiled(*arguments)
 
     def over_rows(self, num_rows: int, *arguments: Any) -> None:
-        """Call ``kernel(begin, end, *arguments)`` for row ranges, on all cores, as `over_rows`."""
-        over_rows(self, num_rows, *arguments)
+        """Call ``kernel(begin, end, *arguments)`` on all cores, for ranges that cover all rows.
+
+        The kernel writes its result into the arguments and must not call `over_rows`. Its result
+        for a row must depend on that row alone.
+        """
+        num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
+        if num_parts <= 1:
+            self(0, num_rows, *arguments)
+            return
+        ranges = list(pairwise(num_rows * i // num_parts for i in range(num_parts + 1)))
+        futures = [_pool().submit(self, begin, end, *arguments) for begin, end in ranges[1:]]
+        try:
+            self(*ranges[0], *arguments)
+        finally:
+            wait(futures)  # before any error is raised: they write into the caller's arrays
+            for future in futures:
+                future.result()
 
     def _do_without_cache(self, error: Exception | str) -> None:
         """Compile the function anew, without a cache, and log the reason."""
@@ -150,27 +165,6 @@ class Kernel:
 def num_threads() -> int:
     """Return the number of cores this process may use, or NUMBA_NUM_THREADS if that is smaller."""
     return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-
-
-def over_rows(function: Callable[..., None], num_rows: int, *arguments: Any) -> None:
-    """Call ``function(begin, end, *arguments)`` on all cores, for ranges that cover all rows.
-
-    The function writes its result into the arguments and must not call `over_rows`. Its result for
-    a row must depend on that row alone.
-    """
-    num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
-    if num_parts <= 1:
-        function(0, num_rows, *arguments)
-        return
-    bounds = [num_rows * i // num_parts for i in range(num_parts + 1)]
-    ranges = list(pairwise(bounds))
-    futures = [_pool().submit(function, begin, end, *arguments) for begin, end in ranges[1:]]
-    try:
-        function(*ranges[0], *arguments)
-    finally:
-        wait(futures)  # before any error is raised: they write into the caller's arrays
-        for future in futures:
-            future.result()
 
 
 @cache

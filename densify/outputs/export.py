@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from densify import __version__
 from densify.config.errors import InputError, did_you_mean
 from densify.config.file_content import needed
 from densify.config.plugins import EXPORTS
@@ -22,6 +21,7 @@ from densify.outputs.cloud_files import save_ply
 from densify.outputs.depth_png import confidence_of, map_path, metres
 from densify.outputs.finished_run import FinishedRun, Kept, Thresholds, finished_runs
 from densify.outputs.key_outputs import writing
+from densify.version import __version__
 
 # Fields: run, to (format), min_confidence, max_age_ms (null for any age), density (camera ->
 # measured, filled -> before, after the thresholds: shares of the pixels), num_points, version

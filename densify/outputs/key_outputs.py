@@ -18,7 +18,6 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from densify import __version__
 from densify.config.errors import InputError
 from densify.geometry.types import Result
 from densify.outputs import flow_writers, plots
@@ -35,6 +34,7 @@ from densify.outputs.depth_png import (
 )
 from densify.outputs.recording_folder import check_recording
 from densify.outputs.report_page import KeyFiles, key_page
+from densify.version import __version__
 
 SCHEMA_VERSION = 1
 """Version of each JSON file. It grows when a field changes its meaning or is removed."""

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from densify import __version__
 from densify.config.errors import InputError
 from densify.depth.object_boxes import corners_of, grown
 from densify.geometry import cameras, poses
@@ -35,6 +34,7 @@ from densify.outputs.depth_png import (
 from densify.outputs.finished_run import FinishedRun
 from densify.outputs.recording_folder import drive_folder, split_of
 from densify.readers.decoded_files import decode_image
+from densify.version import __version__
 
 README = "README.txt"
 

@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from densify import __version__
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry.types import Bool, Float, Int, ObjectTrack
@@ -34,6 +33,7 @@ from densify.outputs.depth_png import PixelType, read_stored
 from densify.outputs.finished_run import map_names, read_scene, read_tracks
 from densify.outputs.plots import front_first
 from densify.readers.decoded_files import decode_image
+from densify.version import __version__
 
 T = TypeVar("T")
 _MAPS: Mapping[str, PixelType] = {

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Compute the result of one method for a key: visibility, projection, fill, scores."""
+"""Compute the result of one method for a key: visibility, projection, fill, prior, scores."""
 
 from __future__ import annotations
 
+import copy
+import logging
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +21,21 @@ from densify.depth.confidence import (
     with_max_outliers,
     without_times,
 )
+from densify.depth.exposure import Shot
+from densify.depth.prior import MAX_WRONG, complete
 from densify.depth.views import HeldOut, SeenCloud, Views, with_ages
 from densify.free_space.range_image import RangeImage
-from densify.geometry.types import Bool, Cloud, DepthMap, Float32, Result, Stretch
-from densify.pipeline.costs import Watch
+from densify.geometry.types import Bool, Cloud, DepthMap, Float32, Prior, Result, Stretch
+from densify.pipeline.process import Watch
 from densify.pipeline.recording import Beyond, Moment
 from densify.registration.deskew import find_compensated
 from densify.scores import depth_metrics
 from densify.scores.cloud_scores import ghost_scores
+
+if TYPE_CHECKING:
+    from densify.readers.prior_files import PriorFiles
+
+_log = logging.getLogger("densify")
 
 
 class Method(NamedTuple):
@@ -247,3 +257,56 @@ def _metrics(
     if scene.settings.output.rejected:
         metrics["rejected"] = {name: maps.counts() for name, maps in depth.items()}
     return metrics
+
+
+def complete_with_prior(
+    result: Result,
+    files: PriorFiles,
+    shots: Mapping[str, Shot],
+    truth: Mapping[str, tuple[Float32, Bool]],
+    kind: str,
+) -> Result:
+    """Return the result with completed maps (``full``) and their scores.
+
+    A prior that does not fit the measured depth is not used, and a warning is logged. ``shots`` and
+    ``truth``, depth (H,W) in metres and mask (H,W) of moving pixels, are by map name. ``kind`` is
+    the setting ``prior.kind``.
+    """
+    full, metrics = {}, copy.deepcopy(dict(result.metrics))
+    for name, prior in _read(files, shots, result.key).items():
+        full[name] = maps = complete(result.depth[name], prior, kind)
+        if not maps.fit.used:
+            _log.warning(
+                "key %d: the prior %s is not used, depth_full is as depth_filled: after the best "
+                "fit %.0f %% of the measured pixels are off by more than 25 %%, expected at most "
+                "%.0f %%",
+                result.key,
+                maps.source,
+                100 * maps.fit.wrong,
+                100 * MAX_WRONG,
+            )
+        prior_alone_m = np.where(maps.from_prior, maps.depth_m, np.float32(0))
+        for product, depth_m in (("full", maps.depth_m), ("prior", prior_alone_m)):
+            metrics["density"][name][product] = depth_metrics.image_density(depth_m)
+            if name in truth:
+                metrics["depth"][name][product] = depth_metrics.scores_by_motion(
+                    depth_m, *truth[name], shots[name].camera
+                )
+    return replace(result, full=full, metrics=metrics)
+
+
+def _read(files: PriorFiles, shots: Mapping[str, Shot], key: int) -> dict[str, Prior]:
+    """Return map name -> prior, read by image number, or by key if the map shows no image."""
+    priors, lacking = {}, []
+    for name, shot in shots.items():
+        number = key if shot.number is None else shot.number
+        prior = files.prior(shot.camera, number)
+        if prior is not None:
+            priors[name] = prior
+        else:
+            lacking.append(f"{shot.camera.name} {number} ({files.said_of(shot.camera.name)})")
+    if lacking and not priors:
+        raise InputError(f"--prior {files.place}: key {key}: no depth image {', '.join(lacking)}")
+    if lacking:
+        _log.warning("key %d: no depth_full: no prior %s", key, ", ".join(lacking))
+    return priors

@@ -16,8 +16,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
-from functools import lru_cache
-from typing import Any, NamedTuple, TypeVar, cast
+from dataclasses import dataclass
+from functools import wraps
+from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar, cast
 
 import numpy as np
 
@@ -30,13 +31,12 @@ from densify.depth.object_boxes import complete_boxes
 from densify.depth.seen_through import Rays
 from densify.flow.engines import Scene, SharedMotion, estimate_motion
 from densify.free_space.ground import HeightMap, ground
-from densify.free_space.sweep_frame import MAP_FRAME_REMEDY, are_placed, is_still, way_in_map
+from densify.free_space.raw_sweeps import MAP_FRAME_REMEDY, in_map_frame
 from densify.geometry import poses
 from densify.geometry.types import (
     Cloud,
     Float,
     FlowField,
-    Int,
     LidarSequence,
     Motion,
     ObjectTrack,
@@ -47,8 +47,8 @@ from densify.geometry.types import (
     Sweep,
     Trajectory,
 )
-from densify.pipeline.costs import Watch
-from densify.pipeline.road import Road
+from densify.pipeline.process import Watch
+from densify.pipeline.road import Road, views_of
 from densify.pipeline.sweeps import Cut, Sweeps
 from densify.readers.timeline import (
     Timeline,
@@ -60,12 +60,29 @@ from densify.registration.deskew import deskew
 from densify.registration.trajectory import LeftOut, Registration, find_trajectory
 
 T = TypeVar("T")
-LEAD_IN_S = 0.5  # before a window or a block, in which odometry settles
-_TELL_SPEED = 2  # sweeps
+P = ParamSpec("P")
+_LEAD_IN_S = 0.5  # before a window or a block, in which odometry settles
+_MIN_LEAD_IN = 2  # sweeps that show the speed
 _SOME = 8  # every eighth point tells the share of points below the ground
 
 
-class Piece(NamedTuple):
+def _latest(
+    method: Callable[Concatenate[Recording, P], T],
+) -> Callable[Concatenate[Recording, P], T]:
+    """Keep the result of a method's latest call in memory, for calls with equal arguments."""
+
+    @wraps(method)
+    def call(recording: Recording, *args: P.args, **kwargs: P.kwargs) -> T:
+        step = recording._results.get(method.__name__)
+        if step is None or step[0] != args:
+            step = recording._results[method.__name__] = args, method(recording, *args, **kwargs)
+        return cast(T, step[1])
+
+    return call
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
     """Consecutive registered sweeps of one block that share a world."""
 
     number: int  # index of the block
@@ -73,6 +90,12 @@ class Piece(NamedTuple):
     # Poses of the piece's sweeps and of one before them, in the first's levelled lidar frame
     poses: Trajectory
     frames: tuple[int, ...]  # frame numbers of the piece's sweeps
+    deskewed: dict[int, RegisteredSweep]  # its sweeps in its world, by frame, as they are needed
+
+    def pose(self, frame: int) -> Float:
+        """Return the pose ``T_world_lidar`` (4,4) of a sweep in the world of the piece."""
+        pose: Float = self.poses.T_world_lidar[self.poses.frames.index(frame)]
+        return pose
 
 
 class Moment(NamedTuple):
@@ -122,23 +145,13 @@ class Recording:
         self.cut = Cut.of(timeline, window, keys, around_s)
         self._step_around = max(1, timeline.num_in(step_s))
         # The sweeps around a window count as lead-in, too.
-        self._num_lead_in = max(_TELL_SPEED, timeline.num_in(LEAD_IN_S - around_s))
+        self._num_lead_in = max(_MIN_LEAD_IN, timeline.num_in(_LEAD_IN_S - around_s))
         self._run = run
-        longest_block = max((len(block) for block in self.cut.blocks), default=0)
-        num_raw = longest_block + self._num_lead_in
-        self._sweeps = Sweeps(
+        num_raw = max(map(len, self.cut.blocks), default=0) + self._num_lead_in
+        self.sweeps = Sweeps(
             sequence, timeline, settings.register, num_raw, cache, run, self._watch
         )
-        self.forget_raw = self._sweeps.read.cache_clear
-        self.registration = lru_cache(maxsize=2)(self._registration)
-        self._pieces = lru_cache(maxsize=2)(self._find_pieces)
-        # Keyed by the index of the block and of the piece, because a Piece cannot be hashed.
-        self._deskewed = lru_cache(maxsize=longest_block)(self._deskew)
-        self._stretch = lru_cache(maxsize=1)(self._make_stretch)
-        self._searched = lru_cache(maxsize=2)(self._find_searched)
-        self._ground = lru_cache(maxsize=2)(self._find_ground)
-        self._motion = lru_cache(maxsize=2)(self._find_motion)
-        self._far = lru_cache(maxsize=1)(self._find_far)
+        self._results: dict[str, tuple[tuple[Any, ...], Any]] = {}  # of `_latest`, by method
 
     def _look_around(self, keys: Collection[int]) -> tuple[float, float]:
         """Return seconds around windows, and between sweeps, in which motion is searched."""
@@ -173,58 +186,44 @@ class Recording:
 
     def window(self, key: int) -> Stretch:
         """Return the registered, deskewed sweeps of a key's window. Raises as `window_frames`."""
-        return self._stretch(self.cut.number_of[key], self.window_frames(key).frames)
-
-    def raw(self, frame: int) -> Sweep:
-        """Return a raw sweep (not deskewed), without returns of the own vehicle."""
-        return self._sweeps.read(frame)
-
-    def returns(self, frames: Sequence[int]) -> Int:
-        """Return the (n,360) number of returns of raw sweeps in each degree of azimuth."""
-        for frame in [f for f in frames if f not in self._sweeps.returns]:
-            self.raw(frame)
-        return np.stack([self._sweeps.returns[frame] for frame in frames])
+        frames = self.window_frames(key).frames  # raises first
+        return self._stretch(self._piece(key), frames)
 
     def around(self, key: int) -> Stretch:
         """Return the registered sweeps, within and around a key's window, searched for motion."""
         piece = self._piece(key)
-        return self._stretch(piece.number, self._searched(piece.number, piece.row))
+        return self._stretch(piece, self._searched(piece))
 
     def is_pair(self, key: int) -> bool:
         """Return True if motion of a key is searched in only two sweeps; a track needs three."""
-        piece = self._piece(key)
-        return len(self._searched(piece.number, piece.row)) == 2
+        return len(self._searched(self._piece(key))) == 2
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
         """Return the flow of all points in a key's window; ``engine`` None is ``flow.engine``."""
-        engine, window, piece = (
-            engine or self.settings.flow.engine,
-            self.window(key),
-            self._piece(key),
-        )
+        engine = engine or self.settings.flow.engine
+        window, piece = self.window(key), self._piece(key)
         # Two sweeps are too few for ``groups``.
         if engine == "groups" and self.is_pair(key):
             engine = "pairs"
         if not engine_row(engine)[0].shared:
-            scene = Scene(window, self._ground(piece.number, piece.row))
+            scene = Scene(window, self._ground(piece))
             return estimate_motion(scene, self.settings, engine)
         # All poses, but points only for the sweeps of the window.
-        at_hand = {s.frame: s for s in window.sweeps}
+        with_points = {s.frame: s for s in window.sweeps}
         sweeps = [
-            at_hand.get(f) or RegisteredSweep.without_points(piece.poses, f)
-            for f in self._searched(piece.number, piece.row)
+            with_points.get(f) or RegisteredSweep.without_points(piece.poses, f)
+            for f in self._searched(piece)
         ]
-        motion = self._motion(piece.number, piece.row, engine)
-        return motion.with_stretch(Stretch(tuple(sweeps)))
+        return self._motion(piece, engine).with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
         """Return the flow of a sweep to the next, or else previous sweep; empty without either."""
         window = self.window(frame)
         beside = [f for f in window.frames if f > frame] or [f for f in window.frames if f < frame]
-        motion = self.motion(frame) if beside else None
-        return StretchFlow(
-            window, {(frame, f): motion.flow(frame, f) for f in beside[:1] if motion is not None}
-        )
+        if not beside:
+            return StretchFlow(window, {})
+        step = (frame, beside[0])
+        return StretchFlow(window, {step: self.motion(frame).flow(*step)})
 
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
@@ -248,92 +247,80 @@ class Recording:
         with self._watch.stage("accumulate"):
             drop_lost = self.settings.accumulate.unfollowed == "drop"
             cloud = accumulate(used, fields, key, drop_lost)
-            tracks = complete_boxes(tracks, cloud, Rays(used, key), self._ground_of(key))
-            deep = self._ground_of(key).below(cloud.rigid_points, stretch[key].T_world_lidar)
+            heights = self._ground(self._piece(key))
+            tracks = complete_boxes(tracks, cloud, Rays(used, key), heights)
+            deep = heights.below(cloud.rigid_points, stretch[key].T_world_lidar)
             return Moment(cloud.select(~deep) if deep.any() else cloud, flow, tracks)
 
     def share_below(self, key: int) -> float:
         """Return the share of the points of a key's window that lie below the ground."""
-        heights, sweeps = self._ground_of(key), self.window(key).sweeps
+        heights, sweeps = self._ground(self._piece(key)), self.window(key).sweeps
         deep = [heights.below(s.sweep.points[::_SOME], s.T_world_lidar) for s in sweeps]
         return float(np.concatenate(deep).mean())
-
-    def _ground_of(self, key: int) -> HeightMap:
-        piece = self._piece(key)
-        return self._ground(piece.number, piece.row)
 
     def standing(self, key: int) -> Beyond | None:
         """Return the static surfaces along the road beyond the key's window, None without any."""
         if not self.settings.accumulate.far_m:  # not requested
             return None
         piece = self._piece(key)
-        surfaces = self._far(piece.number, piece.row)
-        if not len(surfaces.frames):
-            return None
-        return Beyond(
-            surfaces, poses.inverse(piece.poses.T_world_lidar[piece.poses.frames.index(key)])
-        )
+        surfaces = self._far(piece)
+        return Beyond(surfaces, poses.inverse(piece.pose(key))) if surfaces.frames else None
 
     def _piece(self, key: int) -> Piece:
         pieces = self._pieces(self.cut.number_of[key])
         return next(piece for piece in pieces if key in piece.frames)
 
-    def _registration(self, number: int) -> Registration:
+    @_latest
+    def registration(self, number: int) -> Registration:
         """Register each run of consecutive sweeps, split at sweeps that cannot be registered."""
-        settings, frames = self.settings.register, self._registered_together(number)
+        frames = self._registered_together(number)
 
         def make() -> Registration:
-            self._sweeps.prepare(frames)
+            self.sweeps.prepare(frames)
             sweeps, bad, pieces = {}, {}, []
             for frame in frames:
                 try:
-                    self._sweeps.recorded_pose(frame)
-                    sweeps[frame] = self._sweeps.read(frame)
+                    self.sweeps.recorded_pose(frame)
+                    sweeps[frame] = self.sweeps.read(frame)
                 except InputError as error:
                     bad[frame] = LeftOut(str(error), unreadable=True)
-            left = self.timeline.runs(sweeps)
-            while left:
-                together = left.pop()
-                run = [sweeps[f] for f in together]
-                recorded = None
-                if settings.source == "dataset":
-                    recorded = recorded_trajectory(self.sequence, run)
+            remaining = self.timeline.runs(sweeps)
+            while remaining:
+                together = remaining.pop()
                 try:
-                    with self._watch.stage("register"):
-                        piece = find_trajectory(run, settings, recorded)
-                    self._check_frame(run, piece, recorded)
-                    pieces.append(piece)
+                    pieces.append(self._register([sweeps[f] for f in together]))
                 except SweepError as error:
                     unfit = isinstance(error, UnfitSweepError)
                     bad[error.frame] = LeftOut(str(error), unreadable=False, unfit=unfit)
-                    left += self.timeline.runs([f for f in together if f != error.frame])
+                    remaining += self.timeline.runs([f for f in together if f != error.frame])
             return Registration(tuple(sorted(pieces, key=lambda p: p.frames)), bad)
 
         return self._kept("registration", frames, make)
 
-    def _check_frame(
-        self, sweeps: Sequence[Sweep], trajectory: Trajectory, recorded: Trajectory | None
-    ) -> None:
-        """Raise InputError if sweeps are not in the scanner's frame but in the frame of a map."""
-        ends, symptom = (sweeps[0], sweeps[-1]), ""
-        if recorded is not None:
-            if are_placed(sweeps, recorded.T_world_lidar):
-                symptom = "the rays begin at the sweeps' poses"
-        elif is_still(trajectory.T_world_lidar) and (way_m := way_in_map(*ends)):
-            symptom = f"odometry finds no motion, but the rays of both begin {way_m:.1f} m apart"
+    def _register(self, sweeps: Sequence[Sweep]) -> Trajectory:
+        """Return the poses of consecutive sweeps; raise InputError if they are in a map's frame."""
+        settings = self.settings.register
+        is_recorded = settings.source == "dataset"
+        recorded = recorded_trajectory(self.sequence, sweeps) if is_recorded else None
+        with self._watch.stage("register"):
+            trajectory = find_trajectory(sweeps, settings, recorded)
+        symptom = in_map_frame(sweeps, trajectory, recorded)
         if symptom:
+            ends = format_frames([sweeps[0].frame, sweeps[-1].frame])
             raise InputError(
-                f"{self.sequence.name}: sweeps {format_frames([s.frame for s in ends])} are in the "
+                f"{self.sequence.name}: sweeps {ends} are in the "
                 f"frame of a map: {symptom}; expected each in its scanner's own frame: "
                 f"{MAP_FRAME_REMEDY}"
             )
+        return trajectory
 
     def _registered_together(self, number: int) -> list[int]:
         """Return the frames of a block's lead-in, then of the block."""
         block = self.cut.blocks[number]
         return [*self.timeline.before(block[0], self._num_lead_in), *block]
 
-    def _find_pieces(self, number: int) -> list[Piece]:
+    @_latest
+    def _pieces(self, number: int) -> list[Piece]:
         """Return the pieces of a block, with their poses."""
         block = frozenset(self.cut.blocks[number])
         wanted = block.union(self.timeline.before(self.cut.blocks[number][0], 1))
@@ -342,68 +329,69 @@ class Recording:
             frames = tuple(f for f in piece.frames if f in block)
             if frames:
                 trajectory = piece.part([f for f in piece.frames if f in wanted], origin=frames[0])
-                pieces.append(Piece(number, len(pieces), trajectory, frames))
+                pieces.append(Piece(number, len(pieces), trajectory, frames, {}))
         return pieces
 
-    def _deskew(self, number: int, frame: int) -> RegisteredSweep:
-        """Return a sweep of block ``number``, deskewed, at its pose in the world of its piece."""
-        piece = next(p for p in self._pieces(number) if frame in p.frames)
-        sweep = self._sweeps.read(frame)
-        with self._watch.stage("deskew"):
-            return deskew([sweep], piece.poses).sweeps[0]
+    def _stretch(self, piece: Piece, frames: Sequence[int]) -> Stretch:
+        """Return deskewed sweeps of a piece, in its world."""
+        for frame in frames:
+            if frame not in piece.deskewed:
+                sweep = self.sweeps.read(frame)
+                with self._watch.stage("deskew"):
+                    piece.deskewed[frame] = deskew([sweep], piece.poses).sweeps[0]
+        return Stretch(tuple(piece.deskewed[frame] for frame in frames))
 
-    def _make_stretch(self, number: int, frames: tuple[int, ...]) -> Stretch:
-        """Return deskewed sweeps of one piece of block ``number``, in the world of the piece."""
-        return Stretch(tuple(self._deskewed(number, f) for f in frames))
-
-    def _find_searched(self, number: int, row: int) -> tuple[int, ...]:
+    @_latest
+    def _searched(self, piece: Piece) -> tuple[int, ...]:
         """Return the frames of a piece where motion is searched: windows, and every n-th around."""
-        frames, inside = self._pieces(number)[row].frames, self._in_windows(number)
+        frames, inside = piece.frames, self._in_windows(piece.number)
         inside_rows = np.flatnonzero([frame in inside for frame in frames])
         if self._step_around == 1 or not len(inside_rows):
             return frames
         num_away = np.abs(np.arange(len(frames))[:, None] - inside_rows).min(axis=1)
         return tuple(f for f, n in zip(frames, num_away, strict=True) if n % self._step_around == 0)
 
-    def _find_ground(self, number: int, row: int) -> HeightMap:
+    @_latest
+    def _ground(self, piece: Piece) -> HeightMap:
         """Return the height map of the ground of a piece."""
-        stretch = self._stretch(number, self._searched(number, row))
+        stretch = self._stretch(piece, self._searched(piece))
         with self._watch.stage("ground"):
             return ground(stretch)
 
-    def _find_motion(self, number: int, row: int, engine: str) -> SharedMotion:
+    @_latest
+    def _motion(self, piece: Piece, engine: str) -> SharedMotion:
         """Return the scene flow in a piece, without the sweeps to keep the cache small."""
-        asked, frames = self._in_windows(number), self._searched(number, row)
+        asked, frames = self._in_windows(piece.number), self._searched(piece)
 
         def make() -> SharedMotion:
-            stretch, heights = self._stretch(number, frames), self._ground(number, row)
+            stretch, heights = self._stretch(piece, frames), self._ground(piece)
             with self._watch.stage("flow"):
                 scene = Scene(stretch, heights, asked=asked)
                 motion = estimate_motion(scene, self.settings, engine)
             return cast(SharedMotion, motion).with_stretch(Stretch(()))
 
-        settings = [engine, self.settings.flow, self.settings.objective, sorted(asked), row]
-        together = self._registered_together(number)
-        return self._kept("motion", together, make, settings)
+        settings = [engine, self.settings.flow, self.settings.objective, sorted(asked), piece.row]
+        return self._kept("motion", self._registered_together(piece.number), make, settings)
 
-    def _find_far(self, number: int, row: int) -> StandingWorld:
+    @_latest
+    def _far(self, piece: Piece) -> StandingWorld:
         """Return the static surfaces along the road of a piece, in the piece's world."""
-        cameras = list(self.sequence.cameras.values())
-        far_m, settings = self.settings.accumulate.far_m, self.settings.register
-        road = Road(self.timeline, self._sweeps, cameras, settings, far_m)
         # Sweeps of the block outside the windows belong to the far range.
-        inside, frames = self._in_windows(number), self._pieces(number)[row].frames
-        in_windows = tuple(f for f in frames if f in inside) or frames
+        inside = self._in_windows(piece.number)
+        in_windows = tuple(f for f in piece.frames if f in inside) or piece.frames
 
         def make() -> StandingWorld:
-            keys = [k for k in self.cut.keys_of(number) if k in in_windows]
-            stretch = self._stretch(number, in_windows)
+            keys = [k for k in self.cut.keys_of(piece.number) if k in in_windows]
+            window, cameras = self._stretch(piece, in_windows), self.sequence.cameras.values()
             with self._watch.stage("far"):
-                return road.find_standing(stretch, keys, with_window=len(keys) > 1)
+                views, far_m = views_of(cameras, window, keys), self.settings.accumulate.far_m
+                register = self.settings.register
+                road = Road(self.timeline, self.sweeps, register, far_m, window, views)
+                return road.find_standing(with_window=len(keys) > 1)
 
         # Processes of one run share the result. A digest would read every sweep of the road.
         shared = self._cache if self._run is not None else None
-        inputs = [code_digest(), self._run, self.sequence.name, number, row]
+        inputs = [code_digest(), self._run, self.sequence.name, piece.number, piece.row]
         return kept(shared, "far", lambda: inputs, make)
 
     def _in_windows(self, number: int) -> frozenset[int]:
@@ -422,7 +410,7 @@ class Recording:
         """Return the result of ``make``, or the cached result for the same sweeps and settings."""
 
         def inputs() -> Any:
-            content = [(f, self._sweeps.content(f)) for f in frames]
+            content = [(f, self.sweeps.content(f)) for f in frames]
             code, period_ns = code_digest(), self.timeline.period_ns
             return [code, self.settings.register, period_ns, content, list(settings)]
 

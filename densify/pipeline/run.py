@@ -7,7 +7,7 @@
     accumulate rigidly, or with flow   recording.moment   (free space, ground, motion)
     find static surfaces beyond it     recording.standing
     see, project, fill, score          densify.pipeline.key_result, method by method
-    complete with a prior              densify.pipeline.prior
+    complete with a prior              densify.pipeline.key_result
     warn                               densify.pipeline.warnings
 """
 
@@ -33,16 +33,17 @@ from densify.flow.engines import check_engine
 from densify.free_space.range_image import RangeImage
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Cloud, LidarSequence, Progress, Result, StretchFlow
-from densify.pipeline.costs import Watch
 from densify.pipeline.key_result import (
     COMPARED,
     METHODS,
     KeyScene,
+    complete_with_prior,
     looks_around,
     methods_of_run,
     result_of_method,
 )
-from densify.pipeline.recording import Beyond, Moment, Recording
+from densify.pipeline.process import Watch
+from densify.pipeline.recording import Beyond, Recording
 from densify.pipeline.warnings import add_warnings
 from densify.readers.timeline import choose_cameras
 
@@ -200,10 +201,14 @@ def densify(
     with ThreadPoolExecutor(num_threads()) as pool:
         wants_far = any(METHODS[name].far for name in methods)
         far = pool.submit(recording.standing, key) if wants_far else None
-        moments = _moments(recording, key, methods)
+        with_flow = settings.output.flow != "none"
+        moments = {
+            name: recording.moment(key, METHODS[name].all_sweeps, METHODS[name].engine, with_flow)
+            for name in methods
+        }
         beyond = far.result() if far is not None else None
         if key == max(recording.cut.number_of):  # no later key needs them
-            recording.forget_raw()
+            recording.sweeps.read.cache_clear()
         scene = scene_of(
             recording, key, shots, images, beyond, moments[methods[-1]].cloud, with_images, watch
         )
@@ -212,13 +217,9 @@ def densify(
         bare_results = list(pool.map(make, methods, filled))
 
     if priors is not None:
-        from densify.pipeline.prior import complete_with_prior
-
         with watch.stage("prior"):
-            kind = settings.prior.kind
-            bare_results[-1] = complete_with_prior(
-                bare_results[-1], priors, shots, scene.truth, kind
-            )
+            completed = bare_results[-1], priors, shots, scene.truth, settings.prior.kind
+            bare_results[-1] = complete_with_prior(*completed)
     results: dict[str, Result] = {}
     costs = watch.costs()
     for result in bare_results:
@@ -226,15 +227,6 @@ def densify(
             result, costs=costs, baselines=dict(results), recording=sequence.name
         )
     return add_warnings(results, recording, key, shots)
-
-
-def _moments(recording: Recording, key: int, methods: Sequence[str]) -> dict[str, Moment]:
-    """Return the points at the key's time by method, as each method accumulates them."""
-    moments, with_flow = {}, recording.settings.output.flow != "none"
-    for name in methods:
-        method = METHODS[name]
-        moments[name] = recording.moment(key, method.all_sweeps, method.engine, with_flow)
-    return moments
 
 
 def scene_of(

@@ -11,9 +11,9 @@ from uuid import uuid4
 from densify.config import RegisterSettings
 from densify.config.cache import Cache, digest, kept
 from densify.config.errors import InputError
-from densify.free_space.sectors import by_azimuth
+from densify.free_space.raw_sweeps import by_azimuth
 from densify.geometry.types import Float, Int, LidarSequence, Sweep
-from densify.pipeline.costs import Watch
+from densify.pipeline.process import Watch
 from densify.readers.timeline import Timeline, check_key, check_window, read_sweep
 
 BLOCK_S = 2.0
@@ -42,7 +42,7 @@ class Sweeps:
         """
         self._sequence, self._timeline, self._settings = sequence, timeline, settings
         self._cache, self._run, self._watch = cache, run or uuid4().hex, watch
-        self.returns: dict[int, Int] = {}  # of sweeps read: frame -> `by_azimuth`
+        self._returns: dict[int, Int] = {}  # of sweeps read: frame -> `by_azimuth`
         self.read = lru_cache(maxsize=num_kept)(self._read)
         self.content = lru_cache(maxsize=None)(self._content)
 
@@ -64,8 +64,14 @@ class Sweeps:
             raise InputError(self._timeline.unknown[frame])
         with self._watch.stage("read"):
             sweep = read_sweep(self._sequence, frame, self._settings)
-        self.returns[frame] = by_azimuth(sweep)
+        self._returns[frame] = by_azimuth(sweep)
         return sweep
+
+    def returns_by_azimuth(self, frame: int) -> Int:
+        """Return the (360,) number of returns of a sweep in each degree of azimuth from -180."""
+        if frame not in self._returns:
+            self.read(frame)
+        return self._returns[frame]
 
     def _content(self, frame: int) -> str:
         """Return a digest of a sweep and its recorded pose, or the message of its error."""

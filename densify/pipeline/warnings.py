@@ -8,10 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.config import Config
 from densify.config.errors import InputError
 from densify.depth.exposure import Shot
-from densify.free_space.sectors import LOST_DEG, blind_sector, lost_deg
+from densify.free_space.raw_sweeps import LOST_DEG, blind_sector, lost_deg
 from densify.geometry import poses
 from densify.geometry.types import LidarSequence, Result, Stretch, Sweep
 from densify.pipeline.key_result import METHODS, looks_around
@@ -48,9 +47,8 @@ def add_warnings(
             for name in sequence.cameras
             if name not in cameras and not sequence.image_stamps_ns(name)
         ),
-        *_of_sweeps(stretch, recording.settings),
+        *_of_sweeps(recording, key),
         *_of_sectors(stretch, recording),
-        *_of_ground(recording, key),
         *_of_motion(recording, key),
         *_of_images(sequence, shots),
     ]
@@ -67,9 +65,9 @@ def _of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
         yield "in two sweeps moving objects are found less well than in three or more"
 
 
-def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
+def _of_sweeps(recording: Recording, key: int) -> Iterator[str]:
     """Yield warnings about missing point times and about points left out of the sweeps."""
-    sweeps = [registered.sweep for registered in stretch.sweeps]
+    settings, sweeps = recording.settings, [s.sweep for s in recording.window(key).sweeps]
     if settings.register.deskew and any(sweep.offset_ns is None for sweep in sweeps):
         yield "the points have no times of their own: motion within a sweep is not undone"
     untimed = {sweep.frame: sweep.num_untimed for sweep in sweeps if sweep.num_untimed}
@@ -99,6 +97,12 @@ def _of_sweeps(stretch: Stretch, settings: Config) -> Iterator[str]:
             f"of the points as the own vehicle's; indoors and on small robots set it to the reach "
             f"of the vehicle"
         )
+    share = recording.share_below(key)
+    if share > _MUCH_BELOW:
+        yield (
+            f"{100 * share:.1f} % of the points lie below the ground, as mirror images of a wet "
+            f"road and echoes over two surfaces do; they are left out"
+        )
 
 
 def _share_near(sweeps: Sequence[Sweep]) -> float:
@@ -111,7 +115,7 @@ def _of_sectors(stretch: Stretch, recording: Recording) -> Iterator[str]:
     """Yield warnings about directions in which raw sweeps lack returns."""
     if _share_near([registered.sweep for registered in stretch.sweeps]) > _MUCH_NEAR:
         return  # they may lack those left out
-    returns = recording.returns(stretch.frames)
+    returns = np.stack([recording.sweeps.returns_by_azimuth(f) for f in stretch.frames])
     width_deg = zip(stretch.frames, lost_deg(returns), strict=True)
     lacking = {frame: width for frame, width in width_deg if width >= LOST_DEG}
     if lacking:
@@ -128,24 +132,13 @@ def _of_sectors(stretch: Stretch, recording: Recording) -> Iterator[str]:
         )
 
 
-def _of_ground(recording: Recording, key: int) -> Iterator[str]:
-    """Yield a warning if many points lie below the ground."""
-    share = recording.share_below(key)
-    if share > _MUCH_BELOW:
-        yield (
-            f"{100 * share:.1f} % of the points lie below the ground, as mirror images of a wet "
-            f"road and echoes over two surfaces do; they are left out"
-        )
-
-
 def _of_motion(recording: Recording, key: int) -> Iterator[str]:
     """Yield warnings if sweeps seem compensated already, or if given poses do not align them."""
-    settings, stretch = recording.settings.register, recording.window(key)
-    at = stretch[key]
+    settings, at = recording.settings.register, recording.window(key)[key]
     rings = None
     if at.sweep.offset_ns is not None:
         period_s = recording.timeline.period_ns * 1e-9
-        rings = find_compensated(recording.raw(key), at.twist, period_s)
+        rings = find_compensated(recording.sweeps.read(key), at.twist, period_s)
     if rings is not None:
         yield (
             f"the sweeps are compensated already, to {rings.moment}, and now a second time: the "
@@ -165,7 +158,7 @@ def _of_recorded(recording: Recording, key: int) -> Iterator[str]:
     (around,) = (frames for frames in timeline.runs(neighbours) if key in frames)
     settings = replace(recording.settings.register, source="kiss-icp")
     try:
-        sweeps = [recording.raw(frame) for frame in around]
+        sweeps = [recording.sweeps.read(frame) for frame in around]
         odometry = find_trajectory(sweeps, settings).T_world_lidar
         recorded = [recording.sequence.T_world_lidar(frame) for frame in (around[0], around[-1])]
     except InputError:

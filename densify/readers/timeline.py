@@ -13,7 +13,7 @@ import numpy as np
 
 from densify.config import RegisterSettings
 from densify.config.errors import InputError
-from densify.free_space.lone_returns import without_lone
+from densify.free_space.raw_sweeps import without_lone
 from densify.geometry.types import Camera, Int, LidarSequence, Sweep, Trajectory
 
 _HOLE_PERIODS = 3.1  # a longer step is a hole in time: 3 periods and some jitter

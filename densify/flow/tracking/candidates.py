@@ -19,7 +19,7 @@ from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import num_threads
-from densify.geometry.linking import close_to_seeds, link
+from densify.geometry.nearest import close_to_seeds, link
 from densify.geometry.types import Bool, Float, Int, Stretch
 
 LINK_M = 0.6  # candidates closer to each other are one cluster

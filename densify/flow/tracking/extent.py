@@ -18,8 +18,7 @@ from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
-from densify.geometry.linking import close_to_seeds
-from densify.geometry.nearest import is_near, nearest, tree_of
+from densify.geometry.nearest import close_to_seeds, is_near, nearest, tree_of
 from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 
 Instance = NDArray[np.int32]

@@ -18,10 +18,9 @@ from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
 from densify.flow.tracking.candidates import LINK_M, MIN_SEED_SHARE, Batch, Obstacles
 from densify.flow.tracking.objects import BESIDE_M, MovingObject, Track
 from densify.free_space.ground import HeightMap
-from densify.geometry.arrays import bulk
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import Kernel
-from densify.geometry.nearest import is_near, nearest, tree_of
+from densify.geometry.nearest import bulk, is_near, nearest, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 Bytes = NDArray[np.uint8]

@@ -35,7 +35,7 @@ from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
-from densify.geometry.linking import link
+from densify.geometry.nearest import link
 from densify.geometry.types import Bool, Float, Int
 
 _NEAR_S = 0.3

@@ -9,40 +9,36 @@ of the key sweep, ``stretch`` holds the registered sweeps of its window.
 """
 
 from densify.geometry.arrays import Bool, Float, Float32, Int
-from densify.geometry.types.depth import (
-    Camera,
-    CameraView,
-    Cloud,
-    DepthMap,
-    Mover,
-    Patches,
-    Reason,
-    Rejected,
-    StandingWorld,
-)
 from densify.geometry.types.recordings import (
     Boxes,
     BoxView,
-    LidarSequence,
-    SweepTruth,
-    Truth,
-)
-from densify.geometry.types.results import (
-    METHOD_NAMES,
-    FullDepth,
-    ObjectTrack,
-    Prior,
-    PriorFit,
-    Progress,
-    Result,
-    StageCost,
-)
-from densify.geometry.types.sweeps import (
+    Camera,
     FlowField,
+    LidarSequence,
     Motion,
     RegisteredSweep,
     Stretch,
     StretchFlow,
     Sweep,
+    SweepTruth,
     Trajectory,
+    Truth,
+)
+from densify.geometry.types.results import (
+    METHOD_NAMES,
+    CameraView,
+    Cloud,
+    DepthMap,
+    FullDepth,
+    Mover,
+    ObjectTrack,
+    Patches,
+    Prior,
+    PriorFit,
+    Progress,
+    Reason,
+    Rejected,
+    Result,
+    StageCost,
+    StandingWorld,
 )

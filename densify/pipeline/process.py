@@ -1,17 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Measure the cost of each stage of the pipeline, and report progress."""
+"""Measure the cost of each stage, report progress, and set how freed memory is reused."""
 
 from __future__ import annotations
 
+import ctypes
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from resource import RUSAGE_SELF, getrusage
+from typing import TYPE_CHECKING
 
-from densify.geometry.types import Progress, StageCost
+if TYPE_CHECKING:
+    from densify.geometry.types import Progress, StageCost
 
+# glibc's mallopt(3)
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
+_KEPT_BYTES = 2**30
+_MOST_OF_OLDER_BYTES = 2**25  # older releases refuse a larger threshold of mmap
 _PER_MB = 1024 * 1024 if sys.platform == "darwin" else 1024  # of getrusage(2)
 
 
@@ -55,9 +62,26 @@ class Watch:
 
     def costs(self) -> tuple[StageCost, ...]:
         """Return the cost of each stage measured until now, repeated runs of a stage added up."""
+        from densify.geometry.types import StageCost  # the command line starts without numpy
+
         return tuple(StageCost(n, self._seconds[n], peak) for n, peak in self._peak_mb.items())
 
     def _report(self, name: str, done: int) -> None:
         if self._progress is not None:
             with self._lock:
                 self._progress(name, done, 1)
+
+
+def keep_freed_memory() -> None:
+    """Let all threads of this process share one heap that keeps the freed memory of large arrays.
+
+    By default each thread has its own heap, and the system takes back and clears the pages of every
+    large array. Call this before threads are started. It does nothing if the C library is not
+    glibc.
+    """
+    with suppress(OSError, AttributeError, TypeError):  # another library, or none by that name
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_ARENA_MAX, 1)
+        if not mallopt(_MMAP_THRESHOLD, _KEPT_BYTES):
+            mallopt(_MMAP_THRESHOLD, _MOST_OF_OLDER_BYTES)
+        mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
