@@ -79,9 +79,9 @@ def test_a_death_costs_its_item_alone(tmp_path: Path) -> None:
 def test_cores_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(7)))
     before = dict(os.environ)
-    told = [outcome for _, outcome in call_all(worker_calls.threads, [[0], [1]], 2)]
-    assert told[0] == ("3", 3, False)  # one worker may call both, and has loaded numba then
-    assert {outcome[:2] for outcome in told} == {("3", 3)}
+    outcomes = [outcome for _, outcome in call_all(worker_calls.threads, [[0], [1]], 2)]
+    assert outcomes[0] == ("3", 3, False)  # one worker may call both, and has loaded numba then
+    assert {outcome[:2] for outcome in outcomes} == {("3", 3)}
     assert dict(os.environ) == before
     assert executor.share_of_cores(8)["OMP_NUM_THREADS"] == "1"
 

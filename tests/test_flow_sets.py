@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +15,11 @@ from densify.bench.flow import bench_flow
 from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
+from densify.geometry.types import Stretch
 from densify.readers import open_sequence
 from densify.readers.flow_files import labelled_flow
 from densify.readers.street import Street
+from tests.command import files_in
 from tests.exact_motion import registered
 
 feather = pytest.importorskip("pyarrow.feather")
@@ -68,12 +69,7 @@ def test_a_submission_has_a_file_for_each_sweep_and_a_row_for_each_point(log, su
     for frame, (path, sweep) in enumerate(zip(files, sweep_files(log), strict=True)):
         table = feather.read_table(path)
         assert table.column_names == ["is_valid", *AXES]
-        assert [str(t) for t in table.schema.types] == [
-            "bool",
-            "halffloat",
-            "halffloat",
-            "halffloat",
-        ]
+        assert [str(t) for t in table.schema.types] == ["bool", *3 * ["halffloat"]]
         assert len(table) == len(feather.read_table(sweep)) and all(table["is_valid"].to_pylist())
         residual = np.stack([table[axis].to_numpy() for axis in AXES], axis=1).astype(float)
         moving = residual.any(axis=1)
@@ -138,16 +134,16 @@ def test_labels_score_as_the_truth_they_are_made_of(log, tmp_path, capsys):
     command = ["bench", "flow", "--data", str(log), "--key", "2", "--window", "2", *GIVEN]
     command += ["--methods", "ours,rigid"]
     assert main([*command, "--truth", str(labels), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["runs"][0]
-    assert found["num_pairs"] == 2
+    scored = json.loads(capsys.readouterr().out)["runs"][0]
+    assert scored["num_pairs"] == 2
     exact = bench_flow(
         open_sequence(log), 2, 2, resolve({"register": {"source": "dataset"}}), ("ours", "rigid")
     )
-    for name, row in found["methods"].items():
-        here, there = row["challenge"], exact["methods"][name]["challenge"]
-        assert here["three_way"] == pytest.approx(there["three_way"], abs=1e-5)
-        assert here["bucketed"]["CAR"] == pytest.approx(there["bucketed"]["OBJECT"], abs=1e-5)
-    rigid, ours = (found["methods"][name]["challenge"] for name in ("rigid", "ours"))
+    for name, row in scored["methods"].items():
+        labelled, true = row["challenge"], exact["methods"][name]["challenge"]
+        assert labelled["three_way"] == pytest.approx(true["three_way"], abs=1e-5)
+        assert labelled["bucketed"]["CAR"] == pytest.approx(true["bucketed"]["OBJECT"], abs=1e-5)
+    rigid, ours = (scored["methods"][name]["challenge"] for name in ("rigid", "ours"))
     assert rigid["bucketed"]["CAR"]["dynamic"] == pytest.approx(1.0)
     assert rigid["three_way"]["foreground_dynamic_m"] > 0.3
     assert ours["three_way"]["foreground_static_m"] < 1e-4
@@ -213,43 +209,33 @@ def test_doc_depths_exchange_format(tmp_path):
     np.testing.assert_allclose(exposed_ns[seen["indices"]] * 1e-9, seen["timestamp"], atol=1e-6)
 
 
-# --- what is refused ------------------------------------------------------------------------------
-
-
 def test_what_is_there_is_kept(log, submission, capsys):
-    before = {p: p.read_bytes() for p in (submission / log.name).iterdir()}
+    before = files_in(submission)
     assert flow(log, submission, "--all", "--format", "av2") == 2
     assert "already there and kept" in capsys.readouterr().err
-    assert before == {p: p.read_bytes() for p in (submission / log.name).iterdir()}
+    assert before == files_in(submission)
 
 
-def test_bad_labels_are_named(log, tmp_path):
+def test_labels_by_number_and_what_is_wrong_with_them(log, tmp_path):
     points = open_sequence(log)[0].points[:5]
-    stretch_of = [registered(frame, points) for frame in (0, 1)]
-    from densify.geometry.types import Stretch
-
-    stretch = Stretch(tuple(stretch_of))
-    with pytest.raises(InputError, match="no such folder"):
-        labelled_flow(tmp_path / "none", "x", stretch, 0)
-    with pytest.raises(InputError, match="holds no labels of x"):
-        labelled_flow(tmp_path, "x", stretch, 0)
-    labels = labels_of(log, tmp_path / "labels", True)
+    stretch = Stretch(tuple(registered(frame, points) for frame in (0, 1)))
+    labels, empty = labels_of(log, tmp_path / "labels", True), tmp_path / "empty"
     path = labels / log.name / "0000000000.feather"
-    table = feather.read_table(path, memory_map=False)
-    feather.write_feather(table.slice(0, 3), path)
-    with pytest.raises(InputError, match="holds 3 labels"):
-        labelled_flow(labels, log.name, stretch, 0)
-    shutil.rmtree(labels / log.name)
-    np.savez(tmp_path / "000005_000006.npz", residual_flow=np.zeros((9, 3)))
+    feather.write_feather(feather.read_table(path, memory_map=False).slice(0, 3), path)
+    empty.mkdir()
+    for folder, name, words in (
+        (tmp_path / "none", "x", "no such folder"),
+        (empty, "x", "holds no labels of x"),
+        (labels, log.name, "holds 3 labels"),
+    ):
+        with pytest.raises(InputError, match=words):
+            labelled_flow(folder, name, stretch, 0)
+    np.savez(empty / "000005_000006.npz", residual_flow=np.zeros((9, 3)))
     with pytest.raises(InputError, match="no such flow file"):
-        labelled_flow(tmp_path, "x", stretch, 0)
-    np.savez(
-        tmp_path / "000000_000001.npz",
-        residual_flow=np.ones((30, 3)),
-        object=np.arange(30) - 1,
-        valid=np.arange(30) % 2 == 0,
-    )
-    label = labelled_flow(tmp_path, "x", stretch, 0)
-    row = stretch.sweeps[0].sweep.row
+        labelled_flow(empty, "x", stretch, 0)
+    number = np.arange(30)
+    columns = {"object": number - 1, "valid": number % 2 == 0}
+    np.savez(empty / "000000_000001.npz", residual_flow=np.ones((30, 3)), **columns)
+    label, row = labelled_flow(empty, "x", stretch, 0), stretch.sweeps[0].sweep.row
     np.testing.assert_array_equal(label.valid, row % 2 == 0)
     np.testing.assert_array_equal(label.classes > 0, row > 0)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
 from densify.flow.objective.energy import on_one_thread
-from densify.learning.clips import ClipMaker
+from densify.learning import training
 from densify.learning.network import (
     Model,
     NetworkCloud,
@@ -24,16 +25,56 @@ from densify.learning.network import (
     read_model,
     write_model,
 )
-from densify.learning.samples import (
-    ALPHA,
-    NUM_NEIGHBORS,
-    Sample,
-    objective_loss,
-    sample_of,
-    supervised_loss,
-)
-from tests.learning_scenes import clip, train_small
+from densify.learning.samples import Clip, ClipMaker, ClipSweep, Sample, sample_of
+from densify.learning.training import ALPHA, NUM_NEIGHBORS, objective_loss, supervised_loss
+from tests.command import refused
 from tests.small_street import POSES_GIVEN, one_car
+
+NUM_SWEEPS, PERIOD_S = 4, 0.1  # of a small clip
+
+
+def clip(number: int, seed: int = 0, num_points: int = 300) -> Clip:
+    """Posts that stand, and a block at 10 m/s along x; each sweep measures all of it anew."""
+    rng = np.random.default_rng([seed, number])
+    posts = rng.uniform(-20, 20, (12, 2))
+    block, speed = rng.uniform(-8, 8, 2), np.array([10.0, 0.0])
+    sweeps = []
+    for i in range(NUM_SWEEPS):
+        own = rng.integers(len(posts), size=num_points)
+        standing = posts[own] + rng.uniform(-0.3, 0.3, (num_points, 2))
+        moving = block + speed * i * PERIOD_S + rng.uniform([-2, -0.9], [2, 0.9], (num_points, 2))
+        height_m = rng.uniform(0.3, 2.0, 2 * num_points)
+        points = np.column_stack([np.concatenate([standing, moving]), height_m - 1.7])
+        moves = np.arange(2 * num_points) >= num_points
+        step = np.array([*speed, 0.0]) * PERIOD_S
+        flow = np.stack([-step * moves[:, None] * (i > 0), step * moves[:, None]])
+        flow[1] *= i < NUM_SWEEPS - 1
+        sweeps.append(
+            ClipSweep(
+                points.astype(np.float32),
+                height_m.astype(np.float32),
+                np.zeros(3, np.float32),
+                i * PERIOD_S,
+                flow.astype(np.float32),
+                moves,
+            )
+        )
+    return tuple(sweeps)
+
+
+@dataclass(frozen=True)
+class SmallClips(ClipMaker):
+    """In the place of clips of recordings."""
+
+    def __call__(self, number: int) -> Clip:
+        return clip(number, self.seed)
+
+
+def train_small(out: Path, monkeypatch, **options) -> bytes:
+    """`train` on small clips; returns the model's file."""
+    monkeypatch.setattr(training, "ClipMaker", SmallClips)
+    training.train(training.Training(("streets",), steps=1, **options), out)
+    return out.read_bytes()
 
 
 def cloud(count: int, seed: int = 0, reach_m: float = 30.0) -> NetworkCloud:
@@ -94,8 +135,8 @@ def network() -> Voxels:
 
 def test_flow_has_a_row_for_every_point_and_depends_on_the_target(network: Voxels) -> None:
     with torch.inference_mode():
-        for given in ([cloud(500), cloud(300, 1)], [cloud(500), cloud(40, 1), None]):
-            flow = network(given)
+        for sweeps in ([cloud(500), cloud(300, 1)], [cloud(500), cloud(40, 1), None]):
+            flow = network(sweeps)
             assert flow.shape == (500, 3) and torch.isfinite(flow).all() and flow.any()
         assert network([cloud(0), cloud(9)]).shape == (0, 3)
         one, other = (network([cloud(500), cloud(300, seed)]) for seed in (1, 2))
@@ -103,13 +144,13 @@ def test_flow_has_a_row_for_every_point_and_depends_on_the_target(network: Voxel
 
 
 def test_a_whole_sweep_gives_the_same_bytes_with_any_number_of_threads(network: Voxels) -> None:
-    given, found, before = [cloud(20_000, n) for n in range(3)], [], torch.get_num_threads()
+    sweeps, flows, before = [cloud(20_000, n) for n in range(3)], [], torch.get_num_threads()
     for threads in (1, 2):
         torch.set_num_threads(threads)
         with on_one_thread(), torch.inference_mode():
-            found.append(network(given))
+            flows.append(network(sweeps))
     torch.set_num_threads(before)
-    assert torch.equal(*found)
+    assert torch.equal(*flows)
 
 
 def test_sweeps_before_the_source_come_in_the_direction_of_time() -> None:
@@ -133,18 +174,17 @@ def test_the_network_learns_what_moves() -> None:
     assert moving < 0.3 and static < 0.15  # a flow of 0 has an error of 1 m
 
 
-def test_the_objective_trains(tmp_path: Path) -> None:
-    path = train_small(str(tmp_path / "model"), teacher="objective", steps=1)
-    changed = zip(build().parameters(), read_model(path).network.parameters(), strict=True)
-    assert any(not torch.equal(a, b) for a, b in changed)
-
-
-def test_a_seed_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_training_changes_the_network_and_a_seed_gives_the_same_bytes(
+    tmp_path: Path, monkeypatch
+) -> None:
     first, again, other = (
-        train_small(str(tmp_path / f"{i}.pt"), steps=2, seed=seed).read_bytes()
+        train_small(tmp_path / f"{i}.pt", monkeypatch, seed=seed)
         for i, seed in enumerate((0, 0, 1))
     )
     assert first == again != other
+    trained = read_model(tmp_path / "0.pt").network.parameters()
+    changed = zip(build().parameters(), trained, strict=True)
+    assert any(not torch.equal(a, b) for a, b in changed)
 
 
 def test_a_random_change_moves_points_and_flow_alike() -> None:
@@ -168,10 +208,10 @@ def test_a_model_comes_back(tmp_path: Path) -> None:
     for name in ("a.pt", "b"):
         write_model(tmp_path / name, model)
     assert (tmp_path / "a.pt").read_bytes() == (tmp_path / "b").read_bytes()
-    found = read_model(tmp_path / "b")
-    assert found.made == {"teacher": "truth"}
+    back = read_model(tmp_path / "b")
+    assert back.provenance == model.provenance
     for name, tensor in model.network.state_dict().items():
-        assert torch.equal(tensor, found.network.state_dict()[name])
+        assert torch.equal(tensor, back.network.state_dict()[name])
 
 
 def test_other_models_are_refused(tmp_path: Path) -> None:
@@ -197,38 +237,35 @@ def test_other_models_are_refused(tmp_path: Path) -> None:
 
 def test_the_command_trains_on_a_street(tmp_path: Path, capsys, monkeypatch) -> None:
     """A recording is labelled by our engine, and a network learns from it."""
-    monkeypatch.setattr("densify.learning.samples._NUM_MIXED", 1)  # clips made ahead
-    monkeypatch.setattr("densify.learning.clips.open_sequence", lambda spec: one_car())
-    monkeypatch.setattr("densify.learning.clips.resolve", lambda _: resolve(POSES_GIVEN))
+    samples = "densify.learning.samples"
+    monkeypatch.setattr(f"{samples}._NUM_MIXED", 1)  # clips made ahead
+    monkeypatch.setattr(f"{samples}.open_sequence", lambda spec: one_car())
+    monkeypatch.setattr(f"{samples}.resolve", lambda _: resolve(POSES_GIVEN))
     out = tmp_path / "m.pt"
     command = ["train", "flow", "--data", "street", "--out", str(out), "--teacher", "engine"]
     command += ["--steps", "2"]
     assert main(command) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert told[0].startswith("2 steps, loss") and told[1:] == [str(out)]
-    assert read_model(out).made["teacher"] == "engine"
-    assert main(command) == 2
-    assert "already there and kept; give --overwrite" in capsys.readouterr().err
-    found, true = (ClipMaker(("street",), 0, teacher)(0) for teacher in ("engine", "truth"))
-    assert any(sweep.moving.any() for sweep in found), "a clip without moving points says nothing"
-    for sweep, truth in zip(found, true, strict=True):
-        own = sweep.moving & truth.moving
-        error_m = np.linalg.norm(sweep.flow - truth.flow, axis=2)[:, own]
-        assert not own.any() or np.median(error_m) < 0.1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("2 steps, loss") and lines[1:] == [str(out)]
+    assert read_model(out).provenance["teacher"] == "engine"
+    assert "already there and kept; give --overwrite" in refused(capsys, 2, *command)
+    estimated, true = (ClipMaker(("street",), 0, teacher)(0) for teacher in ("engine", "truth"))
+    assert any(sweep.moving.any() for sweep in estimated), "no moving points say nothing"
+    for sweep, truth in zip(estimated, true, strict=True):
+        moving = sweep.moving & truth.moving
+        error_m = np.linalg.norm(sweep.flow - truth.flow, axis=2)[:, moving]
+        assert not moving.any() or np.median(error_m) < 0.1
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("steps", "data", "message"),
     [
-        (["--steps", "0", "--data", "streets"], "--steps 0: expected 1 or more"),
-        (["--steps", "1", "--data", "nowhere"], "nowhere"),
-        (["--steps", "1", "--data", "streets?seed=3"], "seeds are drawn"),
+        ("0", "streets", "--steps 0: expected 1 or more"),
+        ("1", "nowhere", "nowhere"),
+        ("1", "streets?seed=3", "seeds are drawn"),
     ],
-    ids=str,
 )
-def test_bad_input_is_one_line(tmp_path: Path, capsys, options, message: str) -> None:
-    out = str(tmp_path / "m.pt")
-    assert main(["train", "flow", "--out", out, *options]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and message in lines[0]
+def test_bad_input_is_one_line(tmp_path: Path, capsys, steps, data, message: str) -> None:
+    command = ["train", "flow", "--out", tmp_path / "m.pt", "--steps", steps, "--data", data]
+    assert message in refused(capsys, 2, *command)
     assert not list(tmp_path.iterdir())

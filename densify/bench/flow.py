@@ -8,7 +8,6 @@ the flow to the key sweep, without registration and compilation.
 
 from __future__ import annotations
 
-import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -26,14 +25,80 @@ from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
 from densify.geometry.types import Bool, Float, FlowField, LidarSequence, Progress, Stretch, Truth
+from densify.outputs.atomic import plain
 from densify.pipeline.recording import Recording
 from densify.readers.flow_files import LabelledFlow, labelled_flow
-from densify.scores.challenge import CLASSES, ChallengeScorer
 from densify.scores.cloud_scores import ghost_rate
-from densify.scores.flow_metrics import end_point_error, end_point_errors, mean_of
+from densify.scores.flow_metrics import (
+    CLASSES,
+    challenge_scores,
+    end_point_error,
+    end_point_errors,
+    mean_of,
+)
 
 _MIN_RETURNS = 30
 _LEAST_MOTION_M = 0.5
+_PAPER = ("flow.engine=paper", "objective.static_prior=false")
+METHODS: Mapping[str, tuple[str, ...] | None] = {
+    "ours": (),
+    "ours-pair": ("flow.engine=pairs",),
+    "paper": (*_PAPER, "objective.solver=pcg"),
+    "paper-adam": (*_PAPER, "objective.solver=adam"),
+    "rigid": None,
+}
+"""Name of a method -> changes of the configuration. None: all points are static."""
+DEFAULT_METHODS = tuple(name for name in METHODS if name != "paper-adam")
+
+
+def bench_flow(
+    sequence: LidarSequence,
+    key: int,
+    window: int,
+    config: Config,
+    methods: Sequence[str] = DEFAULT_METHODS,
+    progress: Progress | None = None,
+    truth: Path | None = None,
+) -> dict[str, Any]:
+    """Run and measure methods of scene flow. The result has plain numbers, None if unknown.
+
+    Args:
+        window: Number of sweeps on each side of the key sweep.
+        methods: Names in `METHODS`. ``ours`` is the configured engine.
+        truth: Folder of true flow (`densify.readers.flow_files`), which scores only the sweeps
+            before the key sweep. None for the exact ground truth of the recording.
+
+    Returns:
+        ``data``, ``key``, ``frames``, ``num_pairs``, and ``methods``: name -> ``seconds_per_pair``
+            and the scores ``step``, ``challenge``, ``window`` of `Scorer`.
+    """
+    unknown = [method for method in methods if method not in METHODS]
+    if unknown or not methods:
+        raise InputError(
+            f"--methods: got {unknown[0] if unknown else 'none'}, expected {', '.join(METHODS)}"
+        )
+    opened = open_window(sequence, key, window, config)
+    num_before = opened.frames.index(key)
+    if len(opened.frames) < 2 or (truth is not None and num_before == 0):
+        raise InputError(f"--key {key}: no pair to score in {sequence.name}; choose another key")
+    neighbours = tuple(frame for frame in opened.frames if frame != key)
+    scored = neighbours if truth is None else opened.frames[:num_before]
+    scorer = Scorer.of(sequence, opened, scored, truth)
+    rows = {}
+    chosen = [name for name in METHODS if name in methods]
+    for done, method in enumerate(chosen):
+        if progress is not None:
+            progress(method, done, len(chosen))
+        steps, to_key, seconds = _flows(method, opened, config)
+        scores = {
+            "seconds_per_pair": seconds / len(neighbours),
+            "step": scorer.step_scores(steps),
+            "challenge": scorer.pooled_challenge_scores(steps),
+            "window": scorer.window_scores(to_key),
+        }
+        rows[method] = plain(scores)
+    facts = {"data": sequence.name, "key": key, "frames": list(opened.frames)}
+    return {**facts, "num_pairs": len(scored), "methods": rows}
 
 
 @dataclass(frozen=True)
@@ -82,9 +147,14 @@ class SweepTruth(NamedTuple):
         whole = truth.sweep(frame)
         moving, instance = whole.moving[rows], whole.instance[rows]
         num_returns = np.bincount(instance[instance >= 0], minlength=instance.max(initial=-1) + 2)
-        many = (instance >= 0) & (num_returns[instance] >= _MIN_RETURNS)
-        far = np.linalg.norm(last - first, axis=1) >= _LEAST_MOTION_M
-        return SweepTruth(step, to_key, moving, instance >= 0, moving & many & far)
+        is_large = (instance >= 0) & (num_returns[instance] >= _MIN_RETURNS)
+        travels = np.linalg.norm(last - first, axis=1) >= _LEAST_MOTION_M
+        return SweepTruth(step, to_key, moving, instance >= 0, moving & is_large & travels)
+
+    def as_label(self) -> LabelledFlow:
+        """Return the flow to the neighbouring sweep as a label, of objects of unknown kind."""
+        classes = np.where(self.foreground, CLASSES.index("OBJECT"), 0).astype(np.uint8)
+        return LabelledFlow(self.step, classes, np.ones(len(classes), bool))
 
 
 @dataclass(frozen=True)
@@ -100,44 +170,34 @@ class Scorer:
 
     @staticmethod
     def of(
-        sequence: LidarSequence, window: Window, sources: tuple[int, ...], place: Path | None = None
+        sequence: LidarSequence, window: Window, sources: tuple[int, ...], folder: Path | None
     ) -> Scorer:
         """Return the scorer of a window that scores the sweeps ``sources`` (frame numbers).
 
-        ``place``: folder of true flow (`densify.readers.flow_files`); None for exact truth, if any.
+        ``folder`` has true flow (`densify.readers.flow_files`); None for exact truth, if any.
         """
         truths, labels = None, {}
         if sequence.truth is not None:
             truths = {f: SweepTruth.of(sequence.truth, window, f) for f in window.frames}
-            for frame in sources:
-                classes = np.where(truths[frame].foreground, CLASSES.index("OBJECT"), 0)
-                valid = np.ones(len(classes), bool)
-                labels[frame] = LabelledFlow(truths[frame].step, classes.astype(np.uint8), valid)
-        if place is not None:
-            labels = {f: labelled_flow(place, sequence.name, window.stretch, f) for f in sources}
+        if folder is not None:
+            labels = {f: labelled_flow(folder, sequence.name, window.stretch, f) for f in sources}
+        elif truths is not None:
+            labels = {f: truths[f].as_label() for f in sources}
         return Scorer(window, sources, truths, labels)
 
-    def challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
-        """Return the Argoverse 2 challenges' pooled scores, None without ground truth.
+    def pooled_challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
+        """Return `challenge_scores` of all labelled pairs, None without ground truth.
 
-        ``steps`` is frame number -> flow to the neighbour towards the key sweep. The result has
-        ``three_way`` and ``bucketed`` errors and ``num_points``.
+        ``steps`` is frame number -> flow to the neighbour towards the key sweep.
         """
         if not self.labels:
             return None
-        scorer = ChallengeScorer()
+        columns = []
         for frame, label in self.labels.items():
-            counted = self.window.above[frame] & label.valid
             points = self.window.stretch[frame].sweep.points
-            flow = steps[frame].displacement[counted]
-            scorer.add(points[counted], flow, label.flow[counted], label.classes[counted])
-        scores = scorer.scores()
-        buckets = {**scores.by_class, "MEAN": scores.mean}
-        return {
-            "three_way": _plainly(scores.three_way._asdict()),
-            "bucketed": {name: _plainly(error._asdict()) for name, error in buckets.items()},
-            "num_points": scores.num_points,
-        }
+            values = (points, steps[frame].displacement, label.flow, label.classes)
+            columns.append([x[self.window.above[frame] & label.valid] for x in values])
+        return challenge_scores(*map(np.concatenate, zip(*columns, strict=True)))
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
         """Return the scores of the flow to the neighbouring sweep, pooled over the sources.
@@ -158,7 +218,8 @@ class Scorer:
         called = self._above(lambda f: steps[f].moving)
         certain = self._above(lambda f: truths[f].certain)
         static = np.concatenate([steps[f].moving[~truths[f].moving] for f in self.sources])
-        scores = {
+        return {
+            "num_movers": int(moving.sum()),
             "movers_m": end_point_error(flow, true, objects & moving),
             "found_movers_m": end_point_error(flow, true, moving & called),
             "static_objects_m": end_point_error(flow, true, objects & ~moving),
@@ -166,7 +227,6 @@ class Scorer:
             "found": mean_of(called[certain]),
             "falsely_moving": mean_of(static),
         }
-        return {"num_movers": int(moving.sum()), **_plainly(scores)}
 
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
         """Return the scores of the flow to the key sweep: ghost rate and errors of moving points.
@@ -181,87 +241,22 @@ class Scorer:
         if self.truths is None:
             return scores
         errors_m: dict[str, list[Float]] = defaultdict(list)
-        found_m: dict[str, list[Float]] = defaultdict(list)
+        called_m: dict[str, list[Float]] = defaultdict(list)
         for frame, truth in self.truths.items():
             if frame != key:
                 field, hops = to_key[frame], str(abs(self.window.hops(frame)))
                 kept = truth.moving & self.window.above[frame] & ~field.lost
                 error_m = end_point_errors(field.displacement, truth.to_key)
                 errors_m[hops].append(error_m[kept])
-                found_m[hops].append(error_m[kept & field.moving])
-        for name, by_hops in (("movers", errors_m), ("found_movers", found_m)):
+                called_m[hops].append(error_m[kept & field.moving])
+        for name, by_hops in (("movers", errors_m), ("found_movers", called_m)):
             means = {hops: mean_of(np.concatenate(by_hops[hops])) for hops in sorted(by_hops)}
-            scores[f"{name}_m_by_hops"] = _plainly(means)
+            scores[f"{name}_m_by_hops"] = means
         return scores
 
     def _above(self, column: Callable[[int], Any]) -> Any:
         """Return values of points above the ground; ``column`` maps frame number -> (N,) values."""
         return np.concatenate([column(f)[self.window.above[f]] for f in self.sources])
-
-
-def _plainly(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: None if math.isnan(value) else value for name, value in values.items()}
-
-
-_PAPER = ("flow.engine=paper", "objective.static_prior=false")
-METHODS: Mapping[str, tuple[str, ...] | None] = {
-    "ours": (),
-    "ours-pair": ("flow.engine=pairs",),
-    "paper": (*_PAPER, "objective.solver=pcg"),
-    "paper-adam": (*_PAPER, "objective.solver=adam"),
-    "rigid": None,
-}
-"""Name of a method -> changes of the configuration. None: all points are static."""
-DEFAULT_METHODS = tuple(name for name in METHODS if name != "paper-adam")
-
-
-def bench_flow(
-    sequence: LidarSequence,
-    key: int,
-    window: int,
-    config: Config,
-    methods: Sequence[str] = DEFAULT_METHODS,
-    progress: Progress | None = None,
-    truth: Path | None = None,
-) -> dict[str, Any]:
-    """Run and measure methods of scene flow. The result has plain numbers, None if unknown.
-
-    Args:
-        window: Number of sweeps on each side of the key sweep.
-        methods: Names in `METHODS`. ``ours`` is the configured engine.
-        truth: Folder of true flow (`densify.readers.flow_files`), which scores only the sweeps
-            before the key sweep. None for the exact ground truth of the recording.
-
-    Returns:
-        ``data``, ``key``, ``frames``, ``num_pairs``, and ``methods``: name -> ``seconds_per_pair``
-            and the scores ``step``, ``challenge``, ``window`` of `Scorer`.
-    """
-    unknown = [method for method in methods if method not in METHODS]
-    if unknown or not methods:
-        raise InputError(
-            f"--methods: got {unknown[0] if unknown else 'none'}, expected {', '.join(METHODS)}"
-        )
-    opened = open_window(sequence, key, window, config)
-    here = opened.frames.index(key)
-    if len(opened.frames) < 2 or (truth is not None and here == 0):
-        raise InputError(f"--key {key}: no pair to score in {sequence.name}; choose another key")
-    others = tuple(frame for frame in opened.frames if frame != key)
-    scored = others if truth is None else opened.frames[:here]
-    scorer = Scorer.of(sequence, opened, scored, truth)
-    rows = {}
-    chosen = [name for name in METHODS if name in methods]
-    for done, method in enumerate(chosen):
-        if progress is not None:
-            progress(method, done, len(chosen))
-        steps, to_key, seconds = _flows(method, opened, config)
-        rows[method] = {
-            "seconds_per_pair": seconds / len(others),
-            "step": scorer.step_scores(steps),
-            "challenge": scorer.challenge_scores(steps),
-            "window": scorer.window_scores(to_key),
-        }
-    facts = {"data": sequence.name, "key": key, "frames": list(opened.frames)}
-    return {**facts, "num_pairs": len(scored), "methods": rows}
 
 
 def open_window(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
@@ -286,8 +281,8 @@ def _flows(
         return still, still, 0.0
     config = resolve(as_mapping(config), changes)
     if method == "ours":  # compile before the clock starts
-        here = frames.index(window.key)
-        _motion(Stretch(window.stretch.sweeps[max(0, here - 1) : here + 2]), config)
+        first = max(0, frames.index(window.key) - 1)
+        _motion(Stretch(window.stretch.sweeps[first : first + 3]), config)
     start = time.perf_counter()
     motion = _motion(window.around if method == "ours" else window.stretch, config, frames)
     steps = {f: motion.flow(f, window.towards_key(f)) for f in frames if f != window.key}

@@ -28,15 +28,14 @@ from densify.config.errors import InputError
 from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.estimate import estimate_flow
 from densify.geometry.types import Bool, Float, Int, Progress
-from densify.learning.clips import make_clip
 from densify.learning.network import AboveGround, Sweeps, read_model
-from densify.learning.samples import sample_of
+from densify.learning.samples import make_clip, sample_of
 from densify.readers import open_sequence
 from densify.readers.decoded_files import read_arrays
 from densify.scores import flow_metrics as metrics
 
 FARTHEST_M = 35.0
-_MOST_SWEEPS = 5
+_MAX_SWEEPS = 5
 _NAMES = (
     ("points1", "points2", "flow", "valid_mask1"),
     ("pos1", "pos2", "gt", ""),
@@ -112,17 +111,17 @@ def bench_paper(
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
     flows = _flows(methods, models)
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in flows}
+    measured: dict[str, list[dict[str, float]]] = {name: [] for name in flows}
     num_pairs = 0
     for pair in pairs:
         if progress is not None:
             progress(pair.name, num_pairs, num_pairs + 1)
         num_pairs += 1
         for name, flow in flows.items():
-            found[name].append(_measured(flow, pair, num_points))
+            measured[name].append(_measured(flow, pair, num_points))
     if not num_pairs:
         raise InputError("densify bench paper: no pairs of sweeps; choose another recording")
-    means = {name: _mean(measured) for name, measured in found.items()}
+    means = {name: _mean(rows) for name, rows in measured.items()}
     return {"num_pairs": num_pairs, "num_points": num_points, "methods": means}
 
 
@@ -163,8 +162,8 @@ def _measured(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float
 
 def _drawn(points: Float, count: int, rng: np.random.Generator) -> Int:
     """Return at most ``count`` ascending indices of random points within 35 m."""
-    near = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < FARTHEST_M)
-    return np.sort(rng.permutation(near)[:count])
+    rows = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < FARTHEST_M)
+    return np.sort(rng.permutation(rows)[:count])
 
 
 def _mean(measured: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
@@ -189,42 +188,43 @@ def pair_of_recording(spec: str, key: int) -> PaperPair:
     if sequence.truth is not None:
         teacher, settings = "truth", resolve({"register": {"source": "dataset"}})
     clip = make_clip(sequence, key, settings, teacher)
-    here = next(i for i, s in enumerate(clip) if not s.origin_m.any())
-    if here + 1 == len(clip):
+    row = next(i for i, s in enumerate(clip) if not s.origin_m.any())
+    if row + 1 == len(clip):
         raise InputError(f"--data {spec}: no sweep after {key}; choose an earlier one")
-    sample = sample_of(clip, here, here + 1, _MOST_SWEEPS)
-    source, target = (clip[n].points.astype(np.float64) for n in (here, here + 1))
+    sample = sample_of(clip, row, row + 1, _MAX_SWEEPS)
+    source, target = (clip[n].points.astype(np.float64) for n in (row, row + 1))
     flow, moving = sample.flow.double().numpy(), sample.moving.numpy()
     return PaperPair(f"{spec}@{key}", source, target, flow, moving, sample.sweeps)
 
 
-def pairs_of_files(folder: Path, most: int) -> Iterator[PaperPair]:
-    """Yield the pairs in the first ``most`` files of a folder, by file name. 0 means all files."""
+def pairs_of_files(folder: Path, num_files: int) -> Iterator[PaperPair]:
+    """Yield the pairs in the first ``num_files`` files of a folder, by file name; 0 for all."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         raise InputError(f"{folder}: no .npz files; expected the sets of FlowNet3D's authors")
-    for path in paths[: most or None]:
+    for path in paths[: num_files or None]:
         yield read_pair(path)
 
 
 def read_pair(path: Path) -> PaperPair:
     """Return the pair in an .npz file, without points farther than 35 m ahead."""
     arrays = read_arrays(path)
-    found = next((names for names in _NAMES if all(n in arrays for n in names[:3])), None)
-    if found is None:
+    names = next((names for names in _NAMES if all(n in arrays for n in names[:3])), None)
+    if names is None:
         raise InputError(
             f"{path}: holds {', '.join(sorted(arrays)) or 'nothing'}, expected points1, points2 "
             f"and flow, or pos1, pos2 and gt"
         )
-    source, target, flow = (np.asarray(arrays[name], np.float64) for name in found[:3])
-    for name, array in zip(found, (source, target, flow), strict=False):
+    *cloud_names, flow_name, mask_name = names
+    source, target, flow = (np.asarray(arrays[n], np.float64) for n in (*cloud_names, flow_name))
+    for name, array in zip(names, (source, target, flow), strict=False):
         if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
             raise InputError(f"{path}: {name}: got shape {array.shape}, expected (N,3) numbers")
-    valid = np.asarray(arrays.get(found[3], np.ones(len(source)))).astype(bool).ravel()
-    for name, rows in ((found[2], flow), (found[3], valid)):
+    valid = np.asarray(arrays.get(mask_name, np.ones(len(source)))).astype(bool).ravel()
+    for name, rows in ((flow_name, flow), (mask_name, valid)):
         if len(rows) != len(source):
             raise InputError(f"{path}: {name}: got {len(rows)} rows, expected {len(source)}")
-    if found is _NAMES[0]:
+    if names is _NAMES[0]:  # in camera axes
         source, target, flow = (x @ _R_FLU_CAMERA.T for x in (source, target, flow))
     valid &= np.abs(source[:, 0]) < FARTHEST_M
     source, flow = source[valid], flow[valid]

@@ -10,15 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from densify.bench.flow import bench_flow
 from densify.config import resolve
 from densify.config.errors import InputError, did_you_mean
-from densify.geometry import poses
 from densify.geometry.types import Progress
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
+from densify.scores.pose_metrics import window_pose_errors
 
 
 class Scene(NamedTuple):
@@ -34,8 +32,8 @@ class Scene(NamedTuple):
 
 def _streets(text: str) -> tuple[Scene, ...]:
     """Return the scenes in a text of ``SPEC@KEY`` words, where KEY is a frame number."""
-    parts = [word.rpartition("@") for word in text.split()]
-    return tuple(Scene(spec, int(key)) for spec, _, key in parts)
+    words = [word.rpartition("@") for word in text.split()]
+    return tuple(Scene(spec, int(key)) for spec, _, key in words)
 
 
 _FLOW = _streets("""
@@ -95,19 +93,18 @@ def _times_100(value: float | None, digits: int, unit: str) -> str:
 def _row_of_flow(scene: Scene) -> list[str]:
     """Return recall, errors, false positives and ghosts of scene flow on one window."""
     sequence, key = open_sequence(scene.data), scene.key
-    ours = bench_flow(sequence, key, scene.window, resolve(None), ["ours"])["methods"]["ours"]
-    step, window = ours["step"], ours["window"]
-    hops = str(scene.window)
-    all_m, found_m = (window[f"{which}movers_m_by_hops"].get(hops) for which in ("", "found_"))
-    one, one_found, five, five_found = (
-        _times_100(error_m, 1, " cm")
-        for error_m in (step["movers_m"], step["found_movers_m"], all_m, found_m)
-    )
+    scores = bench_flow(sequence, key, scene.window, resolve(None), ["ours"])["methods"]["ours"]
+    step, window = scores["step"], scores["window"]
+    errors_m = [(step["movers_m"], step["found_movers_m"])]
+    by_hops = (window["movers_m_by_hops"], window["found_movers_m_by_hops"])
+    errors_m.append(tuple(errors.get(str(scene.window)) for errors in by_hops))
     return [
         str(scene),
         _times_100(step["found"], 1, " %"),
-        f"{one} ({one_found})",
-        f"{five} ({five_found})",
+        *(
+            f"{_times_100(all_m, 1, ' cm')} ({_times_100(called_m, 1, ' cm')})"
+            for all_m, called_m in errors_m
+        ),
         _times_100(step["falsely_moving"], 4, " %"),
         _times_100(window["ghost_rate"], 2, " %"),
     ]
@@ -117,15 +114,8 @@ def _row_of_registration(scene: Scene) -> list[str]:
     """Return root mean square errors of the window's poses relative to the key sweep's pose."""
     sequence, key = open_sequence(scene.data), scene.key
     stretch = Recording(sequence, resolve(None), scene.window, [key]).window(key)
-    T_true_world = poses.inverse(sequence.T_world_lidar(key))
-    off = []
-    for frame in stretch.frames:
-        T_true = T_true_world @ sequence.T_world_lidar(frame)
-        off.append(poses.log(poses.inverse(T_true) @ stretch.T_target_source(key, frame)))
-    rotation, translation = (
-        np.sqrt((part**2).sum(axis=1).mean()) for part in np.hsplit(np.array(off), 2)
-    )
-    return [str(scene), f"{1000 * translation:.0f} mm", f"{np.rad2deg(rotation):.3f}°"]
+    off_m, off_deg = window_pose_errors(stretch, key, sequence.T_world_lidar)
+    return [str(scene), f"{1000 * off_m:.0f} mm", f"{off_deg:.3f}°"]
 
 
 TABLES: Mapping[str, _Table] = {

@@ -86,11 +86,11 @@ class DepthDataset(Dataset[dict[str, Any]]):
             if _map_path(drive, "groundtruth", camera, record.key) in record.files
         )
         if not self._samples:
-            there = sorted({name for drive in self._drives.values() for name in drive.cameras})
+            known = sorted({name for drive in self._drives.values() for name in drive.cameras})
             raise InputError(
                 f"{self._root}: nothing to load: no finished key in manifest*.jsonl of split "
                 f"{split} and cameras {cameras}, None for all; there are the cameras "
-                f"{', '.join(there)}; let densify dataset finish some"
+                f"{', '.join(known)}; let densify dataset finish some"
             )
 
     def __len__(self) -> int:

@@ -59,6 +59,12 @@ class KeyRecord:
         """The drive and the frame number."""
         return self.drive, self.key
 
+    def values_of(self, score: str) -> list[float]:
+        """Return the known values of a score, of one that has a value for each camera all."""
+        value = self.scores.get(score)
+        values = value.values() if isinstance(value, Mapping) else [value]
+        return [v for v in values if v is not None]
+
     def to_line(self) -> bytes:
         """Return the record as a line of JSON with its newline. Equal records give equal bytes."""
         files = {

@@ -14,7 +14,7 @@ from densify.doctor.sample import Sample, Spot
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 from densify.readers.recorded_poses import PoseTrack
-from densify.scores.recorded_error import RecordedError, main_error
+from densify.scores.pose_metrics import RecordedError, main_error
 
 _LEAST_WAY_M = 1.5  # an error of 3 % of this distance exceeds the tolerance
 _WRONG = 4.0  # as a multiple of the tolerance

@@ -1,20 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Draw pairs of sweeps to train on, in an order that follows from a seed alone.
+"""Prepare what a network sees: clips of recordings, and pairs of sweeps drawn from them.
 
-The pairs of several clips are mixed, in both directions of time, and drawn several times, each time
-turned about the vertical, mirrored and scaled at random.
-
-The losses of the teachers (sources of supervision) are here too. ``objective`` is the published
-objective in m² per point (Pontes, Hays, Lucey, 3DV 2020, sections 3 and 4), with alpha = 4 (10
-without learning) and a graph of 50 neighbours. It needs no labels. ``engine`` and ``truth`` compare
-with a known flow. A plain mean over points, nearly all static, teaches a network to predict no
-motion. Therefore the loss, in metres, is a sum of means over static points, points slower than 1
-m/s, and faster points (DeFlow, Zhang et al., ICRA 2024, eq. 5).
+A clip is a few registered, deskewed sweeps in a row, without the ground. With labels, each sweep
+has its flow to the sweeps before and after it. The pairs of several clips are mixed, in both
+directions of time, and drawn several times, each time turned about the vertical, mirrored and
+scaled at random. Clips and pairs follow from a seed alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from itertools import count
 from typing import Any, NamedTuple
 
@@ -22,17 +19,130 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from densify.flow.objective.energy import energy
-from densify.flow.objective.graph import knn_graph, laplacian
-from densify.geometry.types import Float32
-from densify.learning.clips import Clip, ClipMaker
-from densify.learning.network import REACH_M, NetworkCloud, Sweeps, order_for
+from densify.config import Config, resolve
+from densify.config.errors import ComputationError, InputError
+from densify.flow.engines import Scene, estimate_motion
+from densify.free_space.ground import ground
+from densify.geometry.types import Bool, Float32, LidarSequence
+from densify.learning.network import REACH_M, AboveGround, NetworkCloud, Sweeps, order_for
+from densify.pipeline.recording import Recording
+from densify.readers import open_sequence
+from densify.readers.street import Street
 
-NUM_DRAWN = 4096
-"""Greatest number of points of source, and of target, in the objective."""
+STREETS = "streets"
+"""Recording specification: a new simulated street for every clip; options as of ``street``."""
+_PRESETS, _SHARES = ("street", "crossing", "highway"), (0.5, 0.25, 0.25)
+_RECORDED_POSES = {"register": {"source": "dataset"}}
+_CLIP_SWEEPS = 7
+_MAX_TRIES = 8  # key frames of a recording at which a clip may fail
 _NUM_MIXED = 4  # number of clips
 _PAIRS_OF_CLIP = 48
+_MAX_DRAWN = 4096  # greatest number of points of source, and of target, in the objective
 _SCALES = (0.95, 1.05)
+
+
+@dataclass(frozen=True)
+class ClipSweep:
+    """The n points of a sweep above the ground."""
+
+    # (n,3) metres, world axes, origin at the scanner's position in the clip's key frame
+    points: Float32
+    height_m: Float32  # (n,) height above the ground
+    origin_m: Float32  # (3,) position of the scanner, in the coordinates of ``points``
+    time_s: float  # time since the clip's first sweep
+    # (2,n,3) metres, world axes, ego-motion removed: flow to the previous sweep and to the next
+    # sweep, 0 where that sweep is missing. None without labels.
+    flow: Float32 | None = None
+    moving: Bool | None = None  # (n,) bool, None without labels
+
+
+Clip = tuple[ClipSweep, ...]
+"""Neighbouring sweeps in the order of time."""
+
+
+@dataclass(frozen=True)
+class ClipMaker:
+    """Make clips by number: the same number gives the same clip, in any process."""
+
+    data: tuple[str, ...]  # specifications of recordings, or `STREETS`
+    seed: int
+    teacher: str = "objective"  # source of the labels, as in `make_clip`
+
+    def __call__(self, number: int) -> Clip:
+        """Make the clip of a number."""
+        rng = np.random.default_rng([self.seed, number])
+        spec = self.data[int(rng.integers(len(self.data)))]
+        is_new_street = spec.partition("?")[0] == STREETS
+        sequence = _new_street(spec, rng) if is_new_street else open_sequence(spec)
+        if self.teacher == "truth" and sequence.truth is None:
+            raise InputError(f"--data {spec}: has no true flow; choose another --teacher")
+        if len(sequence.frames) < _CLIP_SWEEPS:
+            raise InputError(
+                f"--data {spec}: {len(sequence.frames)} sweeps, expected {_CLIP_SWEEPS} or more"
+            )
+        settings = resolve(_RECORDED_POSES if isinstance(sequence, Street) else {})
+        for _ in range(_MAX_TRIES):
+            key = int(rng.choice(np.asarray(sequence.frames)))
+            with suppress(ComputationError):
+                clip = make_clip(sequence, key, settings, self.teacher)
+                if len(clip) > 1:
+                    return clip
+        raise ComputationError(
+            f"--data {spec}: at {_MAX_TRIES} places no two neighbouring sweeps could be "
+            f"registered; densify doctor may say why"
+        )
+
+
+def _new_street(spec: str, rng: np.random.Generator) -> LidarSequence:
+    """Open a simulated street whose seed is drawn at random."""
+    preset = str(rng.choice(_PRESETS, p=_SHARES))
+    options = "".join(f"&{option}" for option in spec.partition("?")[2].split("&") if option)
+    if "seed=" in options:
+        raise InputError(f"--data {spec}: seeds are drawn; use street?seed=N for a single street")
+    seed = int(rng.integers(10**9, 10**17))
+    street = Street.from_spec(f"street:{preset}?seed={seed}&cameras=none{options}")
+    street.keep_nothing()
+    return street
+
+
+def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
+    """Return the clip of up to 7 sweeps around a key frame.
+
+    Labels are the ground truth ("truth"), the flow of the engine ``groups`` ("engine"), else none.
+    """
+    stretch = Recording(sequence, settings, _CLIP_SWEEPS // 2, [key]).window(key)
+    heights, frames = ground(stretch), stretch.frames
+    motion = None
+    if teacher == "engine":
+        motion = estimate_motion(Scene(stretch, heights), settings, "groups")
+    origin, begin_ns = stretch[key].T_world_lidar[:3, 3], stretch.sweeps[0].sweep.stamp_ns
+    sweeps = []
+    for before, registered, after in zip(
+        (frames[0], *frames), stretch.sweeps, (*frames[1:], frames[-1]), strict=False
+    ):
+        frame, above = registered.frame, AboveGround.of(registered, heights)
+        flow = moving = None
+        if teacher == "truth" and sequence.truth is not None:
+            row = registered.sweep.row[above.row]
+            flow = [sequence.truth.displacement(frame, f)[row] for f in (before, after)]
+            moving = sequence.truth.sweep(frame).moving[row]
+        elif motion is not None:
+            fields = [motion.flow(frame, f) for f in (before, after)]
+            flow = [field.displacement[above.row] for field in fields]
+            moving = (fields[0].moving & ~fields[0].lost)[above.row]
+        if flow is not None:
+            flow = (np.stack(flow) @ registered.T_world_lidar[:3, :3].T).astype(np.float32)
+        sweeps.append(
+            ClipSweep(
+                points=(above.points - origin).astype(np.float32),
+                height_m=above.height_m,
+                origin_m=(registered.T_world_lidar[:3, 3] - origin).astype(np.float32),
+                time_s=(registered.sweep.stamp_ns - begin_ns) * 1e-9,
+                flow=flow,
+                moving=moving,
+            )
+        )
+    return tuple(sweeps)
 
 
 class Sample(NamedTuple):
@@ -46,16 +156,6 @@ class Sample(NamedTuple):
     duration_s: float
     flow: Any = None  # (n,3) known flow to the target, m, without ego-motion; None without labels
     moving: Any = None  # (n,) bool tensor, None without labels
-
-
-def on_device(value: Any, device: torch.device) -> Any:
-    """Move a tensor, or all tensors of a tuple, to a device; other values stay the same."""
-    if isinstance(value, Tensor):
-        return value.to(device)
-    if isinstance(value, tuple):
-        moved = [on_device(element, device) for element in value]
-        return type(value)(*moved) if hasattr(value, "_fields") else tuple(moved)
-    return value
 
 
 def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
@@ -119,45 +219,9 @@ def _random_change(rng: np.random.Generator) -> Float32:
 
 
 def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
-    """Return at most `NUM_DRAWN` rows where the mask is True, at random or (without rng) evenly."""
+    """Return at most `_MAX_DRAWN` rows where the mask is True, at random or without rng evenly."""
     rows = np.flatnonzero(within)
-    if len(rows) > NUM_DRAWN:
-        every = np.arange(NUM_DRAWN) * len(rows) // NUM_DRAWN
-        rows = rows[every] if rng is None else np.sort(rng.choice(rows, NUM_DRAWN, replace=False))
+    if len(rows) > _MAX_DRAWN:
+        every = np.arange(_MAX_DRAWN) * len(rows) // _MAX_DRAWN
+        rows = rows[every] if rng is None else np.sort(rng.choice(rows, _MAX_DRAWN, replace=False))
     return torch.from_numpy(rows)
-
-
-# Losses
-
-Predict = Callable[[Sweeps], Tensor]
-ALPHA, NUM_NEIGHBORS = 4.0, 50
-FAST_M_S = 1.0
-
-
-def objective_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the published objective for the drawn points of a sample, m² per point, 0-d."""
-    source: Tensor = sample.sweeps[0].points[sample.drawn]  # type: ignore[union-attr]
-    graph = knn_graph(source.detach().cpu().double().numpy(), NUM_NEIGHBORS)
-    flow = predict(sample.sweeps)[sample.drawn]
-    loss = energy(flow, source, sample.drawn_target, laplacian(graph), ALPHA)
-    return loss.total / len(source)
-
-
-def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the sum of the mean errors over static, slow and fast points, metres, 0-d."""
-    flow, true, moving, counted = (
-        predict(sample.sweeps),
-        sample.flow,
-        sample.moving,
-        sample.in_reach,
-    )
-    fast = true.norm(dim=1) >= FAST_M_S * sample.duration_s
-    # The gradient of the norm itself is not a number at 0.
-    error_m = ((flow - true) ** 2).sum(dim=1).add(1e-8).sqrt()
-    sets = (~moving, moving & ~fast, moving & fast)
-    means = [error_m[counted & each].mean() for each in sets if bool((counted & each).any())]
-    return torch.stack(means).sum() if means else (flow * 0).sum()
-
-
-TEACHERS = {"objective": objective_loss, "engine": supervised_loss, "truth": supervised_loss}
-"""Loss function by teacher; it takes a network and a sample and returns a 0-d tensor."""
