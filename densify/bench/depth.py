@@ -18,7 +18,6 @@ import numpy as np
 from scipy import ndimage
 
 from densify.config import Config
-from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.depth.exposure import Exposure, Shot, key_shots
 from densify.geometry import poses
@@ -98,16 +97,10 @@ def without_scanner(sequence: LidarSequence, scanner: int) -> Any:
 
 
 def scanner_truth(
-    scanner: int,
-    sequence: LidarSequence,
-    key: int,
-    window: int,
-    shots: Mapping[str, Shot],
-    config: Config,
-    cache: Cache | None = None,
+    scanner: int, recording: Recording, key: int, shots: Mapping[str, Shot]
 ) -> dict[str, TruthMap]:
     """Return the depth measured by one scanner in the key sweep, by name of the map."""
-    recording = Recording(sequence, config, window, [key], cache, looks_around=True)
+    sequence, config = recording.sequence, recording.settings
     cloud = recording.moment(key, all_sweeps=True, engine="").cloud
     cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
     stretch = recording.window(key)
@@ -218,7 +211,8 @@ def bench_depth(
             shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
             truths = {}
             if scanner is not None:
-                truths["scanner"] = scanner_truth(scanner, sequence, key, window, shots, config)
+                whole = Recording(sequence, config, window, [key], looks_around=True)
+                truths["scanner"] = scanner_truth(scanner, whole, key, shots)
             watch = Watch()
             looks = looks_around([method])
             recording = Recording(used, config.scored(), window, [key], None, None, watch, looks)

@@ -24,7 +24,16 @@ from densify.flow.engines import Scene, estimate_motion
 from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
-from densify.geometry.types import Bool, Float, FlowField, LidarSequence, Progress, Stretch, Truth
+from densify.geometry.types import (
+    Bool,
+    Float,
+    FlowField,
+    LidarSequence,
+    Motion,
+    Progress,
+    Stretch,
+    Truth,
+)
 from densify.outputs.atomic import plain
 from densify.pipeline.recording import Recording
 from densify.readers.flow_files import LabelledFlow, labelled_flow
@@ -77,51 +86,24 @@ def bench_flow(
         raise InputError(
             f"--methods: got {unknown[0] if unknown else 'none'}, expected {', '.join(METHODS)}"
         )
-    opened = open_window(sequence, key, window, config)
-    num_before = opened.frames.index(key)
-    if len(opened.frames) < 2 or (truth is not None and num_before == 0):
+    scorer = Scorer.of(sequence, key, window, config, truth)
+    if not scorer.sources:
         raise InputError(f"--key {key}: no pair to score in {sequence.name}; choose another key")
-    neighbours = tuple(frame for frame in opened.frames if frame != key)
-    scored = neighbours if truth is None else opened.frames[:num_before]
-    scorer = Scorer.of(sequence, opened, scored, truth)
-    rows = {}
+    frames, rows = scorer.stretch.frames, {}
     chosen = [name for name in METHODS if name in methods]
     for done, method in enumerate(chosen):
         if progress is not None:
             progress(method, done, len(chosen))
-        steps, to_key, seconds = _flows(method, opened, config)
+        steps, to_key, seconds = _flows(method, scorer, config)
         scores = {
-            "seconds_per_pair": seconds / len(neighbours),
+            "seconds_per_pair": seconds / (len(frames) - 1),
             "step": scorer.step_scores(steps),
             "challenge": scorer.pooled_challenge_scores(steps),
             "window": scorer.window_scores(to_key),
         }
         rows[method] = plain(scores)
-    facts = {"data": sequence.name, "key": key, "frames": list(opened.frames)}
-    return {**facts, "num_pairs": len(scored), "methods": rows}
-
-
-@dataclass(frozen=True)
-class Window:
-    """Consecutive registered sweeps around a key sweep."""
-
-    stretch: Stretch
-    key: int  # frame number of the key sweep
-    around: Stretch  # sweeps from which the configured method estimates motion
-    above: Mapping[int, Bool]  # frame number -> (N,) mask of points above the ground
-
-    @property
-    def frames(self) -> tuple[int, ...]:
-        """The frame numbers of the window, ascending."""
-        return self.stretch.frames
-
-    def hops(self, frame: int) -> int:
-        """Return the number of sweeps from ``frame`` to the key sweep, negative for later ones."""
-        return self.frames.index(self.key) - self.frames.index(frame)
-
-    def towards_key(self, frame: int) -> int:
-        """Return the next frame number towards the key sweep, or the key sweep's own."""
-        return self.frames[self.frames.index(frame) + int(np.sign(self.hops(frame)))]
+    facts = {"data": sequence.name, "key": key, "frames": list(frames)}
+    return {**facts, "num_pairs": len(scorer.sources), "methods": rows}
 
 
 class SweepTruth(NamedTuple):
@@ -139,10 +121,10 @@ class SweepTruth(NamedTuple):
     certain: Bool
 
     @staticmethod
-    def of(truth: Truth, window: Window, frame: int) -> SweepTruth:
-        """Gather the exact ground truth of the sweep ``frame`` (its number) of the window."""
-        rows = window.stretch[frame].sweep.row
-        targets = window.towards_key(frame), window.key, window.frames[0], window.frames[-1]
+    def of(truth: Truth, stretch: Stretch, frame: int, key: int) -> SweepTruth:
+        """Gather the exact ground truth of the sweep ``frame`` (its number) of a window."""
+        rows, frames = stretch[frame].sweep.row, stretch.frames
+        targets = towards(key, frame, frames), key, frames[0], frames[-1]
         step, to_key, first, last = (truth.displacement(frame, t)[rows] for t in targets)
         whole = truth.sweep(frame)
         moving, instance = whole.moving[rows], whole.instance[rows]
@@ -161,7 +143,10 @@ class SweepTruth(NamedTuple):
 class Scorer:
     """Scorer of methods on a window, mostly by points above the ground, which no method moves."""
 
-    window: Window
+    stretch: Stretch  # registered sweeps of the window
+    key: int  # frame number of the key sweep
+    around: Stretch  # sweeps from which the configured method estimates motion
+    above: Mapping[int, Bool]  # frame number -> (N,) mask of points above the ground
     sources: tuple[int, ...]  # frame numbers of the sweeps whose flow to a neighbour is scored
     # Frame number -> exact ground truth, None for a real recording
     truths: Mapping[int, SweepTruth] | None
@@ -170,20 +155,28 @@ class Scorer:
 
     @staticmethod
     def of(
-        sequence: LidarSequence, window: Window, sources: tuple[int, ...], folder: Path | None
+        sequence: LidarSequence, key: int, size: int, config: Config, folder: Path | None
     ) -> Scorer:
-        """Return the scorer of a window that scores the sweeps ``sources`` (frame numbers).
+        """Open the window of a key sweep, with ``size`` sweeps on each side.
 
         ``folder`` has true flow (`densify.readers.flow_files`); None for exact truth, if any.
         """
+        recording = Recording(sequence, config, size, [key], looks_around=True)
+        stretch = recording.window(key)
+        heights, frames = ground(stretch), stretch.frames
+        above = {}
+        for registered in stretch.sweeps:
+            points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+            above[registered.frame] = heights.above(points) >= ABOVE_GROUND_M
+        sources = tuple(f for f in frames if (f < key if folder is not None else f != key))
         truths, labels = None, {}
         if sequence.truth is not None:
-            truths = {f: SweepTruth.of(sequence.truth, window, f) for f in window.frames}
+            truths = {f: SweepTruth.of(sequence.truth, stretch, f, key) for f in frames}
         if folder is not None:
-            labels = {f: labelled_flow(folder, sequence.name, window.stretch, f) for f in sources}
+            labels = {f: labelled_flow(folder, sequence.name, stretch, f) for f in sources}
         elif truths is not None:
             labels = {f: truths[f].as_label() for f in sources}
-        return Scorer(window, sources, truths, labels)
+        return Scorer(stretch, key, recording.around(key), above, sources, truths, labels)
 
     def pooled_challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
         """Return `challenge_scores` of all labelled pairs, None without ground truth.
@@ -194,9 +187,9 @@ class Scorer:
             return None
         columns = []
         for frame, label in self.labels.items():
-            points = self.window.stretch[frame].sweep.points
+            points = self.stretch[frame].sweep.points
             values = (points, steps[frame].displacement, label.flow, label.classes)
-            columns.append([x[self.window.above[frame] & label.valid] for x in values])
+            columns.append([x[self.above[frame] & label.valid] for x in values])
         return challenge_scores(*map(np.concatenate, zip(*columns, strict=True)))
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
@@ -235,8 +228,9 @@ class Scorer:
         sweeps to the key: ``movers_m_by_hops`` of moving points, ``found_movers_m_by_hops`` of
         those called moving.
         """
-        stretch, key = self.window.stretch, self.window.key
-        cloud = accumulate(stretch, [to_key[f] for f in stretch.frames], key, drop_lost=True)
+        stretch, key = self.stretch, self.key
+        frames = stretch.frames
+        cloud = accumulate(stretch, [to_key[f] for f in frames], key, drop_lost=True)
         scores: dict[str, Any] = {"ghost_rate": ghost_rate(cloud, RangeImage.of(stretch[key]), key)}
         if self.truths is None:
             return scores
@@ -244,8 +238,8 @@ class Scorer:
         called_m: dict[str, list[Float]] = defaultdict(list)
         for frame, truth in self.truths.items():
             if frame != key:
-                field, hops = to_key[frame], str(abs(self.window.hops(frame)))
-                kept = truth.moving & self.window.above[frame] & ~field.lost
+                field, hops = to_key[frame], str(abs(frames.index(key) - frames.index(frame)))
+                kept = truth.moving & self.above[frame] & ~field.lost
                 error_m = end_point_errors(field.displacement, truth.to_key)
                 errors_m[hops].append(error_m[kept])
                 called_m[hops].append(error_m[kept & field.moving])
@@ -256,40 +250,34 @@ class Scorer:
 
     def _above(self, column: Callable[[int], Any]) -> Any:
         """Return values of points above the ground; ``column`` maps frame number -> (N,) values."""
-        return np.concatenate([column(f)[self.window.above[f]] for f in self.sources])
+        return np.concatenate([column(f)[self.above[f]] for f in self.sources])
 
 
-def open_window(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
-    """Return the registered window of a key sweep, with ``size`` sweeps on each side."""
-    recording = Recording(sequence, config, size, [key], looks_around=True)
-    stretch = recording.window(key)
-    heights = ground(stretch)
-    above = {}
-    for registered in stretch.sweeps:
-        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
-        above[registered.sweep.frame] = heights.above(points) >= ABOVE_GROUND_M
-    return Window(stretch, key, recording.around(key), above)
+def towards(key: int, frame: int, frames: Sequence[int]) -> int:
+    """Return the next frame number of ``frames`` towards the key sweep, or the key sweep's own."""
+    row = frames.index(frame)
+    return frames[row + int(np.sign(frames.index(key) - row))]
 
 
 def _flows(
-    method: str, window: Window, config: Config
+    method: str, scorer: Scorer, config: Config
 ) -> tuple[dict[int, FlowField], dict[int, FlowField], float]:
     """Return flow to the neighbour towards the key and flow to the key, by frame, and seconds."""
-    changes, frames = METHODS[method], window.frames
+    stretch, key = scorer.stretch, scorer.key
+    changes, frames = METHODS[method], stretch.frames
     if changes is None:
-        still = {f: FlowField.zero(len(window.stretch[f].sweep)) for f in frames}
+        still = {f: FlowField.zero(len(stretch[f].sweep)) for f in frames}
         return still, still, 0.0
     config = resolve(as_mapping(config), changes)
     if method == "ours":  # compile before the clock starts
-        first = max(0, frames.index(window.key) - 1)
-        _motion(Stretch(window.stretch.sweeps[first : first + 3]), config)
+        first = max(0, frames.index(key) - 1)
+        _motion(Stretch(stretch.sweeps[first : first + 3]), config)
     start = time.perf_counter()
-    motion = _motion(window.around if method == "ours" else window.stretch, config, frames)
-    steps = {f: motion.flow(f, window.towards_key(f)) for f in frames if f != window.key}
-    to_key = {f: motion.flow(f, window.key) for f in frames}
+    motion = _motion(scorer.around if method == "ours" else stretch, config, frames)
+    steps = {f: motion.flow(f, towards(key, f, frames)) for f in frames if f != key}
+    to_key = {f: motion.flow(f, key) for f in frames}
     return steps, to_key, time.perf_counter() - start
 
 
-def _motion(stretch: Stretch, config: Config, asked: Sequence[int] | None = None) -> Any:
-    heights = ground(stretch)
-    return estimate_motion(Scene(stretch, heights, asked=asked), config)
+def _motion(stretch: Stretch, config: Config, asked: Sequence[int] | None = None) -> Motion:
+    return estimate_motion(Scene(stretch, ground(stretch), asked=asked), config)

@@ -263,8 +263,8 @@ class _Subject(NamedTuple):
         if key.truth == "stereo":
             truth = stereo_truth(cast(Path, folder) / _STEREO, key.key, cameras[0])
         elif key.truth == "scanner":
-            maps = scanner_truth(1, whole, key.key, _WINDOW, shots, config, cache)
-            truth = maps[key.camera]
+            measured = Recording(whole, config, _WINDOW, [key.key], cache, looks_around=True)
+            truth = scanner_truth(1, measured, key.key, shots)[key.camera]
         elif key.truth == "exact":
             key_sweep = recording.window(key.key)[key.key].sweep
             truth = exact_truth(sequence, key_sweep, shots, config)[key.camera]

@@ -256,21 +256,22 @@ def _table(recipe: Recipe, drives: Sequence[Drive]) -> dict[str, Any]:
 
 def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise InputError if a set was made with another recipe or version."""
-    for name in _SAME:
-        got, expected = _flat(name, now[name]), _flat(name, before[name])
-        for option in {**expected, **got}:
-            if got.get(option) != expected.get(option):
-                raise InputError(
-                    f"--out {out}: the set in it was made with {option} = {expected.get(option)}, "
-                    f"got {got.get(option)}; choose another --out, or go on with the same options"
-                )
+    expected, got = (_flat({name: table[name] for name in _SAME}) for table in (before, now))
+    for option in {**expected, **got}:
+        if got.get(option) != expected.get(option):
+            raise InputError(
+                f"--out {out}: the set in it was made with {option} = {expected.get(option)}, "
+                f"got {got.get(option)}; choose another --out, or go on with the same options"
+            )
 
 
-def _flat(name: str, value: Any) -> dict[str, Any]:
+def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return the values of nested mappings by their dotted names, such as ``gate.max_ghost``."""
-    if not isinstance(value, dict):
-        return {name: value}
-    return {n: v for key, item in value.items() for n, v in _flat(f"{name}.{key}", item).items()}
+    values = {}
+    for name, value in table.items():
+        nested = isinstance(value, Mapping)
+        values |= _flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
+    return values
 
 
 def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:

@@ -179,8 +179,10 @@ def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
     if boxes.offset_ns is None:
         return boxes.T_lidar_box
     offset_s = boxes.offset_ns[:, None] * 1e-9
-    twist = np.where(offset_s < 0, registered.twist_before, registered.twist_after)
-    return poses.exp(offset_s * twist) @ boxes.T_lidar_box
+    twist: Float = offset_s * np.where(
+        offset_s < 0, registered.twist_before, registered.twist_after
+    )
+    return poses.exp(twist) @ boxes.T_lidar_box
 
 
 def _is_annotated(view: BoxView | None, points: Float) -> Bool:
