@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
 from densify.flow.objective.energy import on_one_thread
-from densify.learning import training
 from densify.learning.network import (
     Model,
     NetworkCloud,
@@ -25,56 +23,23 @@ from densify.learning.network import (
     read_model,
     write_model,
 )
-from densify.learning.samples import Clip, ClipMaker, ClipSweep, Sample, sample_of
-from densify.learning.training import ALPHA, NUM_NEIGHBORS, objective_loss, supervised_loss
+from densify.learning.samples import Clip, ClipMaker, Sample, make_clip, sample_of
+from densify.learning.training import (
+    ALPHA,
+    NUM_NEIGHBORS,
+    Training,
+    objective_loss,
+    supervised_loss,
+    train,
+)
 from tests.command import refused
-from tests.small_street import POSES_GIVEN, one_car
-
-NUM_SWEEPS, PERIOD_S = 4, 0.1  # of a small clip
+from tests.small_street import KEY, POSES_GIVEN, one_car
 
 
-def clip(number: int, seed: int = 0, num_points: int = 300) -> Clip:
-    """Posts that stand, and a block at 10 m/s along x; each sweep measures all of it anew."""
-    rng = np.random.default_rng([seed, number])
-    posts = rng.uniform(-20, 20, (12, 2))
-    block, speed = rng.uniform(-8, 8, 2), np.array([10.0, 0.0])
-    sweeps = []
-    for i in range(NUM_SWEEPS):
-        own = rng.integers(len(posts), size=num_points)
-        standing = posts[own] + rng.uniform(-0.3, 0.3, (num_points, 2))
-        moving = block + speed * i * PERIOD_S + rng.uniform([-2, -0.9], [2, 0.9], (num_points, 2))
-        height_m = rng.uniform(0.3, 2.0, 2 * num_points)
-        points = np.column_stack([np.concatenate([standing, moving]), height_m - 1.7])
-        moves = np.arange(2 * num_points) >= num_points
-        step = np.array([*speed, 0.0]) * PERIOD_S
-        flow = np.stack([-step * moves[:, None] * (i > 0), step * moves[:, None]])
-        flow[1] *= i < NUM_SWEEPS - 1
-        sweeps.append(
-            ClipSweep(
-                points.astype(np.float32),
-                height_m.astype(np.float32),
-                np.zeros(3, np.float32),
-                i * PERIOD_S,
-                flow.astype(np.float32),
-                moves,
-            )
-        )
-    return tuple(sweeps)
-
-
-@dataclass(frozen=True)
-class SmallClips(ClipMaker):
-    """In the place of clips of recordings."""
-
-    def __call__(self, number: int) -> Clip:
-        return clip(number, self.seed)
-
-
-def train_small(out: Path, monkeypatch, **options) -> bytes:
-    """`train` on small clips; returns the model's file."""
-    monkeypatch.setattr(training, "ClipMaker", SmallClips)
-    training.train(training.Training(("streets",), steps=1, **options), out)
-    return out.read_bytes()
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    """A street and a car at 8 m/s along x, with exact flow."""
+    return make_clip(one_car(), KEY, resolve(POSES_GIVEN), "truth")
 
 
 def cloud(count: int, seed: int = 0, reach_m: float = 30.0) -> NetworkCloud:
@@ -159,9 +124,9 @@ def test_sweeps_before_the_source_come_in_the_direction_of_time() -> None:
     assert order_for(0, 1, 5, 3) == [0, 1, None]
 
 
-def test_the_network_learns_what_moves() -> None:
+def test_the_network_learns_what_moves(clip: Clip) -> None:
     """One pair by heart: most of the motion, and that the rest is static."""
-    sample, network = sample_of(clip(0), 1, 2, 3), build()
+    sample, network = sample_of(clip, 1, 2, 3), build()
     optimizer = torch.optim.Adam(network.parameters(), 5e-3)
     with on_one_thread():
         for _ in range(12):
@@ -171,35 +136,36 @@ def test_the_network_learns_what_moves() -> None:
     with torch.inference_mode():
         error_m = (network(sample.sweeps) - sample.flow).norm(dim=1)
     static, moving = error_m[~sample.moving].mean(), error_m[sample.moving].mean()
-    assert moving < 0.3 and static < 0.15  # a flow of 0 has an error of 1 m
+    assert moving < 0.3 and static < 0.15  # a flow of 0 has an error of 0.8 m
 
 
 def test_training_changes_the_network_and_a_seed_gives_the_same_bytes(
-    tmp_path: Path, monkeypatch
+    clip: Clip, tmp_path: Path, monkeypatch
 ) -> None:
-    first, again, other = (
-        train_small(tmp_path / f"{i}.pt", monkeypatch, seed=seed)
-        for i, seed in enumerate((0, 0, 1))
-    )
+    monkeypatch.setattr(ClipMaker, "__call__", lambda maker, number: clip)
+    paths = [tmp_path / f"{i}.pt" for i in range(3)]
+    for path, seed in zip(paths, (0, 0, 1), strict=True):
+        train(Training(("streets",), steps=1, seed=seed), path)
+    first, again, other = (path.read_bytes() for path in paths)
     assert first == again != other
-    trained = read_model(tmp_path / "0.pt").network.parameters()
+    trained = read_model(paths[0]).network.parameters()
     changed = zip(build().parameters(), trained, strict=True)
     assert any(not torch.equal(a, b) for a, b in changed)
 
 
-def test_a_random_change_moves_points_and_flow_alike() -> None:
+def test_a_random_change_moves_points_and_flow_alike(clip: Clip) -> None:
     """Turned, mirrored and scaled, a point plus its flow is where it was seen next."""
-    small, rng = clip(0), np.random.default_rng(2)
+    rng = np.random.default_rng(2)
     for source, target in ((1, 2), (2, 1)):
-        plain = sample_of(small, source, target, 2)
-        changed = sample_of(small, source, target, 2, rng)
+        plain = sample_of(clip, source, target, 2)
+        changed = sample_of(clip, source, target, 2, rng)
         a, b = plain.sweeps[0].points, changed.sweeps[0].points
         change, *_ = np.linalg.lstsq(a.numpy(), b.numpy(), rcond=None)
         np.testing.assert_allclose(plain.flow.numpy() @ change, changed.flow.numpy(), atol=1e-4)
         there = plain.sweeps[1].points.numpy() @ change
         np.testing.assert_allclose(there, changed.sweeps[1].points.numpy(), atol=1e-3)
         sign = 1 if target > source else -1
-        assert plain.flow[plain.moving][:, 0].numpy() == pytest.approx(sign, abs=1e-6)
+        assert plain.flow[plain.moving][:, 0].numpy() == pytest.approx(0.8 * sign, abs=1e-4)
         assert plain.duration_s == pytest.approx(0.1)
 
 

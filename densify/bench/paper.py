@@ -35,11 +35,17 @@ from densify.readers.decoded_files import read_arrays
 from densify.scores import flow_metrics as metrics
 
 FARTHEST_M = 35.0
+NUM_POINTS = 2048
+PUBLISHED: Mapping[str, Mapping[str, float]] = {
+    "flyingthings": {"epe_m": 0.259, "within_5": 0.163, "within_10": 0.416, "angle_rad": 0.369},
+    "kitti": {"epe_m": 0.093, "within_5": 0.648, "within_10": 0.821, "angle_rad": 0.137},
+}
+"""The paper's published scores without learning, by data set."""
 _MAX_SWEEPS = 5
-_NAMES = (
-    ("points1", "points2", "flow", "valid_mask1"),
-    ("pos1", "pos2", "gt", ""),
-)
+_SEED = 0
+_FLYINGTHINGS = ("points1", "points2", "flow")  # names of source, target and flow in a file
+_KITTI = ("pos1", "pos2", "gt")
+_VALID = "valid_mask1"
 _R_FLU_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """Rotation from axes right, down, forward to axes forward, left, up."""
 
@@ -56,36 +62,29 @@ class PaperPair:
     sweeps: Sweeps  # input of trained networks
 
 
-NUM_POINTS = 2048
-PUBLISHED: Mapping[str, Mapping[str, float]] = {
-    "flyingthings": {"epe_m": 0.259, "within_5": 0.163, "within_10": 0.416, "angle_rad": 0.369},
-    "kitti": {"epe_m": 0.093, "within_5": 0.648, "within_10": 0.821, "angle_rad": 0.137},
-}
-"""The paper's published scores without learning, by data set."""
+Flow = Callable[[PaperPair, Int, Int], Float]
+"""Function of a pair and the rows drawn from its source and its target.
 
-_SEED = 0
-
-Flow = Callable[[Float, Float, PaperPair], Float]
-"""Function of drawn source points, drawn target points and the whole pair.
-
-It returns the flow of the drawn source points, or of all source points."""
+It returns the flow of the drawn source points."""
 
 
 def _objective(solver: str, **settings: Any) -> Flow:
     """Return a method of scene flow that minimises the paper's objective by a named solver."""
-
-    def flow(source: Float, target: Float, pair: PaperPair) -> Float:
-        return solve(source, target, SolverSettings(solver=solver, **settings)).flow
-
-    return flow
+    chosen = SolverSettings(solver=solver, **settings)
+    return lambda pair, rows, targets: solve(pair.source[rows], pair.target[targets], chosen).flow
 
 
-def _ours(source: Float, target: Float, pair: PaperPair) -> Float:
-    return estimate_flow(pair.source, pair.target, Config()).displacement
+def _ours(pair: PaperPair, rows: Int, targets: Int) -> Float:
+    return estimate_flow(pair.source, pair.target, Config()).displacement[rows]
+
+
+def _learned(path: Path) -> Flow:
+    model = read_model(path)
+    return lambda pair, rows, targets: model.flow(pair.sweeps)[rows]
 
 
 METHODS: dict[str, Flow] = {
-    "rest": lambda source, target, pair: np.zeros_like(source),
+    "rest": lambda pair, rows, targets: np.zeros((len(rows), 3)),
     "paper-adam": _objective("adam"),
     "paper": _objective("pcg"),
     "no-laplacian": _objective("pcg", alpha=0.0),
@@ -110,7 +109,11 @@ def bench_paper(
     """
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
-    flows = _flows(methods, models)
+    for name in methods:
+        if name not in METHODS:
+            raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
+    flows = {name: METHODS[name] for name in METHODS if name in methods}
+    flows |= {path.name: _learned(path) for path in models}
     measured: dict[str, list[dict[str, float]]] = {name: [] for name in flows}
     num_pairs = 0
     for pair in pairs:
@@ -125,27 +128,13 @@ def bench_paper(
     return {"num_pairs": num_pairs, "num_points": num_points, "methods": means}
 
 
-def _flows(methods: Sequence[str], models: Sequence[Path]) -> dict[str, Flow]:
-    for name in methods:
-        if name not in METHODS:
-            raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
-    flows = {name: METHODS[name] for name in METHODS if name in methods}
-    return flows | {path.name: _learned(path) for path in models}
-
-
-def _learned(path: Path) -> Flow:
-    model = read_model(path)
-    return lambda source, target, pair: model.flow(pair.sweeps)
-
-
 def _measured(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float]:
     rng = np.random.default_rng(_SEED)
-    drawn, of_target = (_drawn(cloud, num_points, rng) for cloud in (pair.source, pair.target))
+    rows, targets = (_drawn(cloud, num_points, rng) for cloud in (pair.source, pair.target))
     start = time.perf_counter()
-    flow = method(pair.source[drawn], pair.target[of_target], pair)
+    flow = method(pair, rows, targets)
     seconds = time.perf_counter() - start
-    flow = flow[drawn] if len(flow) == len(pair.source) else flow
-    true = pair.flow[drawn]
+    true = pair.flow[rows]
     scores = {
         "epe_m": metrics.end_point_error(flow, true),
         "within_5": metrics.accuracy(flow, true, metrics.STRICT),
@@ -154,7 +143,7 @@ def _measured(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float
         "seconds": seconds,
     }
     if pair.moving is not None:
-        moving = pair.moving[drawn]
+        moving = pair.moving[rows]
         scores["moving_m"] = metrics.end_point_error(flow, true, moving)
         scores["static_m"] = metrics.end_point_error(flow, true, ~moving)
     return scores
@@ -209,22 +198,21 @@ def pairs_of_files(folder: Path, num_files: int) -> Iterator[PaperPair]:
 def read_pair(path: Path) -> PaperPair:
     """Return the pair in an .npz file, without points farther than 35 m ahead."""
     arrays = read_arrays(path)
-    names = next((names for names in _NAMES if all(n in arrays for n in names[:3])), None)
+    names = next((n for n in (_FLYINGTHINGS, _KITTI) if arrays.keys() >= set(n)), None)
     if names is None:
         raise InputError(
             f"{path}: holds {', '.join(sorted(arrays)) or 'nothing'}, expected points1, points2 "
             f"and flow, or pos1, pos2 and gt"
         )
-    *cloud_names, flow_name, mask_name = names
-    source, target, flow = (np.asarray(arrays[n], np.float64) for n in (*cloud_names, flow_name))
-    for name, array in zip(names, (source, target, flow), strict=False):
+    source, target, flow = (np.asarray(arrays[name], np.float64) for name in names)
+    for name, array in zip(names, (source, target, flow), strict=True):
         if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
             raise InputError(f"{path}: {name}: got shape {array.shape}, expected (N,3) numbers")
-    valid = np.asarray(arrays.get(mask_name, np.ones(len(source)))).astype(bool).ravel()
-    for name, rows in ((flow_name, flow), (mask_name, valid)):
+    valid = np.asarray(arrays.get(_VALID, np.ones(len(source)))).astype(bool).ravel()
+    for name, rows in ((names[-1], flow), (_VALID, valid)):
         if len(rows) != len(source):
             raise InputError(f"{path}: {name}: got {len(rows)} rows, expected {len(source)}")
-    if names is _NAMES[0]:  # in camera axes
+    if names is _FLYINGTHINGS:
         source, target, flow = (x @ _R_FLU_CAMERA.T for x in (source, target, flow))
     valid &= np.abs(source[:, 0]) < FARTHEST_M
     source, flow = source[valid], flow[valid]
