@@ -68,16 +68,16 @@ def test_a_submission_has_a_file_for_each_sweep_and_a_row_for_each_point(log, su
     num_moving, truth = 0, open_sequence(log).truth
     for frame, (path, sweep) in enumerate(zip(files, sweep_files(log), strict=True)):
         table = feather.read_table(path)
-        assert table.column_names == ["is_valid", *AXES]
-        assert [str(t) for t in table.schema.types] == ["bool", *3 * ["halffloat"]]
+        types = [str(t) for t in table.schema.types]
+        assert (table.column_names, types) == (["is_valid", *AXES], ["bool", *3 * ["halffloat"]])
         assert len(table) == len(feather.read_table(sweep)) and all(table["is_valid"].to_pylist())
         residual = np.stack([table[axis].to_numpy() for axis in AXES], axis=1).astype(float)
         moving = residual.any(axis=1)
         num_moving += int(moving.sum())
         if frame + 1 < len(files):
             true = truth.displacement(frame, frame + 1)
-            residual, moving = residual[: len(true)], moving[: len(true)]
-            error_m = np.linalg.norm(residual - true, axis=1)
+            moving = moving[: len(true)]
+            error_m = np.linalg.norm(residual[: len(true)] - true, axis=1)
             length_m = np.linalg.norm(true, axis=1)
             assert np.median(error_m[moving]) < 0.25 * np.median(length_m[moving])
     assert num_moving > 100 and not moving.any()  # the last sweep has none to flow to
@@ -87,26 +87,21 @@ def test_other_forms_hold_the_same(log, submission, tmp_path):
     h5py = pytest.importorskip("h5py")
     assert flow(log, tmp_path, "--keys", "0:2", "--format", "opensceneflow") == 0
     assert flow(log, tmp_path, "--keys", "0:2") == 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "000000_000001.npz",
-        "000001_000002.npz",
-        f"{log.name}.h5",
-    ]
-    with h5py.File(tmp_path / f"{log.name}.h5") as groups:
-        assert list(groups) == [p.stem for p in sweep_files(log)[:2]]
-        group = groups[sweep_files(log)[0].stem]
-        rows, ids = np.asarray(group["row"]), np.asarray(group["flow_instance_id"])
-        total = np.asarray(group["flow"])
-        pose = [np.asarray(groups[name.stem]["pose"]) for name in sweep_files(log)[:2]]
-        np.testing.assert_allclose(
-            np.linalg.inv(pose[1]) @ pose[0], np.asarray(group["ego_motion"]), atol=1e-5
-        )
-    with np.load(tmp_path / "000000_000001.npz") as file:
+    names = ["000000_000001.npz", "000001_000002.npz", f"{log.name}.h5"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
+    stems = [path.stem for path in sweep_files(log)[:2]]
+    with h5py.File(tmp_path / names[2]) as groups:
+        assert list(groups) == stems
+        first, pose = groups[stems[0]], [np.asarray(groups[stem]["pose"]) for stem in stems]
+        columns = ("row", "flow_instance_id", "flow", "ego_motion")
+        rows, ids, total, ego_motion = (np.asarray(first[name]) for name in columns)
+    np.testing.assert_allclose(np.linalg.inv(pose[1]) @ pose[0], ego_motion, atol=1e-5)
+    with np.load(tmp_path / names[0]) as file:
         residual, moving = file["residual_flow"], file["moving"]
         np.testing.assert_array_equal(file["row"], rows)
         np.testing.assert_array_equal(file["object"] >= 0, ids > 0)
         np.testing.assert_allclose(file["total_flow"], total, atol=1e-5)
-    table = feather.read_table(submission / log.name / sweep_files(log)[0].name)
+    table = feather.read_table(submission / log.name / f"{stems[0]}.feather")
     submitted = np.stack([table[axis].to_numpy() for axis in AXES], axis=1)[rows]
     assert moving.sum() > 50
     np.testing.assert_array_equal(residual.astype(np.float16), submitted)
@@ -172,41 +167,42 @@ def test_moving_masks_by_the_reader_of_semantic_kitti_api(log, tmp_path):
 def test_doc_depths_exchange_format(tmp_path):
     """Read as DOC-Depth's FORMAT.md and renderer do: classes up to 50 ground, up to 100 static,
     then dynamic; poses bring frames together."""
-    plyfile = pytest.importorskip("plyfile")
-    assert main(["flow", "street?sensor=vlp16", "--keys", "59:62", "--format", "doc-depth", *GIVEN,
-                 "--out", str(tmp_path)]) == 0  # fmt: skip
+    plyfile, spec = pytest.importorskip("plyfile"), "street?sensor=vlp16"
+    options = ["--keys", "59:62", "--format", "doc-depth", *GIVEN, "--out", str(tmp_path)]
+    assert main(["flow", spec, *options]) == 0
     (run,) = tmp_path.iterdir()
-    street = Street("street", 0, "vlp16")
-    path = plyfile.PlyData.read(run / "traj_odometry.ply")["vertex"].data
+    street = open_sequence(spec)
+
+    def vertices(name: str):
+        return plyfile.PlyData.read(run / name)["vertex"]
+
+    path = vertices("traj_odometry.ply").data
     assert path["indices"].tolist() == [59, 60, 61]
-    T_world_lidar, dynamic = [], 0
-    for row in path:
-        quaternion = [row[name] for name in ("q_x", "q_y", "q_z", "q_w")]
-        assert quaternion == [row[name] for name in ("qx", "qy", "qz", "qw")]
-        np.testing.assert_allclose(row["timestamp"], street.stamp_ns(int(row["indices"])) * 1e-9)
-        ply = plyfile.PlyData.read(run / "frames" / f"frame_{row['indices']:06d}.ply")["vertex"]
-        assert [p.val_dtype for p in ply.properties] == ["f4", "f4", "f4", "u2"]
-        points = np.stack([ply[axis] for axis in "xyz"], axis=1).astype(float)
-        static = (ply["classid"] >= 50) & (ply["classid"] < 100)
-        dynamic += int((ply["classid"] >= 100).sum())
-        assert (ply["classid"] < 50).mean() > 0.2
-        T = np.eye(4)
+    T_world_lidar, num_dynamic = np.tile(np.eye(4), (3, 1, 1)), 0
+    for T, row in zip(T_world_lidar, path, strict=True):
+        frame, quaternion = int(row["indices"]), [row[f"q_{axis}"] for axis in "xyzw"]
+        assert quaternion == [row[f"q{axis}"] for axis in "xyzw"]
+        np.testing.assert_allclose(row["timestamp"], street.stamp_ns(frame) * 1e-9)
         T[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
         T[:3, 3] = [row[axis] for axis in "xyz"]
-        T_world_lidar.append(T)
-        assert 0.05 < static.mean() < 0.8 and np.abs(points).max() < 130
-    assert dynamic > 50
-    truth = [street.T_world_lidar(frame) for frame in (59, 61)]
+        ply = vertices(f"frames/frame_{frame:06d}.ply")
+        assert [p.val_dtype for p in ply.properties] == ["f4", "f4", "f4", "u2"]
+        kind = np.digitize(ply["classid"], [50, 100])  # ground, static, dynamic
+        assert (kind == 0).mean() > 0.2 and 0.05 < (kind == 1).mean() < 0.8
+        num_dynamic += int((kind == 2).sum())
+        assert max(np.abs(ply[axis]).max() for axis in "xyz") < 130
+    assert num_dynamic > 50
+    first, last = (street.T_world_lidar(frame) for frame in (59, 61))
     step = np.linalg.inv(T_world_lidar[0]) @ T_world_lidar[2]
-    np.testing.assert_allclose(step, np.linalg.inv(truth[0]) @ truth[1], atol=1e-6)
+    np.testing.assert_allclose(step, np.linalg.inv(first) @ last, atol=1e-6)
     camera = street.cameras["image_02"]
     np.testing.assert_array_equal(json.loads((run / "calib.json").read_text())["mtx"], camera.K)
     np.testing.assert_array_equal(np.loadtxt(run / "calib_lidar_ref_cam.txt"), camera.T_cam_lidar)
-    seen = plyfile.PlyData.read(run / "traj_camera.ply")["vertex"].data
-    exposed_ns = np.array([*street.image_stamps_ns("image_02").values()])
-    beside_s = np.abs(seen["timestamp"][:, None] - exposed_ns * 1e-9).min(axis=1)
-    assert len(seen) > 1 and beside_s.max() < 1e-6
-    np.testing.assert_allclose(exposed_ns[seen["indices"]] * 1e-9, seen["timestamp"], atol=1e-6)
+    exposures = vertices("traj_camera.ply").data
+    exposed_s = np.array([*street.image_stamps_ns("image_02").values()]) * 1e-9
+    beside_s = np.abs(exposures["timestamp"][:, None] - exposed_s).min(axis=1)
+    assert len(exposures) > 1 and beside_s.max() < 1e-6
+    np.testing.assert_allclose(exposed_s[exposures["indices"]], exposures["timestamp"], atol=1e-6)
 
 
 def test_what_is_there_is_kept(log, submission, capsys):
