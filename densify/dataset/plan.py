@@ -267,7 +267,7 @@ def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) ->
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return the values of nested mappings by their dotted names, such as ``gate.max_ghost``."""
-    values = {}
+    values: dict[str, Any] = {}
     for name, value in table.items():
         nested = isinstance(value, Mapping)
         values |= _flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}

@@ -178,11 +178,10 @@ def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
     """Return the (K,4,4) box poses, lidar frame, deskewed to the reference time like the points."""
     if boxes.offset_ns is None:
         return boxes.T_lidar_box
-    offset_s = boxes.offset_ns[:, None] * 1e-9
-    twist: Float = offset_s * np.where(
-        offset_s < 0, registered.twist_before, registered.twist_after
-    )
-    return poses.exp(twist) @ boxes.T_lidar_box
+    twists = np.stack([registered.twist_before, registered.twist_after])
+    twist: Float = twists[(boxes.offset_ns >= 0).astype(np.intp)]
+    offset_s: Float = boxes.offset_ns[:, None] * 1e-9
+    return poses.exp(offset_s * twist) @ boxes.T_lidar_box
 
 
 def _is_annotated(view: BoxView | None, points: Float) -> Bool:
