@@ -94,20 +94,21 @@ def _row_of_flow(scene: Scene) -> list[str]:
     """Return recall, errors, false positives and ghosts of scene flow on one window."""
     sequence, key = open_sequence(scene.data), scene.key
     scores = bench_flow(sequence, key, scene.window, resolve(None), ["ours"])["methods"]["ours"]
-    step, window = scores["step"], scores["window"]
-    errors_m = [(step["movers_m"], step["found_movers_m"])]
-    by_hops = (window["movers_m_by_hops"], window["found_movers_m_by_hops"])
-    errors_m.append(tuple(errors.get(str(scene.window)) for errors in by_hops))
+    step, window, hops = scores["step"], scores["window"], str(scene.window)
+    errors_m, called_errors_m = window["movers_m_by_hops"], window["found_movers_m_by_hops"]
     return [
         str(scene),
         _times_100(step["found"], 1, " %"),
-        *(
-            f"{_times_100(all_m, 1, ' cm')} ({_times_100(called_m, 1, ' cm')})"
-            for all_m, called_m in errors_m
-        ),
+        _errors(step["movers_m"], step["found_movers_m"]),
+        _errors(errors_m.get(hops), called_errors_m.get(hops)),
         _times_100(step["falsely_moving"], 4, " %"),
         _times_100(window["ghost_rate"], 2, " %"),
     ]
+
+
+def _errors(all_m: float | None, called_m: float | None) -> str:
+    """Return the errors of all moving points, and in brackets of those called moving."""
+    return f"{_times_100(all_m, 1, ' cm')} ({_times_100(called_m, 1, ' cm')})"
 
 
 def _row_of_registration(scene: Scene) -> list[str]:

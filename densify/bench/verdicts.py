@@ -100,20 +100,19 @@ def verdicts(
         # Both measurements have luck.
         by_luck = float(np.sqrt(2 * (sigma**2).sum()) / len(off))
         beyond = _BEYOND * max(by_luck, 0.0 if math.isnan(error) else error)
-        mean, worst = float(off.mean()), list(row)[int(bad.argmax())]
-        word = "no difference"
-        if abs(mean) > beyond:
+        worst, word = int(bad.argmax()), "no difference"
+        if abs(off.mean()) > beyond:
             word = "worse" if bad.mean() > 0 else "better"
         yield Verdict(
-            name,
-            list(row),
-            float(was.mean()),
-            float(value.mean()),
-            mean,
-            error,
-            by_luck,
-            (worst, float(row[worst][2])),
-            word,
+            figure=name,
+            keys=list(row),
+            before=float(was.mean()),
+            now=float(value.mean()),
+            change=float(off.mean()),
+            error=error,
+            luck=by_luck,
+            worst=(list(row)[worst], float(off[worst])),
+            word=word,
         )
 
 

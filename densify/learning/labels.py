@@ -180,7 +180,7 @@ def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
         return boxes.T_lidar_box
     twists = np.stack([registered.twist_before, registered.twist_after])
     twist: Float = twists[(boxes.offset_ns >= 0).astype(np.intp)]
-    offset_s: Float = boxes.offset_ns[:, None] * 1e-9
+    offset_s = np.asarray(boxes.offset_ns[:, None] * 1e-9, np.float64)
     return poses.exp(offset_s * twist) @ boxes.T_lidar_box
 
 
