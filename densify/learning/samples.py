@@ -163,17 +163,17 @@ def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
     for group in count():
         mixed = [make(group * _NUM_MIXED + n) for n in range(_NUM_MIXED)]
         rng = np.random.default_rng([make.seed, group, 1])
-        pairs = [pair for c, clip in enumerate(mixed) for pair in _pairs(c, clip, rng)]
+        pairs = [(clip, *pair) for clip in mixed for pair in _pairs(clip, rng)]
         for row in rng.permutation(len(pairs)):
             pair_rng = np.random.default_rng([make.seed, group, 2, int(row)])
-            c, source, target = pairs[row]
-            yield sample_of(mixed[c], source, target, num_wanted, pair_rng)
+            clip, source, target = pairs[row]
+            yield sample_of(clip, source, target, num_wanted, pair_rng)
 
 
-def _pairs(c: int, clip: Clip, rng: np.random.Generator) -> list[tuple[int, int, int]]:
-    """Return 48 triples (c, source, target) of a clip, in random rounds of all its pairs."""
+def _pairs(clip: Clip, rng: np.random.Generator) -> list[tuple[int, int]]:
+    """Return 48 pairs (source, target) of a clip, in random rounds of all its pairs."""
     indices = range(len(clip))
-    pairs = [(c, i, j) for i in indices for j in (i - 1, i + 1) if j in indices]
+    pairs = [(i, j) for i in indices for j in (i - 1, i + 1) if j in indices]
     num_rounds = -(-_PAIRS_OF_CLIP // len(pairs))
     order = [row for _ in range(num_rounds) for row in rng.permutation(len(pairs))]
     return [pairs[row] for row in order[:_PAIRS_OF_CLIP]]
