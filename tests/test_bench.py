@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.bench import readme
+from densify.bench import flow as flow_bench
 from densify.bench.depth import bench_depth
 from densify.bench.flow import bench_flow
 from densify.cli import main
@@ -141,19 +141,19 @@ def test_the_commands_print_tables_or_numbers(border_drive, capsys):
 
 def test_scenes_of_the_readme_open_and_its_tables_are_in_the_results():
     text = RESULTS.read_text("utf-8")
-    for name, table in readme.TABLES.items():
+    for name, table in flow_bench.TABLES.items():
         assert f"densify bench readme {name}" in text
-        assert all(scene.key in open_sequence(scene.data).frames for scene in table.scenes)
+        assert all(street.key in open_sequence(street.data).frames for street in table.scenes)
 
 
 def test_rows_of_the_readme(capsys, monkeypatch):
     chosen = {
-        name: readme.TABLES[name]._replace(scenes=(readme.Scene("car", KEY, window=1),))
+        name: flow_bench.TABLES[name]._replace(scenes=(flow_bench.KeySweep("car", KEY, window=1),))
         for name in ("flow", "registration")
     }
-    monkeypatch.setattr(readme, "TABLES", chosen)
-    monkeypatch.setattr(readme, "open_sequence", lambda _: one_car())
-    monkeypatch.setattr(readme, "resolve", lambda _: CONFIG)
+    monkeypatch.setattr(flow_bench, "TABLES", chosen)
+    monkeypatch.setattr(flow_bench, "open_sequence", lambda _: one_car())
+    monkeypatch.setattr(flow_bench, "resolve", lambda *_: CONFIG)
     assert main(["bench", "readme"]) == 0
     flow, _, registration = capsys.readouterr().out.partition(chosen["registration"].about)
     titles, rule, row = (line for line in flow.splitlines() if line.startswith("|"))

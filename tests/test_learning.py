@@ -23,12 +23,16 @@ from densify.learning.network import (
     read_model,
     write_model,
 )
-from densify.learning.samples import Clip, ClipMaker, Sample, make_clip, sample_of
 from densify.learning.training import (
     ALPHA,
     NUM_NEIGHBORS,
+    Clip,
+    ClipMaker,
+    Sample,
     Training,
+    make_clip,
     objective_loss,
+    sample_of,
     supervised_loss,
     train,
 )
@@ -203,10 +207,10 @@ def test_other_models_are_refused(tmp_path: Path) -> None:
 
 def test_the_command_trains_on_a_street(tmp_path: Path, capsys, monkeypatch) -> None:
     """A recording is labelled by our engine, and a network learns from it."""
-    samples = "densify.learning.samples"
-    monkeypatch.setattr(f"{samples}._NUM_MIXED", 1)  # clips made ahead
-    monkeypatch.setattr(f"{samples}.open_sequence", lambda spec: one_car())
-    monkeypatch.setattr(f"{samples}.resolve", lambda _: resolve(POSES_GIVEN))
+    module = "densify.learning.training"
+    monkeypatch.setattr(f"{module}._NUM_MIXED", 1)  # clips made ahead
+    monkeypatch.setattr(f"{module}.open_sequence", lambda spec: one_car())
+    monkeypatch.setattr(f"{module}.resolve", lambda _: resolve(POSES_GIVEN))
     out = tmp_path / "m.pt"
     command = ["train", "flow", "--data", "street", "--out", str(out), "--teacher", "engine"]
     command += ["--steps", "2"]

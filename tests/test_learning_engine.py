@@ -88,7 +88,7 @@ def test_a_run_takes_a_network(model: Path) -> None:
 def test_a_model_is_checked_before_anything_is_computed(tmp_path: Path, capsys) -> None:
     with pytest.raises(InputError, match="got 'network', expected network:MODEL"):
         resolve(None, ["flow.engine=network"])
-    command = ["run", "--key", "120", "--flow", f"network:{tmp_path / 'no.pt'}"]
+    command = ["run", "street", "--key", "120", "--flow", f"network:{tmp_path / 'no.pt'}"]
     message = refused(capsys, 2, *command, "--out", tmp_path / "out")
     assert "no.pt: no such file; expected a model that densify train flow wrote" in message
     assert not (tmp_path / "out").exists()

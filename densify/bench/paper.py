@@ -29,7 +29,7 @@ from densify.flow.objective.solvers import SolverSettings, solve
 from densify.flow.pairs.estimate import estimate_flow
 from densify.geometry.types import Bool, Float, Int, Progress
 from densify.learning.network import AboveGround, Sweeps, read_model
-from densify.learning.samples import make_clip, sample_of
+from densify.learning.training import make_clip, sample_of
 from densify.readers import open_sequence
 from densify.readers.decoded_files import read_arrays
 from densify.scores import flow_metrics as metrics

@@ -298,7 +298,7 @@ def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[PaperPair]]:
 
 
 def _answer_readme(options: argparse.Namespace) -> Iterator[Answer]:
-    from densify.bench.readme import tables
+    from densify.bench.flow import tables
 
     with progress_on_stderr() as progress:
         for line in tables(options.tables, progress):
