@@ -48,63 +48,56 @@ def across_border(
 
 def write_drive(sequence: TinySequence, date: Path, drive: str = DRIVE) -> Path:
     """The sweeps and one camera, ``image_02``, as a KITTI raw drive; returns its folder."""
-    folder = date / drive
-    R, t = CAMERA.T_cam_lidar[:3, :3], CAMERA.T_cam_lidar[:3, 3]
+    folder, T, size_px = date / drive, CAMERA.T_cam_lidar, (CAMERA.width_px, CAMERA.height_px)
     P = np.column_stack([CAMERA.K, np.zeros(3)])
-    _put(
-        date / "calib_cam_to_cam.txt",
-        f"R_rect_00: {_words(np.eye(3))}\n"
-        f"S_rect_02: {CAMERA.width_px} {CAMERA.height_px}\nP_rect_02: {_words(P)}\n",
-    )
-    _put(date / "calib_velo_to_cam.txt", f"R: {_words(R)}\nT: {_words(t)}\n")
-    image = np.full((CAMERA.height_px, CAMERA.width_px, 3), 128, np.uint8)
+    texts = {
+        date / "calib_cam_to_cam.txt": f"R_rect_00: {_words(np.eye(3))}\n"
+        f"S_rect_02: {size_px[0]} {size_px[1]}\nP_rect_02: {_words(P)}\n",
+        date / "calib_velo_to_cam.txt": f"R: {_words(T[:3, :3])}\nT: {_words(T[:3, 3])}\n",
+        date / "calib_imu_to_velo.txt": f"R: {_words(np.eye(3))}\nT: 0 0 0\n",
+        folder / "oxts" / "timestamps.txt": _stamps(sequence.frames, 0),
+    }
+    for name, late_ns in (("", 0), ("_start", -50_000_000), ("_end", 50_000_000)):
+        path = folder / "velodyne_points" / f"timestamps{name}.txt"
+        texts[path] = _stamps(sequence.frames, late_ns)
     for frame in sequence.frames:
+        texts[folder / "oxts" / "data" / f"{frame:010d}.txt"] = _oxts(sequence, frame)
         write_sweep(sequence, folder, frame)
-        write_pose(sequence, folder, frame)
         path = folder / "image_02" / "data" / f"{frame:010d}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), image)
-    every = [stamp_ns(f) for f in range(max(sequence.frames) + 1)]
-    for name, late_ns in (("", 0), ("_start", -50_000_000), ("_end", 50_000_000)):
-        _put_stamps(folder / "velodyne_points" / f"timestamps{name}.txt", every, late_ns)
-    _put_stamps(folder / "oxts" / "timestamps.txt", every)
-    _put(date / "calib_imu_to_velo.txt", f"R: {_words(np.eye(3))}\nT: 0 0 0\n")
+        cv2.imwrite(str(path), np.full((*size_px[::-1], 3), 128, np.uint8))
+    for path, text in texts.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
     return folder
 
 
-def write_pose(sequence: TinySequence, drive: Path, frame: int) -> None:
+def _oxts(sequence: TinySequence, frame: int) -> str:
     """Of a vehicle that drives straight on to the east, at the equator."""
     T = sequence.T_world_lidar(frame)
     assert np.allclose(T[:3, :3], np.eye(3))
-    lat, lon = np.rad2deg(T[1, 3] / 6_378_137), np.rad2deg(T[0, 3] / 6_378_137)
-    text = f"{lat:.17g} {lon:.17g} {T[2, 3]:.17g}" + 27 * " 0" + "\n"
-    _put(drive / "oxts" / "data" / f"{frame:010d}.txt", text)
+    lon, lat = np.rad2deg(T[:2, 3] / 6_378_137)
+    return f"{lat:.17g} {lon:.17g} {T[2, 3]:.17g}" + 27 * " 0" + "\n"
 
 
-def write_sweep(sequence: TinySequence, drive: Path, frame: int) -> None:
-    sweep = sequence[frame]
-    columns = np.column_stack([sweep.points, sweep.intensity]).astype("<f4")
-    path = sweep_file(drive, frame)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(columns.tobytes())
-
-
-def sweep_file(drive: Path, frame: int) -> Path:
-    return drive / "velodyne_points" / "data" / f"{frame:010d}.bin"
-
-
-def _put(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-
-
-def _put_stamps(path: Path, stamps_ns: Sequence[int], late_ns: int = 0) -> None:
-    times = [str(np.datetime64(s + late_ns, "ns")).replace("T", " ") for s in stamps_ns]
-    _put(path, "\n".join(times) + "\n")
+def _stamps(frames: Sequence[int], late_ns: int) -> str:
+    """Of all frames up to the last."""
+    stamps = (np.datetime64(stamp_ns(f) + late_ns, "ns") for f in range(max(frames) + 1))
+    return "\n".join(str(stamp).replace("T", " ") for stamp in stamps) + "\n"
 
 
 def _words(array: np.ndarray) -> str:
     return " ".join(f"{value:.17g}" for value in np.ravel(array))
+
+
+def write_sweep(sequence: TinySequence, drive: Path, frame: int) -> None:
+    sweep, path = sequence[frame], sweep_file(drive, frame)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(np.column_stack([sweep.points, sweep.intensity]).astype("<f4").tobytes())
+
+
+def sweep_file(drive: Path, frame: int) -> Path:
+    return drive / "velodyne_points" / "data" / f"{frame:010d}.bin"
 
 
 # The drives' images are of one colour, of which rims would be told only with a warning.
@@ -135,26 +128,20 @@ def keys_of(names: Iterable[str]) -> set[int]:
 
 def in_order(out: Path) -> None:
     """Nothing is left over, every file is as recorded, and no file is not."""
-    names = files_in(out)
+    names, by_key = files_in(out), read_manifests(out)
     assert not [n for n in names if n.endswith((".tmp", ".old"))]
-    assert {n for n in names if n.startswith(".")} <= {".manifest.lock"} | {
-        n for n in names if n.startswith(".manifest-")
-    }
-    found = read_manifests(out)
-    recorded = set()
-    for record in found.values():
-        assert damaged_files(record, out) == []
-        recorded |= set(record.files)
-    own = ("dataset.json", "README.txt", "manifest", "densify", ".")
-    assert {name for name in names if not name.startswith(own)} == recorded
-    lines = [(r["drive"], r["key"]) for r in records(out)]
-    assert len(lines) == len(set(lines)) == len(found)
+    assert all(n.startswith(".manifest") for n in names if n.startswith("."))
+    recorded: set[str] = set().union(*(record.files for record in by_key.values()))
+    assert not [name for record in by_key.values() for name in damaged_files(record, out)]
+    about = ("dataset.json", "README.txt", "manifest", "densify", ".")
+    assert {name for name in names if not name.startswith(about)} == recorded
+    assert len(records(out)) == len(by_key)
 
 
 def story(out: Path) -> list[dict]:
     """The manifests without the seconds."""
-    said = sorted(records(out), key=lambda r: (r["drive"], r["key"]))
-    return [{k: v for k, v in r.items() if k != "seconds"} for r in said]
+    by_key = sorted(records(out), key=lambda r: (r["drive"], r["key"]))
+    return [{k: v for k, v in r.items() if k != "seconds"} for r in by_key]
 
 
 def copy_drive(drive: Path, to: Path) -> Path:

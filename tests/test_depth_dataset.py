@@ -59,27 +59,26 @@ def write_maps(folder: Path, camera: str, frame: int, rng: np.random.Generator) 
     dense_m = np.where(rng.random((H, W)) < 0.7, filled_m, np.float32(0))
     sparse_m = np.where(rng.random((H, W)) < 0.1, dense_m, np.float32(0))
     confidence = rng.random((H, W), dtype=np.float32)
-    for kind, depth_m in zip(KINDS, (sparse_m, dense_m, filled_m, None), strict=True):
-        path = folder / "proj_depth" / kind / camera / f"{frame:010d}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if depth_m is None:
-            write_confidence_png(path, confidence, filled_m)
-        else:
-            write_depth_png(path, depth_m)
+    *paths, path = (folder / f"proj_depth/{kind}/{camera}/{frame:010d}.png" for kind in KINDS)
+    for depth_path, depth_m in zip(paths, (sparse_m, dense_m, filled_m), strict=True):
+        depth_path.parent.mkdir(parents=True, exist_ok=True)
+        write_depth_png(depth_path, depth_m)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_confidence_png(path, confidence, filled_m)
     return SimpleNamespace(
         sparse_m=sparse_m, dense_m=dense_m, filled_m=filled_m, confidence=confidence
     )
 
 
+def folder_of(drive: str) -> str:
+    return f"{'val' if drive == VAL else 'train'}/{drive}"
+
+
 def line_of(drive: str, frame: int, status: str = "done", cameras=CAMERAS) -> bytes:
-    folder = f"{'val' if drive == VAL else 'train'}/{drive}"
-    paths = [f"{folder}/proj_depth/{k}/{c}/{frame:010d}.png" for k in KINDS for c in cameras]
+    tree = f"{folder_of(drive)}/proj_depth"
+    paths = [f"{tree}/{k}/{c}/{frame:010d}.png" for k in KINDS for c in cameras]
     files = dict.fromkeys(paths, FileRecord.of(b"")) if status == "done" else {}
     return KeyRecord(drive, frame, status, files=files).to_line()
-
-
-def write_manifest(path: Path, *lines: bytes) -> None:
-    path.write_bytes(b"".join(lines))
 
 
 @pytest.fixture
@@ -89,26 +88,22 @@ def made(tmp_path):
     root, date = tmp_path / "set", tmp_path / "raw" / "2011_09_26"
     camera = {"width_px": W, "height_px": H, "K": K.tolist(), "distortion": []}
     camera["T_cam_lidar"] = np.eye(4).tolist()
-    drives, maps, images = {}, {}, {}
+    drives, maps, images, lines = {}, {}, {}, []
     for drive, frames in FRAMES.items():
-        folder = f"{'val' if drive == VAL else 'train'}/{drive}"
+        folder = folder_of(drive)
         recorded = write_recording(date, drive, rng)
         images |= {(drive, *where): image for where, image in recorded.items()}
-        for frame in frames:
+        for frame in reversed(frames):
+            lines.append(line_of(drive, frame))
             for name in CAMERAS:
                 maps[drive, name, frame] = write_maps(root / folder, name, frame, rng)
-        drives[drive] = {
-            "data": str(date / drive),
-            "folder": folder,
-            "frames": [[0, 9]],
-            "cameras": dict.fromkeys(CAMERAS, camera),
-        }
+        cameras = dict.fromkeys(CAMERAS, camera)
+        data = str(date / drive)
+        drives[drive] = {"data": data, "folder": folder, "frames": [[0, 9]], "cameras": cameras}
     about = {"schema_version": 1, "layout": "kitti-depth", "method": "flow", "drives": drives}
     about |= {"densify": "0.1.0", "window": 5, "cameras": None, "gate": {}, "config": {}}
     (root / "dataset.json").write_text(json.dumps(about))
-    write_manifest(
-        root / "manifest.jsonl", *(line_of(d, f) for d, fs in FRAMES.items() for f in reversed(fs))
-    )
+    (root / "manifest.jsonl").write_bytes(b"".join(lines))
     return SimpleNamespace(root=root, date=date, maps=maps, images=images, about=about)
 
 
@@ -157,12 +152,12 @@ def test_which_samples_are_in_the_set(made):
         dataset = DepthDataset(made.root, split=split)
         assert len(dataset) == 2 * len(FRAMES[drive])
         assert {where_of(s)[0] for s in dataset} == {drive}
-    write_manifest(made.root / "manifest.jsonl", line_of(VAL, 3, cameras=["image_03"]))
+    whole, *shards = (made.root / f"manifest{n}.jsonl" for n in ("", "-1of2", "-2of2"))
+    whole.write_bytes(line_of(VAL, 3, cameras=["image_03"]))
     assert [where_of(s) for s in DepthDataset(made.root)] == [(VAL, "image_03", 3)]
-    (made.root / "manifest.jsonl").unlink()
-    lines = line_of(VAL, 5, "failed"), line_of(VAL, 8), line_of(TRAIN, 0, "aside")
-    write_manifest(made.root / "manifest-1of2.jsonl", *lines)
-    write_manifest(made.root / "manifest-2of2.jsonl", line_of(VAL, 3))
+    whole.unlink()
+    shards[0].write_bytes(line_of(VAL, 5, "failed") + line_of(VAL, 8) + line_of(TRAIN, 0, "aside"))
+    shards[1].write_bytes(line_of(VAL, 3))
     dataset = DepthDataset(made.root, cameras=["image_02"])
     assert [where_of(s) for s in dataset] == [(VAL, "image_02", 3), (VAL, "image_02", 8)]
 
@@ -228,43 +223,38 @@ def test_a_seed_repeats_crops_and_flips_in_workers_too(made):
 # What is wrong
 
 
-def refused(*parts, **options) -> None:
-    root = options.pop("root")
+def refused(root: Path, *words, **options) -> None:
     with pytest.raises(InputError) as error:
         list(DepthDataset(root, **options))
     message = str(error.value)
-    assert "\n" not in message
-    for part in parts:
-        assert str(part) in message, message
+    assert "\n" not in message and all(str(word) in message for word in words), message
 
 
 @pytest.mark.parametrize("kind", ["groundtruth", "confidence"])
 def test_a_missing_a_damaged_and_a_foreign_map(made, kind):
     path = made.root / "val" / VAL / "proj_depth" / kind / "image_02" / "0000000005.png"
     whole = path.read_bytes()
-    again = "run densify dataset again"
-    path.write_bytes(whole[: len(whole) // 2])
-    refused(path, again, root=made.root)
-    path.write_bytes(whole[:100] + bytes([whole[100] ^ 1]) + whole[101:])
-    refused(path, again, root=made.root)
+    for damaged in (whole[: len(whole) // 2], whole[:100] + bytes([whole[100] ^ 1]) + whole[101:]):
+        path.write_bytes(damaged)
+        refused(made.root, path, "run densify dataset again")
     stored = cv2.imdecode(np.frombuffer(whole, np.uint8), cv2.IMREAD_UNCHANGED)
     assert cv2.imwrite(str(path), stored[:, :-1])
-    refused(path, f"{W - 1} x {H}", f"{W} x {H}", root=made.root)
+    refused(made.root, path, f"{W - 1} x {H}", f"{W} x {H}")
     path.unlink()
-    refused(path, again, root=made.root)
+    refused(made.root, path, "run densify dataset again")
 
 
 def test_sets_and_options_that_cannot_be_used(made):
-    refused("nothing to load", "cameras image_02, image_03", root=made.root, cameras=["image_07"])
-    for crop, told in (((H + 1, 20), f"{H + 1} x 20"), ((0, 20), "0 x 20")):
-        refused(told, f"{H} x {W}", root=made.root, crop=crop)
-    place = made.root / "dataset.json"
-    for change, told in (
+    refused(made.root, "nothing to load", "cameras image_02, image_03", cameras=["image_07"])
+    for crop in ((H + 1, 20), (0, 20)):
+        refused(made.root, f"{crop[0]} x 20", f"{H} x {W}", crop=crop)
+    path = made.root / "dataset.json"
+    for change, words in (
         ({"layout": "densify"}, "--layout kitti-depth"),
         ({"schema_version": 2}, "schema_version 2"),
         ({"drives": {VAL: {"data": "x"}}}, "damaged"),
     ):
-        place.write_text(json.dumps({**made.about, **change}))
-        refused(place, told, root=made.root)
-    place.unlink()
-    refused(place, "densify dataset --layout kitti-depth", root=made.root)
+        path.write_text(json.dumps({**made.about, **change}))
+        refused(made.root, path, words)
+    path.unlink()
+    refused(made.root, path, "densify dataset --layout kitti-depth")

@@ -21,46 +21,34 @@ from densify.scores.depth_metrics import (
     mean_errors,
 )
 
-KEY = 7
-
 
 def image(values):
     return np.array([values], np.float32)
 
 
 def test_kittis_baseline_is_the_default():
-    truth, found = image([10.0]), image([11.0])
-    # 100 * 0.54 / 10 = 5.4 px: 0.49 px off
-    assert depth_errors(found, truth, focal_px=100.0).outliers == 0
     # 620 * 0.54 = 334.8: 3.04 px off; 600 * 0.54 = 324: 2.95 px off
-    assert depth_errors(found, truth, focal_px=620.0).outliers == 1
-    assert depth_errors(found, truth, focal_px=600.0).outliers == 0
+    for focal_px, share in ((620.0, 1), (600.0, 0)):
+        assert depth_errors(image([11.0]), image([10.0]), focal_px=focal_px).outliers == share
 
 
 def test_depth_scores_split_measured_filled_moving_static():
-    truth = image([10.0, 10.0, 10.0, 10.0])
-    moving = np.array([[True, True, False, False]])
-    depth = DepthMap(
-        camera="cam",
-        depth_m=image([12.0, 0, 10.0, 0]),
-        filled_m=image([12.0, 14.0, 10.0, 0]),
-        confidence=image([1, 0.5, 1, 0]),
-        frame=np.array([[KEY, -1, KEY, -1]], np.int32),
-    )
+    truth, moving = image([10.0] * 4), np.array([[True, True, False, False]])
+    measured_m, filled_m = image([12.0, 0, 10.0, 0]), image([12.0, 14.0, 10.0, 0])
+    frame = np.where(measured_m > 0, 7, -1).astype(np.int32)
+    depth = DepthMap("cam", measured_m, filled_m, image([1, 0.5, 1, 0]), frame)
     camera = Camera("cam", 4, 1, np.diag([700.0, 700, 1]), np.eye(4))
     scores = depth_scores(depth, truth, moving, camera)
     assert json.loads(json.dumps(scores, allow_nan=False)) == scores
-    mae = {(p, m): scores[p][m]["mae_m"] for p in scores for m in scores[p]}
-    assert mae == {
-        ("measured", "all"): 1.0,
-        ("measured", "moving"): 2.0,
-        ("measured", "static"): 0.0,
-        ("filled", "all"): 2.0,
-        ("filled", "moving"): 3.0,
-        ("filled", "static"): 0.0,
+    mae_m = {
+        product: {group: errors["mae_m"] for group, errors in groups.items()}
+        for product, groups in scores.items()
+    }
+    assert mae_m == {
+        "measured": {"all": 1.0, "moving": 2.0, "static": 0.0},
+        "filled": {"all": 2.0, "moving": 3.0, "static": 0.0},
     }
     assert scores["measured"]["moving"]["coverage"] == 0.5
-    assert scores["filled"]["moving"]["coverage"] == 1.0
     assert scores["filled"]["moving"]["outliers"] == 1.0
     nothing = depth_scores(depth, truth, moving & False, camera)["filled"]["moving"]
     assert nothing["num_pixels"] == 0 and nothing["coverage"] is None
@@ -95,9 +83,9 @@ def slow_errors(pixels, fb):
 @given(depth_lists)
 @settings(deadline=None, max_examples=60)
 def test_lists_and_maps_agree_with_the_slow_twin(pixels):
-    found, truth = np.array(pixels, np.float32).T
-    errors = depth_errors(found, truth, focal_px=700.0, baseline_m=0.5)
-    assert errors == depth_errors(found[None], truth[None], focal_px=700.0, baseline_m=0.5)
+    predicted, truth = np.array(pixels, np.float32).T
+    errors = depth_errors(predicted, truth, focal_px=700.0, baseline_m=0.5)
+    assert errors == depth_errors(predicted[None], truth[None], focal_px=700.0, baseline_m=0.5)
     both = [(z, t) for z, t in pixels if z > 0 and t > 0]
     assert errors.num_pixels == sum(t > 0 for _, t in pixels)
     assert errors.num_compared == len(both)

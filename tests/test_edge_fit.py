@@ -34,13 +34,13 @@ def scene(recording):
     return camera, silhouettes_of(stretch[KEY].sweep), sequence.image(CAMERA, shot.number)
 
 
-@pytest.mark.parametrize("shift", [(0, 0), (2, 0), (0, -2)])
+@pytest.mark.parametrize("shift", [(0, 0), (2, -2)])
 def test_an_image_in_its_place_is_not_off(scene, shift) -> None:
     camera, silhouettes, image = scene
     assert not is_off(camera, silhouettes, np.roll(image, shift, (0, 1)))
 
 
-@pytest.mark.parametrize("shift", [(12, 0), (-12, 0), (0, 12), (0, -12)])
+@pytest.mark.parametrize("shift", [(12, 0), (0, -12)])
 def test_an_image_that_lies_aside_is_off(scene, shift) -> None:
     camera, silhouettes, image = scene
     assert is_off(camera, silhouettes, np.roll(image, shift, (0, 1)))
@@ -59,16 +59,11 @@ def test_a_map_says_that_its_image_is_off_and_does_not_use_it(recording, scene, 
     ] * (shift_px > 0)
 
 
-def test_the_best_of_many_turns_by_chance_is_no_better_turn(scene) -> None:
-    """Some discontinuities in an image of noise."""
+def test_chance_and_a_few_discontinuities_judge_nothing(scene) -> None:
+    """Some discontinuities in an image of noise, and a few in an image that lies aside."""
     camera, silhouettes, image = scene
     noise = np.random.default_rng(0).integers(0, 255, image.shape).astype(np.uint8)
-    for first in range(20):
-        some = type(silhouettes)(*(column[first::20] for column in silhouettes))
-        assert not is_off(camera, some, noise)
-
-
-def test_a_few_discontinuities_judge_nothing(scene) -> None:
-    camera, silhouettes, image = scene
-    few = type(silhouettes)(*(column[::100] for column in silhouettes))
-    assert not is_off(camera, few, np.roll(image, 12, 0))
+    cases = [(noise, slice(first, None, 20)) for first in range(20)]
+    for picture, rows in (*cases, (np.roll(image, 12, 0), slice(None, None, 100))):
+        some = type(silhouettes)(*(column[rows] for column in silhouettes))
+        assert not is_off(camera, some, picture)

@@ -19,6 +19,7 @@ from densify.dataset import executor
 from densify.dataset.executor import call_all
 
 PATIENCE_S = 60  # before a test that hangs fails
+HOME = {**os.environ, "PYTHONPATH": str(Path(executor.__file__).parents[2])}
 
 
 def until(what: Callable[[], bool]) -> None:
@@ -48,17 +49,16 @@ def where(request: pytest.FixtureRequest):
 
 
 def test_every_outcome_is_yielded_once(where: dict, tmp_path: Path) -> None:
-    groups = [[1, 2, 3], [4], [-1, 5], [1000, 1001]]
-    log = tmp_path / "log"
-    found = list(call_all(worker_calls.square, groups, log=log, **where))
-    outcomes = dict(found)
-    assert len(found) == len(outcomes) == 8
+    groups, log = [[1, 2, 3], [4], [-1, 5], [1000, 1001]], tmp_path / "log"
+    yielded = list(call_all(worker_calls.square, groups, log=log, **where))
+    outcomes = dict(yielded)
+    assert len(yielded) == len(outcomes) == 8
     error = outcomes.pop(-1)
     assert isinstance(error, ComputationError) and "KeyError: 'negative'" in str(error)
     assert outcomes == {n: n * n for n in (1, 2, 3, 4, 5, 1000, 1001)}
     if where.get("num_workers") != 1:
-        told = sorted(line.partition(" WARNING ")[2] for line in log.read_text().splitlines())
-        assert told == ["large: 1000", "large: 1001"]
+        warnings = sorted(line.partition(" WARNING ")[2] for line in log.read_text().splitlines())
+        assert warnings == ["large: 1000", "large: 1001"]
     assert list(call_all(worker_calls.square, [], **where)) == []
 
 
@@ -79,9 +79,9 @@ def test_a_death_costs_its_item_alone(tmp_path: Path) -> None:
 def test_cores_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(7)))
     before = dict(os.environ)
-    told = [outcome for _, outcome in call_all(worker_calls.threads, [[0], [1]], 2)]
-    assert told[0] == ("3", 3, False)  # one worker may call both, and has loaded numba then
-    assert {outcome[:2] for outcome in told} == {("3", 3)}
+    outcomes = [outcome for _, outcome in call_all(worker_calls.threads, [[0], [1]], 2)]
+    assert outcomes[0] == ("3", 3, False)  # one worker may call both, and has loaded numba then
+    assert {outcome[:2] for outcome in outcomes} == {("3", 3)}
     assert dict(os.environ) == before
     assert executor.share_of_cores(8)["OMP_NUM_THREADS"] == "1"
 
@@ -91,10 +91,8 @@ def test_a_script_without_its_guard_is_told_so(tmp_path: Path) -> None:
     script.write_text(
         "from densify.dataset.executor import call_all\nprint(list(call_all(abs, [[1]], 2)))\n"
     )
-    path = os.pathsep.join([str(Path(executor.__file__).parents[2])])
-    environment = {**os.environ, "PYTHONPATH": path}
     done = subprocess.run(
-        [sys.executable, script], env=environment, capture_output=True, text=True, timeout=60
+        [sys.executable, script], env=HOME, capture_output=True, text=True, timeout=PATIENCE_S
     )
     assert done.returncode == 1 and "before they have begun; a script" in done.stderr
 
@@ -115,10 +113,9 @@ def test_workers_end_with_the_command(how: signal.Signals, tmp_path: Path) -> No
     script = tmp_path / "main.py"
     script.write_text(MAIN)
     arguments = [sys.executable, str(script), str(tmp_path), str(Path(__file__).parent)]
-    path = str(Path(executor.__file__).parents[2])
     with subprocess.Popen(
         arguments,
-        env={**os.environ, "PYTHONPATH": path},
+        env=HOME,
         stderr=subprocess.DEVNULL,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:

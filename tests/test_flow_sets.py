@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +15,11 @@ from densify.bench.flow import bench_flow
 from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
+from densify.geometry.types import Stretch
 from densify.readers import open_sequence
 from densify.readers.flow_files import labelled_flow
 from densify.readers.street import Street
+from tests.command import files_in
 from tests.exact_motion import registered
 
 feather = pytest.importorskip("pyarrow.feather")
@@ -67,21 +68,16 @@ def test_a_submission_has_a_file_for_each_sweep_and_a_row_for_each_point(log, su
     num_moving, truth = 0, open_sequence(log).truth
     for frame, (path, sweep) in enumerate(zip(files, sweep_files(log), strict=True)):
         table = feather.read_table(path)
-        assert table.column_names == ["is_valid", *AXES]
-        assert [str(t) for t in table.schema.types] == [
-            "bool",
-            "halffloat",
-            "halffloat",
-            "halffloat",
-        ]
+        types = [str(t) for t in table.schema.types]
+        assert (table.column_names, types) == (["is_valid", *AXES], ["bool", *3 * ["halffloat"]])
         assert len(table) == len(feather.read_table(sweep)) and all(table["is_valid"].to_pylist())
         residual = np.stack([table[axis].to_numpy() for axis in AXES], axis=1).astype(float)
         moving = residual.any(axis=1)
         num_moving += int(moving.sum())
         if frame + 1 < len(files):
             true = truth.displacement(frame, frame + 1)
-            residual, moving = residual[: len(true)], moving[: len(true)]
-            error_m = np.linalg.norm(residual - true, axis=1)
+            moving = moving[: len(true)]
+            error_m = np.linalg.norm(residual[: len(true)] - true, axis=1)
             length_m = np.linalg.norm(true, axis=1)
             assert np.median(error_m[moving]) < 0.25 * np.median(length_m[moving])
     assert num_moving > 100 and not moving.any()  # the last sweep has none to flow to
@@ -91,26 +87,21 @@ def test_other_forms_hold_the_same(log, submission, tmp_path):
     h5py = pytest.importorskip("h5py")
     assert flow(log, tmp_path, "--keys", "0:2", "--format", "opensceneflow") == 0
     assert flow(log, tmp_path, "--keys", "0:2") == 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "000000_000001.npz",
-        "000001_000002.npz",
-        f"{log.name}.h5",
-    ]
-    with h5py.File(tmp_path / f"{log.name}.h5") as groups:
-        assert list(groups) == [p.stem for p in sweep_files(log)[:2]]
-        group = groups[sweep_files(log)[0].stem]
-        rows, ids = np.asarray(group["row"]), np.asarray(group["flow_instance_id"])
-        total = np.asarray(group["flow"])
-        pose = [np.asarray(groups[name.stem]["pose"]) for name in sweep_files(log)[:2]]
-        np.testing.assert_allclose(
-            np.linalg.inv(pose[1]) @ pose[0], np.asarray(group["ego_motion"]), atol=1e-5
-        )
-    with np.load(tmp_path / "000000_000001.npz") as file:
+    names = ["000000_000001.npz", "000001_000002.npz", f"{log.name}.h5"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
+    stems = [path.stem for path in sweep_files(log)[:2]]
+    with h5py.File(tmp_path / names[2]) as groups:
+        assert list(groups) == stems
+        first, pose = groups[stems[0]], [np.asarray(groups[stem]["pose"]) for stem in stems]
+        columns = ("row", "flow_instance_id", "flow", "ego_motion")
+        rows, ids, total, ego_motion = (np.asarray(first[name]) for name in columns)
+    np.testing.assert_allclose(np.linalg.inv(pose[1]) @ pose[0], ego_motion, atol=1e-5)
+    with np.load(tmp_path / names[0]) as file:
         residual, moving = file["residual_flow"], file["moving"]
         np.testing.assert_array_equal(file["row"], rows)
         np.testing.assert_array_equal(file["object"] >= 0, ids > 0)
         np.testing.assert_allclose(file["total_flow"], total, atol=1e-5)
-    table = feather.read_table(submission / log.name / sweep_files(log)[0].name)
+    table = feather.read_table(submission / log.name / f"{stems[0]}.feather")
     submitted = np.stack([table[axis].to_numpy() for axis in AXES], axis=1)[rows]
     assert moving.sum() > 50
     np.testing.assert_array_equal(residual.astype(np.float16), submitted)
@@ -138,16 +129,16 @@ def test_labels_score_as_the_truth_they_are_made_of(log, tmp_path, capsys):
     command = ["bench", "flow", "--data", str(log), "--key", "2", "--window", "2", *GIVEN]
     command += ["--methods", "ours,rigid"]
     assert main([*command, "--truth", str(labels), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["runs"][0]
-    assert found["num_pairs"] == 2
+    scored = json.loads(capsys.readouterr().out)["runs"][0]
+    assert scored["num_pairs"] == 2
     exact = bench_flow(
         open_sequence(log), 2, 2, resolve({"register": {"source": "dataset"}}), ("ours", "rigid")
     )
-    for name, row in found["methods"].items():
-        here, there = row["challenge"], exact["methods"][name]["challenge"]
-        assert here["three_way"] == pytest.approx(there["three_way"], abs=1e-5)
-        assert here["bucketed"]["CAR"] == pytest.approx(there["bucketed"]["OBJECT"], abs=1e-5)
-    rigid, ours = (found["methods"][name]["challenge"] for name in ("rigid", "ours"))
+    for name, row in scored["methods"].items():
+        labelled, true = row["challenge"], exact["methods"][name]["challenge"]
+        assert labelled["three_way"] == pytest.approx(true["three_way"], abs=1e-5)
+        assert labelled["bucketed"]["CAR"] == pytest.approx(true["bucketed"]["OBJECT"], abs=1e-5)
+    rigid, ours = (scored["methods"][name]["challenge"] for name in ("rigid", "ours"))
     assert rigid["bucketed"]["CAR"]["dynamic"] == pytest.approx(1.0)
     assert rigid["three_way"]["foreground_dynamic_m"] > 0.3
     assert ours["three_way"]["foreground_static_m"] < 1e-4
@@ -176,80 +167,71 @@ def test_moving_masks_by_the_reader_of_semantic_kitti_api(log, tmp_path):
 def test_doc_depths_exchange_format(tmp_path):
     """Read as DOC-Depth's FORMAT.md and renderer do: classes up to 50 ground, up to 100 static,
     then dynamic; poses bring frames together."""
-    plyfile = pytest.importorskip("plyfile")
-    assert main(["flow", "street?sensor=vlp16", "--keys", "59:62", "--format", "doc-depth", *GIVEN,
-                 "--out", str(tmp_path)]) == 0  # fmt: skip
+    plyfile, spec = pytest.importorskip("plyfile"), "street?sensor=vlp16"
+    options = ["--keys", "59:61", "--format", "doc-depth", *GIVEN, "--out", str(tmp_path)]
+    assert main(["flow", spec, *options]) == 0
     (run,) = tmp_path.iterdir()
-    street = Street("street", 0, "vlp16")
-    path = plyfile.PlyData.read(run / "traj_odometry.ply")["vertex"].data
-    assert path["indices"].tolist() == [59, 60, 61]
-    T_world_lidar, dynamic = [], 0
-    for row in path:
-        quaternion = [row[name] for name in ("q_x", "q_y", "q_z", "q_w")]
-        assert quaternion == [row[name] for name in ("qx", "qy", "qz", "qw")]
-        np.testing.assert_allclose(row["timestamp"], street.stamp_ns(int(row["indices"])) * 1e-9)
-        ply = plyfile.PlyData.read(run / "frames" / f"frame_{row['indices']:06d}.ply")["vertex"]
-        assert [p.val_dtype for p in ply.properties] == ["f4", "f4", "f4", "u2"]
-        points = np.stack([ply[axis] for axis in "xyz"], axis=1).astype(float)
-        static = (ply["classid"] >= 50) & (ply["classid"] < 100)
-        dynamic += int((ply["classid"] >= 100).sum())
-        assert (ply["classid"] < 50).mean() > 0.2
-        T = np.eye(4)
+    street = open_sequence(spec)
+
+    def vertices(name: str):
+        return plyfile.PlyData.read(run / name)["vertex"]
+
+    path = vertices("traj_odometry.ply").data
+    assert path["indices"].tolist() == [59, 60]
+    T_world_lidar, num_dynamic = np.tile(np.eye(4), (2, 1, 1)), 0
+    for T, row in zip(T_world_lidar, path, strict=True):
+        frame, quaternion = int(row["indices"]), [row[f"q_{axis}"] for axis in "xyzw"]
+        assert quaternion == [row[f"q{axis}"] for axis in "xyzw"]
+        np.testing.assert_allclose(row["timestamp"], street.stamp_ns(frame) * 1e-9)
         T[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
         T[:3, 3] = [row[axis] for axis in "xyz"]
-        T_world_lidar.append(T)
-        assert 0.05 < static.mean() < 0.8 and np.abs(points).max() < 130
-    assert dynamic > 50
-    truth = [street.T_world_lidar(frame) for frame in (59, 61)]
-    step = np.linalg.inv(T_world_lidar[0]) @ T_world_lidar[2]
-    np.testing.assert_allclose(step, np.linalg.inv(truth[0]) @ truth[1], atol=1e-6)
+        ply = vertices(f"frames/frame_{frame:06d}.ply")
+        assert [p.val_dtype for p in ply.properties] == ["f4", "f4", "f4", "u2"]
+        kind = np.digitize(ply["classid"], [50, 100])  # ground, static, dynamic
+        assert (kind == 0).mean() > 0.2 and 0.05 < (kind == 1).mean() < 0.8
+        num_dynamic += int((kind == 2).sum())
+        assert max(np.abs(ply[axis]).max() for axis in "xyz") < 130
+    assert num_dynamic > 50
+    first, last = (street.T_world_lidar(frame) for frame in (59, 60))
+    step = np.linalg.inv(T_world_lidar[0]) @ T_world_lidar[1]
+    np.testing.assert_allclose(step, np.linalg.inv(first) @ last, atol=1e-6)
     camera = street.cameras["image_02"]
     np.testing.assert_array_equal(json.loads((run / "calib.json").read_text())["mtx"], camera.K)
     np.testing.assert_array_equal(np.loadtxt(run / "calib_lidar_ref_cam.txt"), camera.T_cam_lidar)
-    seen = plyfile.PlyData.read(run / "traj_camera.ply")["vertex"].data
-    exposed_ns = np.array([*street.image_stamps_ns("image_02").values()])
-    beside_s = np.abs(seen["timestamp"][:, None] - exposed_ns * 1e-9).min(axis=1)
-    assert len(seen) > 1 and beside_s.max() < 1e-6
-    np.testing.assert_allclose(exposed_ns[seen["indices"]] * 1e-9, seen["timestamp"], atol=1e-6)
-
-
-# --- what is refused ------------------------------------------------------------------------------
+    exposures = vertices("traj_camera.ply").data
+    exposed_s = np.array([*street.image_stamps_ns("image_02").values()]) * 1e-9
+    beside_s = np.abs(exposures["timestamp"][:, None] - exposed_s).min(axis=1)
+    assert len(exposures) > 1 and beside_s.max() < 1e-6
+    np.testing.assert_allclose(exposed_s[exposures["indices"]], exposures["timestamp"], atol=1e-6)
 
 
 def test_what_is_there_is_kept(log, submission, capsys):
-    before = {p: p.read_bytes() for p in (submission / log.name).iterdir()}
+    before = files_in(submission)
     assert flow(log, submission, "--all", "--format", "av2") == 2
     assert "already there and kept" in capsys.readouterr().err
-    assert before == {p: p.read_bytes() for p in (submission / log.name).iterdir()}
+    assert before == files_in(submission)
 
 
-def test_bad_labels_are_named(log, tmp_path):
+def test_labels_by_number_and_what_is_wrong_with_them(log, tmp_path):
     points = open_sequence(log)[0].points[:5]
-    stretch_of = [registered(frame, points) for frame in (0, 1)]
-    from densify.geometry.types import Stretch
-
-    stretch = Stretch(tuple(stretch_of))
-    with pytest.raises(InputError, match="no such folder"):
-        labelled_flow(tmp_path / "none", "x", stretch, 0)
-    with pytest.raises(InputError, match="holds no labels of x"):
-        labelled_flow(tmp_path, "x", stretch, 0)
-    labels = labels_of(log, tmp_path / "labels", True)
+    stretch = Stretch(tuple(registered(frame, points) for frame in (0, 1)))
+    labels, empty = labels_of(log, tmp_path / "labels", True), tmp_path / "empty"
     path = labels / log.name / "0000000000.feather"
-    table = feather.read_table(path, memory_map=False)
-    feather.write_feather(table.slice(0, 3), path)
-    with pytest.raises(InputError, match="holds 3 labels"):
-        labelled_flow(labels, log.name, stretch, 0)
-    shutil.rmtree(labels / log.name)
-    np.savez(tmp_path / "000005_000006.npz", residual_flow=np.zeros((9, 3)))
+    feather.write_feather(feather.read_table(path, memory_map=False).slice(0, 3), path)
+    empty.mkdir()
+    for folder, name, words in (
+        (tmp_path / "none", "x", "no such folder"),
+        (empty, "x", "holds no labels of x"),
+        (labels, log.name, "holds 3 labels"),
+    ):
+        with pytest.raises(InputError, match=words):
+            labelled_flow(folder, name, stretch, 0)
+    np.savez(empty / "000005_000006.npz", residual_flow=np.zeros((9, 3)))
     with pytest.raises(InputError, match="no such flow file"):
-        labelled_flow(tmp_path, "x", stretch, 0)
-    np.savez(
-        tmp_path / "000000_000001.npz",
-        residual_flow=np.ones((30, 3)),
-        object=np.arange(30) - 1,
-        valid=np.arange(30) % 2 == 0,
-    )
-    label = labelled_flow(tmp_path, "x", stretch, 0)
-    row = stretch.sweeps[0].sweep.row
+        labelled_flow(empty, "x", stretch, 0)
+    number = np.arange(30)
+    columns = {"object": number - 1, "valid": number % 2 == 0}
+    np.savez(empty / "000000_000001.npz", residual_flow=np.ones((30, 3)), **columns)
+    label, row = labelled_flow(empty, "x", stretch, 0), stretch.sweeps[0].sweep.row
     np.testing.assert_array_equal(label.valid, row % 2 == 0)
     np.testing.assert_array_equal(label.classes > 0, row > 0)

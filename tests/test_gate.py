@@ -16,7 +16,6 @@ import pytest
 from densify.bench import gate
 from densify.bench.verdicts import beyond_luck, coverage, curve, outliers_at, verdicts
 from densify.config import resolve
-from densify.geometry.types import Result
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import densify as densify_key
 from densify.readers import open_sequence
@@ -46,10 +45,6 @@ def test_the_luck_of_every_key_is_known() -> None:
     assert all(min(luck.values()) >= 0 and max(luck.values()) > 0 for luck in stored.luck.values())
 
 
-def made(wrong: np.ndarray, confidence: np.ndarray, num: int = 2000) -> dict:
-    return {"all": curve(num, confidence, wrong)}
-
-
 def test_a_curve_leaves_out_the_least_certain_pixels() -> None:
     confidence = np.linspace(1, 0, 1000)
     whole = curve(2000, confidence, confidence < 0.1)
@@ -64,10 +59,11 @@ def test_maps_are_compared_at_equal_coverage() -> None:
     """A map with more pixels, all wrong and known to be uncertain, is no worse."""
     rng = np.random.default_rng(0)
     confidence, wrong = rng.uniform(0.5, 1, 1000), rng.random(1000) < 0.02
-    more = np.append(confidence, np.full(250, 0.1)), np.append(wrong, np.ones(250, bool))
-    before = {"key": made(wrong, confidence)}
+    before = {"key": {"all": curve(2000, confidence, wrong)}}
+    confidence = np.append(confidence, np.full(250, 0.1))
+    now = {"key": {"all": curve(2000, confidence, np.append(wrong, np.ones(250, bool)))}}
     luck = {"key": {"all outliers": 0.05, "all coverage": 0.1}}
-    (outliers, covered) = verdicts(before, {"key": made(more[1], more[0])}, luck)
+    (outliers, covered) = verdicts(before, now, luck)
     assert outliers.change == pytest.approx(0, abs=1e-6) and outliers.word == "no difference"
     assert covered.change == pytest.approx(12.5) and covered.word == "better"
 
@@ -86,12 +82,12 @@ def test_a_verdict_needs_more_than_luck_and_more_than_the_spread_of_keys() -> No
     assert word([0.4, 0.0, 0.0, 0.0], 0.05) == "no difference"  # one key alone
 
 
-def test_recall_and_coverage_are_better_when_larger() -> None:
-    (verdict,) = verdicts({"a": {"flow recall %": 90.0}}, {"a": {"flow recall %": 80.0}}, {})
+def test_recall_is_better_when_larger() -> None:
+    before, luck = {"flow recall %": 90.0}, {"flow recall %": 1.0}
+    (verdict,) = verdicts({"a": before}, {"a": {"flow recall %": 80.0}}, {})
     assert verdict.word == "worse" and verdict.worst == ("a", -10.0)
-    luck = {"flow recall %": 1.0}
-    assert beyond_luck({"flow recall %": 90.0}, {"flow recall %": 80.0}, luck, 4.0)
-    assert not beyond_luck({"flow recall %": 90.0}, {"flow recall %": 85.0}, luck, 4.0)
+    assert beyond_luck(before, {"flow recall %": 80.0}, luck, 4.0)
+    assert not beyond_luck(before, {"flow recall %": 85.0}, luck, 4.0)
 
 
 def test_repeated_draws_carry_their_own_luck() -> None:
@@ -102,7 +98,8 @@ def test_repeated_draws_carry_their_own_luck() -> None:
 
 
 def test_stored_figures_come_back(tmp_path: Path) -> None:
-    stored = gate.Stored({"a": made(np.array([True, False]), np.ones(2))}, {"a": {"x": 0.1}})
+    figures = {"a": {"all": curve(9, np.ones(2), np.array([True, False])), "pair": [0.5, 1.0]}}
+    stored = gate.Stored(figures, {"a": {"x": 0.1}})
     gate.write(tmp_path / "gate.json", stored)
     assert gate.read(tmp_path / "gate.json") == stored
 
@@ -117,9 +114,8 @@ def test_the_command_refuses_what_it_does_not_know(tmp_path: Path, capsys) -> No
 
 def test_a_real_drive(test_data: Path) -> None:
     sequence = open_sequence(str(test_data / DRIVE))
-    recording = Recording(sequence, resolve(None).scored(), 5, [120], looks_around=True)
-    results = densify_key(recording, 120, ["none", "icp", "flow"], ["image_02"])
-    icp, flow = results["icp"], results["flow"]
+    recording = Recording(sequence, resolve(None), 5, [120], looks_around=True)
+    single, icp, flow = densify_key(recording, 120, ["none", "icp", "flow"], ["image_02"]).values()
     assert flow.frames == tuple(range(115, 126))
     assert flow.metrics["ghosts"]["all"] <= 0.5 * icp.metrics["ghosts"]["all"]
     assert flow.cloud.far.sum() > 100_000 and not icp.cloud.far.any()
@@ -128,12 +124,9 @@ def test_a_real_drive(test_data: Path) -> None:
     assert cloud.moving.sum() > 1000
     still = ~cloud.moving
     assert cloud.points[still].tobytes() == cloud.rigid_points[still].tobytes()
-    at = np.full((11, cloud.row.max() + 1), -1)
-    at[icp.cloud.frame - 115, icp.cloud.row] = np.arange(len(icp.cloud))
-    rigid = icp.cloud.points[at[cloud.frame - 115, cloud.row]]
+    number_of = np.full((11, cloud.row.max() + 1), -1)
+    number_of[icp.cloud.frame - 115, icp.cloud.row] = np.arange(len(icp.cloud))
+    rigid = icp.cloud.points[number_of[cloud.frame - 115, cloud.row]]
     assert cloud.rigid_points.tobytes() == rigid.tobytes()
-    assert measured_density(flow) > 2 * measured_density(results["none"])
-
-
-def measured_density(result: Result) -> float:
-    return result.metrics["density"]["image_02"]["measured"]
+    dense, sparse = (result.metrics["density"]["image_02"]["measured"] for result in (flow, single))
+    assert dense > 2 * sparse

@@ -20,8 +20,7 @@ from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
 from densify.geometry.types import Boxes, BoxView, Camera, RegisteredSweep, Sweep
-from densify.learning.boxes import BoxMargins, flow_of_boxes
-from densify.learning.labels import label_sweeps
+from densify.learning.labels import BoxMargins, flow_of_boxes, label_sweeps
 from densify.readers import open_sequence
 from densify.readers.kitti_files import Calibration
 from densify.readers.nuscenes import Annotations

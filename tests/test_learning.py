@@ -14,7 +14,6 @@ from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError
 from densify.flow.energy import on_one_thread
-from densify.learning.clips import ClipMaker
 from densify.learning.network import (
     Model,
     NetworkCloud,
@@ -24,16 +23,27 @@ from densify.learning.network import (
     read_model,
     write_model,
 )
-from densify.learning.samples import (
+from densify.learning.training import (
     ALPHA,
     NUM_NEIGHBORS,
+    Clip,
+    ClipMaker,
     Sample,
+    Training,
+    make_clip,
     objective_loss,
     sample_of,
     supervised_loss,
+    train,
 )
-from tests.learning_scenes import clip, train_small
-from tests.small_street import POSES_GIVEN, one_car
+from tests.command import refused
+from tests.small_street import KEY, POSES_GIVEN, one_car
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    """A street and a car at 8 m/s along x, with exact flow."""
+    return make_clip(one_car(), KEY, resolve(POSES_GIVEN), "truth")
 
 
 def cloud(count: int, seed: int = 0, reach_m: float = 30.0) -> NetworkCloud:
@@ -94,8 +104,8 @@ def network() -> Voxels:
 
 def test_flow_has_a_row_for_every_point_and_depends_on_the_target(network: Voxels) -> None:
     with torch.inference_mode():
-        for given in ([cloud(500), cloud(300, 1)], [cloud(500), cloud(40, 1), None]):
-            flow = network(given)
+        for sweeps in ([cloud(500), cloud(300, 1)], [cloud(500), cloud(40, 1), None]):
+            flow = network(sweeps)
             assert flow.shape == (500, 3) and torch.isfinite(flow).all() and flow.any()
         assert network([cloud(0), cloud(9)]).shape == (0, 3)
         one, other = (network([cloud(500), cloud(300, seed)]) for seed in (1, 2))
@@ -103,13 +113,13 @@ def test_flow_has_a_row_for_every_point_and_depends_on_the_target(network: Voxel
 
 
 def test_a_whole_sweep_gives_the_same_bytes_with_any_number_of_threads(network: Voxels) -> None:
-    given, found, before = [cloud(20_000, n) for n in range(3)], [], torch.get_num_threads()
+    sweeps, flows, before = [cloud(20_000, n) for n in range(3)], [], torch.get_num_threads()
     for threads in (1, 2):
         torch.set_num_threads(threads)
         with on_one_thread(), torch.inference_mode():
-            found.append(network(given))
+            flows.append(network(sweeps))
     torch.set_num_threads(before)
-    assert torch.equal(*found)
+    assert torch.equal(*flows)
 
 
 def test_sweeps_before_the_source_come_in_the_direction_of_time() -> None:
@@ -118,9 +128,9 @@ def test_sweeps_before_the_source_come_in_the_direction_of_time() -> None:
     assert order_for(0, 1, 5, 3) == [0, 1, None]
 
 
-def test_the_network_learns_what_moves() -> None:
+def test_the_network_learns_what_moves(clip: Clip) -> None:
     """One pair by heart: most of the motion, and that the rest is static."""
-    sample, network = sample_of(clip(0), 1, 2, 3), build()
+    sample, network = sample_of(clip, 1, 2, 3), build()
     optimizer = torch.optim.Adam(network.parameters(), 5e-3)
     with on_one_thread():
         for _ in range(12):
@@ -130,36 +140,36 @@ def test_the_network_learns_what_moves() -> None:
     with torch.inference_mode():
         error_m = (network(sample.sweeps) - sample.flow).norm(dim=1)
     static, moving = error_m[~sample.moving].mean(), error_m[sample.moving].mean()
-    assert moving < 0.3 and static < 0.15  # a flow of 0 has an error of 1 m
+    assert moving < 0.3 and static < 0.15  # a flow of 0 has an error of 0.8 m
 
 
-def test_the_objective_trains(tmp_path: Path) -> None:
-    path = train_small(str(tmp_path / "model"), teacher="objective", steps=1)
-    changed = zip(build().parameters(), read_model(path).network.parameters(), strict=True)
+def test_training_changes_the_network_and_a_seed_gives_the_same_bytes(
+    clip: Clip, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(ClipMaker, "__call__", lambda maker, number: clip)
+    paths = [tmp_path / f"{i}.pt" for i in range(3)]
+    for path, seed in zip(paths, (0, 0, 1), strict=True):
+        train(Training(("streets",), steps=1, seed=seed), path)
+    first, again, other = (path.read_bytes() for path in paths)
+    assert first == again != other
+    trained = read_model(paths[0]).network.parameters()
+    changed = zip(build().parameters(), trained, strict=True)
     assert any(not torch.equal(a, b) for a, b in changed)
 
 
-def test_a_seed_gives_the_same_bytes(tmp_path: Path) -> None:
-    first, again, other = (
-        train_small(str(tmp_path / f"{i}.pt"), steps=2, seed=seed).read_bytes()
-        for i, seed in enumerate((0, 0, 1))
-    )
-    assert first == again != other
-
-
-def test_a_random_change_moves_points_and_flow_alike() -> None:
+def test_a_random_change_moves_points_and_flow_alike(clip: Clip) -> None:
     """Turned, mirrored and scaled, a point plus its flow is where it was seen next."""
-    small, rng = clip(0), np.random.default_rng(2)
+    rng = np.random.default_rng(2)
     for source, target in ((1, 2), (2, 1)):
-        plain = sample_of(small, source, target, 2)
-        changed = sample_of(small, source, target, 2, rng)
+        plain = sample_of(clip, source, target, 2)
+        changed = sample_of(clip, source, target, 2, rng)
         a, b = plain.sweeps[0].points, changed.sweeps[0].points
         change, *_ = np.linalg.lstsq(a.numpy(), b.numpy(), rcond=None)
         np.testing.assert_allclose(plain.flow.numpy() @ change, changed.flow.numpy(), atol=1e-4)
         there = plain.sweeps[1].points.numpy() @ change
         np.testing.assert_allclose(there, changed.sweeps[1].points.numpy(), atol=1e-3)
         sign = 1 if target > source else -1
-        assert plain.flow[plain.moving][:, 0].numpy() == pytest.approx(sign, abs=1e-6)
+        assert plain.flow[plain.moving][:, 0].numpy() == pytest.approx(0.8 * sign, abs=1e-4)
         assert plain.duration_s == pytest.approx(0.1)
 
 
@@ -168,10 +178,10 @@ def test_a_model_comes_back(tmp_path: Path) -> None:
     for name in ("a.pt", "b"):
         write_model(tmp_path / name, model)
     assert (tmp_path / "a.pt").read_bytes() == (tmp_path / "b").read_bytes()
-    found = read_model(tmp_path / "b")
-    assert found.made == {"teacher": "truth"}
+    back = read_model(tmp_path / "b")
+    assert back.provenance == model.provenance
     for name, tensor in model.network.state_dict().items():
-        assert torch.equal(tensor, found.network.state_dict()[name])
+        assert torch.equal(tensor, back.network.state_dict()[name])
 
 
 def test_other_models_are_refused(tmp_path: Path) -> None:
@@ -197,38 +207,35 @@ def test_other_models_are_refused(tmp_path: Path) -> None:
 
 def test_the_command_trains_on_a_street(tmp_path: Path, capsys, monkeypatch) -> None:
     """A recording is labelled by our engine, and a network learns from it."""
-    monkeypatch.setattr("densify.learning.samples._NUM_MIXED", 1)  # clips made ahead
-    monkeypatch.setattr("densify.learning.clips.open_sequence", lambda spec: one_car())
-    monkeypatch.setattr("densify.learning.clips.resolve", lambda _: resolve(POSES_GIVEN))
+    module = "densify.learning.training"
+    monkeypatch.setattr(f"{module}._NUM_MIXED", 1)  # clips made ahead
+    monkeypatch.setattr(f"{module}.open_sequence", lambda spec: one_car())
+    monkeypatch.setattr(f"{module}.resolve", lambda _: resolve(POSES_GIVEN))
     out = tmp_path / "m.pt"
     command = ["train", "flow", "--data", "street", "--out", str(out), "--teacher", "engine"]
     command += ["--steps", "2"]
     assert main(command) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert told[0].startswith("2 steps, loss") and told[1:] == [str(out)]
-    assert read_model(out).made["teacher"] == "engine"
-    assert main(command) == 2
-    assert "already there and kept; give --overwrite" in capsys.readouterr().err
-    found, true = (ClipMaker(("street",), 0, teacher)(0) for teacher in ("engine", "truth"))
-    assert any(sweep.moving.any() for sweep in found), "a clip without moving points says nothing"
-    for sweep, truth in zip(found, true, strict=True):
-        own = sweep.moving & truth.moving
-        error_m = np.linalg.norm(sweep.flow - truth.flow, axis=2)[:, own]
-        assert not own.any() or np.median(error_m) < 0.1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("2 steps, loss") and lines[1:] == [str(out)]
+    assert read_model(out).provenance["teacher"] == "engine"
+    assert "already there and kept; give --overwrite" in refused(capsys, 2, *command)
+    estimated, true = (ClipMaker(("street",), 0, teacher)(0) for teacher in ("engine", "truth"))
+    assert any(sweep.moving.any() for sweep in estimated), "no moving points say nothing"
+    for sweep, truth in zip(estimated, true, strict=True):
+        moving = sweep.moving & truth.moving
+        error_m = np.linalg.norm(sweep.flow - truth.flow, axis=2)[:, moving]
+        assert not moving.any() or np.median(error_m) < 0.1
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("steps", "data", "message"),
     [
-        (["--steps", "0", "--data", "streets"], "--steps 0: expected 1 or more"),
-        (["--steps", "1", "--data", "nowhere"], "nowhere"),
-        (["--steps", "1", "--data", "streets?seed=3"], "seeds are drawn"),
+        ("0", "streets", "--steps 0: expected 1 or more"),
+        ("1", "nowhere", "nowhere"),
+        ("1", "streets?seed=3", "seeds are drawn"),
     ],
-    ids=str,
 )
-def test_bad_input_is_one_line(tmp_path: Path, capsys, options, message: str) -> None:
-    out = str(tmp_path / "m.pt")
-    assert main(["train", "flow", "--out", out, *options]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and message in lines[0]
+def test_bad_input_is_one_line(tmp_path: Path, capsys, steps, data, message: str) -> None:
+    command = ["train", "flow", "--out", tmp_path / "m.pt", "--steps", steps, "--data", data]
+    assert message in refused(capsys, 2, *command)
     assert not list(tmp_path.iterdir())

@@ -34,14 +34,6 @@ def write_lines(path: Path, *records: KeyRecord) -> bytes:
     return data
 
 
-def write_files(root: Path, *records: KeyRecord) -> None:
-    """What `record` says they hold."""
-    for r in records:
-        for name in r.files:
-            (root / name).parent.mkdir(parents=True, exist_ok=True)
-            (root / name).write_bytes(b"%d" % r.key)
-
-
 def keys(root: Path) -> list[int]:
     return [key for _, key in read_manifests(root)]
 
@@ -132,22 +124,21 @@ def test_which_line_of_a_key_counts(tmp_path: Path) -> None:
 
 
 def test_whole_and_damaged_files(tmp_path: Path) -> None:
-    good, lost = record(12), record(2)
-    aside = record(3, status="aside", reason="drifts", files={})
-    failed = record(4, status="failed", reason="no image", files={})
-    (name,) = good.files
+    good, lost, empty = record(12), record(2), record(5, files={})
+    aside, failed = (record(3 + n, status=s, files={}) for n, s in enumerate(("aside", "failed")))
+    (name,), path = good.files, tmp_path / next(iter(good.files))
     assert damaged_files(good, tmp_path) == [name]
-    write_files(tmp_path, good)
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"12")
     assert damaged_files(good, tmp_path) == []
-    empty = record(5, files={})
     names = {good.name, aside.name}
     assert finished([good, lost, aside, failed, empty], tmp_path) == names
-    (tmp_path / name).write_bytes(b"21")  # as long, but another
+    path.write_bytes(b"21")  # as long, but another
     assert damaged_files(good, tmp_path) == [name]
     assert finished([good, aside], tmp_path) == names
     assert finished([good, aside], tmp_path, verify=True) == {aside.name}
-    (tmp_path / name).unlink()
-    (tmp_path / name).mkdir()
+    path.unlink()
+    path.mkdir()
     assert damaged_files(good, tmp_path) == [name]
 
 
@@ -155,20 +146,18 @@ def test_whole_and_damaged_files(tmp_path: Path) -> None:
 
 
 def test_the_file_is_ordered_on_closing_and_opening(tmp_path: Path) -> None:
-    out = tmp_path / "new" / "out"
-    path = out / "manifest.jsonl"
-    with Manifest(out) as manifest:
-        assert manifest.path == path
-        made = [record(9, "b"), record(2, "b"), record(10, "a"), record(2, "b", seconds=1.0)]
-        for number, one in enumerate(made, start=1):
+    path = tmp_path / "new" / "out" / "manifest.jsonl"
+    written = [record(9, "b"), record(2, "b"), record(10, "a"), record(2, "b", seconds=1.0)]
+    with Manifest(path.parent) as manifest:
+        for number, one in enumerate(written, start=1):
             manifest.append(one)
-            assert path.read_bytes() == b"".join(r.to_line() for r in made[:number])
-    ordered = b"".join(r.to_line() for r in (made[2], made[3], made[0]))
+            assert path.read_bytes() == b"".join(r.to_line() for r in written[:number])
+    ordered = b"".join(written[i].to_line() for i in (2, 3, 0))
     assert path.read_bytes() == ordered
-    write_lines(path, *made)
-    with Manifest(out):
+    write_lines(path, *written)
+    with Manifest(path.parent):
         assert path.read_bytes() == ordered
-    assert sorted(p.name for p in out.iterdir()) == [".manifest.lock", "manifest.jsonl"]
+    assert sorted(p.name for p in path.parent.iterdir()) == [".manifest.lock", path.name]
 
 
 def test_one_writer_at_a_time(tmp_path: Path) -> None:

@@ -9,25 +9,172 @@ and within 80 m. ``key held out``: returns of the key sweep, for a map made from
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product as cartesian
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
-from densify.bench.truth import TruthMap, Without, exact_truth, scanner_truth
 from densify.config import Config
 from densify.config.errors import InputError
-from densify.depth.exposure import key_shots
-from densify.geometry.types import Camera, Float32, LidarSequence, Progress, Result
+from densify.depth.exposure import Exposure, Shot, key_shots
+from densify.geometry import poses
+from densify.geometry.cameras import converted, depth_along, rays
+from densify.geometry.types import (
+    Bool,
+    Camera,
+    Float,
+    Float32,
+    LidarSequence,
+    Progress,
+    Result,
+    Sweep,
+)
+from densify.outputs.depth_png import read_depth_png, read_mask_png
 from densify.pipeline import run as pipeline
 from densify.pipeline.key_result import METHODS, looks_around
 from densify.pipeline.process import Watch
 from densify.pipeline.recording import Recording
 from densify.readers.timeline import choose_cameras
-from densify.scores.depth_metrics import image_density
+from densify.scores.depth_metrics import KITTI_BASELINE_M, image_density, is_outlier_depth
 
 PRODUCTS = ("measured", "filled")
-_PARTS = ("all", "moving")
+_GROUPS = ("all", "moving")  # of pixels
+_REACH_M = 80.0
+_TOP_QUANTILE = 0.999
+_HIDING_PX = 11  # a return of the other scanner behind a nearer return may be occluded
+_HIDING_FRACTION, _HIDING_M = 0.03, 0.2
+_OUTLIER_M, _OUTLIER_FRACTION = 0.3, 0.05  # of a scanner's truth
+_STEREO_BASELINE_M = 0.532725  # of the drives of 2011_09_26
+
+
+class TruthMap(NamedTuple):
+    """True depth of an image."""
+
+    depth_m: Float32  # (H,W) true depth in metres, 0 for no depth
+    moving: Bool  # (H,W) bool, True at pixels of moving objects
+    # True to count outliers by KITTI's rule (error above 3 px of disparity and 5 %). False to count
+    # errors above 0.3 m and 5 %.
+    by_disparity: bool
+    baseline_m: float = KITTI_BASELINE_M  # stereo baseline that turns depth into disparity
+
+    def outliers(self, depth_m: Float32, known: Bool, focal_px: float) -> Bool:
+        """Return (K,) True where the depth (H,W) is an outlier at the K pixels ``known`` (H,W)."""
+        z, t = depth_m[known].astype(np.float64), self.depth_m[known].astype(np.float64)
+        if self.by_disparity:
+            return is_outlier_depth(z, t, focal_px, self.baseline_m)
+        off_m = np.abs(z - t)
+        outliers: Bool = (off_m > _OUTLIER_M) & (off_m > _OUTLIER_FRACTION * t)
+        return outliers
+
+
+class Altered:
+    """A recording with altered sweeps or other recorded poses; all else is as recorded."""
+
+    def __init__(
+        self,
+        sequence: Any,
+        sweep: Callable[[Sweep], Sweep] | None = None,
+        T_world_lidar: Callable[[int], Float] | None = None,
+    ) -> None:
+        self._sequence, self._alter = sequence, sweep
+        if T_world_lidar is not None:
+            self.T_world_lidar = T_world_lidar
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sequence, name)
+
+    def __getitem__(self, frame: int) -> Sweep:
+        sweep: Sweep = self._sequence[frame]
+        return sweep if self._alter is None else self._alter(sweep)
+
+
+def without_scanner(sequence: LidarSequence, scanner: int) -> Any:
+    """Return a recording without the returns of one scanner."""
+    return Altered(sequence, lambda sweep: sweep.select(sweep.lidar != scanner))
+
+
+def scanner_truth(
+    scanner: int, recording: Recording, key: int, shots: Mapping[str, Shot]
+) -> dict[str, TruthMap]:
+    """Return the depth measured by one scanner in the key sweep, by name of the map."""
+    sequence, config = recording.sequence, recording.settings
+    cloud = recording.moment(key, all_sweeps=True, engine="").cloud
+    cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
+    stretch = recording.window(key)
+    maps = {}
+    for name, shot in shots.items():
+        view = Exposure.of(sequence, stretch, key, shot, config).sees(cloud)
+        depth_m = view.exposure.depth_m(view.points_cam)
+        farthest_first = np.argsort(-depth_m, kind="stable")
+        column, row = np.rint(view.uv[farthest_first]).astype(np.int64).T
+        shape = (shot.camera.height_px, shot.camera.width_px)
+        nearest_m, moving = np.zeros(shape, np.float32), np.zeros(shape, bool)
+        nearest_m[row, column] = depth_m[farthest_first]
+        moving[row, column] = cloud.moving[view.rows[farthest_first]]
+        before_m = ndimage.minimum_filter(
+            np.where(nearest_m > 0, nearest_m, np.float32(np.inf)), _HIDING_PX
+        )
+        nearest_m[nearest_m > (1 + _HIDING_FRACTION) * before_m + _HIDING_M] = 0
+        maps[name] = TruthMap(nearest_m, moving, by_disparity=False)
+    return maps
+
+
+def exact_truth(
+    sequence: LidarSequence, key_sweep: Sweep, shots: Mapping[str, Shot], config: Config
+) -> dict[str, TruthMap]:
+    """Return the exact depth within range and view of the scanner, {} for a real recording."""
+    maps: dict[str, TruthMap] = {}
+    if sequence.truth is None:
+        return maps
+    away = key_sweep.points
+    if key_sweep.scanner_origins is not None:
+        away = away - key_sweep.scanner_origins[key_sweep.lidar]
+    top = np.quantile(away[:, 2] / np.linalg.norm(away[:, :2], axis=1), _TOP_QUANTILE)
+    for name, shot in shots.items():
+        if shot.number is None:
+            continue
+        camera, number = shot.camera, shot.number
+        depth_m = sequence.truth.depth_m(camera.name, number)
+        v, u = np.nonzero((depth_m > 0) & (depth_m <= _REACH_M))
+        ray = rays(camera, np.stack([u, v], 1).astype(np.float64))
+        scale = depth_m[v, u] / depth_along(ray, camera.measure)
+        lidar = poses.transform(poses.inverse(camera.T_cam_lidar), ray * scale[:, None])
+        below = lidar[:, 2] <= top * np.linalg.norm(lidar[:, :2], axis=1)
+        known_m = np.zeros_like(depth_m)
+        known_m[v[below], u[below]] = depth_m[v[below], u[below]]
+        moving = sequence.truth.moving_mask(camera.name, number)
+        measure = config.project.depth if config.project.depth != "auto" else camera.measure
+        known_m = converted(camera, known_m, camera.measure, measure)
+        maps[name] = TruthMap(known_m, moving, by_disparity=True)
+    return maps
+
+
+def stereo_truth(folder: Path, frame: int, camera: Camera) -> TruthMap:
+    """Return the depth of KITTI's 2015 stereo benchmark, whose moving cars are whole models.
+
+    ``folder`` has ``frameN_disparity.png`` (uint16, 256 × disparity in px, 0 for none) and
+    ``frameN_objects.png`` (above 0 at moving cars). ``camera`` is the left colour camera. Source:
+    Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015.
+    """
+    disparity_px = read_depth_png(folder / f"frame{frame}_disparity.png")
+    depth_m = np.zeros_like(disparity_px)
+    known = disparity_px > 0
+    depth_m[known] = camera.focal_px * _STEREO_BASELINE_M / disparity_px[known]
+    moving = read_mask_png(folder / f"frame{frame}_objects.png")
+    return TruthMap(depth_m, moving, True, _STEREO_BASELINE_M)
+
+
+def agrees_beside(truth: TruthMap, depth_m: Float32, reach_px: int, focal_px: float) -> Bool:
+    """Return (H,W) True where the true depth agrees within ``reach_px`` along the row."""
+    agrees = np.zeros(depth_m.shape, bool)
+    for shift in range(-reach_px, reach_px + 1):
+        beside = truth._replace(depth_m=np.roll(truth.depth_m, shift, axis=1))
+        known = (beside.depth_m > 0) & (depth_m > 0)
+        agrees[known] |= ~beside.outliers(depth_m, known, focal_px)
+    return agrees
 
 
 def bench_depth(
@@ -57,29 +204,30 @@ def bench_depth(
         raise InputError(f"--method {method}: expected one of {', '.join(METHODS)}")
     if scanner is not None and not np.any(sequence[keys[0]].lidar == scanner):
         raise InputError(f"--scanner {scanner}: no returns of it in sweep {keys[0]}")
-    used = sequence if scanner is None else Without(sequence, scanner)
+    used = sequence if scanner is None else without_scanner(sequence, scanner)
     sums = {name: _Sums() for name in variants}
     for number, key in enumerate(keys):
         for name, config in variants.items():
             shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
             truths = {}
             if scanner is not None:
-                truths["scanner"] = scanner_truth(scanner, sequence, key, window, shots, config)
+                whole = Recording(sequence, config, window, [key], looks_around=True)
+                truths["scanner"] = scanner_truth(scanner, whole, key, shots)
             watch = Watch()
             looks = looks_around([method])
             recording = Recording(used, config.scored(), window, [key], None, None, watch, looks)
-            made = pipeline.densify(recording, key, [method], cameras, watch)[method]
+            result = pipeline.densify(recording, key, [method], cameras, watch)[method]
             key_sweep = recording.window(key)[key].sweep
             truths["truth"] = exact_truth(used, key_sweep, shots, config)
-            sums[name].add(made, truths, used.cameras)
+            sums[name].add(result, truths, used.cameras)
         if progress is not None:
             progress("bench", number + 1, len(keys))
-    found = {name: variant.numbers(len(keys)) for name, variant in sums.items()}
-    return {"data": sequence.name, "keys": list(keys), "scanner": scanner, "variants": found}
+    numbers = {name: variant.numbers(len(keys)) for name, variant in sums.items()}
+    return {"data": sequence.name, "keys": list(keys), "scanner": scanner, "variants": numbers}
 
 
 class _Sums:
-    """Sums of pixel counts over key sweeps and cameras, by ground truth, map and kind of pixels."""
+    """Sums of pixel counts over key sweeps and cameras, by ground truth, map and pixels."""
 
     def __init__(self) -> None:
         # Pixels with a true depth, those that have a depth in the map too, outliers among these
@@ -89,32 +237,31 @@ class _Sums:
 
     def add(
         self,
-        made: Result,
+        result: Result,
         truths: Mapping[str, Mapping[str, TruthMap]],
         cameras: Mapping[str, Camera],
     ) -> None:
         """Add the maps of a result. ``truths``: name of the ground truth -> map -> true depth."""
-        self._seconds += sum(cost.seconds for cost in made.costs if cost.name == "project")
-        for name, maps in made.depth.items():
+        self._seconds += sum(cost.seconds for cost in result.costs if cost.name == "project")
+        for name, maps in result.depth.items():
             focal_px = cameras[maps.camera].focal_px
             for product, depth_m in zip(PRODUCTS, (maps.depth_m, maps.filled_m), strict=True):
                 self._densities[product].append(image_density(depth_m))
                 for source, truth in [(s, t[name]) for s, t in truths.items() if name in t]:
-                    for part, counts in _counted(depth_m, truth, focal_px):
-                        self._counts[source, product, part] += counts
-        for scores in (made.metrics.get("held_out") or {}).values():
-            for product in PRODUCTS:
-                for part in _PARTS:
-                    score = scores[product][part]
-                    outliers = round((score["outliers"] or 0.0) * score["num_compared"])
-                    counts = (score["num_pixels"], score["num_compared"], outliers)
-                    self._counts["key held out", product, part] += counts
+                    for group, counts in _counted(depth_m, truth, focal_px):
+                        self._counts[source, product, group] += counts
+        for scores in (result.metrics.get("held_out") or {}).values():
+            for product, group in cartesian(PRODUCTS, _GROUPS):
+                score = scores[product][group]
+                outliers = round((score["outliers"] or 0.0) * score["num_compared"])
+                counts = (score["num_pixels"], score["num_compared"], outliers)
+                self._counts["key held out", product, group] += counts
 
     def numbers(self, num_keys: int) -> dict[str, Any]:
         """Return density, seconds and scores of a variant, see `bench_depth`."""
         scores: dict[str, Any] = {}
-        for (source, product, part), (num, compared, outliers) in self._counts.items():
-            scores.setdefault(source, {}).setdefault(product, {})[part] = {
+        for (source, product, group), (num, compared, outliers) in self._counts.items():
+            scores.setdefault(source, {}).setdefault(product, {})[group] = {
                 "num_pixels": int(num),
                 "coverage": compared / num if num else None,
                 "outliers": outliers / compared if compared else None,
@@ -127,8 +274,8 @@ def _counted(
     depth_m: Float32, truth: TruthMap, focal_px: float
 ) -> Iterator[tuple[str, tuple[int, int, int]]]:
     """Yield "all" and "moving" pixels, each with its three counts of `_Sums`."""
-    for part in _PARTS:
-        known = (truth.depth_m > 0) & (truth.moving if part == "moving" else True)
-        both = known & (depth_m > 0)
-        wrong = truth.outliers(depth_m, both, focal_px)
-        yield part, (int(known.sum()), int(both.sum()), int(wrong.sum()))
+    for group in _GROUPS:
+        known = (truth.depth_m > 0) & (truth.moving if group == "moving" else True)
+        compared = known & (depth_m > 0)
+        outliers = truth.outliers(depth_m, compared, focal_px)
+        yield group, (int(known.sum()), int(compared.sum()), int(outliers.sum()))

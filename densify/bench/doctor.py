@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from densify.bench.depth import Altered
 from densify.config import Config
 from densify.config.errors import InputError
 from densify.doctor import Sample, Verdict
@@ -40,8 +41,8 @@ def bench_doctor(
         sample = Sample.of(sequence, config.register)
         for mistake, findings in (*_cameras(sample), *_poses(sample)):
             of_clock = "clock" in mistake
-            found = [f.verdict for f in findings if ("clock" in f.check) == of_clock]
-            counts.setdefault(mistake, Counter())[max(found, default=Verdict.UNKNOWN)] += 1
+            verdicts = [f.verdict for f in findings if ("clock" in f.check) == of_clock]
+            counts.setdefault(mistake, Counter())[max(verdicts, default=Verdict.UNKNOWN)] += 1
     return {
         mistake: {"of": count.total()} | {str(v): count[v] / count.total() for v in Verdict}
         for mistake, count in counts.items()
@@ -49,15 +50,16 @@ def bench_doctor(
 
 
 def _cameras(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
+    """Yield the name of an error and the findings about a camera that has this error."""
     silhouettes: dict[int, Silhouettes] = {}
     for camera in sample.sequence.cameras.values():
         views = camera_views(sample, camera, silhouettes)[0]
         if views:
-            for mistake, other, moved in _put_out(camera, views):
-                yield mistake, check_calibration(other, moved)
+            for mistake, wrong_camera, wrong_views in _with_mistakes(camera, views):
+                yield mistake, check_calibration(wrong_camera, wrong_views)
 
 
-def _put_out(camera: Camera, views: list[View]) -> Iterator[tuple[str, Camera, list[View]]]:
+def _with_mistakes(camera: Camera, views: list[View]) -> Iterator[tuple[str, Camera, list[View]]]:
     """Yield the name of an error, and the camera and views that have this error."""
     yield "cameras as they are", camera, views
     yield "camera's clock as it is", camera, views
@@ -76,20 +78,10 @@ def _put_out(camera: Camera, views: list[View]) -> Iterator[tuple[str, Camera, l
             yield f"camera's clock {1000 * size:g} ms", camera, late
 
 
-class _OtherPoses:
-    """A recording whose recorded poses are replaced."""
-
-    def __init__(self, sequence: LidarSequence, T_world_lidar: Callable[[int], Float]) -> None:
-        self._sequence, self.T_world_lidar = sequence, T_world_lidar
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._sequence, name)
-
-
 def _poses(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
     """Yield the name of an error and the findings about poses that have this error."""
     sequence = sample.sequence
-    stamp_ns, at = sample.timeline.stamp_ns, {f: i for i, f in enumerate(sample.timeline.frames)}
+    stamp_ns, row = sample.timeline.stamp_ns, sample.timeline.row
     try:
         T_world_lidar = np.stack([sequence.T_world_lidar(f) for f in sample.timeline.frames])
     except InputError:  # the recording has no poses
@@ -98,14 +90,14 @@ def _poses(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
 
     def checked(scale: float = 1.0, climb_m_s: float = 0.0, late_s: float = 0.0) -> list[Finding]:
         def pose(frame: int) -> Float:
-            moment_ns = int(stamp_ns[at[frame]]) - round(1e9 * late_s)
+            moment_ns = int(stamp_ns[row[frame]]) - round(1e9 * late_s)
             T = track.at(int(np.clip(moment_ns, stamp_ns[0], stamp_ns[-1]))).copy()
             T[:3, 3] = scale * (T[:3, 3] - T_world_lidar[0, :3, 3]) + T_world_lidar[0, :3, 3]
-            T[2, 3] += climb_m_s * (stamp_ns[at[frame]] - stamp_ns[0]) * 1e-9
+            T[2, 3] += climb_m_s * (stamp_ns[row[frame]] - stamp_ns[0]) * 1e-9
             return T
 
-        other: Any = _OtherPoses(sequence, pose)
-        return check_poses(replace(sample, sequence=other))
+        altered: Any = Altered(sequence, T_world_lidar=pose)
+        return check_poses(replace(sample, sequence=altered))
 
     yield "poses as they are", checked()
     yield "clock of poses as it is", checked()

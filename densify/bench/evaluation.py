@@ -23,9 +23,8 @@ from densify.scores.depth_metrics import (
 
 SCHEMA_VERSION = 1
 """Version of `evaluate`'s dictionary. It grows when an entry changes its meaning or is removed."""
-
-_ALIKE = 0.05
-"""A map and its truth agree this well in most pixels."""
+_AGREEMENT = 0.05  # of a map and its truth in most pixels
+_MILLIMETRES = 1000 / 256  # factor between the two usual scales of stored depth
 KITTI_FOCAL_PX = 721.5377
 """Focal length of KITTI's rectified cameras on 2011_09_26. On other days it is 707 to 719 px."""
 
@@ -55,45 +54,47 @@ def evaluate(
     for number, pair in enumerate(pairs.pairs):
         predicted_m, truth_m, moving = _read(pair)
         _check_unit(pair, predicted_m, truth_m)
-        parts = errors_by_part(predicted_m, truth_m, moving, **stereo)
-        for name, errors in parts.items():
-            by_part[name].append(errors)
+        errors = errors_by_part(predicted_m, truth_m, moving, **stereo)
+        for name, of_part in errors.items():
+            by_part[name].append(of_part)
         paths = {side: None if path is None else str(path) for side, path in vars(pair).items()}
         densities = {"predicted": image_density(predicted_m), "truth": image_density(truth_m)}
-        images.append({**paths, "density": densities, **asdict(parts["all"])})
+        images.append({**paths, "density": densities, **asdict(errors["all"])})
         if progress is not None:
             progress("evaluate", number + 1, len(pairs.pairs))
-    sides, lonely = ("predicted", "truth"), ("truth", "prediction", "mask")
-    means = {
-        name: {
-            "num_images": sum(e.num_compared > 0 for e in several),
-            **asdict(mean_errors(several)),
-        }
-        for name, several in by_part.items()
-    }
     return {
         "schema_version": SCHEMA_VERSION,
         **stereo,
         "num_images": len(images),
-        "density": {s: float(np.mean([image["density"][s] for image in images])) for s in sides},
-        "parts": means,
+        "density": {
+            side: float(np.mean([image["density"][side] for image in images]))
+            for side in ("predicted", "truth")
+        },
+        "parts": {
+            name: {"num_images": sum(e.num_compared > 0 for e in errors)}
+            | asdict(mean_errors(errors))
+            for name, errors in by_part.items()
+        },
         "images": images,
-        **{f"without_{side}": [*map(str, getattr(pairs, f"without_{side}"))] for side in lonely},
+        "without_truth": [*map(str, pairs.without_truth)],
+        "without_prediction": [*map(str, pairs.without_prediction)],
+        "without_mask": [*map(str, pairs.without_mask)],
     }
 
 
 def _check_unit(pair: DepthPair, predicted_m: Float32, truth_m: Float32) -> None:
     """Raise InputError if one of two maps stores 1000 x metres instead of 256 x metres."""
-    both = (predicted_m > 0) & (truth_m > 0)
-    ratio = predicted_m[both] / truth_m[both]
-    factor = 1000 / 256
+    compared = (predicted_m > 0) & (truth_m > 0)
+    if not compared.any():
+        return
+    ratio = predicted_m[compared] / truth_m[compared]
     for path, too_large in ((pair.predicted, ratio), (pair.truth, 1 / ratio)):
-        middle = np.percentile(too_large, [25, 50, 75]) / factor if len(ratio) else np.zeros(3)
-        if np.abs(middle - 1).max() < _ALIKE:
+        quartiles = np.percentile(too_large, [25, 50, 75])
+        if np.abs(quartiles / _MILLIMETRES - 1).max() < _AGREEMENT:
             raise InputError(
-                f"{path}: holds depths {factor * middle[1]:.2f} times those of the other map, as "
-                f"if it stored 1000 x metres (millimetres); expected 256 x metres: multiply its "
-                f"values by 0.256"
+                f"{path}: holds depths {quartiles[1]:.2f} times those of the other map, as if it "
+                f"stored 1000 x metres (millimetres); expected 256 x metres: multiply its values "
+                f"by 0.256"
             )
 
 

@@ -4,14 +4,16 @@
 Errors are those of the flow to the neighbouring sweep towards the key sweep, pooled over the points
 above the ground in all sweeps. Seconds per pair of sweeps cover ground estimation, this flow and
 the flow to the key sweep, without registration and compilation.
+
+``densify bench readme`` makes the tables of docs/results.md again, as Markdown. A table is a list
+of streets with key frame numbers, and a function that measures a row.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,190 +21,38 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from densify.config import Config, as_mapping, resolve
-from densify.config.errors import InputError
+from densify.config.errors import InputError, did_you_mean
 from densify.depth.accumulate import accumulate
 from densify.flow.engines import Scene, estimate_motion
 from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
-from densify.geometry.types import Bool, Float, FlowField, LidarSequence, Progress, Stretch, Truth
+from densify.geometry.types import (
+    Bool,
+    Float,
+    FlowField,
+    LidarSequence,
+    Motion,
+    Progress,
+    Stretch,
+    Truth,
+)
+from densify.outputs.atomic import plain
 from densify.pipeline.recording import Recording
+from densify.readers import open_sequence
 from densify.readers.flow_files import LabelledFlow, labelled_flow
-from densify.scores.challenge import CLASSES, ChallengeScorer
 from densify.scores.cloud_scores import ghost_rate
-from densify.scores.flow_metrics import end_point_error, end_point_errors, mean_of
+from densify.scores.flow_metrics import (
+    CLASSES,
+    challenge_scores,
+    end_point_error,
+    end_point_errors,
+    mean_of,
+)
+from densify.scores.pose_metrics import window_pose_errors
 
 _MIN_RETURNS = 30
 _LEAST_MOTION_M = 0.5
-
-
-@dataclass(frozen=True)
-class Window:
-    """Consecutive registered sweeps around a key sweep."""
-
-    stretch: Stretch
-    key: int  # frame number of the key sweep
-    around: Stretch  # sweeps from which the configured method estimates motion
-    above: Mapping[int, Bool]  # frame number -> (N,) mask of points above the ground
-
-    @property
-    def frames(self) -> tuple[int, ...]:
-        """The frame numbers of the window, ascending."""
-        return self.stretch.frames
-
-    def hops(self, frame: int) -> int:
-        """Return the number of sweeps from ``frame`` to the key sweep, negative for later ones."""
-        return self.frames.index(self.key) - self.frames.index(frame)
-
-    def towards_key(self, frame: int) -> int:
-        """Return the next frame number towards the key sweep, or the key sweep's own."""
-        return self.frames[self.frames.index(frame) + int(np.sign(self.hops(frame)))]
-
-
-class SweepTruth(NamedTuple):
-    """The ground truth of the N points of a sweep: scene flow in metres without ego-motion.
-
-    Flow starts at the sweep's reference time and is in the lidar frame of that time.
-    """
-
-    step: Float  # (N,3) flow to the neighbouring sweep towards the key sweep
-    to_key: Float  # (N,3) flow to the key sweep
-    moving: Bool  # (N,) bool, True for points that move at the reference time
-    foreground: Bool  # (N,) bool, True for points of objects, moving or not
-    # (N,) bool, True for moving points that travel at least 0.5 m over the window and belong to an
-    # object with 30 returns or more
-    certain: Bool
-
-    @staticmethod
-    def of(truth: Truth, window: Window, frame: int) -> SweepTruth:
-        """Gather the exact ground truth of the sweep ``frame`` (its number) of the window."""
-        rows = window.stretch[frame].sweep.row
-        targets = window.towards_key(frame), window.key, window.frames[0], window.frames[-1]
-        step, to_key, first, last = (truth.displacement(frame, t)[rows] for t in targets)
-        whole = truth.sweep(frame)
-        moving, instance = whole.moving[rows], whole.instance[rows]
-        num_returns = np.bincount(instance[instance >= 0], minlength=instance.max(initial=-1) + 2)
-        many = (instance >= 0) & (num_returns[instance] >= _MIN_RETURNS)
-        far = np.linalg.norm(last - first, axis=1) >= _LEAST_MOTION_M
-        return SweepTruth(step, to_key, moving, instance >= 0, moving & many & far)
-
-
-@dataclass(frozen=True)
-class Scorer:
-    """Scorer of methods on a window, mostly by points above the ground, which no method moves."""
-
-    window: Window
-    sources: tuple[int, ...]  # frame numbers of the sweeps whose flow to a neighbour is scored
-    # Frame number -> exact ground truth, None for a real recording
-    truths: Mapping[int, SweepTruth] | None
-    # Frame number -> labelled flow to the neighbour, {} without ground truth
-    labels: Mapping[int, LabelledFlow]
-
-    @staticmethod
-    def of(
-        sequence: LidarSequence, window: Window, sources: tuple[int, ...], place: Path | None = None
-    ) -> Scorer:
-        """Return the scorer of a window that scores the sweeps ``sources`` (frame numbers).
-
-        ``place``: folder of true flow (`densify.readers.flow_files`); None for exact truth, if any.
-        """
-        truths, labels = None, {}
-        if sequence.truth is not None:
-            truths = {f: SweepTruth.of(sequence.truth, window, f) for f in window.frames}
-            for frame in sources:
-                classes = np.where(truths[frame].foreground, CLASSES.index("OBJECT"), 0)
-                valid = np.ones(len(classes), bool)
-                labels[frame] = LabelledFlow(truths[frame].step, classes.astype(np.uint8), valid)
-        if place is not None:
-            labels = {f: labelled_flow(place, sequence.name, window.stretch, f) for f in sources}
-        return Scorer(window, sources, truths, labels)
-
-    def challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
-        """Return the Argoverse 2 challenges' pooled scores, None without ground truth.
-
-        ``steps`` is frame number -> flow to the neighbour towards the key sweep. The result has
-        ``three_way`` and ``bucketed`` errors and ``num_points``.
-        """
-        if not self.labels:
-            return None
-        scorer = ChallengeScorer()
-        for frame, label in self.labels.items():
-            counted = self.window.above[frame] & label.valid
-            points = self.window.stretch[frame].sweep.points
-            flow = steps[frame].displacement[counted]
-            scorer.add(points[counted], flow, label.flow[counted], label.classes[counted])
-        scores = scorer.scores()
-        buckets = {**scores.by_class, "MEAN": scores.mean}
-        return {
-            "three_way": _plainly(scores.three_way._asdict()),
-            "bucketed": {name: _plainly(error._asdict()) for name, error in buckets.items()},
-            "num_points": scores.num_points,
-        }
-
-    def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the scores of the flow to the neighbouring sweep, pooled over the sources.
-
-        ``found`` is the share of ``certain`` moving points that are called moving,
-        ``falsely_moving`` that of static points, ground included. End-point errors in metres are
-        ``movers_m`` of moving points and ``found_movers_m`` of those called moving. Without ground
-        truth, ``called_moving`` is the share of all points called moving.
-        """
-        truths = self.truths
-        if truths is None:
-            moving = np.concatenate([steps[f].moving for f in self.sources])
-            return {"called_moving": float(moving.mean())}
-        flow = self._above(lambda f: steps[f].displacement)
-        true = self._above(lambda f: truths[f].step)
-        moving = self._above(lambda f: truths[f].moving)
-        objects = self._above(lambda f: truths[f].foreground)
-        called = self._above(lambda f: steps[f].moving)
-        certain = self._above(lambda f: truths[f].certain)
-        static = np.concatenate([steps[f].moving[~truths[f].moving] for f in self.sources])
-        scores = {
-            "movers_m": end_point_error(flow, true, objects & moving),
-            "found_movers_m": end_point_error(flow, true, moving & called),
-            "static_objects_m": end_point_error(flow, true, objects & ~moving),
-            "background_m": end_point_error(flow, true, ~objects & ~moving),
-            "found": mean_of(called[certain]),
-            "falsely_moving": mean_of(static),
-        }
-        return {"num_movers": int(moving.sum()), **_plainly(scores)}
-
-    def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the scores of the flow to the key sweep: ghost rate and errors of moving points.
-
-        Given ground truth, end-point errors in metres of points above the ground, by number of
-        sweeps to the key: ``movers_m_by_hops`` of moving points, ``found_movers_m_by_hops`` of
-        those called moving.
-        """
-        stretch, key = self.window.stretch, self.window.key
-        cloud = accumulate(stretch, [to_key[f] for f in stretch.frames], key, drop_lost=True)
-        scores: dict[str, Any] = {"ghost_rate": ghost_rate(cloud, RangeImage.of(stretch[key]), key)}
-        if self.truths is None:
-            return scores
-        errors_m: dict[str, list[Float]] = defaultdict(list)
-        found_m: dict[str, list[Float]] = defaultdict(list)
-        for frame, truth in self.truths.items():
-            if frame != key:
-                field, hops = to_key[frame], str(abs(self.window.hops(frame)))
-                kept = truth.moving & self.window.above[frame] & ~field.lost
-                error_m = end_point_errors(field.displacement, truth.to_key)
-                errors_m[hops].append(error_m[kept])
-                found_m[hops].append(error_m[kept & field.moving])
-        for name, by_hops in (("movers", errors_m), ("found_movers", found_m)):
-            means = {hops: mean_of(np.concatenate(by_hops[hops])) for hops in sorted(by_hops)}
-            scores[f"{name}_m_by_hops"] = _plainly(means)
-        return scores
-
-    def _above(self, column: Callable[[int], Any]) -> Any:
-        """Return values of points above the ground; ``column`` maps frame number -> (N,) values."""
-        return np.concatenate([column(f)[self.window.above[f]] for f in self.sources])
-
-
-def _plainly(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: None if math.isnan(value) else value for name, value in values.items()}
-
-
 _PAPER = ("flow.engine=paper", "objective.static_prior=false")
 METHODS: Mapping[str, tuple[str, ...] | None] = {
     "ours": (),
@@ -241,60 +91,318 @@ def bench_flow(
         raise InputError(
             f"--methods: got {unknown[0] if unknown else 'none'}, expected {', '.join(METHODS)}"
         )
-    opened = open_window(sequence, key, window, config)
-    here = opened.frames.index(key)
-    if len(opened.frames) < 2 or (truth is not None and here == 0):
+    scorer = Scorer.of(sequence, key, window, config, truth)
+    if not scorer.sources:
         raise InputError(f"--key {key}: no pair to score in {sequence.name}; choose another key")
-    others = tuple(frame for frame in opened.frames if frame != key)
-    scored = others if truth is None else opened.frames[:here]
-    scorer = Scorer.of(sequence, opened, scored, truth)
-    rows = {}
+    frames, rows = scorer.stretch.frames, {}
     chosen = [name for name in METHODS if name in methods]
     for done, method in enumerate(chosen):
         if progress is not None:
             progress(method, done, len(chosen))
-        steps, to_key, seconds = _flows(method, opened, config)
-        rows[method] = {
-            "seconds_per_pair": seconds / len(others),
+        steps, to_key, seconds = _flows(method, scorer, config)
+        scores = {
+            "seconds_per_pair": seconds / (len(frames) - 1),
             "step": scorer.step_scores(steps),
-            "challenge": scorer.challenge_scores(steps),
+            "challenge": scorer.pooled_challenge_scores(steps),
             "window": scorer.window_scores(to_key),
         }
-    facts = {"data": sequence.name, "key": key, "frames": list(opened.frames)}
-    return {**facts, "num_pairs": len(scored), "methods": rows}
+        rows[method] = plain(scores)
+    facts = {"data": sequence.name, "key": key, "frames": list(frames)}
+    return {**facts, "num_pairs": len(scorer.sources), "methods": rows}
 
 
-def open_window(sequence: LidarSequence, key: int, size: int, config: Config) -> Window:
-    """Return the registered window of a key sweep, with ``size`` sweeps on each side."""
-    recording = Recording(sequence, config, size, [key], looks_around=True)
-    stretch = recording.window(key)
-    heights = ground(stretch)
-    above = {}
-    for registered in stretch.sweeps:
-        points = poses.transform(registered.T_world_lidar, registered.sweep.points)
-        above[registered.sweep.frame] = heights.above(points) >= ABOVE_GROUND_M
-    return Window(stretch, key, recording.around(key), above)
+class SweepTruth(NamedTuple):
+    """The ground truth of the N points of a sweep: scene flow in metres without ego-motion.
+
+    Flow starts at the sweep's reference time and is in the lidar frame of that time.
+    """
+
+    step: Float  # (N,3) flow to the neighbouring sweep towards the key sweep
+    to_key: Float  # (N,3) flow to the key sweep
+    moving: Bool  # (N,) bool, True for points that move at the reference time
+    foreground: Bool  # (N,) bool, True for points of objects, moving or not
+    # (N,) bool, True for moving points that travel at least 0.5 m over the window and belong to an
+    # object with 30 returns or more
+    certain: Bool
+
+    @staticmethod
+    def of(truth: Truth, stretch: Stretch, frame: int, key: int) -> SweepTruth:
+        """Gather the exact ground truth of the sweep ``frame`` (its number) of a window."""
+        rows, frames = stretch[frame].sweep.row, stretch.frames
+        targets = towards(key, frame, frames), key, frames[0], frames[-1]
+        step, to_key, first, last = (truth.displacement(frame, t)[rows] for t in targets)
+        whole = truth.sweep(frame)
+        moving, instance = whole.moving[rows], whole.instance[rows]
+        num_returns = np.bincount(instance[instance >= 0], minlength=instance.max(initial=-1) + 2)
+        is_large = (instance >= 0) & (num_returns[instance] >= _MIN_RETURNS)
+        travels = np.linalg.norm(last - first, axis=1) >= _LEAST_MOTION_M
+        return SweepTruth(step, to_key, moving, instance >= 0, moving & is_large & travels)
+
+    def as_label(self) -> LabelledFlow:
+        """Return the flow to the neighbouring sweep as a label, of objects of unknown kind."""
+        classes = np.where(self.foreground, CLASSES.index("OBJECT"), 0).astype(np.uint8)
+        return LabelledFlow(self.step, classes, np.ones(len(classes), bool))
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """Scorer of methods on a window, mostly by points above the ground, which no method moves."""
+
+    stretch: Stretch  # registered sweeps of the window
+    key: int  # frame number of the key sweep
+    around: Stretch  # sweeps from which the configured method estimates motion
+    above: Mapping[int, Bool]  # frame number -> (N,) mask of points above the ground
+    sources: tuple[int, ...]  # frame numbers of the sweeps whose flow to a neighbour is scored
+    # Frame number -> exact ground truth, None for a real recording
+    truths: Mapping[int, SweepTruth] | None
+    # Frame number -> labelled flow to the neighbour, {} without ground truth
+    labels: Mapping[int, LabelledFlow]
+
+    @staticmethod
+    def of(
+        sequence: LidarSequence, key: int, size: int, config: Config, folder: Path | None
+    ) -> Scorer:
+        """Open the window of a key sweep, with ``size`` sweeps on each side.
+
+        ``folder`` has true flow (`densify.readers.flow_files`); None for exact truth, if any.
+        """
+        recording = Recording(sequence, config, size, [key], looks_around=True)
+        stretch = recording.window(key)
+        heights, frames = ground(stretch), stretch.frames
+        above = {}
+        for registered in stretch.sweeps:
+            points = poses.transform(registered.T_world_lidar, registered.sweep.points)
+            above[registered.frame] = heights.above(points) >= ABOVE_GROUND_M
+        sources = tuple(f for f in frames if (f < key if folder is not None else f != key))
+        truths, labels = None, {}
+        if sequence.truth is not None:
+            truths = {f: SweepTruth.of(sequence.truth, stretch, f, key) for f in frames}
+        if folder is not None:
+            labels = {f: labelled_flow(folder, sequence.name, stretch, f) for f in sources}
+        elif truths is not None:
+            labels = {f: truths[f].as_label() for f in sources}
+        return Scorer(stretch, key, recording.around(key), above, sources, truths, labels)
+
+    def pooled_challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
+        """Return `challenge_scores` of all labelled pairs, None without ground truth.
+
+        ``steps`` is frame number -> flow to the neighbour towards the key sweep.
+        """
+        if not self.labels:
+            return None
+        columns = []
+        for frame, label in self.labels.items():
+            points = self.stretch[frame].sweep.points
+            values = (points, steps[frame].displacement, label.flow, label.classes)
+            columns.append([x[self.above[frame] & label.valid] for x in values])
+        return challenge_scores(*map(np.concatenate, zip(*columns, strict=True)))
+
+    def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
+        """Return the scores of the flow to the neighbouring sweep, pooled over the sources.
+
+        ``found`` is the share of ``certain`` moving points that are called moving,
+        ``falsely_moving`` that of static points, ground included. End-point errors in metres are
+        ``movers_m`` of moving points and ``found_movers_m`` of those called moving. Without ground
+        truth, ``called_moving`` is the share of all points called moving.
+        """
+        truths = self.truths
+        if truths is None:
+            moving = np.concatenate([steps[f].moving for f in self.sources])
+            return {"called_moving": float(moving.mean())}
+        flow = self._above(lambda f: steps[f].displacement)
+        true = self._above(lambda f: truths[f].step)
+        moving = self._above(lambda f: truths[f].moving)
+        objects = self._above(lambda f: truths[f].foreground)
+        called = self._above(lambda f: steps[f].moving)
+        certain = self._above(lambda f: truths[f].certain)
+        static = np.concatenate([steps[f].moving[~truths[f].moving] for f in self.sources])
+        return {
+            "num_movers": int(moving.sum()),
+            "movers_m": end_point_error(flow, true, objects & moving),
+            "found_movers_m": end_point_error(flow, true, moving & called),
+            "static_objects_m": end_point_error(flow, true, objects & ~moving),
+            "background_m": end_point_error(flow, true, ~objects & ~moving),
+            "found": mean_of(called[certain]),
+            "falsely_moving": mean_of(static),
+        }
+
+    def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
+        """Return the scores of the flow to the key sweep: ghost rate and errors of moving points.
+
+        Given ground truth, end-point errors in metres of points above the ground, by number of
+        sweeps to the key: ``movers_m_by_hops`` of moving points, ``found_movers_m_by_hops`` of
+        those called moving.
+        """
+        stretch, key = self.stretch, self.key
+        frames = stretch.frames
+        cloud = accumulate(stretch, [to_key[f] for f in frames], key, drop_lost=True)
+        scores: dict[str, Any] = {"ghost_rate": ghost_rate(cloud, RangeImage.of(stretch[key]), key)}
+        if self.truths is None:
+            return scores
+        errors_m: dict[str, list[Float]] = defaultdict(list)
+        called_m: dict[str, list[Float]] = defaultdict(list)
+        for frame, truth in self.truths.items():
+            if frame != key:
+                field, hops = to_key[frame], str(abs(frames.index(key) - frames.index(frame)))
+                kept = truth.moving & self.above[frame] & ~field.lost
+                error_m = end_point_errors(field.displacement, truth.to_key)
+                errors_m[hops].append(error_m[kept])
+                called_m[hops].append(error_m[kept & field.moving])
+        for name, by_hops in (("movers", errors_m), ("found_movers", called_m)):
+            means = {hops: mean_of(np.concatenate(by_hops[hops])) for hops in sorted(by_hops)}
+            scores[f"{name}_m_by_hops"] = means
+        return scores
+
+    def _above(self, column: Callable[[int], Any]) -> Any:
+        """Return values of points above the ground; ``column`` maps frame number -> (N,) values."""
+        return np.concatenate([column(f)[self.above[f]] for f in self.sources])
+
+
+def towards(key: int, frame: int, frames: Sequence[int]) -> int:
+    """Return the next frame number of ``frames`` towards the key sweep, or the key sweep's own."""
+    row = frames.index(frame)
+    return frames[row + int(np.sign(frames.index(key) - row))]
 
 
 def _flows(
-    method: str, window: Window, config: Config
+    method: str, scorer: Scorer, config: Config
 ) -> tuple[dict[int, FlowField], dict[int, FlowField], float]:
     """Return flow to the neighbour towards the key and flow to the key, by frame, and seconds."""
-    changes, frames = METHODS[method], window.frames
+    stretch, key = scorer.stretch, scorer.key
+    changes, frames = METHODS[method], stretch.frames
     if changes is None:
-        still = {f: FlowField.zero(len(window.stretch[f].sweep)) for f in frames}
+        still = {f: FlowField.zero(len(stretch[f].sweep)) for f in frames}
         return still, still, 0.0
     config = resolve(as_mapping(config), changes)
     if method == "ours":  # compile before the clock starts
-        here = frames.index(window.key)
-        _motion(Stretch(window.stretch.sweeps[max(0, here - 1) : here + 2]), config)
+        first = max(0, frames.index(key) - 1)
+        _motion(Stretch(stretch.sweeps[first : first + 3]), config)
     start = time.perf_counter()
-    motion = _motion(window.around if method == "ours" else window.stretch, config, frames)
-    steps = {f: motion.flow(f, window.towards_key(f)) for f in frames if f != window.key}
-    to_key = {f: motion.flow(f, window.key) for f in frames}
+    motion = _motion(scorer.around if method == "ours" else stretch, config, frames)
+    steps = {f: motion.flow(f, towards(key, f, frames)) for f in frames if f != key}
+    to_key = {f: motion.flow(f, key) for f in frames}
     return steps, to_key, time.perf_counter() - start
 
 
-def _motion(stretch: Stretch, config: Config, asked: Sequence[int] | None = None) -> Any:
-    heights = ground(stretch)
-    return estimate_motion(Scene(stretch, heights, asked=asked), config)
+def _motion(stretch: Stretch, config: Config, asked: Sequence[int] | None = None) -> Motion:
+    return estimate_motion(Scene(stretch, ground(stretch), asked=asked), config)
+
+
+# The tables of docs/results.md
+
+
+class KeySweep(NamedTuple):
+    """A street and the key sweep of a row."""
+
+    data: str
+    key: int  # frame number
+    window: int = 5  # number of sweeps on each side of the key sweep
+
+    def __str__(self) -> str:
+        return f"`{self.data}`, key {self.key}"
+
+
+def _key_sweeps(text: str) -> tuple[KeySweep, ...]:
+    """Return the key sweeps in a text of ``SPEC@KEY`` words, where KEY is a frame number."""
+    words = [word.rpartition("@") for word in text.split()]
+    return tuple(KeySweep(spec, int(key)) for spec, _, key in words)
+
+
+_FLOW = _key_sweeps("""
+    street?seed=21@70 street:crossing?seed=22@90 street:highway?seed=23@110
+    street:static?seed=24@60 street?seed=25&sensor=hdl32@70
+    street:crossing?seed=26&sensor=vlp16@90 street?seed=27&sensor=dual32@60
+    street:highway?seed=28&sensor=hdl32@70 street:crossing?seed=60&sensor=hdl32@80
+    street?seed=63&sensor=hdl32@80 street:highway?seed=29&sensor=vlp16@70
+    street?seed=59&sensor=vlp16@80 street:crossing?seed=64&sensor=vlp16@80
+    street?seed=421&sensor=rosette@70 street:crossing?seed=422&sensor=rosette@70
+""")
+_REGISTERED = _key_sweeps("""
+    street@120 street:crossing@120 street:highway@120 street?seed=59@80
+    street:highway?seed=30&sensor=dual32@70 street:highway?seed=28&sensor=hdl32@70
+    street?seed=63&sensor=hdl32@80 street:highway?seed=29&sensor=vlp16@70
+    street?seed=59&sensor=vlp16@80 street:crossing?seed=304&sensor=rosette@90
+""")
+
+
+class _Table(NamedTuple):
+    """A table of results. ``row`` returns the cells of a scene."""
+
+    about: str
+    titles: str
+    scenes: tuple[KeySweep, ...]
+    row: Callable[[KeySweep], Sequence[str]]
+
+
+def tables(names: Sequence[str], progress: Progress | None = None) -> Iterator[str]:
+    """Measure the tables of `names` in `TABLES` (empty for all); yield each Markdown line."""
+    for name in names:
+        if name not in TABLES:
+            hint = did_you_mean(name, TABLES)
+            raise InputError(f"bench readme {name}: {hint}expected of {', '.join(TABLES)}")
+    chosen = [TABLES[name] for name in names or TABLES]
+    num_scenes = sum(len(table.scenes) for table in chosen)
+    done = 0
+    for number, table in enumerate(chosen):
+        yield "\n" * (number > 0) + f"{table.about}\n"
+        yield f"| | {table.titles} |"
+        yield _line(["---"] * (table.titles.count("|") + 2))
+        for scene in table.scenes:
+            yield _line(table.row(scene))
+            done += 1
+            if progress is not None:
+                progress("bench", done, num_scenes)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _times_100(value: float | None, digits: int, unit: str) -> str:
+    return ("–" if value is None else f"{100 * value:.{digits}f}") + unit * (value is not None)
+
+
+def _row_of_flow(scene: KeySweep) -> list[str]:
+    """Return recall, errors, false positives and ghosts of scene flow on one window."""
+    sequence, key = open_sequence(scene.data), scene.key
+    scores = bench_flow(sequence, key, scene.window, resolve(None), ["ours"])["methods"]["ours"]
+    step, window, hops = scores["step"], scores["window"], str(scene.window)
+    errors_m, called_errors_m = window["movers_m_by_hops"], window["found_movers_m_by_hops"]
+    return [
+        str(scene),
+        _times_100(step["found"], 1, " %"),
+        _errors(step["movers_m"], step["found_movers_m"]),
+        _errors(errors_m.get(hops), called_errors_m.get(hops)),
+        _times_100(step["falsely_moving"], 4, " %"),
+        _times_100(window["ghost_rate"], 2, " %"),
+    ]
+
+
+def _errors(all_m: float | None, called_m: float | None) -> str:
+    """Return the errors of all moving points, and in brackets of those called moving."""
+    return f"{_times_100(all_m, 1, ' cm')} ({_times_100(called_m, 1, ' cm')})"
+
+
+def _row_of_registration(scene: KeySweep) -> list[str]:
+    """Return root mean square errors of the window's poses relative to the key sweep's pose."""
+    sequence, key = open_sequence(scene.data), scene.key
+    stretch = Recording(sequence, resolve(None), scene.window, [key]).window(key)
+    off_m, off_deg = window_pose_errors(stretch, key, sequence.T_world_lidar)
+    return [str(scene), f"{1000 * off_m:.0f} mm", f"{off_deg:.3f}°"]
+
+
+TABLES: Mapping[str, _Table] = {
+    "flow": _Table(
+        "Recall of moving points, their error with missed points counted as static, and in "
+        "brackets of those found.",
+        "recall | one sweep | five sweeps | false positives | ghosts",
+        _FLOW,
+        _row_of_flow,
+    ),
+    "registration": _Table(
+        "Errors of the poses of eleven sweeps relative to the key's, root mean square.",
+        "translation | rotation",
+        _REGISTERED,
+        _row_of_registration,
+    ),
+}

@@ -4,19 +4,22 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from densify.bench.truth import (
+from densify.bench.depth import (
+    Altered,
     TruthMap,
-    Without,
     agrees_beside,
     exact_truth,
     scanner_truth,
     stereo_truth,
+    without_scanner,
 )
 from densify.bench.verdicts import Curve, change, curve
 from densify.config import resolve
@@ -29,9 +32,10 @@ from densify.flow.two_clouds import estimate_flow
 from densify.geometry import poses
 from densify.geometry.types import (
     Bool,
+    Camera,
     DepthMap,
     Float,
-    Float32,
+    FlowField,
     LidarSequence,
     Progress,
     Sweep,
@@ -46,6 +50,7 @@ from densify.pipeline.run import scene_of
 from densify.readers import open_sequence
 from densify.readers.timeline import choose_cameras
 from densify.registration.trajectory import Registration
+from densify.scores.pose_metrics import window_pose_errors
 
 KINDS = ("depth", "flow", "registration")
 _WINDOW = 5
@@ -57,6 +62,7 @@ _STEREO = "kitti_stereo/truth"
 _DRIVE = "2011_09_26/2011_09_26_drive_0013_sync"
 _CAR_M, _CAR_REACH_M = (-4.6, -2.2, 0.0), 2.5  # the nearest moving car of the Argoverse 2 pair
 _CAR_FLOW_M = (0.83, 0.0, 0.0)  # by its profile, which both sweeps measured
+_PAIR_REACH_M = 35.0  # of the scored moving points
 
 
 class GateKey(NamedTuple):
@@ -129,16 +135,16 @@ def read(path: Path) -> Stored:
 
 def write(path: Path, stored: Stored) -> None:
     """Write figures and luck as JSON, a figure a line."""
-    parts = []
-    for part, keys in stored._asdict().items():
-        rows = (
-            f"  {json.dumps(key)}: {{\n"
-            + ",\n".join(f"   {json.dumps(n)}: {json.dumps(v)}" for n, v in figures.items())
-            + "\n  }"
-            for key, figures in keys.items()
-        )
-        parts.append(f' "{part}": {{\n' + ",\n".join(rows) + "\n }")
-    write_file(path, ("{\n" + ",\n".join(parts) + "\n}\n").encode())
+    write_file(path, (_as_lines(stored._asdict()) + "\n").encode())
+
+
+def _as_lines(value: Any, depth: int = 0) -> str:
+    """Return JSON in which tables three deep (kind, key, figure) have a line for each row."""
+    if depth == 3:
+        return json.dumps(value)
+    indent = " " * depth
+    rows = (f"{indent} {json.dumps(k)}: {_as_lines(v, depth + 1)}" for k, v in value.items())
+    return "{\n" + ",\n".join(rows) + f"\n{indent}}}"
 
 
 def measure(
@@ -166,15 +172,13 @@ def measure(
     figures: dict[str, dict[str, Any]] = {}
     luck: dict[str, dict[str, float]] = {}
     for number, key in enumerate(chosen):
-        sequence = _opened(key, folder)
-        if key in PAIRS:
-            if "flow" in kinds:
-                figures[key.name] = _pair_figures(sequence, key)
-        else:
-            still = _Still(sequence, key, folder, cache)
-            figures[key.name] = still.figures(kinds)
-            moved = [still.moved(seed).figures(kinds) for seed in range(draws)]
+        if key not in PAIRS:
+            subject = _Subject.of(key, folder, cache)
+            figures[key.name] = subject.figures(kinds)
+            moved = [subject.figures(kinds, seed) for seed in range(draws)]
             luck[key.name] = _luck(figures[key.name], moved)
+        elif "flow" in kinds:
+            figures[key.name] = _pair_figures(key, folder)
         if progress is not None:
             progress("gate", number + 1, len(chosen))
     return Stored(figures, luck)
@@ -198,16 +202,16 @@ def judged_maps(
 ) -> Iterator[JudgedMap]:
     """Yield the depth map of each of `KEYS` with its ground truth; arguments as for `measure`."""
     for key in _chosen(KEYS, folder, names):
-        sequence = _opened(key, folder)
-        focal_px = sequence.cameras[key.camera].focal_px
-        depth, truth = _Still(sequence, key, folder, cache).made(through_glass=False)
+        subject = _Subject.of(key, folder, cache)
+        focal_px = subject.camera.focal_px
+        depth, truth = subject.depth_and_truth(subject.recording, through_glass=False)
         truth = truth._replace(by_disparity=True)
         depth_m = depth.filled_m
         if depth.rejected is not None:
             depth_m = np.maximum(depth_m, depth.rejected.depth_m)
-        both = (truth.depth_m > 0) & (depth_m > 0)
-        outlier = np.zeros(both.shape, bool)
-        outlier[both] = truth.outliers(depth_m, both, focal_px)
+        compared = (truth.depth_m > 0) & (depth_m > 0)
+        outlier = np.zeros(compared.shape, bool)
+        outlier[compared] = truth.outliers(depth_m, compared, focal_px)
         if key.truth == "stereo":
             outlier &= ~agrees_beside(truth, depth_m, _ASIDE_PX, focal_px)
         yield JudgedMap(key, depth, truth, outlier)
@@ -217,11 +221,12 @@ def _chosen(
     keys: Iterable[GateKey], folder: Path | None, names: Collection[str] | None
 ) -> list[GateKey]:
     """Return the keys with these names, None for all; real ones only with a folder."""
-    there = [key for key in keys if not key.is_real or folder is not None]
-    known = {key.name for key in there}
-    for name in set(names or ()) - known:
-        raise InputError(f"--keys {name}: no such key; expected of {', '.join(sorted(known))}")
-    return [key for key in there if names is None or key.name in names]
+    known = {key.name: key for key in keys if not key.is_real or folder is not None}
+    for name in names or ():
+        if name not in known:
+            expected = ", ".join(sorted(known))
+            raise InputError(f"--keys {name}: no such key; expected of {expected}")
+    return [key for name, key in known.items() if names is None or name in names]
 
 
 def _opened(key: GateKey, folder: Path | None) -> LidarSequence:
@@ -239,96 +244,107 @@ def _luck(still: Mapping[str, Any], moved: list[dict[str, Any]]) -> dict[str, fl
     return {k: round(float(np.std([c[k] for c in changes], ddof=1)), 5) for k in changes[0]}
 
 
-class _Still:
-    """A key with the poses that registration finds."""
+class _Subject(NamedTuple):
+    """A key as it is measured."""
 
-    def __init__(
-        self, sequence: LidarSequence, key: GateKey, folder: Path | None, cache: Cache | None
-    ) -> None:
-        self._key, self._whole, self._folder = key, sequence, folder
-        self._sequence = Without(sequence, 1) if key.truth == "scanner" else sequence
-        self._recording, self._cache = self._recorded(self._sequence, cache), cache
-        self._truth = self._true_map() if key.truth != "held out" else None
+    key: GateKey
+    whole: LidarSequence  # recording with the returns that are the truth
+    recording: Recording  # recording without them, with the poses that registration finds
+    truth: TruthMap | None  # None where returns of the key sweep are held out instead
 
-    def _recorded(self, sequence: Any, cache: Cache | None = None) -> Recording:
-        return Recording(
-            sequence, resolve(None), _WINDOW, [self._key.key], cache, looks_around=True
-        )
+    @staticmethod
+    def of(key: GateKey, folder: Path | None, cache: Cache | None) -> _Subject:
+        """Open the recording of a key, and read or measure its true depth."""
+        whole, config = _opened(key, folder), resolve(None)
+        sequence = without_scanner(whole, 1) if key.truth == "scanner" else whole
+        recording = Recording(sequence, config, _WINDOW, [key.key], cache, looks_around=True)
+        truth, cameras = None, choose_cameras(whole, [key.camera])
+        shots = key_shots(whole, cameras, key.key, config.project)
+        if key.truth == "stereo":
+            truth = stereo_truth(cast(Path, folder) / _STEREO, key.key, cameras[0])
+        elif key.truth == "scanner":
+            measured = Recording(whole, config, _WINDOW, [key.key], cache, looks_around=True)
+            truth = scanner_truth(1, measured, key.key, shots)[key.camera]
+        elif key.truth == "exact":
+            key_sweep = recording.window(key.key)[key.key].sweep
+            truth = exact_truth(sequence, key_sweep, shots, config)[key.camera]
+        return _Subject(key, whole, recording, truth)
 
-    def moved(self, seed: int) -> _Still:
-        """Return the key with other poses, and fewer returns for registration."""
-        one = object.__new__(_Still)
-        one.__dict__ |= self.__dict__
-        one._recording = _Moved(self._recording, self._sequence, self._key.key, seed)
-        one._sequence = _Thinned(self._sequence, seed)
-        return one
+    @property
+    def camera(self) -> Camera:
+        """The camera of the depth map."""
+        return self.whole.cameras[self.key.camera]
 
-    def figures(self, kinds: Collection[str]) -> dict[str, Any]:
+    def figures(self, kinds: Collection[str], seed: int | None = None) -> dict[str, Any]:
+        """Return the figures of `measure`; with a seed, of slightly other poses."""
+        key, recording, registered = self.key.key, self.recording, self.recording
+        if seed is not None:
+            recording = _Moved(self.recording, key, seed)
+            sequence: Any = Altered(recording.sequence, lambda sweep: _thinned(sweep, seed))
+            settings = recording.settings
+            registered = Recording(sequence, settings, _WINDOW, [key], looks_around=True)
         figures: dict[str, Any] = {}
         if "depth" in kinds:
-            figures |= self._depth()
-        if "flow" in kinds and self._recording.sequence.truth is not None:
-            figures |= _flow_figures(self._recording, self._key.key)
-        if "registration" in kinds and self._key.truth in ("exact", "scanner"):
-            sequence, of_poses = self._sequence, self._recording
-            if isinstance(sequence, _Thinned):
-                of_poses = self._recorded(sequence)
-            figures["poses mm"] = _pose_error_mm(of_poses, self._key.key)
+            figures |= self._curves(recording)
+        if "flow" in kinds and recording.sequence.truth is not None:
+            figures |= _flow_figures(recording, key)
+        if "registration" in kinds and self.key.truth in ("exact", "scanner"):
+            true_pose = registered.sequence.T_world_lidar
+            error_m, _ = window_pose_errors(registered.window(key), key, true_pose)
+            figures["poses mm"] = round(1000 * error_m, 2)
         return figures
 
-    def _true_map(self) -> TruthMap:
-        key, config, recording = self._key, resolve(None), self._recording
-        shots = key_shots(
-            self._whole, choose_cameras(self._whole, [key.camera]), key.key, config.project
-        )
-        if key.truth == "stereo":
-            camera = self._whole.cameras[key.camera]
-            return stereo_truth(cast(Path, self._folder) / _STEREO, key.key, camera)
-        if key.truth == "scanner":
-            return scanner_truth(1, self._whole, key.key, _WINDOW, shots, config, self._cache)[
-                key.camera
-            ]
-        key_sweep = recording.window(key.key)[key.key].sweep
-        return exact_truth(self._sequence, key_sweep, shots, config)[key.camera]
+    def _curves(self, recording: Recording) -> dict[str, Curve]:
+        """Return the curves of the measured and the filled map, for each group of pixels."""
+        depth, truth = self.depth_and_truth(recording)
+        known, focal_px, curves = truth.depth_m > 0, self.camera.focal_px, {}
+        groups = {"all": known}
+        if truth.moving[known].any():
+            groups["moving"] = known & truth.moving
+        if self.key.truth == "stereo":
+            groups["aside"] = known  # without outliers at widened posts
+        for product, depth_m in (("measured", depth.depth_m), ("filled", depth.filled_m)):
+            for group, pixels in groups.items():
+                compared = pixels & (depth_m > 0)
+                outliers = truth.outliers(depth_m, compared, focal_px)
+                if group == "aside":
+                    beside = agrees_beside(truth, depth_m, _ASIDE_PX, focal_px)
+                    outliers &= ~beside[compared]
+                confidence = depth.confidence[compared]
+                curves[f"{product} {group}"] = curve(int(pixels.sum()), confidence, outliers)
+        return curves
 
-    def _depth(self) -> dict[str, Curve]:
-        depth, truth = self.made()
-        focal_px = self._whole.cameras[self._key.camera].focal_px
-        parts = ["all", "moving"] + ["aside"] * (self._key.truth == "stereo")
-        return {
-            f"{product} {part}": _curve_of(depth, depth_m, truth, part, focal_px)
-            for product, depth_m in (("measured", depth.depth_m), ("filled", depth.filled_m))
-            for part in parts
-            if part != "moving" or truth.moving[truth.depth_m > 0].any()
-        }
+    def depth_and_truth(
+        self, recording: Recording, through_glass: bool = True
+    ) -> tuple[DepthMap, TruthMap]:
+        """Return the depth map of the key, and its ground truth.
 
-    def made(self, through_glass: bool = True) -> tuple[DepthMap, TruthMap]:
-        """Return the depth map of the key, and its ground truth."""
-        # through_glass: keep returns of another scanner from far inside a moving body
-        recording, key, camera = self._recording, self._key.key, self._key.camera
+        ``through_glass`` keeps returns of another scanner from far inside a moving body.
+        """
+        key, camera, truth = self.key.key, self.key.camera, self.truth
         sequence, settings = recording.sequence, recording.settings
         shots = key_shots(sequence, choose_cameras(sequence, [camera]), key, settings.project)
         images, cloud = load_images(sequence, shots), recording.moment(key, True, "").cloud
         beyond = recording.standing(key)
         scene = scene_of(recording, key, shots, images, beyond, cloud, False, Watch())
         seen = see(scene, "flow", cloud)
-        if (truth := self._truth) is not None:
-            if self._key.truth == "scanner" and not through_glass:
-                exposure = scene.views.exposures[camera]
-                inside = far_inside(seen.bodies.values(), exposure, truth.depth_m)
-                truth = truth._replace(depth_m=np.where(inside, np.float32(0), truth.depth_m))
-            return scene.views.depth(seen)[camera], truth
-        held_out = HeldOut.of(scene.views, cloud).maps(seen, METHODS["flow"].visible)
-        depth, truth_m, moving = held_out[camera]
-        return depth, TruthMap(truth_m, moving, by_disparity=True)
+        if truth is None:
+            held_out = HeldOut.of(scene.views, cloud).maps(seen, METHODS["flow"].visible)
+            depth, truth_m, moving = held_out[camera]
+            return depth, TruthMap(truth_m, moving, by_disparity=True)
+        if self.key.truth == "scanner" and not through_glass:
+            exposure = scene.views.exposures[camera]
+            inside = far_inside(seen.bodies.values(), exposure, truth.depth_m)
+            truth = truth._replace(depth_m=np.where(inside, np.float32(0), truth.depth_m))
+        return scene.views.depth(seen)[camera], truth
 
 
 class _Moved(Recording):
     """A recording with slightly other poses."""
 
-    def __init__(self, still: Recording, sequence: Any, key: int, seed: int) -> None:
+    def __init__(self, still: Recording, key: int, seed: int) -> None:
         self._still, self._seed = still, seed
-        super().__init__(sequence, still.settings, _WINDOW, [key], looks_around=True)
+        super().__init__(still.sequence, still.settings, _WINDOW, [key], looks_around=True)
 
     def registration(self, number: int) -> Registration:
         registration = self._still.registration(number)
@@ -340,38 +356,14 @@ class _Moved(Recording):
 def _jittered(trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
     """Return the trajectory with each pose moved by 2 mm and turned by 0.01° along each axis."""
     sigma = np.repeat([np.radians(_TURNED_DEG), _MOVED_M], 3)
-    moves = [poses.exp(sigma * rng.standard_normal(6)) for _ in trajectory.frames]
-    moved = trajectory.T_world_lidar @ np.stack(moves)
-    return Trajectory(trajectory.frames, trajectory.stamp_ns, moved, trajectory.R_level_lidar)
+    moves = poses.exp(sigma * rng.standard_normal((len(trajectory.frames), 6)))
+    return replace(trajectory, T_world_lidar=trajectory.T_world_lidar @ moves)
 
 
-class _Thinned:
-    """A recording with a random share of the returns of each sweep."""
-
-    def __init__(self, sequence: Any, seed: int) -> None:
-        self._sequence, self._seed = sequence, seed
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._sequence, name)
-
-    def __getitem__(self, frame: int) -> Sweep:
-        sweep: Sweep = self._sequence[frame]
-        rng = np.random.default_rng([self._seed, frame])
-        return sweep.select(rng.random(len(sweep)) < _KEPT)
-
-
-def _curve_of(
-    depth: DepthMap, depth_m: Float32, truth: TruthMap, part: str, focal_px: float
-) -> Curve:
-    """Return the curve of one part of the pixels: all, moving, or all but widened posts (aside)."""
-    known = truth.depth_m > 0
-    if part == "moving":
-        known &= truth.moving
-    both = known & (depth_m > 0)
-    outliers = truth.outliers(depth_m, both, focal_px)
-    if part == "aside":
-        outliers &= ~agrees_beside(truth, depth_m, _ASIDE_PX, focal_px)[both]
-    return curve(int(known.sum()), depth.confidence[both], outliers)
+def _thinned(sweep: Sweep, seed: int) -> Sweep:
+    """Return the sweep with a random share of its returns."""
+    rng = np.random.default_rng([seed, sweep.frame])
+    return sweep.select(rng.random(len(sweep)) < _KEPT)
 
 
 def _flow_figures(recording: Recording, key: int) -> dict[str, float]:
@@ -401,57 +393,61 @@ def _flow_figures(recording: Recording, key: int) -> dict[str, float]:
     return {name: round(value, 5) for name, value in figures.items()}
 
 
-def _pose_error_mm(recording: Recording, key: int) -> float:
-    """Return the root mean square error of the window's positions relative to the key sweep's."""
-    sequence, stretch = recording.sequence, recording.window(key)
-    T_true_world = poses.inverse(sequence.T_world_lidar(key))
-    off_m = []
-    for frame in stretch.frames:
-        T_true = T_true_world @ sequence.T_world_lidar(frame)
-        T_off = poses.inverse(T_true) @ stretch.T_target_source(key, frame)
-        off_m.append(np.linalg.norm(T_off[:3, 3]))
-    return round(1000 * float(np.sqrt(np.mean(np.square(off_m)))), 2)
+class _Pair(NamedTuple):
+    """Two neighbouring sweeps that two scanners measured, and the true flow of the first."""
+
+    sweeps: tuple[Sweep, Sweep]
+    T_first_second: Float  # (4,4) recorded motion
+    true_m: Float  # (N,3) flow of the first sweep's points in metres
+    moving: Bool  # (N,) points whose flow is scored
+    static: Bool  # (N,) static points, none if unknown
+
+    @staticmethod
+    def of(key: GateKey, folder: Path | None) -> _Pair:
+        """Open the sweep ``key`` and the next, with recorded poses."""
+        sequence = _opened(key, folder)
+        config = resolve({"register": {"source": "dataset"}})
+        window = Recording(sequence, config, 1, [key.key]).window(key.key)
+        first, second = window[key.key], window[key.key + 1]
+        points = first.sweep.points
+        if key.truth == "car":
+            is_near = np.linalg.norm(points - _CAR_M, axis=1) < _CAR_REACH_M
+            moving, static = is_near & (points[:, 2] > 0), np.zeros(len(points), bool)
+            true_m: Float = np.broadcast_to(_CAR_FLOW_M, points.shape)
+        else:
+            truth, row = cast(Truth, sequence.truth), first.sweep.row
+            true_m = truth.displacement(key.key, key.key + 1)[row]
+            static = ~truth.sweep(key.key).moving[row]
+            moving = ~static & (np.linalg.norm(points[:, :2], axis=1) < _PAIR_REACH_M)
+        T_first_second = poses.inverse(first.T_world_lidar) @ second.T_world_lidar
+        return _Pair((first.sweep, second.sweep), T_first_second, true_m, moving, static)
+
+    def flow(self, rng: np.random.Generator) -> FlowField:
+        """Estimate the flow with slightly other poses."""
+        first, second = self.sweeps
+        stamps_ns = np.array([first.stamp_ns, second.stamp_ns])
+        recorded = Trajectory((0, 1), stamps_ns, np.stack([np.eye(4), self.T_first_second]))
+        T_first, T_second = _jittered(recorded, rng).T_world_lidar
+        return estimate_flow(
+            first.points,
+            poses.transform(poses.inverse(T_first) @ T_second, second.points),
+            source_offset_ns=first.offset_ns,
+            target_offset_ns=second.offset_ns,
+            source_lidar=first.lidar,
+            target_lidar=second.lidar,
+        )
 
 
-def _pair_figures(sequence: LidarSequence, key: GateKey) -> dict[str, list[float]]:
+def _pair_figures(key: GateKey, folder: Path | None) -> dict[str, list[float]]:
     """Return figures of the flow from sweep ``key`` to the next, in draws with moved poses."""
-    rows = [_pair_row(*pair) for pair in _pairs(sequence, key)]
-    return {name: [round(row[name], 5) for row in rows] for name in rows[0]}
-
-
-def _pairs(sequence: LidarSequence, key: GateKey) -> Iterator[tuple[Any, Float, Bool, Bool]]:
-    """Yield flow, true flow (N,3) in metres, and masks (N,) of moving and of static points."""
-    config = resolve({"register": {"source": "dataset"}})
-    recording, rng = Recording(sequence, config, 1, [key.key]), np.random.default_rng(0)
-    source, target = (recording.window(key.key)[key.key + k] for k in (0, 1))
-    sweeps = {"source": source.sweep, "target": target.sweep}
-    columns: dict[str, Any] = {f"{k}_offset_ns": s.offset_ns for k, s in sweeps.items()}
-    columns |= {f"{k}_lidar": s.lidar for k, s in sweeps.items()}
-    points = source.sweep.points
-    if key.truth == "car":
-        near = np.linalg.norm(points - _CAR_M, axis=1) < _CAR_REACH_M
-        moving, static = near & (points[:, 2] > 0), np.zeros(len(points), bool)
-        true_m: Float = np.broadcast_to(_CAR_FLOW_M, points.shape)
-    else:
-        truth, row = cast(Truth, sequence.truth), source.sweep.row
-        true_m = truth.displacement(key.key, key.key + 1)[row]
-        moving = truth.sweep(key.key).moving[row]
-        static = ~moving
-        moving = moving & (np.linalg.norm(points[:, :2], axis=1) < 35)
-    T_source_target = poses.inverse(source.T_world_lidar) @ target.T_world_lidar
-    stamps_ns = np.array([source.sweep.stamp_ns, target.sweep.stamp_ns])
+    pair, rng = _Pair.of(key, folder), np.random.default_rng(0)
+    figures: dict[str, list[float]] = defaultdict(list)
     for _ in range(_NUM_DRAWS):
-        two = np.stack([np.eye(4), T_source_target])
-        moved = _jittered(Trajectory((0, 1), stamps_ns, two), rng).T_world_lidar
-        there = poses.transform(poses.inverse(moved[0]) @ moved[1], target.sweep.points)
-        yield estimate_flow(points, there, **columns), true_m, moving, static
-
-
-def _pair_row(flow: Any, true_m: Float, moving: Bool, static: Bool) -> dict[str, float]:
-    called = flow.moving & moving
-    error_m = np.linalg.norm(flow.displacement - true_m, axis=1)[called]
-    row = {
-        "pair recall %": 100 * float(flow.moving[moving].mean()),
-        "pair error m": float(error_m.mean()) if called.any() else float(np.linalg.norm(true_m[0])),
-    }
-    return row | ({"pair false %": 100 * float(flow.moving[static].mean())} if static.any() else {})
+        flow = pair.flow(rng)
+        error_m = np.linalg.norm(flow.displacement - pair.true_m, axis=1)[flow.moving & pair.moving]
+        error_of_zero_m = float(np.linalg.norm(pair.true_m[0]))
+        figures["pair recall %"].append(100 * float(flow.moving[pair.moving].mean()))
+        figures["pair error m"].append(float(error_m.mean()) if len(error_m) else error_of_zero_m)
+        if pair.static.any():
+            figures["pair false %"].append(100 * float(flow.moving[pair.static].mean()))
+    return {name: [round(value, 5) for value in values] for name, values in figures.items()}

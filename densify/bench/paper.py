@@ -28,19 +28,24 @@ from densify.config.errors import InputError
 from densify.flow.objective import SolverSettings, solve
 from densify.flow.two_clouds import estimate_flow
 from densify.geometry.types import Bool, Float, Int, Progress
-from densify.learning.clips import make_clip
 from densify.learning.network import AboveGround, Sweeps, read_model
-from densify.learning.samples import sample_of
+from densify.learning.training import make_clip, sample_of
 from densify.readers import open_sequence
 from densify.readers.decoded_files import read_arrays
 from densify.scores import flow_metrics as metrics
 
 FARTHEST_M = 35.0
-_MOST_SWEEPS = 5
-_NAMES = (
-    ("points1", "points2", "flow", "valid_mask1"),
-    ("pos1", "pos2", "gt", ""),
-)
+NUM_POINTS = 2048
+PUBLISHED: Mapping[str, Mapping[str, float]] = {
+    "flyingthings": {"epe_m": 0.259, "within_5": 0.163, "within_10": 0.416, "angle_rad": 0.369},
+    "kitti": {"epe_m": 0.093, "within_5": 0.648, "within_10": 0.821, "angle_rad": 0.137},
+}
+"""The paper's published scores without learning, by data set."""
+_MAX_SWEEPS = 5
+_SEED = 0
+_FLYINGTHINGS = ("points1", "points2", "flow")  # names of source, target and flow in a file
+_KITTI = ("pos1", "pos2", "gt")
+_VALID = "valid_mask1"
 _R_FLU_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """Rotation from axes right, down, forward to axes forward, left, up."""
 
@@ -57,36 +62,29 @@ class PaperPair:
     sweeps: Sweeps  # input of trained networks
 
 
-NUM_POINTS = 2048
-PUBLISHED: Mapping[str, Mapping[str, float]] = {
-    "flyingthings": {"epe_m": 0.259, "within_5": 0.163, "within_10": 0.416, "angle_rad": 0.369},
-    "kitti": {"epe_m": 0.093, "within_5": 0.648, "within_10": 0.821, "angle_rad": 0.137},
-}
-"""The paper's published scores without learning, by data set."""
+Flow = Callable[[PaperPair, Int, Int], Float]
+"""Function of a pair and the rows drawn from its source and its target.
 
-_SEED = 0
-
-Flow = Callable[[Float, Float, PaperPair], Float]
-"""Function of drawn source points, drawn target points and the whole pair.
-
-It returns the flow of the drawn source points, or of all source points."""
+It returns the flow of the drawn source points."""
 
 
 def _objective(solver: str, **settings: Any) -> Flow:
     """Return a method of scene flow that minimises the paper's objective by a named solver."""
-
-    def flow(source: Float, target: Float, pair: PaperPair) -> Float:
-        return solve(source, target, SolverSettings(solver=solver, **settings)).flow
-
-    return flow
+    chosen = SolverSettings(solver=solver, **settings)
+    return lambda pair, rows, targets: solve(pair.source[rows], pair.target[targets], chosen).flow
 
 
-def _ours(source: Float, target: Float, pair: PaperPair) -> Float:
-    return estimate_flow(pair.source, pair.target, Config()).displacement
+def _ours(pair: PaperPair, rows: Int, targets: Int) -> Float:
+    return estimate_flow(pair.source, pair.target, Config()).displacement[rows]
+
+
+def _learned(path: Path) -> Flow:
+    model = read_model(path)
+    return lambda pair, rows, targets: model.flow(pair.sweeps)[rows]
 
 
 METHODS: dict[str, Flow] = {
-    "rest": lambda source, target, pair: np.zeros_like(source),
+    "rest": lambda pair, rows, targets: np.zeros((len(rows), 3)),
     "paper-adam": _objective("adam"),
     "paper": _objective("pcg"),
     "no-laplacian": _objective("pcg", alpha=0.0),
@@ -111,42 +109,32 @@ def bench_paper(
     """
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
-    flows = _flows(methods, models)
-    found: dict[str, list[dict[str, float]]] = {name: [] for name in flows}
+    for name in methods:
+        if name not in METHODS:
+            raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
+    flows = {name: METHODS[name] for name in METHODS if name in methods}
+    flows |= {path.name: _learned(path) for path in models}
+    measured: dict[str, list[dict[str, float]]] = {name: [] for name in flows}
     num_pairs = 0
     for pair in pairs:
         if progress is not None:
             progress(pair.name, num_pairs, num_pairs + 1)
         num_pairs += 1
         for name, flow in flows.items():
-            found[name].append(_measured(flow, pair, num_points))
+            measured[name].append(_measured(flow, pair, num_points))
     if not num_pairs:
         raise InputError("densify bench paper: no pairs of sweeps; choose another recording")
-    means = {name: _mean(measured) for name, measured in found.items()}
+    means = {name: _mean(rows) for name, rows in measured.items()}
     return {"num_pairs": num_pairs, "num_points": num_points, "methods": means}
-
-
-def _flows(methods: Sequence[str], models: Sequence[Path]) -> dict[str, Flow]:
-    for name in methods:
-        if name not in METHODS:
-            raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
-    flows = {name: METHODS[name] for name in METHODS if name in methods}
-    return flows | {path.name: _learned(path) for path in models}
-
-
-def _learned(path: Path) -> Flow:
-    model = read_model(path)
-    return lambda source, target, pair: model.flow(pair.sweeps)
 
 
 def _measured(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float]:
     rng = np.random.default_rng(_SEED)
-    drawn, of_target = (_drawn(cloud, num_points, rng) for cloud in (pair.source, pair.target))
+    rows, targets = (_drawn(cloud, num_points, rng) for cloud in (pair.source, pair.target))
     start = time.perf_counter()
-    flow = method(pair.source[drawn], pair.target[of_target], pair)
+    flow = method(pair, rows, targets)
     seconds = time.perf_counter() - start
-    flow = flow[drawn] if len(flow) == len(pair.source) else flow
-    true = pair.flow[drawn]
+    true = pair.flow[rows]
     scores = {
         "epe_m": metrics.end_point_error(flow, true),
         "within_5": metrics.accuracy(flow, true, metrics.STRICT),
@@ -155,7 +143,7 @@ def _measured(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float
         "seconds": seconds,
     }
     if pair.moving is not None:
-        moving = pair.moving[drawn]
+        moving = pair.moving[rows]
         scores["moving_m"] = metrics.end_point_error(flow, true, moving)
         scores["static_m"] = metrics.end_point_error(flow, true, ~moving)
     return scores
@@ -163,8 +151,8 @@ def _measured(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float
 
 def _drawn(points: Float, count: int, rng: np.random.Generator) -> Int:
     """Return at most ``count`` ascending indices of random points within 35 m."""
-    near = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < FARTHEST_M)
-    return np.sort(rng.permutation(near)[:count])
+    rows = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < FARTHEST_M)
+    return np.sort(rng.permutation(rows)[:count])
 
 
 def _mean(measured: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
@@ -189,42 +177,42 @@ def pair_of_recording(spec: str, key: int) -> PaperPair:
     if sequence.truth is not None:
         teacher, settings = "truth", resolve({"register": {"source": "dataset"}})
     clip = make_clip(sequence, key, settings, teacher)
-    here = next(i for i, s in enumerate(clip) if not s.origin_m.any())
-    if here + 1 == len(clip):
+    row = next(i for i, s in enumerate(clip) if not s.origin_m.any())
+    if row + 1 == len(clip):
         raise InputError(f"--data {spec}: no sweep after {key}; choose an earlier one")
-    sample = sample_of(clip, here, here + 1, _MOST_SWEEPS)
-    source, target = (clip[n].points.astype(np.float64) for n in (here, here + 1))
+    sample = sample_of(clip, row, row + 1, _MAX_SWEEPS)
+    source, target = (clip[n].points.astype(np.float64) for n in (row, row + 1))
     flow, moving = sample.flow.double().numpy(), sample.moving.numpy()
     return PaperPair(f"{spec}@{key}", source, target, flow, moving, sample.sweeps)
 
 
-def pairs_of_files(folder: Path, most: int) -> Iterator[PaperPair]:
-    """Yield the pairs in the first ``most`` files of a folder, by file name. 0 means all files."""
+def pairs_of_files(folder: Path, num_files: int) -> Iterator[PaperPair]:
+    """Yield the pairs in the first ``num_files`` files of a folder, by file name; 0 for all."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         raise InputError(f"{folder}: no .npz files; expected the sets of FlowNet3D's authors")
-    for path in paths[: most or None]:
+    for path in paths[: num_files or None]:
         yield read_pair(path)
 
 
 def read_pair(path: Path) -> PaperPair:
     """Return the pair in an .npz file, without points farther than 35 m ahead."""
     arrays = read_arrays(path)
-    found = next((names for names in _NAMES if all(n in arrays for n in names[:3])), None)
-    if found is None:
+    names = next((n for n in (_FLYINGTHINGS, _KITTI) if arrays.keys() >= set(n)), None)
+    if names is None:
         raise InputError(
             f"{path}: holds {', '.join(sorted(arrays)) or 'nothing'}, expected points1, points2 "
             f"and flow, or pos1, pos2 and gt"
         )
-    source, target, flow = (np.asarray(arrays[name], np.float64) for name in found[:3])
-    for name, array in zip(found, (source, target, flow), strict=False):
+    source, target, flow = (np.asarray(arrays[name], np.float64) for name in names)
+    for name, array in zip(names, (source, target, flow), strict=True):
         if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
             raise InputError(f"{path}: {name}: got shape {array.shape}, expected (N,3) numbers")
-    valid = np.asarray(arrays.get(found[3], np.ones(len(source)))).astype(bool).ravel()
-    for name, rows in ((found[2], flow), (found[3], valid)):
+    valid = np.asarray(arrays.get(_VALID, np.ones(len(source)))).astype(bool).ravel()
+    for name, rows in ((names[-1], flow), (_VALID, valid)):
         if len(rows) != len(source):
             raise InputError(f"{path}: {name}: got {len(rows)} rows, expected {len(source)}")
-    if found is _NAMES[0]:
+    if names is _FLYINGTHINGS:
         source, target, flow = (x @ _R_FLU_CAMERA.T for x in (source, target, flow))
     valid &= np.abs(source[:, 0]) < FARTHEST_M
     source, flow = source[valid], flow[valid]

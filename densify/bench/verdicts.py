@@ -32,24 +32,23 @@ def curve(num_true: int, confidence: Float | Float32, outliers: Bool) -> Curve:
 
     Both arrays (K,) are of the covered ones. Equal confidences share their outliers evenly.
     """
-    _, level, size = np.unique(-confidence, return_inverse=True, return_counts=True)
-    of_level = np.bincount(level, outliers, len(size))
-    ends, sums = np.append(0, size.cumsum()), np.append(0, of_level.cumsum())
-    at = np.linspace(0, len(confidence), _NUM_STEPS + 1)
-    made = np.interp(at, ends, sums)
-    return {"num": num_true, "covered": len(confidence), "outliers": np.round(made, 2).tolist()}
+    _, rank, size = np.unique(-confidence, return_inverse=True, return_counts=True)
+    of_rank = np.bincount(rank, outliers, len(size))
+    ends, sums = np.append(0, size.cumsum()), np.append(0, of_rank.cumsum())
+    steps = np.interp(np.linspace(0, len(confidence), _NUM_STEPS + 1), ends, sums)
+    return {"num": num_true, "covered": len(confidence), "outliers": np.round(steps, 2).tolist()}
 
 
-def coverage(of: Curve) -> float:
+def coverage(outliers: Curve) -> float:
     """Return the share of the true pixels with a depth in percent."""
-    return 100 * of["covered"] / max(of["num"], 1)
+    return 100 * outliers["covered"] / max(outliers["num"], 1)
 
 
-def outliers_at(of: Curve, covered_percent: float) -> float:
+def outliers_at(outliers: Curve, covered_percent: float) -> float:
     """Return the share of outliers in percent among the most certain pixels of this coverage."""
-    num = covered_percent / 100 * of["num"]
-    steps = np.linspace(0, of["covered"], len(of["outliers"]))
-    return float(100 * np.interp(num, steps, of["outliers"]) / max(num, 1))
+    num = covered_percent / 100 * outliers["num"]
+    steps = np.linspace(0, outliers["covered"], len(outliers["outliers"]))
+    return float(100 * np.interp(num, steps, outliers["outliers"]) / max(num, 1))
 
 
 def change(figure: str, before: Any, now: Any) -> dict[str, float]:
@@ -101,20 +100,19 @@ def verdicts(
         # Both measurements have luck.
         by_luck = float(np.sqrt(2 * (sigma**2).sum()) / len(off))
         beyond = _BEYOND * max(by_luck, 0.0 if math.isnan(error) else error)
-        mean, worst = float(off.mean()), list(row)[int(bad.argmax())]
-        word = "no difference"
-        if abs(mean) > beyond:
+        worst, word = int(bad.argmax()), "no difference"
+        if abs(off.mean()) > beyond:
             word = "worse" if bad.mean() > 0 else "better"
         yield Verdict(
-            name,
-            list(row),
-            float(was.mean()),
-            float(value.mean()),
-            mean,
-            error,
-            by_luck,
-            (worst, float(row[worst][2])),
-            word,
+            figure=name,
+            keys=list(row),
+            before=float(was.mean()),
+            now=float(value.mean()),
+            change=float(off.mean()),
+            error=error,
+            luck=by_luck,
+            worst=(list(row)[worst], float(off[worst])),
+            word=word,
         )
 
 
@@ -122,13 +120,13 @@ def beyond_luck(
     before: Mapping[str, Any], now: Mapping[str, Any], luck: Mapping[str, float], sigmas: float
 ) -> dict[str, float]:
     """Return the changes of one key's figures for the worse beyond ``sigmas`` of both lucks."""
-    found = {}
+    worse = {}
     for figure in before:
         for name, off in change(figure, before[figure], now[figure]).items():
             bad = off if _is_cost(name) else -off
             if bad > sigmas * math.sqrt(2) * luck[name]:
-                found[name] = off
-    return found
+                worse[name] = off
+    return worse
 
 
 def _is_cost(name: str) -> bool:

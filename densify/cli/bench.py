@@ -11,8 +11,7 @@ from pathlib import Path
 from densify.bench import gate, paper
 from densify.bench.depth import bench_depth
 from densify.bench.doctor import bench_doctor
-from densify.bench.flow import DEFAULT_METHODS, bench_flow
-from densify.bench.readme import tables
+from densify.bench.flow import DEFAULT_METHODS, bench_flow, tables
 from densify.bench.verdicts import Verdict, verdicts
 from densify.cli.options import config_of, recording_of, recordings_of
 from densify.cli.screen import Answer, aligned, numbers_table, progress_on_stderr

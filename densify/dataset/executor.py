@@ -64,20 +64,18 @@ def call_all(
                 yield item, _outcome(partial(call, item))
         return
     ready = deque(group[0] for group in groups)
-    others = {group[0]: group[1:] for group in groups}
+    followers = {group[0]: group[1:] for group in groups}
     suspects: deque[Item] = deque()  # items that were running when a process died
     while ready or suspects:
-        alone = bool(suspects)
-        waiting, most = (suspects, 1) if alone else (ready, num_workers)
-        workers = _open_pool(most) if scheduler is None else _open_dask(scheduler)
+        is_retry = bool(suspects)
+        waiting, num_processes = (suspects, 1) if is_retry else (ready, num_workers)
+        workers = _open_pool(num_processes) if scheduler is None else _open_dask(scheduler)
         for item, outcome in _until_a_death(partial(_call_logged, call, log), waiting, workers):
-            if isinstance(outcome, BrokenExecutor):
-                if not alone:
-                    suspects.append(item)
-                    continue
-                outcome = ComputationError(_DEATH)
-            ready.extendleft(reversed(others.pop(item, ())))
-            yield item, outcome
+            if isinstance(outcome, BrokenExecutor) and not is_retry:
+                suspects.append(item)
+                continue
+            ready.extendleft(reversed(followers.pop(item, ())))
+            yield item, ComputationError(_DEATH) if isinstance(outcome, BrokenExecutor) else outcome
 
 
 @contextmanager
@@ -104,9 +102,8 @@ def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
 def share_of_cores(num_workers: int) -> dict[str, str]:
     """Return environment variables that limit the threads of a worker to its share of the cores."""
     share = str(max(1, len(os.sched_getaffinity(0)) // num_workers))
-    return {f"{library}_NUM_THREADS": share for library in ("NUMBA", "OMP", "OPENBLAS", "MKL")} | {
-        "OPENCV_FOR_THREADS_NUM": share
-    }
+    names = [f"{library}_NUM_THREADS" for library in ("NUMBA", "OMP", "OPENBLAS", "MKL")]
+    return dict.fromkeys([*names, "OPENCV_FOR_THREADS_NUM"], share)
 
 
 def _call_logged(call: Callable[[Item], Any], log: Path | None, item: Item) -> Any:
@@ -193,8 +190,9 @@ def _open_dask(scheduler: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
             # With pure=True, Dask would run two equal calls only once.
             yield client.get_executor(pure=False), lambda: max(1, sum(client.nthreads().values()))
         except (OSError, RuntimeError, CancelledError) as error:
-            told = "the Dask scheduler was lost; run the same command again to go on"
-            raise ComputationError(told) from error
+            raise ComputationError(
+                "the Dask scheduler was lost; run the same command again to go on"
+            ) from error
 
 
 def _begin(environment: dict[str, str]) -> None:

@@ -19,7 +19,7 @@ from densify.dataset.manifest import read_manifests
 from densify.dataset.plan import Drive, drives_of, read_plan
 from densify.depth.confidence import most_certain
 from densify.depth.exposure import key_shots
-from densify.geometry.types import Camera, LidarSequence
+from densify.geometry.types import Camera, Float, LidarSequence
 from densify.outputs.depth_png import read_depth_png, read_stored
 from densify.readers import open_sequence
 
@@ -86,11 +86,11 @@ class DepthDataset(Dataset[dict[str, Any]]):
             if _map_path(drive, "groundtruth", camera, record.key) in record.files
         )
         if not self._samples:
-            there = sorted({name for drive in self._drives.values() for name in drive.cameras})
+            known = sorted({name for drive in self._drives.values() for name in drive.cameras})
             raise InputError(
                 f"{self._root}: nothing to load: no finished key in manifest*.jsonl of split "
                 f"{split} and cameras {cameras}, None for all; there are the cameras "
-                f"{', '.join(there)}; let densify dataset finish some"
+                f"{', '.join(known)}; let densify dataset finish some"
             )
 
     def __repr__(self) -> str:
@@ -101,12 +101,18 @@ class DepthDataset(Dataset[dict[str, Any]]):
         return len(self._samples)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        name, camera_name, frame = self._samples[index]
-        drive = self._drives[name]
-        camera, K = drive.cameras[camera_name], drive.cameras[camera_name].K.copy()
+        drive, camera_name, frame = self._samples[index]
+        camera = self._drives[drive].cameras[camera_name]
+        maps, K = self._cut(self._maps(drive, camera, frame), camera, drive)
+        tensors = {name: torch.from_numpy(array.copy()) for name, array in maps.items()}
+        names = {"drive": drive, "camera": camera_name, "frame": frame}
+        return {**tensors, "intrinsics": torch.from_numpy(K.astype(np.float32)), **names}
+
+    def _maps(self, name: str, camera: Camera, frame: int) -> dict[str, NDArray[Any]]:
+        """Return the image and the maps (channels,H,W) of a sample."""
 
         def read(kind: str, reader: Callable[[Path], NDArray[Any]]) -> NDArray[Any]:
-            path = self._root / _map_path(drive, kind, camera_name, frame)
+            path = self._root / _map_path(self._drives[name], kind, camera.name, frame)
             try:
                 return _of_size(camera, str(path), reader(path))[None]
             except InputError as error:
@@ -116,37 +122,39 @@ class DepthDataset(Dataset[dict[str, Any]]):
                 ) from None
 
         dense_m = read(self._dense, read_depth_png)
-        levels = read("confidence", lambda path: read_stored(path, np.uint8, "a confidence map"))
-        # Stored levels are 1 to 255, see `densify.outputs.depth_png.stored_confidence`.
-        confidence = np.where(dense_m > 0, (levels - np.float32(1)) / 254, np.float32(0)).clip(0)
+        stored = read("confidence", lambda path: read_stored(path, np.uint8, "a confidence map"))
+        # Stored values are 1 to 255, see `densify.outputs.depth_png.stored_confidence`.
+        confidence = np.where(dense_m > 0, (stored - np.float32(1)) / 254, np.float32(0)).clip(0)
         if self._max_outliers is not None:
             kept = dense_m > 0
             kept[kept] = most_certain(confidence[kept], self._max_outliers)
             dense_m, confidence = dense_m * kept, confidence * kept
-        maps = {
+        return {
             "image": self._image(name, camera, frame).transpose(2, 0, 1) / np.float32(255),
             "sparse_depth_m": read("velodyne_raw", read_depth_png),
             "dense_depth_m": dense_m,
             "confidence": confidence,
         }
-        size_px = camera.height_px, camera.width_px
-        height_px, width_px = self._crop or size_px
-        if not (0 < height_px <= size_px[0] and 0 < width_px <= size_px[1]):
+
+    def _cut(
+        self, maps: Mapping[str, NDArray[Any]], camera: Camera, drive: str
+    ) -> tuple[dict[str, NDArray[Any]], Float]:
+        """Return the maps, cropped and flipped at random, and their intrinsics (3,3)."""
+        height_px, width_px = self._crop or (camera.height_px, camera.width_px)
+        if not (0 < height_px <= camera.height_px and 0 < width_px <= camera.width_px):
             raise InputError(
                 f"crop: got {height_px} x {width_px} px (height x width), expected at most the "
-                f"{size_px[0]} x {size_px[1]} of {camera.name} in {name}"
+                f"{camera.height_px} x {camera.width_px} of {camera.name} in {drive}"
             )
-        top, left = size_px[0] - height_px, int(torch.randint(size_px[1] - width_px + 1, ()))
+        top = camera.height_px - height_px
+        left = int(torch.randint(camera.width_px - width_px + 1, ()))
+        K = camera.K.copy()
         K[:2, 2] -= left, top
         step = -1 if self._flip and torch.randint(2, ()) else 1
         if step < 0:  # pixel u becomes width - 1 - u
             K[0, 1:] = -K[0, 1], width_px - 1 - K[0, 2]
-        arrays = {n: array[:, top:, left : left + width_px] for n, array in maps.items()}
-        return {
-            **{n: torch.from_numpy(array[..., ::step].copy()) for n, array in arrays.items()},
-            "intrinsics": torch.from_numpy(K.astype(np.float32)),
-            **{"drive": name, "camera": camera_name, "frame": frame},
-        }
+        columns = slice(left, left + width_px)
+        return {name: array[:, top:, columns][..., ::step] for name, array in maps.items()}, K
 
     def _image(self, drive: str, camera: Camera, frame: int) -> NDArray[np.uint8]:
         """Return the (H,W,3) RGB image of a camera at a key sweep."""

@@ -1,24 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""Make a training set: plan it, skip finished key sweeps, densify and record the others."""
+"""Make a training set: plan it, skip finished key sweeps, densify and record the others.
+
+The command's process plans, records and judges; `make_key` runs in any process.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
+import platform
 import re
 import time
+import traceback
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import numpy as np
+
 from densify.config import as_mapping
 from densify.config.cache import Cache
-from densify.config.errors import ComputationError, InputError, OutputError
+from densify.config.errors import ComputationError, InputError, OutputError, is_out_of_memory
 from densify.dataset.executor import call_all, logged_to
-from densify.dataset.key import Job, make_key
 from densify.dataset.manifest import (
     Key,
     KeyRecord,
@@ -27,26 +35,26 @@ from densify.dataset.manifest import (
     finished,
     read_manifests,
 )
-from densify.dataset.neighbours import worse_than_neighbours
-from densify.dataset.plan import (
-    Drive,
-    Recipe,
-    check_place,
-    plan,
-    planned_keys,
-    read_plan,
-    write_plan,
-)
+from densify.dataset.plan import Drive, Recipe, plan, planned_keys, read_plan, write_plan
 from densify.flow.engines import check_engine
 from densify.geometry.compiled import num_threads
+from densify.geometry.types import Result
 from densify.outputs.atomic import LEFT_AFTER_S, clear_leftovers
-from densify.outputs.kitti_tree import write_readme
+from densify.outputs.key_outputs import write_result
+from densify.outputs.kitti_tree import FileRecord, write_key, write_readme
+from densify.pipeline import run as pipeline
+from densify.pipeline.key_result import looks_around, methods_of_run
+from densify.pipeline.recording import Recording
+from densify.readers import open_sequence
+from densify.version import __version__
 
 _log = logging.getLogger("densify")
-_LEAST_KEYS = 8  # key sweeps per process; fewer are done before another process has started
+_KEYS_PER_PROCESS = 8  # fewer are done before another process has started
 _BASE_BYTES, _SWEEP_BYTES = 1.5e9, 0.15e9  # memory per process, and per sweep of 64 rings
-Block = tuple[Drive, tuple[int, ...]]
-"""A recording, and the key frame numbers of one of its blocks."""
+_LEAST_SHARE = 0.001  # smaller shares of ghosts or outliers do not matter to a training set
+_JUDGED = {"ghost": "ghosts", "outliers": "held-out outliers"}
+Shard = tuple[int, int]
+"""(i, n), part i of n, from 1."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +78,8 @@ class Summary:
 
     def mean(self, score: str) -> float | None:
         """Return a score's mean over finished key sweeps and their cameras, None if unknown."""
-        values: list[Any] = []
-        for record in self.records.values():
-            value = record.scores.get(score) if record.status == "done" else None
-            values += value.values() if isinstance(value, Mapping) else [value]
-        known = [value for value in values if value is not None]
+        done = [record for record in self.records.values() if record.status == "done"]
+        known = [value for record in done for value in record.values_of(score)]
         return sum(known) / len(known) if known else None
 
 
@@ -86,7 +91,7 @@ def make_dataset(
     *,
     num_workers: int | None = 1,
     scheduler: str | None = None,
-    shard: tuple[int, int] | None = None,
+    shard: Shard | None = None,
     verify: bool = False,
     report: Callable[[Summary], None] | None = None,
 ) -> Summary:
@@ -114,11 +119,11 @@ def make_dataset(
     out, recipe = Path(out), recipe or Recipe()
     check_engine(recipe.config.flow.engine)
     drives = plan(data, keys, recipe)
-    check_place(out)
+    _check_folder(out)
     Cache()  # raises InputError if other users can write to the cache folder
     num_workers = _num_processes(num_workers, recipe, drives)
-    age_s, part = (0.0, "") if shard is None else (LEFT_AFTER_S, f"-{shard[0]}of{shard[1]}")
-    log = out.absolute() / f"densify{part}.log"
+    age_s, suffix = (0.0, "") if shard is None else (LEFT_AFTER_S, f"-{shard[0]}of{shard[1]}")
+    log = out.absolute() / f"densify{suffix}.log"
     with Manifest(out, shard) as manifest:
         write_plan(out, recipe, drives)  # no log where the plan is refused
         with logged_to(log):
@@ -127,10 +132,10 @@ def make_dataset(
                 write_readme(out, recipe.method, recipe.window, as_mapping(recipe.config))
             blocks = _blocks(drives, shard)
             num_keys, records = sum(len(keys) for _, keys in blocks), _finished(blocks, out, verify)
-            left = _jobs(blocks, records.keys(), recipe, out, num_workers)
+            groups = _jobs(blocks, records.keys(), recipe, out, num_workers)
             _log.info("%d of %d keys finished, %d worker(s)", len(records), num_keys, num_workers)
-            made = call_all(make_key, left, num_workers, log, scheduler)
-            summary = _record(made, manifest, records, num_keys, report)
+            outcomes = call_all(make_key, groups, num_workers, log, scheduler)
+            summary = _record(outcomes, manifest, records, num_keys, report)
             if recipe.gate.max_ratio is not None:
                 worse = worse_than_neighbours(records, recipe.gate.max_ratio)
                 records |= {record.name: record for record in manifest.set_aside(worse)}
@@ -154,6 +159,17 @@ def damaged(out: Path) -> list[str]:
     return [name for r in records if r.status != "failed" for name in damaged_files(r, out)]
 
 
+# The command's process
+
+
+def _check_folder(out: Path) -> None:
+    """Raise InputError if the folder holds files other than a finished or begun training set."""
+    begun = (".", "manifest")  # a run makes these files before dataset.json
+    names = [path.name for path in out.iterdir()] if out.is_dir() else []
+    if read_plan(out) is None and not all(name.startswith(begun) for name in names):
+        raise InputError(f"--out {out}: not empty, and no dataset.json in it; choose another")
+
+
 def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[Drive]) -> int:
     """Return the wanted number, or as many as cores, free memory and key sweeps allow."""
     if wanted is not None:
@@ -162,43 +178,47 @@ def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[Drive]) 
         return wanted
     need_bytes = _BASE_BYTES + _SWEEP_BYTES * (2 * recipe.window + 1)
     num_keys = sum(len(drive.keys) for drive in drives)
-    fitting = (_free_bytes() / need_bytes, num_threads(), num_keys / _LEAST_KEYS)
-    return max(1, int(min(fitting)))
+    limits = (_free_bytes() / need_bytes, num_threads(), num_keys / _KEYS_PER_PROCESS)
+    return max(1, int(min(limits)))
 
 
 def _free_bytes() -> float:
     """Return the free memory of the system, or a container's lower limit."""
-    found = []
-    with suppress(OSError, ValueError, TypeError):
+    sizes = [math.inf]
+    with suppress(OSError, ValueError, IndexError):
         table = Path("/proc/meminfo").read_text()
-        found.append(1024.0 * int(re.findall(r"MemAvailable:\s+(\d+)", table)[0]))
-        found.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))  # may be "max"
-    return min(found, default=float("inf"))
+        sizes.append(1024.0 * int(re.findall(r"MemAvailable:\s+(\d+)", table)[0]))
+        sizes.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))  # may be "max"
+    return min(sizes)
 
 
-def _blocks(drives: Sequence[Drive], shard: tuple[int, int] | None) -> list[Block]:
-    """Return the blocks of all drives, or the consecutive blocks of one shard."""
+def _blocks(drives: Sequence[Drive], shard: Shard | None) -> list[tuple[Drive, tuple[int, ...]]]:
+    """Return the key frame numbers of all blocks, or of the consecutive blocks of one shard."""
     i, n = shard or (1, 1)
     blocks = [(drive, keys) for drive in drives for keys in drive.blocks]
     return blocks[len(blocks) * (i - 1) // n : len(blocks) * i // n]
 
 
-def _finished(blocks: Sequence[Block], out: Path, verify: bool) -> dict[Key, KeyRecord]:
+def _finished(
+    blocks: Sequence[tuple[Drive, tuple[int, ...]]], out: Path, verify: bool
+) -> dict[Key, KeyRecord]:
     wanted = {(drive.name, key) for drive, keys in blocks for key in keys}
     before = read_manifests(out)
-    done = finished(before.values(), out, verify)
-    return {name: before[name] for name in sorted(wanted & done)}
+    return {name: before[name] for name in sorted(wanted & finished(before.values(), out, verify))}
 
 
 def _jobs(
-    blocks: Sequence[Block], done: Collection[Key], recipe: Recipe, out: Path, num_workers: int
+    blocks: Sequence[tuple[Drive, tuple[int, ...]]],
+    done: Collection[Key],
+    recipe: Recipe,
+    out: Path,
+    num_workers: int,
 ) -> list[list[tuple[Job, int]]]:
     """Return the key sweeps to make, in a group for each block."""
     # The first key sweep of a group computes the results that the group shares.
     run, groups = uuid4().hex, []
     for drive, keys in blocks:
-        cameras, place = tuple(drive.cameras), out.absolute()
-        job = Job(drive.name, drive.data, drive.folder, drive.keys, cameras, recipe, place, run)
+        job = Job(drive, recipe, out.absolute(), run)
         if group := [(job, key) for key in keys if (drive.name, key) not in done]:
             groups.append(group)
     # Workers begin at distant blocks, because neighbouring blocks share results too.
@@ -207,7 +227,7 @@ def _jobs(
 
 
 def _record(
-    made: Iterator[tuple[tuple[Job, int], Any]],
+    outcomes: Iterator[tuple[tuple[Job, int], Any]],
     manifest: Manifest,
     records: dict[Key, KeyRecord],
     num_keys: int,
@@ -219,21 +239,166 @@ def _record(
     try:
         if report is not None:
             report(summary)
-        for num_made, ((job, key), record) in enumerate(made, start=1):
+        for num_made, ((job, key), record) in enumerate(outcomes, start=1):
             if isinstance(record, Exception):
-                record = KeyRecord(job.drive, key, "failed", str(record))
+                record = KeyRecord(job.drive.name, key, "failed", str(record))
             manifest.append(record)
             records[record.name] = record
             summary = Summary(records, num_keys, num_made, time.monotonic() - start_s)
-            told = f" ({record.reason})" if record.reason else ""
-            _log.debug("key %d of %s: %s%s", record.key, record.drive, record.status, told)
+            reason = f" ({record.reason})" if record.reason else ""
+            _log.debug("key %d of %s: %s%s", record.key, record.drive, record.status, reason)
             if report is not None:
                 report(summary)
     except BaseException as error:
         num_kept = summary.count("done") + summary.count("aside")
-        told = f"{num_kept} of {num_keys} keys are finished and kept"
+        message = f"{num_kept} of {num_keys} keys are finished and kept"
         if isinstance(error, OutputError):
-            raise ComputationError(f"{error}; {told}") from error
-        _log.info(told)
+            raise ComputationError(f"{error}; {message}") from error
+        _log.info(message)
         raise
     return summary
+
+
+def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) -> dict[Key, str]:
+    """Return finished keys with far more ghosts or outliers than their neighbours -> reason.
+
+    A limit for all recordings passes keys that are bad for their own, such as cut windows at its
+    ends. ``max_ratio`` is the greatest share, as a multiple of the median of the neighbours.
+    """
+    drives: dict[str, list[KeyRecord]] = defaultdict(list)
+    for record in records.values():
+        if record.status != "failed":
+            drives[record.drive].append(record)
+    worse: dict[Key, list[str]] = defaultdict(list)
+    for drive in drives.values():
+        drive.sort(key=lambda record: record.key)
+        # Twice a window: the keys whose windows an end cuts are the minority of neighbours.
+        num_beside = 2 * max(len(record.frames) for record in drive)
+        for score, title in _JUDGED.items():
+            shares = [max(record.values_of(score), default=np.nan) for record in drive]
+            for row in _outlying(shares, num_beside, max_ratio):
+                if drive[row].status == "done":
+                    worse[drive[row].name].append(title)
+    return {
+        name: f"more than {max_ratio:g} times the {' and '.join(titles)} of the neighbouring keys"
+        for name, titles in sorted(worse.items())
+    }
+
+
+def _outlying(shares: Sequence[float], num_beside: int, max_ratio: float) -> Iterator[int]:
+    """Yield the rows whose share exceeds the median of ``num_beside`` rows around by the ratio."""
+    for row, share in enumerate(shares):
+        begin = max(0, min(row - num_beside // 2, len(shares) - num_beside - 1))
+        beside = np.array([*shares[begin:row], *shares[row + 1 : begin + num_beside + 1]])
+        beside = beside[np.isfinite(beside)]
+        # Two keys do not tell which of them is unusual.
+        if len(beside) > 1 and share > max(_LEAST_SHARE, max_ratio * float(np.median(beside))):
+            yield row
+
+
+# Any process
+
+
+@dataclass(frozen=True)
+class Job:
+    """A recording of a training set, as every process opens it."""
+
+    drive: Drive
+    recipe: Recipe
+    out: Path  # absolute folder of the training set
+    run: str  # unique text of the command's run; long-lived workers reopen the recording in each
+    version: str = __version__  # version of densify that made the job
+
+
+def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
+    """Densify and write one key and return its record, ``failed`` on any error but OutputError."""
+    job, key = job_and_key
+    start_s = time.perf_counter()
+    try:
+        record = _densified(job, key)
+    except OutputError:
+        raise
+    except (InputError, ComputationError) as error:
+        record = KeyRecord(job.drive.name, key, "failed", str(error))
+    except Exception as error:  # other key sweeps may succeed
+        _log.debug("key %d of %s: %s", key, job.drive.name, traceback.format_exc())
+        record = KeyRecord(job.drive.name, key, "failed", _unexpected(error))
+    return replace(record, seconds=time.perf_counter() - start_s)
+
+
+def _unexpected(error: Exception) -> str:
+    """Return the reason in the manifest for an error that densify does not raise itself."""
+    message = f"{type(error).__name__}: {error}"
+    if is_out_of_memory(error):
+        return f"out of memory ({message}); fewer --workers or a smaller --window take less"
+    return f"this is a bug in densify; please report it with densify.log: {message}"
+
+
+def _densified(job: Job, key: int) -> KeyRecord:
+    """Densify and write one key, unless its scores are beyond a limit; return its record."""
+    recipe = job.recipe
+    recording, cache = _opened(job)
+    is_tree = recipe.layout == "kitti-depth"
+    # The sparse input in the tree is the depth of the single key sweep.
+    methods = ["none", recipe.method] if is_tree else methods_of_run(recipe.method, recipe.config)
+    cameras = tuple(job.drive.cameras)
+    results = pipeline.densify(recording, key, methods, cameras, with_images=not is_tree)
+    cache.trim()
+    result = results[recipe.method]
+    scores = _scores(result.metrics)
+    reason = recipe.gate.reason(scores, len(result.frames))
+    return KeyRecord(
+        job.drive.name,
+        key,
+        "done" if reason is None else "aside",
+        reason,
+        frames=result.frames,
+        files=_write(job, results) if reason is None else {},
+        scores=scores,
+        warnings=result.warnings,
+    )
+
+
+def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scores for a manifest line from the metrics of a result."""
+    held_out = metrics["held_out"] or {}
+    errors = {name: scores["measured"]["all"] for name, scores in held_out.items()}
+    return {
+        "num_points": metrics["num_points"],
+        "num_moving": metrics["num_moving"],
+        "ghost": metrics["ghosts"]["all"],
+        "density": {n: d["measured"] for n, d in metrics["density"].items()},
+        "density_filled": {n: d["filled"] for n, d in metrics["density"].items()},
+        "outliers": {n: e["outliers"] for n, e in errors.items()},
+        "mae_m": {n: e["mae_m"] for n, e in errors.items()},
+    }
+
+
+def _write(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
+    """Write the files of a key sweep, and return path relative to the set -> size and hash."""
+    result, out, drive = results[job.recipe.method], job.out, job.drive
+    if job.recipe.layout == "kitti-depth":
+        return write_key(out, drive.folder, result.key, results["none"].depth, result.depth)
+    config = as_mapping(job.recipe.config)
+    paths = write_result(result, out / drive.folder, config=config, data=drive.data, overwrite=True)
+    return {p.relative_to(out).as_posix(): FileRecord.of(p.read_bytes()) for p in paths}
+
+
+@lru_cache(maxsize=1)
+def _opened(job: Job) -> tuple[Recording, Cache]:
+    if job.version != __version__:
+        raise ComputationError(
+            f"the worker on {platform.node()} has densify {__version__}, the command has "
+            f"{job.version}; install the same on both"
+        )
+    cache, recipe = Cache(), job.recipe
+    recording = Recording(
+        open_sequence(job.drive.data),
+        recipe.config,
+        recipe.window,
+        job.drive.keys,
+        cache,
+        job.run,
+        looks_around=looks_around([recipe.method]),
+    )
+    return recording, cache

@@ -22,8 +22,8 @@ import fcntl
 import json
 import logging
 import os
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -58,6 +58,12 @@ class KeyRecord:
     def name(self) -> Key:
         """The drive and the frame number."""
         return self.drive, self.key
+
+    def values_of(self, score: str) -> list[float]:
+        """Return the known values of a score, of one that has a value for each camera all."""
+        value = self.scores.get(score)
+        values = value.values() if isinstance(value, Mapping) else [value]
+        return [v for v in values if v is not None]
 
     def to_line(self) -> bytes:
         """Return the record as a line of JSON with its newline. Equal records give equal bytes."""
@@ -158,7 +164,7 @@ class Manifest:
         """Open the manifest of a training set, or of shard (k, n); its folder is made if needed."""
         stem = "manifest" if shard is None else f"manifest-{shard[0]}of{shard[1]}"
         self.path = root / f"{stem}.jsonl"
-        try:
+        with self._errors_explained():
             root.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(root / f".{stem}.lock", os.O_RDWR | os.O_CREAT, 0o666)
             try:
@@ -167,8 +173,6 @@ class Manifest:
             except BaseException:
                 os.close(self._lock)
                 raise
-        except OSError as error:
-            raise self._not_written(error) from error
 
     def __enter__(self) -> Manifest:
         return self
@@ -180,13 +184,10 @@ class Manifest:
 
     def append(self, record: KeyRecord) -> None:
         """Add or replace the record of a key sweep. The record is on the disk at return."""
-        try:
-            with self.path.open("ab") as file:
-                file.write(record.to_line())
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise self._not_written(error) from error
+        with self._errors_explained(), self.path.open("ab") as file:
+            file.write(record.to_line())
+            file.flush()
+            os.fsync(file.fileno())
 
     def set_aside(self, reasons: Mapping[Key, str]) -> list[KeyRecord]:
         """Delete the files of finished key sweeps of this manifest, and record why.
@@ -197,11 +198,10 @@ class Manifest:
         for name, (record, _) in _read(self.path).items():
             if name not in reasons or record.status != "done":
                 continue
-            try:  # files first: if the process is killed here, the key sweep is made again
+            with self._errors_explained():
+                # Files first: if the process is killed here, the key sweep is made again.
                 for file in record.files:
                     (self.path.parent / file).unlink(missing_ok=True)
-            except OSError as error:
-                raise self._not_written(error) from error
             aside.append(replace(record, status="aside", reason=reasons[name], files={}))
             self.append(aside[-1])
         return aside
@@ -211,11 +211,16 @@ class Manifest:
         if not self.path.exists() or read_bytes(self.path) != data:
             write_file(self.path, data)
 
-    def _not_written(self, error: OSError) -> OutputError:
-        return OutputError(
-            f"--out {self.path.parent}: {self.path.name} cannot be written: "
-            f"{error.strerror or error}; see to it and run the same command again"
-        )
+    @contextmanager
+    def _errors_explained(self) -> Iterator[None]:
+        """Raise OutputError for the errors of the disk in the block."""
+        try:
+            yield
+        except OSError as error:
+            raise OutputError(
+                f"--out {self.path.parent}: {self.path.name} cannot be written: "
+                f"{error.strerror or error}; see to it and run the same command again"
+            ) from error
 
 
 def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:

@@ -33,10 +33,7 @@ from densify.readers.timeline import Timeline, check_window, choose_cameras, for
 from densify.version import __version__
 
 SCHEMA_VERSION = 1
-_KNOWN = {
-    "method": ("flow", "icp", "none"),
-    "layout": ("kitti-depth", "densify"),
-}
+_KNOWN = {"method": ("flow", "icp", "none"), "layout": ("kitti-depth", "densify")}
 _FILE = "dataset.json"
 _MOST_FRAMES = 10_000_000
 _SAME = ("densify", "layout", "method", "window", "cameras", "gate", "config")
@@ -115,8 +112,7 @@ class Recipe:
             )
         for option, known in _KNOWN.items():
             if (value := getattr(self, option)) not in known:
-                expected = ", ".join(filter(None, known))
-                raise InputError(f"--{option} {value}: expected one of {expected}")
+                raise InputError(f"--{option} {value}: expected one of {', '.join(known)}")
 
 
 @dataclass(frozen=True)
@@ -126,7 +122,7 @@ class Drive:
     name: str  # name of the recording's folder
     data: str  # text of ``--data``, with an absolute path
     folder: str  # folder of the recording's files, relative to the training set
-    cameras: Mapping[str, Camera]  # the wanted cameras, by name
+    cameras: Mapping[str, Camera] = field(compare=False)  # the wanted cameras, by name
     # Key frame numbers, ascending. The key sweeps of a block share pipeline stages.
     blocks: tuple[tuple[int, ...], ...]
 
@@ -181,14 +177,6 @@ def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, 
     return chosen
 
 
-def check_place(out: Path) -> None:
-    """Raise InputError if the folder holds files other than a finished or begun training set."""
-    begun = (".", "manifest")  # a run makes these files before dataset.json
-    names = [path.name for path in out.iterdir()] if out.is_dir() else []
-    if read_plan(out) is None and not all(name.startswith(begun) for name in names):
-        raise InputError(f"--out {out}: not empty, and no dataset.json in it; choose another")
-
-
 def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
     """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe."""
     table = _table(recipe, drives)
@@ -212,9 +200,9 @@ def read_plan(out: Path) -> dict[str, Any] | None:
             drives_of(table)
             return {name: table[name] for name in ("schema_version", *_SAME, "drives")}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        told = f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
+        reason = f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
         raise InputError(
-            f"{path}: damaged or no description of a training set: {told}; choose another folder"
+            f"{path}: damaged or no description of a training set: {reason}; choose another folder"
         ) from error
     raise InputError(
         f"{path}: got schema_version {table['schema_version']}, expected {SCHEMA_VERSION}; "
@@ -224,12 +212,16 @@ def read_plan(out: Path) -> dict[str, Any] | None:
 
 def drives_of(table: Mapping[str, Any]) -> dict[str, Drive]:
     """Return the recordings in the result of `read_plan`, by name, each with a single block."""
-    found = {}
-    for name, drive in table["drives"].items():
-        cameras = {n: _camera(n, camera) for n, camera in drive["cameras"].items()}
-        blocks = (tuple(_frames(drive["frames"])),)
-        found[name] = Drive(name, drive["data"], drive["folder"], cameras, blocks)
-    return found
+    return {
+        name: Drive(
+            name,
+            drive["data"],
+            drive["folder"],
+            {n: _read_camera(n, stored) for n, stored in drive["cameras"].items()},
+            (tuple(_frames(drive["frames"])),),
+        )
+        for name, drive in table["drives"].items()
+    }
 
 
 def planned_keys(table: Mapping[str, Any]) -> set[tuple[str, int]]:
@@ -245,40 +237,43 @@ def _table(recipe: Recipe, drives: Sequence[Drive]) -> dict[str, Any]:
         "gate": asdict(recipe.gate),
         "config": as_mapping(recipe.config),
         "drives": {
-            d.name: {
-                "data": d.data,
-                "folder": d.folder,
-                "frames": _as_runs(d.keys),
+            drive.name: {
+                "data": drive.data,
+                "folder": drive.folder,
+                "frames": _as_runs(drive.keys),
                 "cameras": {
-                    name: {part: getattr(camera, part) for part in _CAMERA}
-                    for name, camera in d.cameras.items()
+                    name: {column: getattr(camera, column) for column in _CAMERA}
+                    for name, camera in drive.cameras.items()
                 },
             }
-            for d in drives
+            for drive in drives
         },
     }
     return dict(plain(table))
 
 
 def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    for name in _SAME:
-        got, expected = _flat(name, now[name]), _flat(name, before[name])
-        for where in {**expected, **got}:
-            if got.get(where) != expected.get(where):
-                raise InputError(
-                    f"--out {out}: the set in it was made with {where} = {expected.get(where)}, "
-                    f"got {got.get(where)}; choose another --out, or go on with the same options"
-                )
+    """Raise InputError if a set was made with another recipe or version."""
+    expected, got = (_flat({name: table[name] for name in _SAME}) for table in (before, now))
+    for option in {**expected, **got}:
+        if got.get(option) != expected.get(option):
+            raise InputError(
+                f"--out {out}: the set in it was made with {option} = {expected.get(option)}, "
+                f"got {got.get(option)}; choose another --out, or go on with the same options"
+            )
 
 
-def _flat(name: str, value: Any) -> dict[str, Any]:
+def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return the values of nested mappings by their dotted names, such as ``gate.max_ghost``."""
-    if not isinstance(value, dict):
-        return {name: value}
-    return {n: v for key, part in value.items() for n, v in _flat(f"{name}.{key}", part).items()}
+    values: dict[str, Any] = {}
+    for name, value in table.items():
+        nested = isinstance(value, Mapping)
+        values |= _flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
+    return values
 
 
 def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """Return the drives of an earlier plan with those of this run, their frames together."""
     united = dict(before)
     for name, drive in now.items():
         old = before.get(name, drive)
@@ -287,32 +282,33 @@ def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str,
                 f"--out {out}: {name} in the set is another recording, {old['data']}; got "
                 f"{drive['data']}; choose another --out"
             )
-        for part in ("folder", "cameras"):
-            if old[part] != drive[part]:
+        for entry in ("folder", "cameras"):
+            if old[entry] != drive[entry]:
                 raise InputError(
-                    f"--out {out}: {name} is in the set with other {part}; choose another --out"
+                    f"--out {out}: {name} is in the set with other {entry}; choose another --out"
                 )
-        if len({d["folder"] for d in (*before.values(), drive)}) < len({*before, name}):
-            raise InputError(f"--out {out}: holds another recording; choose another --out")
-        frames = sorted({*_frames(old["frames"]), *_frames(drive["frames"])})
-        united[name] = {**drive, "frames": _as_runs(frames)}
+        frames = {*_frames(old["frames"]), *_frames(drive["frames"])}
+        united[name] = {**drive, "frames": _as_runs(sorted(frames))}
+    if len({drive["folder"] for drive in united.values()}) < len(united):
+        raise InputError(f"--out {out}: holds another recording; choose another --out")
     return dict(sorted(united.items()))
 
 
-def _camera(name: str, stored: Mapping[str, Any]) -> Camera:
-    given = {part: stored[part] for part in _CAMERA if part in stored}
-    given["K"] = np.array(stored["K"], np.float64).reshape(3, 3)
-    given["T_cam_lidar"] = np.array(stored["T_cam_lidar"], np.float64).reshape(4, 4)
-    given["distortion"] = tuple(stored["distortion"])
-    return Camera(name=name, **given)
+def _read_camera(name: str, stored: Mapping[str, Any]) -> Camera:
+    columns = {column: stored[column] for column in _CAMERA if column in stored}
+    columns["K"] = np.array(stored["K"], np.float64).reshape(3, 3)
+    columns["T_cam_lidar"] = np.array(stored["T_cam_lidar"], np.float64).reshape(4, 4)
+    columns["distortion"] = tuple(stored["distortion"])
+    return Camera(name=name, **columns)
 
 
 def _as_runs(frames: Iterable[int]) -> list[list[int]]:
     return [[run[0], run[-1]] for run in runs(frames)]
 
 
-def _frames(pairs: Iterable[Sequence[int]]) -> list[int]:
-    runs = [range(first, last + 1) for first, last in pairs]
-    if sum(max(0, run.stop - run.start) for run in runs) > _MOST_FRAMES:
+def _frames(ends: Iterable[Sequence[int]]) -> list[int]:
+    """Return the frame numbers in runs [first, last]."""
+    ranges = [range(first, last + 1) for first, last in ends]
+    if sum(max(0, run.stop - run.start) for run in ranges) > _MOST_FRAMES:  # len() overflows
         raise ValueError(f"more than {_MOST_FRAMES:,} frames of one recording")
-    return [frame for run in runs for frame in run]
+    return [frame for run in ranges for frame in run]

@@ -19,9 +19,9 @@ def write_comparison_page(folder: Path) -> Path:
     return page
 
 
-def write_report(place: Path, overwrite: bool = False) -> list[Path]:
+def write_report(folder: Path, overwrite: bool = False) -> list[Path]:
     """Write the HTML pages of a folder, or of the only key sweep in it, and return their paths."""
-    pages = _pages(place)
+    pages = _pages(folder)
     for path in pages:
         if path.exists() and not overwrite:
             raise InputError(f"{path}: already there and kept; give --overwrite to replace it")
@@ -30,26 +30,28 @@ def write_report(place: Path, overwrite: bool = False) -> list[Path]:
     return list(pages)
 
 
-def _pages(place: Path) -> dict[Path, Callable[[], bytes]]:
-    if not place.is_dir():
+def _pages(folder: Path) -> dict[Path, Callable[[], bytes]]:
+    """Return path -> function that makes the page, for each page of a folder."""
+    if not folder.is_dir():
         raise InputError(
-            f"{place}: no such folder; expected what densify run, compare or dataset wrote"
+            f"{folder}: no such folder; expected what densify run, compare or dataset wrote"
         )
-    if (place / "dataset.json").is_file():
-        return {place / "report.html": lambda: set_page(place)}
-    pages: dict[Path, Callable[[], bytes]] = {}
-    if (place / "run.yaml").is_file():
-        pages[place / "report.html"] = lambda: key_page(KeyFiles.of_run(place), str(place))
-    if (place / "compare.json").is_file():
-        pages[place / "compare.html"] = lambda: key_page(KeyFiles.of_comparison(place), "")
+    makers: dict[str, tuple[str, Callable[[], bytes]]] = {
+        "run.yaml": ("report.html", lambda: key_page(KeyFiles.of_run(folder), str(folder))),
+        "compare.json": ("compare.html", lambda: key_page(KeyFiles.of_comparison(folder), "")),
+    }
+    if (folder / "dataset.json").is_file():
+        return {folder / "report.html": lambda: set_page(folder)}
+    pages = {
+        folder / page: make for name, (page, make) in makers.items() if (folder / name).is_file()
+    }
     if pages:
         return pages
-    names = ("run.yaml", "compare.json")
-    inside = [p for p in sorted(place.iterdir()) if any((p / name).is_file() for name in names)]
+    inside = [p for p in sorted(folder.iterdir()) if any((p / name).is_file() for name in makers)]
     if len(inside) == 1:
         return _pages(inside[0])
-    found = f"{len(inside)} keys; name one of them" if inside else "none of these"
+    content = f"{len(inside)} keys; name one of them" if inside else "none of these"
     raise InputError(
-        f"{place}: holds {found}; expected the folder of a key, such as "
+        f"{folder}: holds {content}; expected the folder of a key, such as "
         f"densify-out/street/000120, or a training set"
     )

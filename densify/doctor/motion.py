@@ -43,7 +43,7 @@ from densify.registration.deskew import (
     sharpness,
     turning_s,
 )
-from densify.scores.recorded_error import RecordedError, main_error
+from densify.scores.pose_metrics import RecordedError, main_error
 
 _NEAR_M = 25.0
 # Returns of the own vehicle

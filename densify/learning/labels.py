@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Make scene flow labels from tracked boxes: the flow of each sweep to the next sweep."""
+"""Make scene flow labels from tracked boxes: points in a box move with it, all others are static.
+
+Sources: Pontes, Hays, Lucey, 3DV 2020, section 4.1 (Argoverse, nuScenes); Jund et al., RA-L 2022.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,11 +17,24 @@ from densify.config import Config
 from densify.config.errors import ComputationError, InputError
 from densify.config.plugins import READERS
 from densify.geometry import poses
-from densify.geometry.types import Bool, Boxes, FlowField, LidarSequence, Progress, RegisteredSweep
-from densify.learning.boxes import flow_of_boxes
+from densify.geometry.cameras import image_points
+from densify.geometry.types import (
+    Bool,
+    Boxes,
+    BoxView,
+    Float,
+    FlowField,
+    Int,
+    LidarSequence,
+    Progress,
+    RegisteredSweep,
+)
 from densify.outputs.atomic import write_file
 from densify.outputs.flow_writers import flow_npz
 from densify.pipeline.recording import Recording
+
+_MOVES_M_S = 0.5
+"""Least speed of a moving box; box poses are not accurate (Chodosh et al., WACV 2024)."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +45,15 @@ class Label:
     after: RegisteredSweep  # the next sweep
     field: FlowField  # flow to the next sweep, in the sweep's lidar frame, ego-motion removed
     sure: Bool  # (N,) True for points whose flow is certain
-    # (4,4) from the lidar frame of the sweep to the lidar frame of the next sweep
-    T_next_here: np.ndarray
+    T_after_sweep: Float  # (4,4) from the lidar frame of the sweep to that of the next sweep
+
+
+class BoxMargins(NamedTuple):
+    """Margins around a box in metres."""
+
+    grown_m: float = 0.1  # added to each side; more takes in mirrors and feet, and more ground
+    unsure_m: float = 0.3  # width of the zone outside the grown box where flow is uncertain
+    foot_m: float = 0.1  # height above the bottom of a moving box; points below may be the road
 
 
 def label_sweeps(
@@ -58,16 +82,15 @@ def label_sweeps(
 
 def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: int) -> Label | None:
     stretch = recording.window(frame)
-    following = [f for f in stretch.frames if f > frame]
-    if not following:
+    following = next((f for f in stretch.frames if f > frame), None)
+    if following is None:
         return None
-    source_boxes, target_boxes = boxes(frame), boxes(following[0])
+    source_boxes, target_boxes = boxes(frame), boxes(following)
     if source_boxes is None or target_boxes is None:
         return None
-    registered, after = stretch[frame], stretch[following[0]]
+    registered, after = stretch[frame], stretch[following]
     field, sure = flow_of_boxes(registered, after, source_boxes, target_boxes)
-    T_next_here = stretch.T_target_source(following[0], frame)
-    return Label(registered, after, field, sure, T_next_here)
+    return Label(registered, after, field, sure, stretch.T_target_source(following, frame))
 
 
 def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
@@ -76,9 +99,98 @@ def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
     path = folder / f"{sweep.frame:06d}_{label.after.frame:06d}.npz"
     if path.exists() and not overwrite:
         raise InputError(f"{path}: there already, kept; give --overwrite to replace it")
-    arrived = poses.transform(label.T_next_here, sweep.points + field.total)
-    total = arrived - sweep.points
+    total = poses.transform(label.T_after_sweep, sweep.points + field.total) - sweep.points
     # total_flow includes ego-motion, valid marks certain flow
     data = flow_npz(field, row=sweep.row, total_flow=total, object=field.instance, valid=label.sure)
     write_file(path, data)
     return path
+
+
+def flow_of_boxes(
+    source: RegisteredSweep,
+    after: RegisteredSweep,
+    boxes: Boxes,
+    next_boxes: Boxes,
+    margins: BoxMargins | None = None,
+) -> tuple[FlowField, Bool]:
+    """Return the flow of the N points of one sweep to the next, and which flows are certain.
+
+    Args:
+        source: Sweep of the N points.
+        after: Next sweep in the same world. Only its pose and time are used.
+        boxes: Boxes of ``source``.
+        next_boxes: Boxes of ``after``. Boxes of one object share the track name.
+
+    Returns:
+        The flow with ego-motion removed, in the lidar frame of ``source``; ``instance`` is the row
+            of the point's box, -1 for no box. Then (N,) True where the flow is certain. It is False
+            for points in two boxes, just outside a box, at the bottom of a moving box, in a box
+            that the next sweep lacks, or in image areas without annotation.
+    """
+    margins = margins or BoxMargins()
+    points = source.sweep.points
+    field = FlowField.zero(len(points))
+    num_inside, is_near_box = np.zeros(len(points), np.int64), np.zeros(len(points), bool)
+    sure = _is_annotated(boxes.view, points)
+    least_m = _MOVES_M_S * (after.sweep.stamp_ns - source.sweep.stamp_ns) * 1e-9
+    T_source_after = poses.inverse(source.T_world_lidar) @ after.T_world_lidar
+    T_source_next_boxes = T_source_after @ _at_reference(next_boxes, after)
+    next_pose = dict(zip(next_boxes.track, T_source_next_boxes, strict=True))
+    for k, T_source_box in enumerate(_at_reference(boxes, source)):
+        rows = _rows_around(boxes, k, T_source_box, source, margins)
+        in_box = poses.transform(poses.inverse(T_source_box), points[rows])
+        outside_m = (np.abs(in_box) - boxes.size_m[k] / 2).max(axis=1)
+        is_near_box[rows] |= outside_m <= margins.grown_m + margins.unsure_m
+        inside = outside_m <= margins.grown_m
+        rows, in_box = rows[inside], in_box[inside]
+        num_inside[rows] += 1
+        field.instance[rows] = k
+        T_source_next_box = next_pose.get(boxes.track[k]) if boxes.track[k] else None
+        if T_source_next_box is None:
+            sure[rows] = False
+        elif np.linalg.norm(T_source_next_box[:3, 3] - T_source_box[:3, 3]) >= least_m:
+            field.displacement[rows] = poses.transform(T_source_next_box, in_box) - points[rows]
+            field.moving[rows] = True
+            sure[rows[in_box[:, 2] < margins.foot_m - boxes.size_m[k, 2] / 2]] = False
+    twice = num_inside > 1
+    sure &= ~twice & ~(is_near_box & (num_inside == 0))
+    field.displacement[twice] = 0.0
+    field.moving[twice] = False
+    return field, sure
+
+
+def _rows_around(
+    boxes: Boxes, k: int, T_lidar_box: Float, registered: RegisteredSweep, margins: BoxMargins
+) -> Int:
+    """Return the indices of the points that may be in or beside box k."""
+    sweep = registered.sweep
+    reach_m = np.linalg.norm(boxes.size_m[k] / 2 + margins.grown_m + margins.unsure_m)
+    rows: Int = np.flatnonzero(
+        (np.abs(sweep.points[:, 0] - T_lidar_box[0, 3]) <= reach_m)
+        & (np.abs(sweep.points[:, 1] - T_lidar_box[1, 3]) <= reach_m)
+    )
+    if boxes.lidar is not None and boxes.lidar[k] >= 0:  # drawn for one scanner
+        rows = rows[sweep.lidar[rows] == boxes.lidar[k]]
+    return rows
+
+
+def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
+    """Return the (K,4,4) box poses, lidar frame, deskewed to the reference time like the points."""
+    if boxes.offset_ns is None:
+        return boxes.T_lidar_box
+    twists = np.stack([registered.twist_before, registered.twist_after])
+    twist: Float = twists[(boxes.offset_ns >= 0).astype(np.intp)]
+    offset_s = np.asarray(boxes.offset_ns[:, None] * 1e-9, np.float64)
+    return poses.exp(offset_s * twist) @ boxes.T_lidar_box
+
+
+def _is_annotated(view: BoxView | None, points: Float) -> Bool:
+    """Return (N,) True for the points (N,3, lidar frame) in the annotated image area."""
+    if view is None:
+        return np.ones(len(points), bool)
+    uv, visible = image_points(view.camera, poses.transform(view.camera.T_cam_lidar, points))
+    with np.errstate(invalid="ignore"):
+        for left, top, right, bottom in view.left_out_px:
+            inside = (uv >= (left, top)) & (uv <= (right, bottom))
+            visible &= ~inside.all(axis=1)
+    return visible

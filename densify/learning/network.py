@@ -238,8 +238,7 @@ class Model:
     """A network with its weights."""
 
     network: Voxels
-    # How the network was trained, plain values for JSON
-    made: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # how it was trained, for JSON
 
     def flow(self, sweeps: Sweeps) -> Float:
         """Return `Voxels.forward` as an array, with the same bytes on any number of cores."""
@@ -250,7 +249,7 @@ class Model:
 
 def write_model(path: Path, model: Model) -> None:
     """Write a model file. The same model gives the same bytes."""
-    header = {"format": FORMAT, "version": VERSION, "network": NETWORK, "made": model.made}
+    header = {"format": FORMAT, "version": VERSION, "network": NETWORK, "made": model.provenance}
     text = json.dumps(header, sort_keys=True).encode()
     arrays: dict[str, NDArray[Any]] = {_HEADER: np.frombuffer(text, np.uint8)}
     for name, tensor in model.network.state_dict().items():

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -129,9 +130,9 @@ def errors_by_part(
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]
     masks: dict[str, Bool | None] = {"all": None}
-    for near_m, far_m in zip(_RANGES_M, (*_RANGES_M[1:], math.inf), strict=True):
-        name = f"over {near_m} m" if math.isinf(far_m) else f"{near_m}-{far_m} m"
-        masks[name] = (t >= near_m) & (t < far_m)
+    for near_m, far_m in pairwise(_RANGES_M):
+        masks[f"{near_m}-{far_m} m"] = (t >= near_m) & (t < far_m)
+    masks[f"over {_RANGES_M[-1]} m"] = t >= _RANGES_M[-1]
     edge = depth_edges(truth_m, focal_px=focal_px, baseline_m=baseline_m)[known]
     masks |= {"edge": edge, "not edge": ~edge}
     if moving is not None:

@@ -146,8 +146,7 @@ def turned(camera: Camera, offset: Float) -> Camera:
 def score(camera: Camera, views: Sequence[View]) -> tuple[float, int]:
     """Return the sum of image gradients at depth discontinuities, and the number in view."""
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
-    total = sum(float(line.scores(np.zeros((1, 4)))[0]) for line in lines)
-    return total, sum(len(line.uv) for line in lines)
+    return _sum(lines, np.zeros(4)), sum(len(line.uv) for line in lines)
 
 
 def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -> bool:
@@ -160,13 +159,12 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
     """
     view = View(silhouettes, *image_edges(image, camera.focal_px), np.zeros(6), 0.0)
     lines, turns = _Lines.of(camera, view, np.zeros(4)), _turns(np.zeros(1), np.zeros(1))
-    scores, near_given = lines.scores(turns), (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
-    best = [turns[mask][np.argmax(scores[mask])] for mask in (near_given, ~near_given)]
-    # best: the best turn within 0.3 degrees, then the best beyond
-    better = np.diff(lines.strengths(np.array(best)), axis=0)
-    rival = scores[_is_beside(turns, best[1])].max()
+    scores, is_small = lines.scores(turns), (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
+    small, large = (turns[mask][np.argmax(scores[mask])] for mask in (is_small, ~is_small))
+    better = np.diff(lines.strengths(np.stack([small, large])), axis=0)
+    rival = scores[_is_beside(turns, large)].max()
     median = np.median(scores)
-    stands_out = rival - median < _AS_HIGH * (scores[~near_given].max() - median)
+    stands_out = rival - median < _AS_HIGH * (scores[~is_small].max() - median)
     return bool(stands_out and better.sum() > _CLEARLY * np.sqrt((better**2).sum()))
 
 
@@ -177,7 +175,9 @@ def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
     """
     free = np.array([True, True, True, with_clock])
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
-    grid = _grid(free)
+    grid = _turns(_steps(2), np.zeros(1))
+    if with_clock:
+        grid = np.concatenate([grid, _turns(np.zeros(1), _steps(3))])
     thin = sum(len(line.uv) for line in lines) // _NUM_ON_GRID + 1
     on_grid = np.sum([line.scores(grid, thin) for line in lines], axis=0)
     usual = float(np.median(on_grid)) * thin
@@ -234,13 +234,6 @@ def _simplest(
 def num_changed(offsets: Float) -> Any:
     """Return the (M,) numbers of parameters that offsets (M,4) change by more than 3 blurs."""
     return (np.abs(offsets) > 3 * _BLURRED).sum(axis=-1)
-
-
-def _grid(free: Bool) -> Float:
-    """Return (M,4) offsets: pitches and yaws with each roll, then with each delay, if ``free``."""
-    roll, delay = _steps(2), _steps(3)
-    grids = [_turns(roll, np.zeros(1))] if free[2] else []
-    return np.concatenate([*grids, *([_turns(np.zeros(1), delay)] if free[3] else [])])
 
 
 def _steps(axis: int) -> Float:

@@ -7,12 +7,22 @@ Sources: Liu, Qi, Guibas, "FlowNet3D", CVPR 2019 (errors); Pontes et al., 3DV 20
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.geometry.types import Bool, Float
 
 STRICT, RELAXED = 0.05, 0.1
 """Limits of `accuracy`, both in metres and as a share of the true flow's length."""
+CLASSES = ("BACKGROUND", "CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU", "OBJECT")
+"""The challenge's classes; a point's class is the index. OBJECT is an object of unknown kind."""
+IGNORED = 255
+"""Class number of points that the challenge leaves out, such as signs."""
+_WITHIN_M = 35.0  # the challenge's range, on each side of the vehicle
+_MOVES_M = 0.05  # flow of a moving point, per sweep
+_EDGES_M = np.linspace(0, 2.0, 51)  # lower edges of the buckets; the first holds static points
 
 
 def end_point_errors(estimated: Float, true: Float) -> Float:
@@ -51,3 +61,63 @@ def angle_error_rad(estimated: Float, true: Float) -> float:
 def mean_of(values: Float | Bool) -> float:
     """Return the mean of the values, NaN if there are none."""
     return float(values.mean()) if len(values) else float("nan")
+
+
+def challenge_scores(
+    points: Float, estimated: Float, true: Float, classes: NDArray[Any]
+) -> dict[str, Any]:
+    """Score flow as the Argoverse 2 scene flow challenges do, within 35 m of the vehicle.
+
+    Args:
+        points: (N,3) metres, vehicle frame, of all pairs of sweeps, without the ground.
+        estimated: (N,3) flow to the next sweep.
+        true: (N,3) true flow to the next sweep.
+        classes: (N,) indices in `CLASSES`, or `IGNORED`.
+
+    Returns:
+        ``three_way``: mean errors in metres of moving objects (0.05 m a sweep or more), of other
+            objects, of the background, and the mean of the three (Chodosh, Ramanan, Lucey, WACV
+            2024; the package av2). ``bucketed``: name of each class with points, and MEAN ->
+            ``static_m``, ``dynamic`` (Khatri et al., "I Can't Believe It's Not Scene Flow!", ECCV
+            2024; the package bucketed-scene-flow-eval). Points of a class are sorted into buckets
+            by their true flow. ``static_m`` is the mean error in the first bucket. ``dynamic`` is
+            the mean over the other buckets of error divided by true length. ``num_points``: number
+            of scored points.
+    """
+    scored = np.abs(points[:, :2]).max(axis=1, initial=0) < _WITHIN_M
+    scored &= classes < len(CLASSES)
+    error_m = end_point_errors(estimated, true)[scored]
+    length_m = np.linalg.norm(np.asarray(true, np.float64), axis=1)[scored]
+    class_number = classes[scored].astype(np.intp)
+    moves, is_object = length_m >= _MOVES_M, class_number > 0
+    three_way = {
+        "foreground_dynamic_m": mean_of(error_m[is_object & moves]),
+        "foreground_static_m": mean_of(error_m[is_object & ~moves]),
+        "background_static_m": mean_of(error_m[~is_object & ~moves]),
+    }
+    three_way["mean_m"] = sum(three_way.values()) / len(three_way)
+    bucket = np.digitize(length_m, _EDGES_M) - 1
+    bucketed = {
+        CLASSES[k]: _bucketed(*(x[class_number == k] for x in (error_m, length_m, bucket)))
+        for k in np.unique(class_number)
+    }
+    columns = {name: [row[name] for row in bucketed.values()] for name in ("static_m", "dynamic")}
+    means = {name: mean_of(_finite(column)) for name, column in columns.items()}
+    return {
+        "three_way": three_way,
+        "bucketed": {**bucketed, "MEAN": means},
+        "num_points": int(scored.sum()),
+    }
+
+
+def _bucketed(error_m: Float, length_m: Float, bucket: NDArray[np.intp]) -> dict[str, float]:
+    """Return the two scores of one class with points."""
+    errors, lengths = (np.bincount(bucket, x, len(_EDGES_M))[1:] for x in (error_m, length_m))
+    filled = lengths > 0
+    quotients = errors[filled] / lengths[filled]
+    return {"static_m": mean_of(error_m[bucket == 0]), "dynamic": mean_of(quotients)}
+
+
+def _finite(values: list[float]) -> Float:
+    array = np.array(values, np.float64)
+    return array[np.isfinite(array)]

@@ -1,18 +1,34 @@
 # SPDX-License-Identifier: MIT
-"""Compare the recorded motion between two sweeps with odometry from the sweeps themselves."""
+"""Compare poses of sweeps with other poses: true ones, or recorded ones with odometry."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from densify.geometry import poses
-from densify.geometry.types import Float
+from densify.geometry.types import Float, Stretch
 
 # Tolerance over half a second; an error of 1 % shifts surfaces by 0.1 m over 10 m.
 _OFF_M, _OFF_PER_M, _OFF_DEG = 0.03, 0.01, 0.3
+
+
+def window_pose_errors(
+    stretch: Stretch, key: int, T_world_lidar: Callable[[int], Float]
+) -> tuple[float, float]:
+    """Return the error of a window's poses relative to the key sweep's: metres, degrees.
+
+    Both are root mean squares over the sweeps. ``T_world_lidar`` returns a frame's true pose.
+    """
+    T_key_world = poses.inverse(T_world_lidar(key))
+    true = T_key_world @ np.stack([T_world_lidar(frame) for frame in stretch.frames])
+    estimated = np.stack([stretch.T_target_source(key, frame) for frame in stretch.frames])
+    off = poses.inverse(true) @ estimated
+    squared_m2, squared_rad2 = (off[:, :3, 3] ** 2, poses.log(off)[:, :3] ** 2)
+    off_m, off_rad = (np.sqrt(x.sum(axis=1).mean()) for x in (squared_m2, squared_rad2))
+    return float(off_m), float(np.rad2deg(off_rad))
 
 
 class RecordedError(NamedTuple):
@@ -26,11 +42,11 @@ class RecordedError(NamedTuple):
     @staticmethod
     def of(recorded: Sequence[Float], odometry: Sequence[Float]) -> RecordedError:
         """Compare the motions (4,4), one or more, from the first to the last sweep of a stretch."""
-        pairs = zip(recorded, odometry, strict=True)
-        apart = [poses.log(poses.inverse(a) @ b) for a, b in pairs]
-        way_m = np.array([np.linalg.norm(T[:3, 3]) for T in odometry])
-        off_m = np.array([np.linalg.norm(d[3:]) for d in apart])
-        off_deg = float(np.rad2deg(np.median([np.linalg.norm(d[:3]) for d in apart])))
+        T_recorded, T_odometry = np.stack(recorded), np.stack(odometry)
+        apart = poses.log(poses.inverse(T_recorded) @ T_odometry)
+        way_m = np.linalg.norm(T_odometry[:, :3, 3], axis=1)
+        off_rad, off_m = (np.linalg.norm(x, axis=1) for x in np.hsplit(apart, 2))
+        off_deg = float(np.rad2deg(np.median(off_rad)))
         cost = max(float(np.median(off_m / (_OFF_M + _OFF_PER_M * way_m))), off_deg / _OFF_DEG)
         return RecordedError(float(np.median(off_m)), off_deg, cost, float(way_m.max()))
 
