@@ -17,7 +17,7 @@ from densify.depth import moving_bodies as stage
 from densify.depth.exposure import Exposure
 from densify.depth.moving_bodies import moving_bodies, without_sweep
 from densify.depth.project import project
-from densify.depth.seen_through import Rays
+from densify.depth.rays import Rays
 from densify.geometry.types import Stretch
 
 CAMERA = make_camera(width=420, height=160, focal=400.0)

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.depth.accumulate import accumulate, object_tracks
-from densify.depth.object_boxes import complete_boxes, grown
-from densify.depth.seen_through import Rays
+from densify.pipeline.accumulate import accumulate, object_tracks
+from densify.depth.rays import complete_boxes, grown
+from densify.depth.rays import Rays
 from densify.free_space.ground import HeightMap
 from densify.geometry.types import FlowField, ObjectTrack, RegisteredSweep, Stretch, Sweep
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.depth.accumulate import object_tracks
+from densify.pipeline.accumulate import object_tracks
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Stretch
 from tests.exact_motion import CAR, FRAMES, KEY, T_world_lidar, scene, turning

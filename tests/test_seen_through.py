@@ -10,7 +10,7 @@ from test_project import KEY, T_CAM_LIDAR, make_camera, make_cloud, patches_of
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure
 from densify.depth.project import project
-from densify.depth.seen_through import Rays, crossings
+from densify.depth.rays import Rays, crossings
 from densify.geometry.poses import exp, transform
 from densify.geometry.types import RegisteredSweep, Stretch, Sweep
 

@@ -20,12 +20,12 @@ import numpy as np
 
 from densify.config import Config, as_mapping, resolve
 from densify.config.errors import InputError
-from densify.depth.accumulate import accumulate
 from densify.flow.engines import Scene, estimate_motion
 from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.free_space.range_image import RangeImage
 from densify.geometry import poses
 from densify.geometry.types import Bool, Float, FlowField, LidarSequence, Progress, Stretch, Truth
+from densify.pipeline.accumulate import accumulate
 from densify.pipeline.recording import Recording
 from densify.readers.flow_files import LabelledFlow, labelled_flow
 from densify.scores.challenge import CLASSES, ChallengeScorer

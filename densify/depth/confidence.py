@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from densify.depth.layers import Layers
-from densify.depth.measured_pixels import ALL_ROUND
+from densify.depth.measured_pixels import ALL_ROUND, MapRecord
 from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32, Int
 from densify.scores.depth_metrics import (
     DECADES,
@@ -51,7 +50,7 @@ _NUM_STEPS = 20
 _UNCONFIRMED = 2.7  # found / expected outliers of one sweep alone: 0.9 to 6, on six recordings
 
 
-def features(layers: Layers, since_key_ns: Int, camera: Camera) -> Float32:
+def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
     """Return the (P,10) features of the P pixels with a filled or rejected depth, row by row.
 
     Shares, steps and ages enter by their logarithm to base 10, because probabilities of errors are
@@ -61,27 +60,26 @@ def features(layers: Layers, since_key_ns: Int, camera: Camera) -> Float32:
     neighbouring rays.
 
     Args:
-        layers: The finished map, before `densify.depth.spots`.
+        record: The map, before `densify.depth.fill.measure_spots`.
         since_key_ns: (M,) ns from the key sweep of the points of the cloud.
         camera: Camera of the map.
     """
-    shown, rejected = layers.filled_m > 0, layers.rejected_m > 0
-    some, depth_m = shown | rejected, np.where(shown, layers.filled_m, layers.rejected_m)
-    measured = layers.depth_m > 0
-    gap_px = float(np.median(layers.gap_px))
-    nearest = nearest_measured(layers)
-    age_s = np.abs(since_key_ns[layers.point[nearest]]) * 1e-9 if measured.any() else 0 * depth_m
-    edge = np.where(measured, layers.edge, 0)[nearest]
-    if layers.solid is not None:
-        edge[layers.solid] = ALL_ROUND
-    step = _step(depth_m, layers.filled_m, _size(1, gap_px)) / tolerance(depth_m, camera)
+    shown, rejected = record.filled_m > 0, record.rejected_m > 0
+    some, depth_m = shown | rejected, np.where(shown, record.filled_m, record.rejected_m)
+    measured = record.depth_m > 0
+    gap_px = float(np.median(record.gap_px))
+    nearest = nearest_measured(record)
+    age_s = np.abs(since_key_ns[record.point[nearest]]) * 1e-9 if measured.any() else 0 * depth_m
+    edge = np.where(measured, record.edge, 0)[nearest]
+    edge[record.on_body] = ALL_ROUND
+    step = _step(depth_m, record.filled_m, _size(1, gap_px)) / tolerance(depth_m, camera)
     around_px = _size(2, gap_px)
     cover = _mean(shown, around_px) / _mean(np.ones_like(shown), around_px)  # within the image
     columns = [
         np.ones(shown.shape),
         ~measured,
-        _logarithm(1 - layers.votes, _LEAST_VOTES),
-        *(_rejected(layers, _size(reach, gap_px)) for reach in (2, 8)),
+        _logarithm(1 - record.votes, _LEAST_VOTES),
+        *(_rejected(record, _size(reach, gap_px)) for reach in (2, 8)),
         _logarithm(step, _LEAST_STEP),
         _logarithm(age_s, _AGE_S),
         -np.log2(np.maximum(cover, _LEAST_COVER)),
@@ -91,10 +89,10 @@ def features(layers: Layers, since_key_ns: Int, camera: Camera) -> Float32:
     return np.stack([column[some] for column in columns], axis=1).astype(np.float32)
 
 
-def nearest_measured(layers: Layers) -> tuple[Int, Int]:
+def nearest_measured(record: MapRecord) -> tuple[Int, Int]:
     """Return the (H,W) rows and the (H,W) columns of the nearest measured pixel of each pixel."""
     row, column = ndimage.distance_transform_edt(
-        layers.depth_m == 0, return_distances=False, return_indices=True
+        record.depth_m == 0, return_distances=False, return_indices=True
     )
     return row, column
 
@@ -121,9 +119,9 @@ def _mean(mask: Bool, size_px: int) -> Float32:
     return mean
 
 
-def _rejected(layers: Layers, size_px: int) -> Float:
+def _rejected(record: MapRecord, size_px: int) -> Float:
     """Return the (H,W) logarithm of the share of boundary pixels around that are not accepted."""
-    rejected, measured = (layers.rim_m > 0) & (layers.depth_m == 0), layers.depth_m > 0
+    rejected, measured = (record.boundary_m > 0) & (record.depth_m == 0), record.depth_m > 0
     share = _mean(rejected, size_px) / np.maximum(_mean(rejected | measured, size_px), 1e-4)
     return _logarithm(share, _LEAST_SHARE)
 
@@ -144,6 +142,11 @@ def confidence_of(evidence: NDArray[np.floating], weights: Float | None = None) 
     used = np.array([*WEIGHTS.values()]) if weights is None else weights
     log_p = -np.logaddexp(0, -(evidence @ used)) / np.log(10)
     return np.clip(-log_p / DECADES, 0, 1).astype(np.float32)
+
+
+def confidence_by_age(since_key_ns: Int) -> Float32:
+    """Return (M,) relative scores 1 / (1 + t) of 0 to 1, for sweeps t seconds from the key."""
+    return (1 / (1 + np.abs(since_key_ns) * 1e-9)).astype(np.float32)
 
 
 def most_certain(confidence: Float32, max_outliers: float, before: Float32 | None = None) -> Bool:

@@ -186,9 +186,9 @@ class Exposure:
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
         """Project points (N,3) to the image; metres, key sweep's lidar frame at its reference time.
 
-        Moving points advance by their velocity (N,3), ego-motion removed, to the exposure. With a
-        rolling shutter each row or column has its own exposure time. Points beside or behind a wide
-        lens have no z and are not inside.
+        Moving points advance by their velocity, (N,3) or (3,) for all, ego-motion removed, to the
+        exposure. With a rolling shutter each row or column has its own exposure time. Points beside
+        or behind a wide lens have no z and are not inside.
         """
         late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, late)

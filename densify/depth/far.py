@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from densify.depth.accumulate import confidence_of
+from densify.depth.confidence import confidence_by_age
 from densify.depth.exposure import AT_ONCE, Exposure
-from densify.depth.image_points import HIDDEN_FRACTION
-from densify.depth.patches import tangents
+from densify.depth.patches import HIDDEN_FRACTION, tangents
 from densify.free_space.range_image import RangeImage
 from densify.free_space.seen_through import FREE_MARGIN
 from densify.free_space.sensor import Sensors
@@ -105,10 +104,7 @@ def standing(sensors: Sensors, registered: RegisteredSweep, gone: Bool) -> Stand
     """Return a sweep's points that are not ``gone`` (N,), world frame, with their patches."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     source = np.zeros(len(sweep), np.int32)
-    wanted = np.ones(len(source), bool)
-    normal, spacing_m = tangents(
-        sweep.points, sweep.lidar, source, wanted, sensors, [sensors.origins_m]
-    )
+    normal, spacing_m = tangents(sweep.points, sweep.lidar, source, sensors, [sensors.origins_m])
     return StandingWorld(
         points=poses.transform(T_world_lidar, sweep.points).astype(np.float32),
         normal=poses.rotate(T_world_lidar, normal.astype(np.float64)).astype(np.float32),
@@ -202,7 +198,7 @@ def far_cloud(
         moving=np.zeros(num, bool),
         instance=np.full(num, -1, np.int32),
         velocity_m_s=np.zeros((num, 3), np.float32),
-        confidence=confidence_of(since_key_ns)[world.source],
+        confidence=confidence_by_age(since_key_ns)[world.source],
         intensity=world.intensity,
         rgb=np.zeros((num, 3), np.uint8),
         far=np.ones(num, bool),

@@ -12,21 +12,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import Config, ProjectSettings
-from densify.depth.boundary_pixels import lab
 from densify.depth.confidence import reliability, tolerance, with_max_outliers
 from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.far import far_cloud
-from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
-from densify.depth.moving_bodies import (
-    MovingBody,
-    far_inside,
-    moving_bodies,
-    outlines,
-    without_sweep,
-)
-from densify.depth.patches import patches
+from densify.depth.measured_pixels import MapInputs
+from densify.depth.moving_bodies import far_inside, fronts
+from densify.depth.patches import hidden_m, patches
 from densify.depth.project import project
-from densify.depth.seen_through import Rays
+from densify.depth.rays import MovingBody, Rays, moving_bodies, without_sweep
+from densify.depth.votes import lab
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.cameras import converted
@@ -156,8 +150,9 @@ class Views:
         settings = replace(self.settings, visibility=visible)
         maps = {}
         for name, view in seen.in_view.items():
-            shown = self.lab.get(name), self.rays, seen.bodies
-            depth_map = project(seen.cloud, view, settings, seen.patches, filled, *shown)
+            evidence = self.lab.get(name), self.rays, seen.bodies
+            inputs = MapInputs(seen.cloud, seen.patches, view, settings, filled, *evidence)
+            depth_map = project(inputs)
             maps[name] = replace(depth_map, warnings=(_OFF,)) if name in self.off else depth_map
         return maps
 
@@ -177,7 +172,7 @@ class Views:
             view = seen.in_view[name]
             u, v = np.rint(view.uv).astype(np.int64).T
             surface_m = depth[name].filled_m[v, u]
-            reach_m = surface_m + HIDDEN_M + HIDDEN_FRACTION * surface_m
+            reach_m = surface_m + hidden_m(surface_m)
             shows = (surface_m > 0) & (view.exposure.depth_m(view.points_cam) <= reach_m)
             rgb[view.rows[shows]] = image[v[shows], u[shows]]
         return replace(seen.cloud, rgb=rgb)
@@ -327,7 +322,7 @@ class HeldOut:
         def alone(returns: SeenCloud) -> dict[str, DepthMap]:
             """Return the maps of returns of the key sweep."""
             return {
-                name: project(returns.cloud, view, settings, returns.patches, filled=False)
+                name: project(MapInputs(returns.cloud, returns.patches, view, settings, False))
                 for name, view in returns.in_view.items()
             }
 
@@ -390,6 +385,6 @@ class HeldOut:
         away_px = ndimage.distance_transform_edt(self.key_alone[name].depth_m == 0)
         unjudged = away_px > self.gap_rad * self.views.exposures[name].camera.focal_px
         filled = maps.filled_m > 0
-        moving = outlines(bodies.values(), self.views.exposures[name])
+        moving = fronts(bodies.values(), self.views.exposures[name]) > 0
         masks = {"all": filled, "moving": filled & moving, "static": filled & ~moving}
         return {n: float(unjudged[p].mean()) if p.any() else None for n, p in masks.items()}

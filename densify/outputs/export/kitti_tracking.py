@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.depth.object_boxes import corners_of, grown
+from densify.depth.rays import corners_of, grown
 from densify.geometry import cameras, poses
 from densify.geometry.types import CameraView, Float, ObjectTrack
 from densify.outputs.atomic import write_file
