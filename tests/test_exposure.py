@@ -16,7 +16,6 @@ from tests.scenes import (
     TinySequence,
     World,
     by_flow,
-    car,
     street,
 )
 from tests.small_street import KEY, POSES_GIVEN, one_car
@@ -40,21 +39,6 @@ def test_an_image_of_another_moment_sees_from_where_the_camera_was(late_s):
     np.testing.assert_allclose(maps.age_s[found > 0], np.abs(since_s - late_s), atol=1e-6)
     assert len(np.unique(since_s)) == 3
     np.testing.assert_array_equal(np.isnan(maps.age_s), maps.filled_m == 0)
-
-
-def test_a_mover_is_shown_where_it_was_at_the_exposure():
-    """Oncoming at 20 m/s it is 1 m nearer after 50 ms."""
-    scene = Scene(
-        World((*street(), car(40, 0.5, 20, 1, yaw=np.pi))),
-        Arc(0, -1.5),
-        Scanner(num_azimuths=1200, sigma_m=0.01),
-    )
-    sequence = TinySequence(scene, range(13), late_s=0.05)
-    found = by_flow(sequence, 6, 2, config=POSES_GIVEN).depth["front"].depth_m
-    truth = sequence.truth.depth_m("front", 6)
-    on = sequence.truth.moving_mask("front", 6) & (found > 0)
-    assert on.sum() > 50
-    assert abs(np.median(found[on] - truth[on])) < 0.3
 
 
 def test_at_the_sweeps_time_the_shutter_does_not_matter():

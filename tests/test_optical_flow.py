@@ -13,6 +13,7 @@ from densify.geometry import poses
 from densify.geometry.types import Camera, Cloud, DepthMap, Reason
 from densify.outputs.depth_png import write_flow_png
 from densify.pipeline.run import run
+from tests.depth_scenes import at_pixel, make_cloud
 from tests.scenes import CAMERA, SWEEP_S, by_flow
 from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
 
@@ -23,35 +24,25 @@ T_OTHER_KEY = poses.exp(np.array([0.12, -0.15, 0.02, 0.1, 0.1, -0.6]))
 
 def seen(pixel, depth_m, velocity_m_s=(0, 0, 0)) -> Cloud:
     """Points at these (N,2) image coordinates and camera depths."""
-    pixel, z = np.atleast_2d(np.asarray(pixel, float)), np.atleast_1d(np.asarray(depth_m, float))
-    n = len(pixel)
-    ray = np.column_stack([pixel, np.ones(n)]) @ np.linalg.inv(SMALL.K).T
-    points = poses.transform(poses.inverse(T_CAM_KEY), ray * z[:, None])
-    velocity = np.tile(np.asarray(velocity_m_s, np.float32), (n, 1))
-    zeros = np.zeros(n, np.int32)
-    return Cloud(
-        *(points, points, zeros, np.zeros(n, np.int64), np.arange(n), np.zeros(n, np.uint8)),
-        *(zeros > 0, zeros, velocity),
-        *(np.ones(n, np.float32), np.ones(n, np.float32), np.zeros((n, 3), np.uint8)),
-        far=np.zeros(n, bool),
-    )
+    points_cam = at_pixel(SMALL, *np.transpose(pixel), np.asarray(depth_m, float))
+    cloud = make_cloud(poses.transform(poses.inverse(T_CAM_KEY), points_cam))
+    cloud.velocity_m_s[:] = velocity_m_s
+    return cloud
 
 
 def map_of(pixel, depth_m, kept=None) -> DepthMap:
     """kept: which of the cloud's points the pixels show; all if None."""
-    kept = np.ones(len(np.atleast_2d(pixel)), bool) if kept is None else np.array(kept)
+    kept = np.ones(len(pixel), bool) if kept is None else np.array(kept)
     reason = np.where(kept, Reason.KEPT, Reason.HIDDEN).astype(np.uint8)
     image = np.zeros((SMALL.height_px, SMALL.width_px), np.float32)
-    u, v = np.rint(np.atleast_2d(pixel)).astype(int).T
+    u, v = np.rint(pixel).astype(int).T
     image[v, u] = depth_m
-    frame = np.zeros(image.shape, np.int32)
-    return DepthMap("cam", image, image, image, frame, reason=reason)
+    return DepthMap("cam", image, image, image, np.zeros(image.shape, np.int32), reason=reason)
 
 
 def flow_of(cloud: Cloud, depth: DepthMap, seconds: float = 0.1, T_other=T_OTHER_KEY):
-    return optical_flow(
-        cloud, depth, Exposure(SMALL, T_CAM_KEY), Exposure(SMALL, T_other, late_s=seconds)
-    )
+    target = Exposure(SMALL, T_other, late_s=seconds)
+    return optical_flow(cloud, depth, Exposure(SMALL, T_CAM_KEY), target)
 
 
 @pytest.mark.parametrize("velocity_m_s", [(0, 0, 0), (3.0, -2.0, 1.0)])
@@ -75,9 +66,6 @@ def test_unknown_where_nothing_was_measured_or_it_falls_behind_the_other_camera(
     assert np.isnan(flow_of(cloud, depth, T_other=ahead)).all()
     nothing = map_of([[2, 2]], [4.0], kept=[])
     assert np.isnan(flow_of(cloud.select(np.zeros(2, bool)), nothing)).all()
-
-
-# --- the pipeline ---------------------------------------------------------------------------------
 
 
 def true_flow(sequence, other: int) -> tuple[np.ndarray, np.ndarray]:
@@ -129,26 +117,17 @@ def test_at_the_end_of_the_window_one_neighbour_is_missing():
     assert run(sequence, KEY, 0, "icp", config=POSES_GIVEN).optical_flow == {}
 
 
-# --- PNG ------------------------------------------------------------------------------------------
-
-
-def read_as_kitti(path) -> tuple[np.ndarray, np.ndarray]:
-    """flow_u = (I(:,:,1) - 2^15) / 64, flow_v of the second channel, valid the third."""
-    bgr = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert bgr.dtype == np.uint16 and bgr.shape[2] == 3
-    rgb = bgr[..., ::-1].astype(float)
-    return (rgb[..., :2] - 2**15) / 64, rgb[..., 2]
-
-
 def test_flow_png_is_kittis(tmp_path):
     rng = np.random.default_rng(0)
     flow = rng.uniform(-500, 500, (20, 30, 2)).astype(np.float32)
     flow[3, :5] = np.nan
     flow[4, 0, 1] = np.nan
     write_flow_png(tmp_path / "f.png", flow)
-    read, valid = read_as_kitti(tmp_path / "f.png")
+    # KITTI: flow_u = (I(:,:,1) - 2^15) / 64, flow_v of the second channel, valid the third
+    raw = cv2.imread(str(tmp_path / "f.png"), cv2.IMREAD_UNCHANGED)
+    assert raw.dtype == np.uint16 and raw.shape == (20, 30, 3)
+    read, valid = (raw[..., :0:-1].astype(float) - 2**15) / 64, raw[..., 0]
     known = np.isfinite(flow).all(axis=2)
     assert known.sum() == 594 and np.array_equal(valid, known)
     assert np.abs(read - flow)[known].max() <= 1 / 128
-    raw = cv2.imread(str(tmp_path / "f.png"), cv2.IMREAD_UNCHANGED)
     assert not raw[~known].any()

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_project import KEY, make_cloud, patches_of
 
 from densify.depth.patches import patches
 from densify.free_space.sensor import Sensors
 from densify.geometry.types import RegisteredSweep
+from tests.depth_scenes import KEY, make_cloud, patches_of
 from tests.fired import fired
 from tests.scenes import Arc, Box, World
 

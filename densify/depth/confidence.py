@@ -68,7 +68,7 @@ def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
     some, depth_m = shown | rejected, np.where(shown, record.filled_m, record.rejected_m)
     measured = record.depth_m > 0
     gap_px = float(np.median(record.gap_px))
-    nearest = nearest_measured(record)
+    nearest = nearest_pixel(measured)
     age_s = np.abs(since_key_ns[record.point[nearest]]) * 1e-9 if measured.any() else 0 * depth_m
     edge = np.where(measured, record.edge, 0)[nearest]
     edge[record.on_body] = ALL_ROUND
@@ -89,10 +89,10 @@ def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
     return np.stack([column[some] for column in columns], axis=1).astype(np.float32)
 
 
-def nearest_measured(record: MapRecord) -> tuple[Int, Int]:
-    """Return the (H,W) rows and the (H,W) columns of the nearest measured pixel of each pixel."""
+def nearest_pixel(known: Bool) -> tuple[Int, Int]:
+    """Return the (H,W) rows and the (H,W) columns of the nearest known pixel of each pixel."""
     row, column = ndimage.distance_transform_edt(
-        record.depth_m == 0, return_distances=False, return_indices=True
+        ~known, return_distances=False, return_indices=True
     )
     return row, column
 
@@ -180,29 +180,19 @@ def with_max_outliers(maps: DepthMap, max_outliers: float | None) -> DepthMap:
     rejected, shown = maps.rejected, maps.filled_m > 0
     if rejected is None or max_outliers is None:
         return replace(maps, rejected=None)
-    own, none = maps.confidence[shown], np.float32(0)
-    if shown.any() and outlier_probability(own).mean() > max_outliers:
-        kept = shown.copy()
-        kept[shown] = most_certain(own, max_outliers)
-        depth_m, filled_m, confidence = (
-            np.where(kept, values, none)
-            for values in (maps.depth_m, maps.filled_m, maps.confidence)
-        )
-        frame = np.where(kept, maps.frame, -1)
+    kept, back, confidence = shown.copy(), rejected.depth_m > 0, maps.confidence[shown]
+    if shown.any() and outlier_probability(confidence).mean() > max_outliers:
+        kept[shown] = most_certain(confidence, max_outliers)
+        back[:] = False
     else:
-        back = rejected.depth_m > 0
-        back[back] = most_certain(rejected.confidence[back], max_outliers, own)
-        measured = back & (rejected.frame >= 0)
-        depth_m = np.where(measured, rejected.depth_m, maps.depth_m)
-        filled_m = np.where(back, rejected.depth_m, maps.filled_m)
-        confidence = np.where(back, rejected.confidence, maps.confidence)
-        frame = np.where(measured, rejected.frame, maps.frame)
+        back[back] = most_certain(rejected.confidence[back], max_outliers, confidence)
+    measured = back & (rejected.frame >= 0)
     return replace(
         maps,
-        depth_m=depth_m,
-        filled_m=filled_m,
-        confidence=confidence,
-        frame=frame.astype(np.int32),
+        depth_m=np.select([measured, kept], [rejected.depth_m, maps.depth_m]),
+        filled_m=np.select([back, kept], [rejected.depth_m, maps.filled_m]),
+        confidence=np.select([back, kept], [rejected.confidence, maps.confidence]),
+        frame=np.select([measured, kept], [rejected.frame, maps.frame], np.int32(-1)),
         evidence=None,
         rejected=None,
     )

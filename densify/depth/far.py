@@ -12,7 +12,7 @@ import numpy as np
 
 from densify.depth.confidence import confidence_by_age
 from densify.depth.exposure import AT_ONCE, Exposure
-from densify.depth.patches import HIDDEN_FRACTION, tangents
+from densify.depth.patches import AGREE_M, HIDDEN_FRACTION, tangents
 from densify.free_space.range_image import RangeImage
 from densify.free_space.seen_through import FREE_MARGIN
 from densify.free_space.sensor import Sensors
@@ -34,7 +34,9 @@ from densify.geometry.types import (
 )
 
 _MOST_RANGE_M = 60.0
-_MOST_SPACING_M = 0.05  # enough, as many sweeps measure a surface; larger patches hide edges
+_MOST_SPACING_M = (
+    0.5 * AGREE_M
+)  # enough, as many sweeps measure a surface; larger patches hide edges
 _SLACK_M = 0.5
 _PRIME = 2_654_435_761  # its multiples visit any smaller number of points in mixed order
 _FEW_FILLED = 3  # least number of filled cells of nine, for a sweep beyond the window
@@ -167,26 +169,19 @@ def far_cloud(
     stretch: Stretch,
     key: int,
     exposures: Mapping[str, Exposure],
-    standing_only: bool,
 ) -> tuple[Cloud, Patches]:
     """Return the points beyond the window that a camera observes, and their patches.
 
     Both are in the key sweep's lidar frame. One point per pixel and step of depth is kept.
-    ``T_key_world`` (4,4) maps the world frame of ``world`` to that frame. ``standing_only`` leaves
-    out points that the first or the last sweep of the window saw through.
+    ``T_key_world`` (4,4) maps the world frame of ``world`` to that frame.
     """
     beyond = ~np.isin(world.frames, stretch.frames)
     rows = np.flatnonzero(beyond[world.source])
     needed = np.zeros(len(world), bool)
     for exposure in exposures.values():
         needed[_seen(world.points, rows, T_key_world, exposure)] = True
-    rows = np.flatnonzero(needed)
-    points = poses.transform(T_key_world, world.points.take(rows, axis=0).astype(np.float64))
-    if standing_only:
-        ends = sorted({stretch.frames[0], stretch.frames[-1]} - {key})
-        is_static = ~_gone(points, stretch, key, ends)
-        rows, points = rows[is_static], points[is_static]
-    world = world.select(rows)
+    world = world.select(needed)
+    points = poses.transform(T_key_world, world.points.astype(np.float64))
     num, since_key_ns = len(world), world.stamp_ns - stretch[key].sweep.stamp_ns
     cloud = Cloud(
         points=points,
@@ -228,13 +223,3 @@ def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) ->
     # A pixel is supported only by several sweeps, so neighbouring pixels take different sweeps.
     mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
     return rows[thinned(np.concatenate(cells), mixed, 1.0, 1)]
-
-
-def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:
-    """Return (M,) True for points (M,3), key frame, that a sweep of ``witnesses`` saw through."""
-    free = np.zeros(len(points), bool)
-    for frame in witnesses:
-        points_sweep = poses.transform(stretch.T_target_source(frame, key), points)
-        image = RangeImage.of(stretch[frame])
-        free |= image.sees_through(points_sweep, *FREE_MARGIN)
-    return free

@@ -12,8 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.depth.measured_pixels import AGREE_FRACTION, AGREE_M, MapRecord
-from densify.depth.patches import FOOTPRINT, HIDDEN_FRACTION, HIDDEN_M, plane
+from densify.depth.measured_pixels import MapRecord
+from densify.depth.patches import (
+    AGREE_FRACTION,
+    AGREE_M,
+    FOOTPRINT,
+    HIDDEN_FRACTION,
+    HIDDEN_M,
+    add_moments,
+    plane,
+)
 from densify.depth.votes import (
     DIRECTIONS,
     NONE,
@@ -31,10 +39,9 @@ LEAST_SHARE = 0.97
 """Share of the votes for a boundary pixel that is kept."""
 _FILL_SHARE, _STAR_SHARE = 0.9, 0.8  # share of the votes for a filled pixel
 _NUM_SIZES = 3  # of the windows, up to a half size of a spacing of rays
-_RIDGE_PX2 = 1e-7
 _MIN_PLANE_PX = 6  # fewer do not distinguish a plane from a step
 _MOST_PX = 120  # greatest half size of a window
-_STAR_MET, _STAR_GAP = 8, 7  # directions with a known pixel; neighbouring directions without
+_STAR_MET = len(DIRECTIONS) // 2  # least number of directions with a known pixel
 _STAR_SPREAD = 0.1  # greatest difference between the predictions, as a share of inverse depth
 _SPOT_PX = 4  # greatest half width of a spot
 
@@ -92,14 +99,6 @@ class _Known(NamedTuple):
     inverse: Float  # (K,) float64 inverse depth of each pixel, 1/m
 
 
-class _Inside(NamedTuple):
-    """The measured pixels in a window: inverse depth (1/m), columns and rows from the centre."""
-
-    inverse: Float
-    right: Float
-    down: Float
-
-
 def fill_between(filled_m: Float32, tilt: Float32, spacing_px: Float32, reach: float) -> None:
     """Interpolate empty pixels that have measured pixels on both sides, in place.
 
@@ -132,8 +131,9 @@ def _any(num, top, bottom, left, right):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _surrounded(num, top, bottom, left, right, row, column):  # type: ignore[no-untyped-def]
+def _surrounded(num, window, row, column):  # type: ignore[no-untyped-def]
     """Return True if a window has measured pixels to the left, to the right, above and below."""
+    top, bottom, left, right = window
     return (
         _any(num, top, bottom, left, column)
         and _any(num, top, bottom, column + 1, right)
@@ -143,52 +143,41 @@ def _surrounded(num, top, bottom, left, right, row, column):  # type: ignore[no-
 
 
 @inlined
-def _gather(known, top, bottom, left, right, row, column, inside):  # type: ignore[no-untyped-def]
-    """Put a window's pixels into ``inside``; return number, greatest and least inverse depth."""
+def _sum_up(known, window, row, column, m):  # type: ignore[no-untyped-def]
+    """Fill in the sums of a window's pixels for `plane`; return number, nearest, farthest."""
+    # window: its rows, its columns; nearest and farthest are inverse depths
+    top, bottom, left, right = window
+    reach_v, reach_u = max(row - top, bottom - 1 - row), max(column - left, right - 1 - column)
     num, w_near, w_far = 0, 0.0, np.inf
+    m[:] = 0.0
     for r in range(top, bottom):
         for k in range(known.before[r, left], known.before[r, right]):
-            w = known.inverse[k]
-            w_near, w_far = max(w_near, w), min(w_far, w)
-            inside.inverse[num] = w
-            inside.right[num] = known.column[k] - column
-            inside.down[num] = r - row
-            num += 1
+            w, du, dv = known.inverse[k], known.column[k] - column, r - row
+            # It falls to 0 just beyond the reach (px).
+            weight = (1 - abs(dv) / (reach_v + 1)) * (1 - abs(du) / (reach_u + 1))
+            add_moments(m, weight, du, dv, w)
+            num, w_near, w_far = num + 1, max(w_near, w), min(w_far, w)
     return num, w_near, w_far
 
 
 @inlined
-def _fit(inside, num, reach_u, reach_v):  # type: ignore[no-untyped-def]
-    """Fit a plane; return its inverse depth in the middle, both slopes, range of deviations."""
-    n = u = v = uu = uv = vv = w = uw = vw = 0.0
-    for i in range(num):
-        inverse, du, dv = inside.inverse[i], inside.right[i], inside.down[i]
-        # It falls to 0 just beyond the reach (px).
-        weight = (1 - abs(dv) / (reach_v + 1)) * (1 - abs(du) / (reach_u + 1))
-        n += weight
-        u += weight * du
-        v += weight * dv
-        uu += weight * du * du
-        uv += weight * du * dv
-        vv += weight * dv * dv
-        w += weight * inverse
-        uw += weight * du * inverse
-        vw += weight * dv * inverse
-    centre, slope_u, slope_v = plane(n, u, v, uu, uv, vv, w, uw, vw, _RIDGE_PX2)
+def _spread(known, window, row, column, centre, slope_u, slope_v):  # type: ignore[no-untyped-def]
+    """Return the range of the deviations of a window's pixels from a plane, in inverse depth."""
+    top, bottom, left, right = window
     low, high = np.inf, -np.inf
-    for i in range(num):
-        inverse = centre + inside.down[i] * slope_v
-        off = inside.inverse[i] - inverse - inside.right[i] * slope_u
-        low, high = min(low, off), max(high, off)
-    return centre, slope_u, slope_v, high - low
+    for r in range(top, bottom):
+        inverse = centre + (r - row) * slope_v
+        for k in range(known.before[r, left], known.before[r, right]):
+            off = known.inverse[k] - inverse - (known.column[k] - column) * slope_u
+            low, high = min(low, off), max(high, off)
+    return high - low
 
 
 @Kernel
 def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ignore[no-untyped-def]
     """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`."""
     height, width = filled_m.shape
-    capacity = (2 * _MOST_PX + 1) ** 2
-    inside = _Inside(np.empty(capacity), np.empty(capacity), np.empty(capacity))
+    m = np.empty(9)
     for p in range(first, last):
         row, column = p // width, p % width
         if filled_m[row, column] > 0:
@@ -202,15 +191,20 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ign
             if reach_u == before_u and reach_v == before_v:
                 continue
             before_u, before_v = reach_u, reach_v
-            top, bottom = max(row - reach_v, 0), min(row + reach_v + 1, height)
-            left, right = max(column - reach_u, 0), min(column + reach_u + 1, width)
-            if not _surrounded(known.num, top, bottom, left, right, row, column):
+            window = (
+                max(row - reach_v, 0),
+                min(row + reach_v + 1, height),
+                max(column - reach_u, 0),
+                min(column + reach_u + 1, width),
+            )
+            if not _surrounded(known.num, window, row, column):
                 continue
-            num, w_near, w_far = _gather(known, top, bottom, left, right, row, column, inside)
+            num, w_near, w_far = _sum_up(known, window, row, column, m)
             allowed = max(HIDDEN_M, HIDDEN_FRACTION / w_near)
             if num < _MIN_PLANE_PX and 1 / w_far - 1 / w_near > allowed:
                 continue
-            centre, slope_u, slope_v, spread = _fit(inside, num, reach_u, reach_v)
+            centre, slope_u, slope_v = plane(m)
+            spread = _spread(known, window, row, column, centre, slope_u, slope_v)
             if num >= _MIN_PLANE_PX and spread / (centre * centre) > allowed:
                 continue
             if centre > 0:
@@ -266,7 +260,7 @@ def _star(first, last, pixel, steps, inverse, tilt, spacing_px, predicted_m):  #
                 sum_w += w / k
                 weight += 1 / k
                 num += 1
-        if num < _STAR_MET or _widest_gap(met) > _STAR_GAP:
+        if num < _STAR_MET or _widest_gap(met) >= _STAR_MET:
             continue
         w = sum_w / weight
         if w_near - w_far <= _STAR_SPREAD * w:

@@ -18,41 +18,34 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import ProjectSettings
-from densify.depth.exposure import InView
+from densify.depth.exposure import InView, PointsInImage, points_in_image
 from densify.depth.patches import (
+    AGREE_FRACTION,
+    AGREE_M,
     FOOTPRINT,
     HIDDEN_FRACTION,
     HIDDEN_M,
-    PointsInImage,
+    add_moments,
     is_occluded,
     limited,
     plane,
-    points_in_image,
     sorted_by_pixel,
 )
 from densify.depth.rays import MovingBody, Rays
 from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Bool, Camera, Cloud, Float, Float32, Int, Patches, Reason
 
-AGREE_M, AGREE_FRACTION = 0.1, 0.02
-"""Greatest deviation between points on one surface: metres plus share of the depth."""
 _REACH = 0.65  # radius of the plane and of the sweeps that agree, in spacings of rays
-_SLACK_M = 0.015  # added to the radius of a discontinuity, for errors of registration
+_SLACK_M = 0.15 * AGREE_M  # added to the radius of a discontinuity, for errors of registration
 _EDGE_WINDOW_PX = 1.5  # width beyond the edge in which points must continue the surface
 # Sweeps beyond the window share errors, and continue a surface behind a nearer one.
 _FAR_SWEEPS, _FAR_EDGE = 6, 1.5
-_RIDGE_PX2 = 0.02
 _LEAST_PX, _MOST_PX = 3, 24  # limits of the radius
 ALL_ROUND = 3.0
 """Extent of a surface without a depth discontinuity nearby, in radii of a discontinuity."""
 _NUM_BITS = np.iinfo(np.int64).bits - 1  # sweeps are counted by their frame number modulo 63
 _BLOCK_PX = 16  # blocks within which the density of rays is about constant
 _JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
-
-
-def agree_m(depth_m: Float | Float32) -> Float | Float32:
-    """Return the greatest deviation between points on one surface at these depths."""
-    return AGREE_M + AGREE_FRACTION * depth_m
 
 
 class MapInputs(NamedTuple):
@@ -298,8 +291,8 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
     """Compare the points around pixel (v0, u0) with the tangent plane of point i."""
     # The plane has inverse depth centre (1/m) in the pixel, and visible points within agree (1/m)
     # of it agree. Points farther behind it within outer (px) show a discontinuity. Filled in are
-    # the sums m (9,) of the fit, the first nine arguments of `plane` with the deviation from the
-    # tangent plane as inverse depth, and the extent of the surface, reach (8,).
+    # the sums m (9,) of `plane`, of deviations from the tangent plane, and the extent of the
+    # surface, reach (8,).
     start, uv = points.start, points.uv
     inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
     su, sv, w0 = points.slope[i, 0], points.slope[i, 1], inverse[i]
@@ -326,15 +319,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
             agree_ns = min(agree_ns, age_ns[k]) if vouches else agree_ns
             _extend(reach, du if close else 0.0, dv if close else 0.0)
             weight = max(1 - abs(du) / (reach_u + 1), 0.0) * max(1 - abs(dv) / (reach_v + 1), 0.0)
-            m[0] += weight
-            m[1] += weight * du
-            m[2] += weight * dv
-            m[3] += weight * du * du
-            m[4] += weight * du * dv
-            m[5] += weight * dv * dv
-            m[6] += weight * off
-            m[7] += weight * du * off
-            m[8] += weight * dv * off
+            add_moments(m, weight, du, dv, off)
     # A bit for each sweep that agrees; True if no other sweep there is nearer to the key; True if a
     # point is close behind.
     return seen, agree_ns <= other_ns, behind
@@ -359,7 +344,7 @@ def _settle(first, last, points, shape, done, settled):  # type: ignore[no-untyp
         seen, supported, behind = _look_round(
             points, shape, i, u0, v0, centre, agree, inner + _EDGE_WINDOW_PX, m, reach
         )
-        off, _, _ = plane(m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], _RIDGE_PX2)
+        off, _, _ = plane(m)
         settled[0, p] = 1 / limited(centre + min(max(off, -agree), agree), w0)
         settled[1, p], settled[2, p] = _count(seen), supported
         settled[3, p] = ALL_ROUND

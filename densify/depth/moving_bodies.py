@@ -19,8 +19,8 @@ from scipy.sparse.linalg import cg
 
 from densify.depth.exposure import Exposure
 from densify.depth.fill import LEAST_SHARE
-from densify.depth.measured_pixels import MapRecord, agree_m
-from densify.depth.patches import FOOTPRINT, hidden_m
+from densify.depth.measured_pixels import MapRecord
+from densify.depth.patches import FOOTPRINT, HIDDEN_M, agree_m, hidden_m
 from densify.depth.rays import MovingBody, crossing, half_spaces
 from densify.depth.votes import ROUNDED, VOTERS_REACH, votes_for
 from densify.geometry import cameras
@@ -31,7 +31,7 @@ _PRIOR = 0.05  # number of rays that end on the body, assumed everywhere
 _WHOLE = 0.8  # closed share of the front from which a body is closed as a whole, as a car is
 _LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # share of rays that end on the body; a third at glass
 _VOTES_OF_WHOLE = 0.75  # share of the votes along the silhouette
-_DEEP_M = 0.6  # farther behind the front of the hull are seats, axles and the far side
+_DEEP_M = 3 * HIDDEN_M  # farther behind the front of the hull are seats, axles and the far side
 _STIFF, _HELD = 3.0, 0.01  # weights of a smooth and of a small offset, against one return
 _ROUNDING = float(np.finfo(np.float32).eps)  # of the stored depth
 _AGREES = 2.0  # tolerance, as a multiple of the tolerance between two static points of a surface

@@ -10,30 +10,33 @@ depth of a plane is linear, so planes are fitted in inverse depth.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.depth.exposure import Exposure, InView
+from densify.depth.exposure import PointsInImage
 from densify.free_space.sensor import Sensors
-from densify.geometry.cameras import pixels_per_metre
 from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.poses import rotate
 from densify.geometry.types import Bool, Camera, Cloud, Float, Float32, Int, Patches
 
+AGREE_M, AGREE_FRACTION = 0.1, 0.02
+"""Greatest deviation between points on one surface: metres plus share of the depth."""
 HIDDEN_M, HIDDEN_FRACTION = 0.2, 0.06
 """Least distance of an occluded point behind the nearest surface: metres plus share of depth."""
 FOOTPRINT = 0.35
 """Half size of a patch, and of the spot of a laser, in spacings of neighbouring rays."""
-_SLACK_M = 0.05  # added to the footprint, for errors of registration and flow
-_SAME_AGE_NS = 10_000_000
+_SLACK_M = 0.5 * AGREE_M  # added to the footprint, for errors of registration and flow
 _STEEP = 5.7  # greatest slope, 10 degrees of incidence; a steeper surface on one side is a step
-_BEND_M, _BEND = 0.10, 0.25  # greatest change of the slope, in metres and as a share
+_BEND = 0.25  # greatest change of the slope on one surface, as a share
 _AROUND, _MOST_CELLS = 5.0, 20  # radius of neighbours of unordered rays: spacings, most cells
 _RIDGE = 0.005  # share of the mean square distance of the neighbours
+_RIDGE_PX2 = 0.02  # added variance: pixels on one line do not tilt the plane across the line
 _MOST = 1.4  # greatest ratio of the extended inverse depth and that at the start
+
+
+def agree_m(depth_m: Float | Float32) -> Float | Float32:
+    """Return the greatest deviation between points on one surface at these depths."""
+    return AGREE_M + AGREE_FRACTION * depth_m
 
 
 def hidden_m(surface_m: Float | Float32) -> Float | Float32:
@@ -169,7 +172,7 @@ def _slope(slope_a, slope_b, step, range_m):  # type: ignore[no-untyped-def]
     """Return the slope of inverse range per radian from its slopes on both sides (NaN: unknown)."""
     metres = step * range_m * range_m  # of range per step, by a unit of slope
     # On one surface the mean, else the lesser slope, or 0 if that is a step in depth; step in rad
-    if abs(slope_a - slope_b) * metres <= _BEND_M + _BEND * abs(slope_a + slope_b) * metres:
+    if abs(slope_a - slope_b) * metres <= AGREE_M + _BEND * abs(slope_a + slope_b) * metres:
         return 0.5 * (slope_a + slope_b)
     if not abs(slope_a) <= abs(slope_b):  # NaN too
         slope_a = slope_b
@@ -256,7 +259,7 @@ def _tangents_anywhere(first, last, members, spherical, table, grid, cells, norm
                         continue  # the point itself, or its equal
                     num += 1
                     off_m = abs(w - slope_u * u - slope_v * v) * range_m * range_m
-                    if turn and off_m > _BEND_M + _BEND * abs(w) * range_m * range_m:
+                    if turn and off_m > AGREE_M + _BEND * abs(w) * range_m * range_m:
                         continue
                     num_kept += 1
                     uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
@@ -265,116 +268,6 @@ def _tangents_anywhere(first, last, members, spherical, table, grid, cells, norm
             if 2 * num_kept < num:  # no plane: the patch faces the scanner
                 slope_u, slope_v = 0.0, 0.0
         _put(i, spherical, table, slope_u * flatten, slope_v, normal, spacing)
-
-
-@dataclass(frozen=True)
-class PointsInImage:
-    """The K points of a cloud in an image."""
-
-    index: Int  # (K,) indices of the points in the cloud
-    uv: Float  # (K,2) column and row in px
-    depth: Float32  # (K,) depth in m
-    focal_px: Float  # (K,2) local scale, px per metre at a depth of 1 m
-    # (K,2) slope of the tangent plane's inverse depth to the right and down, 1/m per px
-    slope: Float
-    spacing_px: Float  # (K,2) spacing of neighbouring rays, across and down
-    frame: np.ndarray  # (K,) frame number of the source sweep
-    age_ns: Int  # (K,) time between the source sweep and the key sweep, see `_ages_ns`
-    far: Bool  # (K,) True for points of sweeps beyond the window
-
-    def select(self, keep: Bool) -> PointsInImage:
-        """Return the points where ``keep`` (K,) is True."""
-        if keep.all():
-            return self
-        rows = np.flatnonzero(keep)
-        return PointsInImage(
-            **{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)}
-        )
-
-    @property
-    def inverse(self) -> Float:
-        """The (K,) inverse depths in 1/m."""
-        return 1 / self.depth.astype(np.float64)
-
-
-def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInImage:
-    """Return the points of the cloud in the view, with the patches' size and slope in pixels."""
-    by_row = np.argsort(np.rint(view.uv[:, 1]).astype(np.uint16), kind="stable")
-    exposure, index = view.exposure, view.rows[by_row]
-    points_cam = view.points_cam.take(by_row, axis=0)
-    depth = exposure.depth_m(points_cam).astype(np.float32)
-    normal = rotate(exposure.T_cam_key, patches.normal.take(index, axis=0).astype(np.float64))
-    plain = exposure.camera.is_rectified and exposure.measure == "z"
-    focal_px, slope, spacing_px = (_pinhole if plain else _any_lens)(
-        exposure, points_cam, depth, normal, patches.spacing_m.take(index, axis=0)
-    )
-    frame, far = cloud.frame[index], cloud.far[index]
-    return PointsInImage(
-        index=index,
-        uv=view.uv.take(by_row, axis=0),
-        depth=depth,
-        focal_px=focal_px,
-        slope=np.nan_to_num(slope, posinf=0.0, neginf=0.0),
-        spacing_px=spacing_px,
-        frame=frame,
-        age_ns=_ages_ns(cloud.since_key_ns[index], frame, far),
-        far=far,
-    )
-
-
-def _pinhole(
-    exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
-) -> tuple[Float, Float, Float]:
-    """Return focal_px, slope and spacing_px of `PointsInImage` for z depth in a rectified image."""
-    focal_px = exposure.camera.K[[0, 1], [0, 1]]
-    # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
-    d = np.einsum("ij,ij->i", normal, points_cam)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope = normal[:, :2] / (d[:, None] * focal_px)
-    everywhere = np.broadcast_to(focal_px, points_cam[:, :2].shape)
-    # Patches count as facing the camera.
-    return everywhere, slope, spacing_m * focal_px / depth[:, None]
-
-
-def _any_lens(
-    exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
-) -> tuple[Float, Float, Float]:
-    """Return focal_px, slope and spacing_px of `PointsInImage` for any lens and measure."""
-    # If a point moves on the plane n · p = d until the image moves by one pixel, p moves by
-    # δ = J⁺ - p (n · J⁺) / d, the inverse depth by -δ_z / z², and the inverse range by -p · δ / r³.
-    J = pixels_per_metre(exposure.camera, points_cam)
-    focal_px = np.linalg.norm(J, axis=2) * depth[:, None]
-    d = np.einsum("ij,ij->i", normal, points_cam)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        across = J.transpose(0, 2, 1) @ np.linalg.inv(J @ J.transpose(0, 2, 1))
-        along = -np.einsum("ij,ijk->ik", normal, across) / d[:, None]
-        if exposure.measure == "z":
-            z = points_cam[:, 2:]
-            slope = -(across[:, 2] + along * z) / z**2
-        else:
-            slope = -along / np.linalg.norm(points_cam, axis=1, keepdims=True)
-    # Rays of a scanner are spaced in azimuth and in elevation, about the key's upward axis.
-    azimuth_axis = np.cross(exposure.T_cam_key[:3, 2], points_cam)
-    azimuth_axis /= np.maximum(np.linalg.norm(azimuth_axis, axis=1, keepdims=True), 1e-9)
-    elevation_axis = np.cross(points_cam, azimuth_axis)
-    elevation_axis /= np.linalg.norm(elevation_axis, axis=1, keepdims=True)
-    px_per_m = [np.einsum("ijk,ik->ij", J, axis) for axis in (azimuth_axis, elevation_axis)]
-    spacing_px = np.hypot(px_per_m[0] * spacing_m[:, :1], px_per_m[1] * spacing_m[:, 1:])
-    return focal_px, slope, spacing_px
-
-
-def _ages_ns(since_key_ns: Int, frame: np.ndarray, far: Bool) -> Int:
-    """Return the (K,) times between the points' sweeps and the key sweep."""
-    ages_ns, in_window = np.abs(since_key_ns), np.flatnonzero(~far)
-    first = int(frame[in_window].min(initial=np.iinfo(np.int32).max))
-    sweep_ages_ns = np.zeros(max(0, int(frame[in_window].max(initial=-1)) + 1 - first), np.int64)
-    sweep_ages_ns[frame[in_window] - first] = ages_ns[in_window]
-    for younger, older in pairwise(np.argsort(sweep_ages_ns, kind="stable")):
-        # Else clock jitter would decide between the sweeps before and after the key sweep.
-        if sweep_ages_ns[older] - sweep_ages_ns[younger] < _SAME_AGE_NS:
-            sweep_ages_ns[older] = sweep_ages_ns[younger]
-    ages_ns[in_window] = sweep_ages_ns[frame[in_window] - first]
-    return ages_ns
 
 
 def is_occluded(points: PointsInImage, camera: Camera) -> Bool:
@@ -476,14 +369,24 @@ def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def plane(n, u, v, uu, uv, vv, w, uw, vw, ridge):  # type: ignore[no-untyped-def]
-    """Return the inverse depth at the origin and both slopes of the least-squares plane.
+def add_moments(m, weight, u, v, w):  # type: ignore[no-untyped-def]
+    """Add a pixel, at offset (u, v) with inverse depth w, to the sums m (9,) of `plane`."""
+    m[0] += weight
+    m[1] += weight * u
+    m[2] += weight * v
+    m[3] += weight * u * u
+    m[4] += weight * u * v
+    m[5] += weight * v * v
+    m[6] += weight * w
+    m[7] += weight * u * w
+    m[8] += weight * v * w
 
-    ``ridge`` is a variance in px² added in both directions. With it, pixels on one line do not tilt
-    the plane across the line. The other arguments are sums over pixels: of the weight (n), and of
-    the weight times products of column offset u, row offset v and inverse depth w.
-    """
-    u, v, w = u / n, v / n, w / n
-    uu, vv, uv = uu / n - u * u + ridge, vv / n - v * v + ridge, uv / n - u * v
-    slope_u, slope_v = slopes(uu, uv, vv, uw / n - u * w, vw / n - v * w)
+
+@inlined
+def plane(m):  # type: ignore[no-untyped-def]
+    """Return inverse depth at the origin and both slopes of the least-squares plane of m (9,)."""
+    n = m[0]
+    u, v, w = m[1] / n, m[2] / n, m[6] / n
+    uu, vv, uv = m[3] / n - u * u + _RIDGE_PX2, m[5] / n - v * v + _RIDGE_PX2, m[4] / n - u * v
+    slope_u, slope_v = slopes(uu, uv, vv, m[7] / n - u * w, m[8] / n - v * w)
     return w - slope_u * u - slope_v * v, slope_u, slope_v

@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.depth.confidence import confidence_of, features, nearest_measured
+from densify.depth.confidence import confidence_of, features, nearest_pixel
 from densify.depth.exposure import Exposure, InView
 from densify.depth.fill import accept_boundary_pixels, fill, fill_stars, measure_spots
-from densify.depth.measured_pixels import MapInputs, MapRecord, agree_m, measure
+from densify.depth.measured_pixels import MapInputs, MapRecord, measure
 from densify.depth.moving_bodies import close_bodies
-from densify.depth.patches import FOOTPRINT, hidden_m
+from densify.depth.patches import FOOTPRINT, agree_m, hidden_m
 from densify.depth.rays import Rays
 from densify.geometry import poses
 from densify.geometry.types import Bool, Camera, Cloud, DepthMap, Float, Float32, Reason, Rejected
@@ -77,7 +77,7 @@ def _rate_by_age(record: MapRecord, cloud: Cloud) -> None:
     """Set the confidence of each pixel to that of the point that measured the nearest pixel."""
     shown = record.filled_m > 0
     if shown.any():
-        of_point = cloud.confidence[record.point[nearest_measured(record)]][shown]
+        of_point = cloud.confidence[record.point[nearest_pixel(record.depth_m > 0)]][shown]
         record.confidence[shown] = np.maximum(of_point, _LEAST_CONFIDENCE)
 
 

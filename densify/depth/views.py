@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import Config, ProjectSettings
-from densify.depth.confidence import reliability, tolerance, with_max_outliers
+from densify.depth.confidence import nearest_pixel, reliability, tolerance, with_max_outliers
 from densify.depth.exposure import Exposure, InView, Shot
 from densify.depth.far import far_cloud
 from densify.depth.measured_pixels import MapInputs
@@ -130,13 +130,9 @@ class Views:
         """Return the bodies of moving objects by instance number, from all points of the window."""
         return moving_bodies(cloud, self.rays, self.exposures.values())
 
-    def far(
-        self, world: StandingWorld, T_key_world: Float, stretch: Stretch, standing_only: bool
-    ) -> SeenCloud:
+    def far(self, world: StandingWorld, T_key_world: Float, stretch: Stretch) -> SeenCloud:
         """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`."""
-        cloud, surface = far_cloud(
-            world, T_key_world, stretch, self.key, self.exposures, standing_only
-        )
+        cloud, surface = far_cloud(world, T_key_world, stretch, self.key, self.exposures)
         return SeenCloud(cloud, surface, self.in_view(cloud))
 
     def depth(
@@ -277,8 +273,7 @@ def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, target: Expo
     hit[row, column] = True
     covered = (depth.depth_m > 0) & ~hit
     if covered.any():
-        nearest = ndimage.distance_transform_edt(~hit, return_distances=False, return_indices=True)
-        flow[covered] = flow[tuple(nearest)][covered]
+        flow[covered] = flow[nearest_pixel(hit)][covered]
     return flow
 
 
@@ -290,16 +285,11 @@ def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: f
     """
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
     age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
-    measured = depth.depth_m > 0
-    frames, frame_index = np.unique(depth.frame[measured], return_inverse=True)
+    measured, shown = depth.depth_m > 0, depth.filled_m > 0
     ages = np.full(measured.shape, np.nan, np.float32)
-    ages[measured] = np.array([age_s[int(f)] for f in frames])[frame_index]
-    filled = (depth.filled_m > 0) & ~measured
-    if len(frames) and filled.any():
-        row, column = ndimage.distance_transform_edt(
-            ~measured, return_distances=False, return_indices=True
-        )[:, filled]
-        ages[filled] = ages[row, column]
+    if measured.any():
+        frames, index = np.unique(depth.frame[nearest_pixel(measured)][shown], return_inverse=True)
+        ages[shown] = np.array([age_s[int(f)] for f in frames])[index]
     return replace(depth, age_s=ages)
 
 
@@ -318,20 +308,13 @@ class HeldOut:
         """Return the ground truth of a key sweep; ``cloud`` has its moving points' velocities."""
         settings = replace(views.settings, rims="strict", visibility=True)
         key_cloud = cloud.select(cloud.frame == views.key)
-
-        def alone(returns: SeenCloud) -> dict[str, DepthMap]:
-            """Return the maps of returns of the key sweep."""
-            return {
-                name: project(MapInputs(returns.cloud, returns.patches, view, settings, False))
-                for name, view in returns.in_view.items()
-            }
-
-        seen = views.see(key_cloud)
-        key_alone = alone(seen)
-        moving = {
-            name: (maps.depth_m > 0) & (maps.depth_m == key_alone[name].depth_m)
-            for name, maps in alone(views.see(key_cloud.select(key_cloud.moving))).items()
-        }
+        seen, key_alone, moving = views.see(key_cloud), {}, {}
+        for name, view in seen.in_view.items():
+            maps = project(MapInputs(key_cloud, seen.patches, view, settings, filled=False))
+            moves = (maps.reason == Reason.KEPT) & key_cloud.moving
+            column, row = np.rint(view.uv[moves[view.rows]]).astype(np.int64).T
+            key_alone[name], moving[name] = maps, np.zeros(maps.depth_m.shape, bool)
+            moving[name][row, column] = True
         gap_rad = seen.patches.spacing_m[:, 1] / np.linalg.norm(key_cloud.points, axis=1)
         known = gap_rad[np.isfinite(gap_rad) & (gap_rad > 0)]
         return HeldOut(views, key_alone, moving, float(np.median(known)) if len(known) else 0.0)
