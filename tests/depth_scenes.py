@@ -17,7 +17,8 @@ from densify.geometry.types import Camera, Cloud, RegisteredSweep, Sweep
 KEY, PERIOD_NS = 10, 100_000_000
 T_CAM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])  # axes only
 NO_POINTS = PointsInImage(
-    *(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros((0, 2))),
+    *(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0)),
+    np.zeros((0, 2)),
     *(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, int), np.zeros(0, int), np.zeros(0, bool)),
 )
 

@@ -81,18 +81,20 @@ def vote_twin(record, pixel, depth_m, surely):
     for right, down in ((0, 0), (aside, 0), (-aside, 0), (0, aside), (0, -aside)):
         votes_for, all_votes = doubt / 2, doubt
         for (u1, v1), (u2, v2) in DIRECTIONS.tolist():
+            change = 0.0
             for step in range(1, 200):
                 du, dv = step // 2 * u2 + step % 2 * u1, step // 2 * v2 + step % 2 * v1
                 if not (0 <= u + du < width and 0 <= v + dv < height):
                     break
                 if max(abs(du), abs(dv)) > votes.VOTERS_REACH * gap:
                     break
+                off = colour(v + down + dv, u + right + du) - colour(v + down, u + right)
+                change = max(change, off @ off)
                 if record.depth_m[v + dv, u + du]:
                     known = 1 / record.depth_m[v + dv, u + du]
                     predicted = known - record.tilt[v + dv, u + du] @ (du, dv)
                     predicted = min(max(predicted, known / 1.4), 1.4 * known)
-                    off = colour(v + down + dv, u + right + du) - colour(v + down, u + right)
-                    weight = np.exp(-(off @ off) / (2 * votes._COLOURS**2)) + votes._THROUGH
+                    weight = np.exp(-change / (2 * votes._COLOURS**2)) + votes._THROUGH
                     weight /= 1 + step / (votes._DECAY * gap)
                     same_m = HIDDEN_M + HIDDEN_FRACTION * depth_m
                     all_votes += weight
@@ -379,7 +381,8 @@ def measured_at(uv, spacing_px):
     measured, index = np.zeros(PLANE.shape, bool), 3 * np.arange(num) + 1  # others are outside
     measured[row, column], nothing = True, np.zeros(num, np.int64)
     points = PointsInImage(
-        *(index, uv, PLANE[row, column], np.ones((num, 2)), np.tile(tilt, (num, 1))),
+        *(index, uv, PLANE[row, column], 1 / PLANE[row, column].astype(float)),
+        *(np.ones((num, 2)), np.tile(tilt, (num, 1))),
         *(np.stack([spacing, 9 * spacing], 1), nothing, nothing, nothing > 0),
     )
     record = record_of(PLANE, measured, tilt=tilt, points=points)
@@ -402,7 +405,7 @@ def test_pixels_whose_middle_the_spot_covers_are_measured():
             assert record.point[v, u] == before.point[v, u]
         elif covers.any():
             nearest = np.flatnonzero(covers)[np.argmin(away_px[covers])]
-            assert record.point[v, u] == record.points.index[nearest]
+            assert record.point[v, u] == record.points.rows[nearest]
     known = record.depth_m > 0
     assert known.sum() > 2 * len(uv)
     np.testing.assert_array_equal(record.depth_m[known], PLANE[known])

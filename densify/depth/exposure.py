@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -254,13 +254,13 @@ def _exposure(
     )
 
 
-@dataclass(frozen=True)
-class PointsInImage:
+class PointsInImage(NamedTuple):
     """The K points of a cloud in an image."""
 
-    index: Int  # (K,) indices of the points in the cloud
+    rows: Int  # (K,) indices of the points in the cloud
     uv: Float  # (K,2) column and row in px
     depth: Float32  # (K,) depth in m
+    inverse: Float  # (K,) inverse depth in 1/m
     focal_px: Float  # (K,2) local scale, px per metre at a depth of 1 m
     # (K,2) slope of the tangent plane's inverse depth to the right and down, 1/m per px
     slope: Float
@@ -269,42 +269,34 @@ class PointsInImage:
     age_ns: Int  # (K,) time between the source sweep and the key sweep, see `_ages_ns`
     far: Bool  # (K,) True for points of sweeps beyond the window
 
-    def select(self, keep: Bool) -> PointsInImage:
-        """Return the points where ``keep`` (K,) is True."""
-        if keep.all():
-            return self
-        rows = np.flatnonzero(keep)
-        return PointsInImage(
-            **{f.name: getattr(self, f.name).take(rows, axis=0) for f in fields(self)}
-        )
-
-    @property
-    def inverse(self) -> Float:
-        """The (K,) inverse depths in 1/m."""
-        return 1 / self.depth.astype(np.float64)
+    def take(self, rows: Int) -> PointsInImage:
+        """Return the points at these indices, in their order."""
+        columns: Any = (column.take(rows, axis=0) for column in self)
+        return PointsInImage(*columns)
 
 
 def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInImage:
     """Return the points of the cloud in the view, with the patches' size and slope in pixels."""
     by_row = np.argsort(np.rint(view.uv[:, 1]).astype(np.uint16), kind="stable")
-    exposure, index = view.exposure, view.rows[by_row]
+    exposure, rows = view.exposure, view.rows[by_row]
     points_cam = view.points_cam.take(by_row, axis=0)
     depth = exposure.depth_m(points_cam).astype(np.float32)
-    normal = poses.rotate(exposure.T_cam_key, patches.normal.take(index, axis=0).astype(np.float64))
+    normal = poses.rotate(exposure.T_cam_key, patches.normal.take(rows, axis=0).astype(np.float64))
     plain = exposure.camera.is_rectified and exposure.measure == "z"
     focal_px, slope, spacing_px = (_pinhole if plain else _any_lens)(
-        exposure, points_cam, depth, normal, patches.spacing_m.take(index, axis=0)
+        exposure, points_cam, depth, normal, patches.spacing_m.take(rows, axis=0)
     )
-    frame, far = cloud.frame[index], cloud.far[index]
+    frame, far = cloud.frame[rows], cloud.far[rows]
     return PointsInImage(
-        index=index,
+        rows=rows,
         uv=view.uv.take(by_row, axis=0),
         depth=depth,
+        inverse=1 / depth.astype(np.float64),
         focal_px=focal_px,
         slope=np.nan_to_num(slope, posinf=0.0, neginf=0.0),
         spacing_px=spacing_px,
         frame=frame,
-        age_ns=_ages_ns(cloud.since_key_ns[index], frame, far),
+        age_ns=_ages_ns(cloud.since_key_ns[rows], frame, far),
         far=far,
     )
 

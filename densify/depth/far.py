@@ -169,11 +169,13 @@ def far_cloud(
     stretch: Stretch,
     key: int,
     exposures: Mapping[str, Exposure],
+    standing_only: bool,
 ) -> tuple[Cloud, Patches]:
     """Return the points beyond the window that a camera observes, and their patches.
 
     Both are in the key sweep's lidar frame. One point per pixel and step of depth is kept.
-    ``T_key_world`` (4,4) maps the world frame of ``world`` to that frame.
+    ``T_key_world`` (4,4) maps the world frame of ``world`` to that frame. ``standing_only`` leaves
+    out points that the first or the last sweep of the window saw through.
     """
     beyond = ~np.isin(world.frames, stretch.frames)
     rows = np.flatnonzero(beyond[world.source])
@@ -182,6 +184,9 @@ def far_cloud(
         needed[_seen(world.points, rows, T_key_world, exposure)] = True
     world = world.select(needed)
     points = poses.transform(T_key_world, world.points.astype(np.float64))
+    if standing_only:
+        is_static = ~_gone(points, stretch, key)
+        world, points = world.select(is_static), points[is_static]
     num, since_key_ns = len(world), world.stamp_ns - stretch[key].sweep.stamp_ns
     cloud = Cloud(
         points=points,
@@ -223,3 +228,12 @@ def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) ->
     # A pixel is supported only by several sweeps, so neighbouring pixels take different sweeps.
     mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
     return rows[thinned(np.concatenate(cells), mixed, 1.0, 1)]
+
+
+def _gone(points: Float, stretch: Stretch, key: int) -> Bool:
+    """Return (M,) True for points, key frame, that an end of the window saw through."""
+    free = np.zeros(len(points), bool)
+    for frame in {stretch.frames[0], stretch.frames[-1]} - {key}:
+        points_sweep = poses.transform(stretch.T_target_source(frame, key), points)
+        free |= RangeImage.of(stretch[frame]).sees_through(points_sweep, *FREE_MARGIN)
+    return free

@@ -39,6 +39,7 @@ LEAST_SHARE = 0.97
 """Share of the votes for a boundary pixel that is kept."""
 _FILL_SHARE, _STAR_SHARE = 0.9, 0.8  # share of the votes for a filled pixel
 _NUM_SIZES = 3  # of the windows, up to a half size of a spacing of rays
+_RIDGE_PX2 = 1e-7
 _MIN_PLANE_PX = 6  # fewer do not distinguish a plane from a step
 _MOST_PX = 120  # greatest half size of a window
 _STAR_MET = len(DIRECTIONS) // 2  # least number of directions with a known pixel
@@ -203,7 +204,7 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ign
             allowed = max(HIDDEN_M, HIDDEN_FRACTION / w_near)
             if num < _MIN_PLANE_PX and 1 / w_far - 1 / w_near > allowed:
                 continue
-            centre, slope_u, slope_v = plane(m)
+            centre, slope_u, slope_v = plane(m, _RIDGE_PX2)
             spread = _spread(known, window, row, column, centre, slope_u, slope_v)
             if num >= _MIN_PLANE_PX and spread / (centre * centre) > allowed:
                 continue
@@ -275,7 +276,7 @@ def measure_spots(record: MapRecord) -> None:
     """
     points, measured = record.points, np.flatnonzero(record.depth_m > 0)
     index_of = np.zeros(len(record.reason), np.int64)  # in the image, by index in the cloud
-    index_of[points.index] = np.arange(len(points.index))
+    index_of[points.rows] = np.arange(len(points.rows))
     point = index_of[record.point.flat[measured]]
     radius_px = np.minimum(FOOTPRINT * points.spacing_px[point, 0], _SPOT_PX)
     filled_m = np.where(record.depth_m == 0, record.filled_m, np.float32(0))

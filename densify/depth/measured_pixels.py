@@ -33,17 +33,19 @@ from densify.depth.patches import (
 )
 from densify.depth.rays import MovingBody, Rays
 from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.types import Bool, Camera, Cloud, Float, Float32, Int, Patches, Reason
+from densify.geometry.types import Bool, Camera, Cloud, Float32, Int, Patches, Reason
 
 _REACH = 0.65  # radius of the plane and of the sweeps that agree, in spacings of rays
 _SLACK_M = 0.15 * AGREE_M  # added to the radius of a discontinuity, for errors of registration
 _EDGE_WINDOW_PX = 1.5  # width beyond the edge in which points must continue the surface
 # Sweeps beyond the window share errors, and continue a surface behind a nearer one.
 _FAR_SWEEPS, _FAR_EDGE = 6, 1.5
+_RIDGE_PX2 = 0.02
 _LEAST_PX, _MOST_PX = 3, 24  # limits of the radius
 ALL_ROUND = 3.0
 """Extent of a surface without a depth discontinuity nearby, in radii of a discontinuity."""
-_NUM_BITS = np.iinfo(np.int64).bits - 1  # sweeps are counted by their frame number modulo 63
+# Sweeps are counted by the last six bits of their frame number, one bit of 64 each.
+_ONE, _LAST_BIT = np.uint64(1), 63
 _BLOCK_PX = 16  # blocks within which the density of rays is about constant
 _JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
 
@@ -123,7 +125,8 @@ def measure(inputs: MapInputs) -> MapRecord:
     from depth discontinuities.
     """
     camera, points = inputs.camera, points_in_image(inputs.cloud, inputs.view, inputs.patches)
-    shape, in_window = (camera.height_px, camera.width_px), points.select(~points.far)
+    shape = (camera.height_px, camera.width_px)
+    in_window = points.take(np.flatnonzero(~points.far)) if points.far.any() else points
     zero, no_image = np.zeros(shape, np.float32), np.zeros((0, 0, 3), np.float32)
     lab = no_image if inputs.lab is None else inputs.lab
     record = MapRecord(
@@ -175,10 +178,10 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
 
 def _measure_nearest(record: MapRecord, points: PointsInImage, camera: Camera) -> None:
     """Measure each pixel by its nearest point, without occlusion or support tests."""
-    start, order = sorted_by_pixel(points, np.zeros(len(points.index), np.int64), camera)
+    start, order = sorted_by_pixel(points, np.zeros(len(points.rows), np.int64), camera)
     pixel = np.flatnonzero(np.diff(start))
     nearest = order[start[pixel]]
-    record.reason[points.index] = Reason.NOT_CHOSEN
+    record.reason[points.rows] = Reason.NOT_CHOSEN
     record.depth_m.flat[pixel] = points.depth[nearest]
     record.edge.flat[pixel] = ALL_ROUND
     _set_source(record, points, pixel, nearest)
@@ -186,7 +189,7 @@ def _measure_nearest(record: MapRecord, points: PointsInImage, camera: Camera) -
 
 def _set_source(record: MapRecord, points: PointsInImage, pixel: Int, chosen: Int) -> None:
     """Set the source of flat pixels (P,): the ``chosen`` (P,) of the points in the image."""
-    record.point.flat[pixel] = points.index[chosen]
+    record.point.flat[pixel] = points.rows[chosen]
     record.tilt.reshape(-1, 2)[pixel] = points.slope[chosen]
 
 
@@ -199,8 +202,15 @@ def _measure_visible(
     """
     hidden = is_occluded(points, camera)
     reasons = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
-    pixel, winner, settled = _fit_surfaces(points, hidden, camera, record.depth_m > 0)
-    depth_m, num_sweeps, supported, edge = settled
+    last = int(points.age_ns.max(initial=0)) + 1
+    start, order = sorted_by_pixel(points, np.where(hidden, last, points.age_ns), camera)
+    done = record.depth_m > 0
+    settled = np.zeros((4, done.size), np.float32)
+    by_pixel = _ByPixel(points.take(order), hidden[order], start, done.shape)
+    _settle.over_rows(done.size, by_pixel, done.ravel(), settled)
+    pixel = np.flatnonzero(settled[0])
+    winner = order[start[pixel]]
+    depth_m, num_sweeps, supported, edge = settled[:, pixel]
     if beyond:
         # Beyond the window the sweep nearest to the key need not agree, but six sweeps must.
         is_supported, inside = num_sweeps >= _FAR_SWEEPS, edge >= _FAR_EDGE
@@ -211,7 +221,7 @@ def _measure_visible(
         used = is_supported
     reasons[winner[~is_supported]] = Reason.UNSUPPORTED
     set_by = points.far if beyond else ~points.far
-    record.reason[points.index[set_by]] = reasons[set_by]
+    record.reason[points.rows[set_by]] = reasons[set_by]
     pixel, winner, depth_m, edge, inside = (
         column[used] for column in (pixel, winner, depth_m, edge, inside)
     )
@@ -221,44 +231,13 @@ def _measure_visible(
     _set_source(record, points, pixel, winner)
 
 
-class _Visible(NamedTuple):
-    """K points in an image, sorted by pixel, occluded points last in each pixel."""
+class _ByPixel(NamedTuple):
+    """Points in an image sorted by pixel, occluded points last in each pixel."""
 
-    start: Int  # (H·W+1,) index of each pixel's first point, of `sorted_by_pixel`
-    uv: Float  # (K,2) column and row in px
-    inverse: Float  # (K,) inverse depth in 1/m
-    slope: Float  # (K,2) slope of the inverse depth, 1/m per px
-    edge_px: Float  # (K,) radius of a depth discontinuity
-    spacing_px: Float  # (K,2) spacing of neighbouring rays
-    sweep: NDArray[np.integer]  # (K,) frame number of the source sweep modulo 63
-    hidden: Bool
-    age_ns: Int  # (K,) time from the key sweep
-
-
-def _fit_surfaces(
-    points: PointsInImage, hidden: Bool, camera: Camera, done: Bool
-) -> tuple[Int, Int, Float32]:
-    """Return pixels (P,) with visible points, the best point of each, and (4,P) of `_settle`."""
-    # done: (H,W) pixels that are left out
-    last = int(points.age_ns.max(initial=0)) + 1
-    start, order = sorted_by_pixel(points, np.where(hidden, last, points.age_ns), camera)
-    settled = np.zeros((4, len(start) - 1), np.float32)
-    inverse = points.inverse
-    edge_px = FOOTPRINT * points.spacing_px[:, 0] + _SLACK_M * points.focal_px[:, 0] * inverse
-    visible = _Visible(
-        start,
-        points.uv.take(order, axis=0),
-        inverse[order],
-        points.slope.take(order, axis=0),
-        edge_px[order],
-        points.spacing_px.take(order, axis=0),
-        points.frame[order] % _NUM_BITS,
-        hidden[order],
-        points.age_ns[order],
-    )
-    _settle.over_rows(done.size, visible, done.shape, done.ravel(), settled)
-    pixel = np.flatnonzero(settled[0])
-    return pixel, order[start[pixel]], settled[:, pixel]
+    points: PointsInImage
+    hidden: Bool  # (K,) True for occluded points
+    start: Int  # (H·W+1,) index of each pixel's first point
+    shape: tuple[int, ...]  # height and width of the image
 
 
 @inlined
@@ -281,26 +260,26 @@ def _count(seen):  # type: ignore[no-untyped-def]
     """Return the number of sweeps, the bits set in ``seen``."""
     num_sweeps = 0
     while seen:
-        num_sweeps += seen & 1
-        seen >>= 1
+        num_sweeps += seen & _ONE
+        seen >>= _ONE
     return num_sweeps
 
 
 @inlined
-def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # type: ignore[no-untyped-def]
+def _look_round(by_pixel, i, u0, v0, centre, agree, outer, m, reach):  # type: ignore[no-untyped-def]
     """Compare the points around pixel (v0, u0) with the tangent plane of point i."""
     # The plane has inverse depth centre (1/m) in the pixel, and visible points within agree (1/m)
     # of it agree. Points farther behind it within outer (px) show a discontinuity. Filled in are
     # the sums m (9,) of `plane`, of deviations from the tangent plane, and the extent of the
     # surface, reach (8,).
-    start, uv = points.start, points.uv
-    inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
+    points, hidden, start, shape = by_pixel
+    uv, inverse, age_ns = points.uv, points.inverse, points.age_ns
     su, sv, w0 = points.slope[i, 0], points.slope[i, 1], inverse[i]
     far = (HIDDEN_M + HIDDEN_FRACTION / w0) * w0 * w0
     reach_u = _window(_REACH * points.spacing_px[i, 0])
     reach_v = _window(_REACH * points.spacing_px[i, 1])
     wide_u, wide_v = max(reach_u, _window(outer)), max(reach_v, _window(outer))
-    seen, behind = np.int64(0), False
+    seen, behind = np.uint64(0), False
     agree_ns = other_ns = age_ns[i]
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
@@ -315,7 +294,7 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
                 other_ns = min(other_ns, age_ns[k]) if vouches else other_ns
                 continue
             # No branches: half of them would be predicted wrongly.
-            seen |= np.int64(vouches) << np.int64(points.sweep[k])
+            seen |= np.uint64(vouches) << np.uint64(points.frame[k] & _LAST_BIT)
             agree_ns = min(agree_ns, age_ns[k]) if vouches else agree_ns
             _extend(reach, du if close else 0.0, dv if close else 0.0)
             weight = max(1 - abs(du) / (reach_u + 1), 0.0) * max(1 - abs(dv) / (reach_v + 1), 0.0)
@@ -326,25 +305,25 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
 
 
 @Kernel
-def _settle(first, last, points, shape, done, settled):  # type: ignore[no-untyped-def]
+def _settle(first, last, by_pixel, done, settled):  # type: ignore[no-untyped-def]
     """Find the depth of each pixel from the surrounding points that agree with its first point."""
     # settled (4,P): depth (m), sweeps that agree, 1 if no sweep nearer to the key disagrees, extent
     # of the surface in radii of discontinuities
     m, reach = np.empty(9), np.empty(8)
+    points, start, width = by_pixel.points, by_pixel.start, by_pixel.shape[1]
     for p in range(first, last):
-        i = points.start[p]
-        if done[p] or i == points.start[p + 1] or points.hidden[i]:
+        i = start[p]
+        if done[p] or i == start[p + 1] or by_pixel.hidden[i]:
             continue
-        v0, u0 = p // shape[1], p % shape[1]
+        v0, u0 = p // width, p % width
         w0, uv, slope = points.inverse[i], points.uv[i], points.slope[i]
         centre = w0 + slope[0] * (u0 - uv[0]) + slope[1] * (v0 - uv[1])
         agree = (AGREE_M + AGREE_FRACTION / w0) * w0 * w0
-        inner = points.edge_px[i]
+        inner = FOOTPRINT * points.spacing_px[i, 0] + _SLACK_M * points.focal_px[i, 0] * w0
+        outer = inner + _EDGE_WINDOW_PX
         m[:], reach[:] = 0.0, 0.0
-        seen, supported, behind = _look_round(
-            points, shape, i, u0, v0, centre, agree, inner + _EDGE_WINDOW_PX, m, reach
-        )
-        off, _, _ = plane(m)
+        seen, supported, behind = _look_round(by_pixel, i, u0, v0, centre, agree, outer, m, reach)
+        off, _, _ = plane(m, _RIDGE_PX2)
         settled[0, p] = 1 / limited(centre + min(max(off, -agree), agree), w0)
         settled[1, p], settled[2, p] = _count(seen), supported
         settled[3, p] = ALL_ROUND

@@ -30,7 +30,6 @@ _STEEP = 5.7  # greatest slope, 10 degrees of incidence; a steeper surface on on
 _BEND = 0.25  # greatest change of the slope on one surface, as a share
 _AROUND, _MOST_CELLS = 5.0, 20  # radius of neighbours of unordered rays: spacings, most cells
 _RIDGE = 0.005  # share of the mean square distance of the neighbours
-_RIDGE_PX2 = 0.02  # added variance: pixels on one line do not tilt the plane across the line
 _MOST = 1.4  # greatest ratio of the extended inverse depth and that at the start
 
 
@@ -383,10 +382,12 @@ def add_moments(m, weight, u, v, w):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def plane(m):  # type: ignore[no-untyped-def]
+def plane(m, ridge):  # type: ignore[no-untyped-def]
     """Return inverse depth at the origin and both slopes of the least-squares plane of m (9,)."""
+    # ridge: variance (px²) added in both directions: pixels on one line do not tilt the plane
+    # across the line
     n = m[0]
     u, v, w = m[1] / n, m[2] / n, m[6] / n
-    uu, vv, uv = m[3] / n - u * u + _RIDGE_PX2, m[5] / n - v * v + _RIDGE_PX2, m[4] / n - u * v
+    uu, vv, uv = m[3] / n - u * u + ridge, m[5] / n - v * v + ridge, m[4] / n - u * v
     slope_u, slope_v = slopes(uu, uv, vv, m[7] / n - u * w, m[8] / n - v * w)
     return w - slope_u * u - slope_v * v, slope_u, slope_v

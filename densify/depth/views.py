@@ -130,9 +130,12 @@ class Views:
         """Return the bodies of moving objects by instance number, from all points of the window."""
         return moving_bodies(cloud, self.rays, self.exposures.values())
 
-    def far(self, world: StandingWorld, T_key_world: Float, stretch: Stretch) -> SeenCloud:
+    def far(
+        self, world: StandingWorld, T_key_world: Float, stretch: Stretch, standing_only: bool
+    ) -> SeenCloud:
         """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`."""
-        cloud, surface = far_cloud(world, T_key_world, stretch, self.key, self.exposures)
+        of_key = stretch, self.key, self.exposures
+        cloud, surface = far_cloud(world, T_key_world, *of_key, standing_only)
         return SeenCloud(cloud, surface, self.in_view(cloud))
 
     def depth(

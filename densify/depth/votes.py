@@ -29,6 +29,7 @@ VOTERS_REACH = 6.0
 _DECAY = 1.2  # distance at which a vote counts half, in spacings of neighbouring rays
 _COLOURS = 6.0  # standard deviation of the colours of a surface, in L*a*b*
 _THROUGH = 0.001  # weight of a vote across an edge of the image
+_STRIDE = 3.0  # number of compared colours per spacing of rays, on the path to a voter
 _DOUBT = 0.04  # weight of a constant vote, half of it for the depth and half against
 _ASIDE = 0.6  # tested shift of the image, in spacings of neighbouring rays
 ROUNDED = 1 - 1e-6
@@ -185,20 +186,23 @@ def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-
 
 
 @inlined
-def _alike(lab, v, u, du, dv):  # type: ignore[no-untyped-def]
-    """Return the weight exp(-c² / 2 s²) + ``_THROUGH`` of a vote by the colours of both pixels."""
-    # c: distance of the colours (L*a*b*), s: _COLOURS
+def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
+    """Return the weight exp(-c² / 2 s²) + ``_THROUGH`` of a vote by the colours of the image."""
     if lab.size == 0:
         return 1 + _THROUGH
+    stride = max(np.int64(gap / _STRIDE), 1)
     height, width = lab.shape[:2]
     row, column = min(max(v, 0), height - 1), min(max(u, 0), width - 1)
-    beyond, beside = min(max(v + dv, 0), height - 1), min(max(u + du, 0), width - 1)
-    light = lab[beyond, beside, 0] - lab[row, column, 0]
-    a, b = (
-        lab[beyond, beside, 1] - lab[row, column, 1],
-        lab[beyond, beside, 2] - lab[row, column, 2],
-    )
-    return np.exp(-0.5 / (_COLOURS * _COLOURS) * (light * light + a * a + b * b)) + _THROUGH
+    light, a, b = lab[row, column, 0], lab[row, column, 1], lab[row, column, 2]
+    # c²: greatest squared colour distance from the start along the path; s is _COLOURS
+    change = np.float32(0)
+    for step in range((k - 1) % stride + 1, k + 1, stride):
+        du, dv = offset(d, step)
+        row, column = min(max(v + dv, 0), height - 1), min(max(u + du, 0), width - 1)
+        off_light, off_a = lab[row, column, 0] - light, lab[row, column, 1] - a
+        off_b = lab[row, column, 2] - b
+        change = max(change, off_light * off_light + off_a * off_a + off_b * off_b)
+    return np.exp(-0.5 / (_COLOURS * _COLOURS) * change) + _THROUGH
 
 
 @Kernel
@@ -224,8 +228,7 @@ def _vote(first, last, pixel, inverse, voters, lab, gap_px, surely, share):  # t
                 k = steps[d]
                 if k == 0:
                     continue
-                du, dv = offset(d, k)
-                weight = _alike(lab, v + down, u + right, du, dv) / (1 + k / (_DECAY * gap))
+                weight = _alike(lab, v + down, u + right, d, k, gap) / (1 + k / (_DECAY * gap))
                 votes += weight
                 votes_for += weight * agrees[d]
             least_share = min(least_share, votes_for / votes)

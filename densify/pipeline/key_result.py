@@ -163,7 +163,7 @@ def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
     if not method.far or scene.beyond is None:
         return None
     with scene.watch.stage("far"):
-        return scene.views.far(*scene.beyond, scene.stretch)
+        return scene.views.far(*scene.beyond, scene.stretch, standing_only=method.visible)
 
 
 def _add_ages(
