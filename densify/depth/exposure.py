@@ -116,6 +116,12 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
     return (before_ns + key_ns) // 2, (key_ns + after_ns) // 2
 
 
+def pixel_of(uv: Float) -> tuple[Int, Int]:
+    """Return the (K,) rows and the (K,) columns of the pixels at image coordinates (K,2)."""
+    column, row = np.rint(uv).astype(np.int64).T
+    return row, column
+
+
 class InView(NamedTuple):
     """The K points of a cloud that lie in an image."""
 

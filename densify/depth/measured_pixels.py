@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import ProjectSettings
-from densify.depth.exposure import InView, PointsInImage, points_in_image
+from densify.depth.exposure import InView, PointsInImage, pixel_of, points_in_image
 from densify.depth.patches import (
     AGREE_FRACTION,
     AGREE_M,
@@ -157,8 +157,8 @@ def measure(inputs: MapInputs) -> MapRecord:
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     """Return the (H,W,2) spacing of rays across and down, the mean over blocks of pixels."""
     height, width = (-(-size // _BLOCK_PX) for size in shape)
-    column, row = np.rint(points.uv).astype(np.int64).T // _BLOCK_PX
-    block = row * width + column
+    row, column = pixel_of(points.uv)
+    block = row // _BLOCK_PX * width + column // _BLOCK_PX
     num = np.bincount(block, minlength=height * width)
     if not num.any():
         return np.ones((*shape, 2), np.float32)

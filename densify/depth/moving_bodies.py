@@ -17,7 +17,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from densify.depth.exposure import Exposure
+from densify.depth.exposure import Exposure, pixel_of
 from densify.depth.fill import LEAST_SHARE
 from densify.depth.measured_pixels import MapRecord
 from densify.depth.patches import FOOTPRINT, HIDDEN_M, agree_m, hidden_m
@@ -103,7 +103,7 @@ class _Front(NamedTuple):
     def pixels(self, exposure: Exposure, points: Float, velocity_m_s: Float32) -> _Pixels:
         """Project points (N,3), key sweep's lidar frame, to pixels within the box."""
         sight = exposure.see(points, velocity_m_s)
-        column, row = np.rint(np.where(sight.inside, sight.uv.T, -1)).astype(np.int64)
+        row, column = pixel_of(np.where(sight.inside[:, None], sight.uv, -1))
         row, column = row - self.box[0].start, column - self.box[1].start
         height, width = self.inverse.shape
         shown = sight.inside & (row >= 0) & (row < height) & (column >= 0) & (column < width)

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.depth.exposure import PointsInImage
+from densify.depth.exposure import PointsInImage, pixel_of
 from densify.free_space.sensor import Sensors
 from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Bool, Camera, Cloud, Float, Float32, Int, Patches
@@ -275,9 +275,8 @@ def is_occluded(points: PointsInImage, camera: Camera) -> Bool:
     half_px = np.maximum(FOOTPRINT * points.spacing_px + slack_px, 0.5)
     nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
     paint(points.uv, points.inverse, points.slope, half_px, nearest)
-    column, row = np.rint(points.uv).astype(np.int64).T
     with np.errstate(divide="ignore"):
-        nearest_m = 1 / nearest[row, column].astype(np.float64)  # inf without a patch
+        nearest_m = 1 / nearest[pixel_of(points.uv)].astype(np.float64)  # inf without a patch
     occluded: Bool = points.depth - nearest_m > hidden_m(nearest_m)
     return occluded
 
@@ -312,7 +311,7 @@ def sorted_by_pixel(points: PointsInImage, rank: Int, camera: Camera) -> tuple[I
     The lowest ``rank`` (K,) comes first, then the nearest point. Returns ``start`` (H·W+1,) and
     ``order`` (K,): the points of pixel p are ``order[start[p]:start[p + 1]]``.
     """
-    column, row = np.rint(points.uv).astype(np.int64).T
+    row, column = pixel_of(points.uv)
     start = np.empty(camera.height_px * camera.width_px + 1, np.int64)
     order = np.empty(len(rank), np.int64)
     pixel = row * camera.width_px + column

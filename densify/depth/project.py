@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.depth.confidence import confidence_of, features, nearest_pixel
-from densify.depth.exposure import Exposure, InView
+from densify.depth.exposure import Exposure, InView, pixel_of
 from densify.depth.fill import accept_boundary_pixels, fill, fill_stars, measure_spots
 from densify.depth.measured_pixels import MapInputs, MapRecord, measure
 from densify.depth.moving_bodies import close_bodies
@@ -134,7 +134,7 @@ def reject_seen_through(record: MapRecord, cloud: Cloud, view: InView, rays: Ray
 
 def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
     """Return (H,W) the number of positions uv (K,2) in each pixel, blurred by ``blur_px``."""
-    column, row = np.rint(uv).astype(np.int64).T
+    row, column = pixel_of(uv)
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
     size = 2 * round(2.5 * blur_px) + 1
     pixels = counts.reshape(shape).astype(np.float32)
@@ -156,11 +156,10 @@ def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Expo
     uv, valid = sight.uv, sight.inside
     depth_m = np.full(len(to_key), np.inf)
     for _ in range(_NUM_STEPS):
-        column, row = np.rint(np.where(valid[:, None], uv, 0)).astype(np.int64).T
-        there_m = surface_m[row, column].astype(np.float64)
+        before_m, pixel = depth_m, pixel_of(np.where(valid[:, None], uv, 0))
+        depth_m = surface_m[pixel].astype(np.float64)
         with np.errstate(invalid="ignore"):
-            same = abs(there_m - depth_m) <= agree_m(depth_m)
-        depth_m = there_m
+            same = abs(depth_m - before_m) <= agree_m(before_m)
         share = _share(start, end, depth_m, exposure.measure)
         valid &= (depth_m > 0) & (share > 0) & (share < 1)
         share = np.where(valid, share, 1.0)[:, None]

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from densify.config import Config, ProjectSettings
 from densify.depth.confidence import nearest_pixel, reliability, tolerance, with_max_outliers
-from densify.depth.exposure import Exposure, InView, Shot
+from densify.depth.exposure import Exposure, InView, Shot, pixel_of
 from densify.depth.far import far_cloud
 from densify.depth.measured_pixels import MapInputs
 from densify.depth.moving_bodies import far_inside, fronts
@@ -169,11 +169,11 @@ class Views:
         rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
             view = seen.in_view[name]
-            u, v = np.rint(view.uv).astype(np.int64).T
-            surface_m = depth[name].filled_m[v, u]
+            pixel = pixel_of(view.uv)
+            surface_m = depth[name].filled_m[pixel]
             reach_m = surface_m + hidden_m(surface_m)
             shows = (surface_m > 0) & (view.exposure.depth_m(view.points_cam) <= reach_m)
-            rgb[view.rows[shows]] = image[v[shows], u[shows]]
+            rgb[view.rows[shows]] = image[pixel][shows]
         return replace(seen.cloud, rgb=rgb)
 
     def confident(self, seen: SeenCloud, cloud: Cloud, depth: Mapping[str, DepthMap]) -> Cloud:
@@ -188,11 +188,11 @@ class Views:
         """
         confidence = np.zeros(len(cloud), np.float32)
         for name, view in seen.in_view.items():
-            maps, (u, v) = depth[name], np.rint(view.uv).astype(np.int64).T
-            surface_m = maps.filled_m[v, u]
+            maps, pixel = depth[name], pixel_of(view.uv)
+            surface_m = maps.filled_m[pixel]
             off_m = abs(view.exposure.depth_m(view.points_cam) - surface_m)
             agrees = off_m <= surface_m * tolerance(surface_m, view.exposure.camera)
-            of_pixel = np.where(agrees & (surface_m > 0), maps.confidence[v, u], 0)
+            of_pixel = np.where(agrees & (surface_m > 0), maps.confidence[pixel], 0)
             confidence[view.rows] = np.maximum(confidence[view.rows], of_pixel)
         return replace(cloud, confidence=confidence)
 
@@ -238,9 +238,8 @@ class Views:
             farthest_first = np.argsort(-depth_m, kind="stable")
             lost = np.isin(reason[farthest_first], [Reason.KEPT, Reason.NOT_CHOSEN], invert=True)
             rejected = farthest_first[lost]
-            column, row = np.rint(view.uv[rejected]).astype(np.int64).T
             maps[name] = np.zeros(depth[name].depth_m.shape, np.uint8)
-            maps[name][row, column] = reason[rejected]
+            maps[name][pixel_of(view.uv[rejected])] = reason[rejected]
         return maps
 
     def movers(
@@ -269,11 +268,10 @@ def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, target: Expo
     chosen = np.flatnonzero(depth.reason == Reason.KEPT)
     points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
     uv = exposure.see(points, velocity_m_s).uv
-    column, row = np.rint(uv).astype(np.int64).T
     flow = np.full((*depth.depth_m.shape, 2), np.nan, np.float32)
-    flow[row, column] = target.see(points, velocity_m_s).uv - uv
     hit = np.zeros(depth.depth_m.shape, bool)
-    hit[row, column] = True
+    flow[pixel_of(uv)] = target.see(points, velocity_m_s).uv - uv
+    hit[pixel_of(uv)] = True
     covered = (depth.depth_m > 0) & ~hit
     if covered.any():
         flow[covered] = flow[nearest_pixel(hit)][covered]
@@ -315,9 +313,8 @@ class HeldOut:
         for name, view in seen.in_view.items():
             maps = project(MapInputs(key_cloud, seen.patches, view, settings, filled=False))
             moves = (maps.reason == Reason.KEPT) & key_cloud.moving
-            column, row = np.rint(view.uv[moves[view.rows]]).astype(np.int64).T
             key_alone[name], moving[name] = maps, np.zeros(maps.depth_m.shape, bool)
-            moving[name][row, column] = True
+            moving[name][pixel_of(view.uv[moves[view.rows]])] = True
         gap_rad = seen.patches.spacing_m[:, 1] / np.linalg.norm(key_cloud.points, axis=1)
         known = gap_rad[np.isfinite(gap_rad) & (gap_rad > 0)]
         return HeldOut(views, key_alone, moving, float(np.median(known)) if len(known) else 0.0)
