@@ -65,7 +65,7 @@ def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
         camera: Camera of the map.
     """
     shown, rejected = record.filled_m > 0, record.rejected_m > 0
-    some, depth_m = shown | rejected, np.where(shown, record.filled_m, record.rejected_m)
+    has_depth, depth_m = shown | rejected, np.where(shown, record.filled_m, record.rejected_m)
     measured = record.depth_m > 0
     gap_px = float(np.median(record.gap_px))
     nearest = nearest_pixel(measured)
@@ -86,7 +86,7 @@ def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
         np.clip(ALL_ROUND - edge, 0, ALL_ROUND - 1),
         rejected,
     ]
-    return np.stack([column[some] for column in columns], axis=1).astype(np.float32)
+    return np.stack([column[has_depth] for column in columns], axis=1).astype(np.float32)
 
 
 def nearest_pixel(known: Bool) -> tuple[Int, Int]:
@@ -240,10 +240,8 @@ def expected_outliers(maps: DepthMap) -> dict[str, float | None]:
     """Return the expected share of outliers of the ``measured`` and the ``filled`` map."""
     shares: dict[str, float | None] = {}
     for name, depth_m in (("measured", maps.depth_m), ("filled", maps.filled_m)):
-        some = depth_m > 0
-        shares[name] = (
-            float(outlier_probability(maps.confidence[some]).mean()) if some.any() else None
-        )
+        probability = outlier_probability(maps.confidence[depth_m > 0])
+        shares[name] = float(probability.mean()) if len(probability) else None
     return shares
 
 
@@ -262,13 +260,13 @@ def reliability(maps: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[s
     step = np.minimum((confidence * _NUM_STEPS).astype(np.int64), _NUM_STEPS - 1)
     num = np.bincount(step, minlength=_NUM_STEPS)
     expected = np.bincount(step, outlier_probability(confidence), _NUM_STEPS)
-    found = np.bincount(step, bad, _NUM_STEPS)
+    num_outliers = np.bincount(step, bad, _NUM_STEPS)
     return [
         {
             "confidence": i / _NUM_STEPS,
             "num_compared": int(num[i]),
             "expected": float(expected[i] / num[i]),
-            "outliers": float(found[i] / num[i]),
+            "outliers": float(num_outliers[i] / num[i]),
         }
         for i in np.flatnonzero(num).tolist()
     ]

@@ -34,9 +34,8 @@ from densify.geometry.types import (
 )
 
 _MOST_RANGE_M = 60.0
-_MOST_SPACING_M = (
-    0.5 * AGREE_M
-)  # enough, as many sweeps measure a surface; larger patches hide edges
+# Enough, as many sweeps measure a surface; larger patches hide edges.
+_MOST_SPACING_M = 0.5 * AGREE_M
 _SLACK_M = 0.5
 _PRIME = 2_654_435_761  # its multiples visit any smaller number of points in mixed order
 _FEW_FILLED = 3  # least number of filled cells of nine, for a sweep beyond the window

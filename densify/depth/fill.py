@@ -26,6 +26,7 @@ from densify.depth.votes import (
     DIRECTIONS,
     NONE,
     ROUNDED,
+    Voters,
     extended,
     first_known,
     inverse_of,
@@ -223,10 +224,10 @@ def fill_stars(record: MapRecord) -> None:
     steps, needs eight tenths of the votes.
     """
     empty = record.filled_m == 0
-    pixel, inverse, steps = np.flatnonzero(empty), inverse_of(record.filled_m), first_known(~empty)
+    pixel = np.flatnonzero(empty)
     predicted_m = np.zeros(len(pixel), np.float32)
-    spacing_px = record.spacing_px
-    _star.over_rows(len(pixel), pixel, steps, inverse, record.tilt, spacing_px, predicted_m)
+    known = Voters(first_known(~empty), inverse_of(record.filled_m), record.tilt)
+    _star.over_rows(len(pixel), pixel, known, record.spacing_px, predicted_m)
     record.filled_m.flat[pixel] = predicted_m
     _reject_unconfirmed(record, empty, _STAR_SHARE)
 
@@ -242,9 +243,9 @@ def _widest_gap(met):  # type: ignore[no-untyped-def]
 
 
 @Kernel
-def _star(first, last, pixel, steps, inverse, tilt, spacing_px, predicted_m):  # type: ignore[no-untyped-def]
+def _star(first, last, pixel, known, spacing_px, predicted_m):  # type: ignore[no-untyped-def]
     """Predict the depth of empty pixels from the first known pixels around them, 0 for none."""
-    width = inverse.shape[1]
+    width = known.inverse.shape[1]
     met = np.empty(len(DIRECTIONS), np.bool_)
     for p in range(first, last):
         row, column = pixel[p] // width, pixel[p] % width
@@ -252,11 +253,11 @@ def _star(first, last, pixel, steps, inverse, tilt, spacing_px, predicted_m):  #
         num, w_near, w_far = 0, 0.0, np.inf
         sum_w, weight = 0.0, 0.0
         for d in range(len(DIRECTIONS)):
-            k = np.int64(steps[d, row, column])
+            k = np.int64(known.steps[d, row, column])
             du, dv = offset(d, k)
             met[d] = k != NONE and du * du + dv * dv <= reach_px * reach_px
             if met[d]:
-                w = extended(inverse, tilt, row + dv, column + du, du, dv)
+                w = extended(known.inverse, known.tilt, row + dv, column + du, du, dv)
                 w_near, w_far = max(w_near, w), min(w_far, w)
                 sum_w += w / k
                 weight += 1 / k

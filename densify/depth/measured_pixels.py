@@ -44,8 +44,6 @@ _RIDGE_PX2 = 0.02
 _LEAST_PX, _MOST_PX = 3, 24  # limits of the radius
 ALL_ROUND = 3.0
 """Extent of a surface without a depth discontinuity nearby, in radii of a discontinuity."""
-# Sweeps are counted by the last six bits of their frame number, one bit of 64 each.
-_ONE, _LAST_BIT = np.uint64(1), 63
 _BLOCK_PX = 16  # blocks within which the density of rays is about constant
 _JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
 
@@ -196,10 +194,8 @@ def _set_source(record: MapRecord, points: PointsInImage, pixel: Int, chosen: In
 def _measure_visible(
     record: MapRecord, points: PointsInImage, camera: Camera, beyond: bool = False
 ) -> None:
-    """Measure pixels by visible points, and set the reason of each point in the image.
-
-    ``beyond``: some points are of sweeps beyond the window. Pixels measured before stay.
-    """
+    """Measure pixels by visible points, and set the reason of each point in the image."""
+    # beyond: with points of sweeps beyond the window; pixels measured before stay
     hidden = is_occluded(points, camera)
     reasons = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
     last = int(points.age_ns.max(initial=0)) + 1
@@ -260,8 +256,8 @@ def _count(seen):  # type: ignore[no-untyped-def]
     """Return the number of sweeps, the bits set in ``seen``."""
     num_sweeps = 0
     while seen:
-        num_sweeps += seen & _ONE
-        seen >>= _ONE
+        num_sweeps += seen & np.uint64(1)
+        seen >>= np.uint64(1)
     return num_sweeps
 
 
@@ -293,8 +289,9 @@ def _look_round(by_pixel, i, u0, v0, centre, agree, outer, m, reach):  # type: i
                 behind |= close and off < -far
                 other_ns = min(other_ns, age_ns[k]) if vouches else other_ns
                 continue
-            # No branches: half of them would be predicted wrongly.
-            seen |= np.uint64(vouches) << np.uint64(points.frame[k] & _LAST_BIT)
+            # No branches: half of them would be predicted wrongly. Sweeps are told apart by the last
+            # six bits of their frame number.
+            seen |= np.uint64(vouches) << np.uint64(points.frame[k] & 63)
             agree_ns = min(agree_ns, age_ns[k]) if vouches else agree_ns
             _extend(reach, du if close else 0.0, dv if close else 0.0)
             weight = max(1 - abs(du) / (reach_u + 1), 0.0) * max(1 - abs(dv) / (reach_v + 1), 0.0)

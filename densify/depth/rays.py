@@ -24,11 +24,11 @@ from densify.free_space.ground import HeightMap
 from densify.geometry import poses
 from densify.geometry.types import Bool, Cloud, Float, Float32, Int, ObjectTrack, Stretch
 
-_AROUND_M, _LEAST_AROUND = 2.5 * AGREE_M, 6  # a point of the body has six other such points around
+_AROUND_M = 2.5 * AGREE_M  # distance within which a point of a body has other points of it
+_LEAST_AROUND = 6  # number of these points
 _SIDES = (("rear", "front"), ("right", "left"), ("bottom", "top"))
-_BESIDE_M = (
-    2 * HIDDEN_M
-)  # of rays to a side that is seen; tolerates errors of motion and registration
+# Distance of rays to a side that is seen; tolerates errors of motion and registration.
+_BESIDE_M = 2 * HIDDEN_M
 _NUM_RAYS = 3  # rays that show free space; single rays may be mixed echoes
 _MIDDLE = 0.6  # share of a side, around its middle, that is flat; corners are round
 _BODY = (0.2, 0.5)  # share of the height: above the road, below the panes

@@ -109,7 +109,7 @@ def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
     return limited(known - tilt[v, u, 0] * du - tilt[v, u, 1] * dv, known)
 
 
-class _Voters(NamedTuple):
+class Voters(NamedTuple):
     """Pixels with a known depth, which vote on the depths of pixels around them."""
 
     steps: NDArray[np.uint8]  # (16,H,W) of `first_known`
@@ -144,7 +144,7 @@ def votes_for(
     tilt, inverse = np.ascontiguousarray(record.tilt), 1 / depth_m
     colours, gap_px = np.ascontiguousarray(record.lab), record.gap_px
     for map_m, share in zip(maps_m, shares, strict=True):
-        voters = _Voters(first_known(map_m > 0), inverse_of(map_m), tilt)
+        voters = Voters(first_known(map_m > 0), inverse_of(map_m), tilt)
         _vote.over_rows(len(pixel), pixel, inverse, voters, colours, gap_px, surely, share)
     least_share: Float32 = shares.min(axis=0)
     return least_share
