@@ -256,7 +256,7 @@ def _count(seen):  # type: ignore[no-untyped-def]
     """Return the number of sweeps, the bits set in ``seen``."""
     num_sweeps = 0
     while seen:
-        num_sweeps += seen & np.uint64(1)
+        num_sweeps += np.int64(seen & np.uint64(1))
         seen >>= np.uint64(1)
     return num_sweeps
 
@@ -289,8 +289,8 @@ def _look_round(by_pixel, i, u0, v0, centre, agree, outer, m, reach):  # type: i
                 behind |= close and off < -far
                 other_ns = min(other_ns, age_ns[k]) if vouches else other_ns
                 continue
-            # No branches: half of them would be predicted wrongly. Sweeps are told apart by the last
-            # six bits of their frame number.
+            # No branches: half of them would be predicted wrongly. The last six bits of the frame
+            # number tell sweeps apart.
             seen |= np.uint64(vouches) << np.uint64(points.frame[k] & 63)
             agree_ns = min(agree_ns, age_ns[k]) if vouches else agree_ns
             _extend(reach, du if close else 0.0, dv if close else 0.0)
