@@ -256,8 +256,8 @@ def _count(seen):  # type: ignore[no-untyped-def]
     """Return the number of sweeps, the bits set in ``seen``."""
     num_sweeps = 0
     while seen:
-        num_sweeps += np.int64(seen & np.uint64(1))
-        seen >>= np.uint64(1)
+        num_sweeps += seen & 1
+        seen >>= 1
     return num_sweeps
 
 
@@ -275,7 +275,7 @@ def _look_round(by_pixel, i, u0, v0, centre, agree, outer, m, reach):  # type: i
     reach_u = _window(_REACH * points.spacing_px[i, 0])
     reach_v = _window(_REACH * points.spacing_px[i, 1])
     wide_u, wide_v = max(reach_u, _window(outer)), max(reach_v, _window(outer))
-    seen, behind = np.uint64(0), False
+    seen, behind = np.int64(0), False
     agree_ns = other_ns = age_ns[i]
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
@@ -289,9 +289,8 @@ def _look_round(by_pixel, i, u0, v0, centre, agree, outer, m, reach):  # type: i
                 behind |= close and off < -far
                 other_ns = min(other_ns, age_ns[k]) if vouches else other_ns
                 continue
-            # No branches: half of them would be predicted wrongly. The last six bits of the frame
-            # number tell sweeps apart.
-            seen |= np.uint64(vouches) << np.uint64(points.frame[k] & 63)
+            # No branches: half of them would be predicted wrongly. A bit of 63 for each sweep.
+            seen |= np.int64(vouches) << np.int64(points.frame[k] % 63)
             agree_ns = min(agree_ns, age_ns[k]) if vouches else agree_ns
             _extend(reach, du if close else 0.0, dv if close else 0.0)
             weight = max(1 - abs(du) / (reach_u + 1), 0.0) * max(1 - abs(dv) / (reach_v + 1), 0.0)
