@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.depth.accumulate import accumulate
 from densify.flow.chained import ChainedMotion
 from densify.geometry import poses
 from densify.geometry.types import FlowField
+from densify.pipeline.accumulate import accumulate
 from tests.exact_motion import (
     CAR,
     FRAMES,
@@ -33,13 +33,6 @@ def to_key(motion: ChainedMotion) -> list[FlowField]:
     return fields
 
 
-def at_key(motion: ChainedMotion, frame: int) -> np.ndarray:
-    """Where registration alone puts a sweep's points."""
-    return poses.transform(
-        motion.stretch.T_target_source(KEY, frame), motion.stretch[frame].sweep.points
-    )
-
-
 def test_a_moved_object_comes_together_at_the_key():
     motion = scene()
     cloud = accumulate(motion.stretch, to_key(motion), KEY, drop_lost=True)
@@ -55,7 +48,10 @@ def test_nothing_moves_rigid_to_the_last_bit():
     motion = scene()
     zero = [FlowField.zero(len(s.sweep)) for s in motion.stretch.sweeps]
     rigid = accumulate(motion.stretch, zero, KEY, drop_lost=True)
-    placed = np.concatenate([at_key(motion, f) for f in FRAMES])
+    stretch = motion.stretch
+    placed = np.concatenate(
+        [poses.transform(stretch.T_target_source(KEY, f), stretch[f].sweep.points) for f in FRAMES]
+    )
     assert rigid.points.tobytes() == placed.tobytes() == rigid.rigid_points.tobytes()
     assert not rigid.displaced.any() and not rigid.moving.any() and not rigid.velocity_m_s.any()
     flow = accumulate(motion.stretch, to_key(motion), KEY, drop_lost=True)

@@ -10,10 +10,10 @@ import pytest
 
 import densify
 from densify.depth import confidence as scale
-from densify.depth.layers import Layers
+from densify.depth.measured_pixels import MapRecord
 from densify.geometry.types import DepthMap, Rejected
 from densify.scores.depth_metrics import is_outlier_depth
-from tests.depth_layers import layers_of
+from tests.depth_scenes import record_of
 from tests.scenes import CAMERA
 
 SHAPE = (120, 160)
@@ -21,10 +21,8 @@ COLUMN = np.arange(SHAPE[1]) * np.ones(SHAPE)
 
 
 def made(confidence, filled_m) -> DepthMap:
-    shape = confidence.shape
-    measured_m = np.where(np.arange(shape[1]) % 2 == 0, filled_m, 0).astype(np.float32)
-    frame = np.zeros(shape, np.int32)
-    return DepthMap("front", measured_m, filled_m, confidence, frame)
+    measured_m = np.where(np.arange(confidence.shape[1]) % 2 == 0, filled_m, 0).astype(np.float32)
+    return DepthMap("front", measured_m, filled_m, confidence, np.zeros(filled_m.shape, np.int32))
 
 
 def test_a_fifth_more_is_ten_times_less_wrong():
@@ -32,16 +30,16 @@ def test_a_fifth_more_is_ten_times_less_wrong():
     assert densify.outlier_probability(values) == pytest.approx([1, 0.1, 0.01, 1e-5])
 
 
-def wall(**more) -> Layers:
+def wall(**more) -> MapRecord:
     """A wall at 10 m, with rays 4 px apart."""
-    return layers_of(np.full(SHAPE, 10.0), spacing_px=(4, 4), **more)
+    return record_of(np.full(SHAPE, 10.0), spacing_px=(4, 4), **more)
 
 
-def risk(layers: Layers, age_s: float = 0.1) -> np.ndarray:
-    ages_ns = np.full(layers.point.max() + 1, round(1e9 * age_s))
-    evidence = scale.features(layers, ages_ns, CAMERA)
-    probability = np.full(layers.filled_m.shape, np.nan)
-    some = (layers.filled_m > 0) | (layers.rejected_m > 0)
+def risk(record: MapRecord, age_s: float = 0.1) -> np.ndarray:
+    ages_ns = np.full(record.point.max() + 1, round(1e9 * age_s))
+    evidence = scale.features(record, ages_ns, CAMERA)
+    probability = np.full(record.filled_m.shape, np.nan)
+    some = (record.filled_m > 0) | (record.rejected_m > 0)
     probability[some] = scale.outlier_probability(scale.confidence_of(evidence))
     return probability
 
@@ -57,17 +55,15 @@ def test_what_speaks_against_a_pixel_raises_its_probability_of_an_outlier():
     assert np.nanmean(risk(plain, age_s=1.0)) > 1.2 * usual
     hedge = (rng.random(SHAPE) < 0.4) & (COLUMN > 110)
     boundary = np.where(hedge, 10.0, 0)
-    rejected = replace(layers_of(10.0 * ~hedge, spacing_px=(4, 4), rim_m=boundary))
+    rejected = record_of(10.0 * ~hedge, spacing_px=(4, 4), boundary_m=boundary)
     assert np.nanmean(risk(rejected)[:, 120:]) > 5 * np.nanmean(risk(rejected)[:, :80])
-    holes = layers_of(10.0 * ((COLUMN < 40) | (COLUMN > 100)), spacing_px=(4, 4))
+    holes = record_of(10.0 * ((COLUMN < 40) | (COLUMN > 100)), spacing_px=(4, 4))
     assert np.nanmean(risk(holes)[:, 36:40]) > np.nanmean(risk(holes)[:, :15])
-
-
-def test_a_step_of_depth_counts_by_the_tolerance_of_the_outlier_rule():
     step = wall()
     step.filled_m[:, 80:] = 11.0
     near = risk(step)
-    far = risk(replace(step, filled_m=20 * step.filled_m))  # there the rule allows more than 10 %
+    step.filled_m *= 20  # the rule allows more than 10 % of depth there
+    far = risk(step)
     assert near[:, 78:82].mean() > 1.2 * near[:, :40].mean()
     assert far[:, 78:82].mean() < near[:, 78:82].mean()
 
@@ -112,10 +108,8 @@ def test_a_single_sweep_expects_what_no_other_sweep_contradicts():
     """The factor is between those of six recordings; rejected pixels are less certain too."""
     maps = with_rejected(np.random.default_rng(9))
     alone = scale.unconfirmed(maps)
-    for before, after in (
-        (maps.confidence, alone.confidence),
-        (maps.rejected.confidence, alone.rejected.confidence),
-    ):
+    for before, after in ((maps, alone), (maps.rejected, alone.rejected)):
+        before, after = before.confidence, after.confidence
         more = scale.outlier_probability(after) / scale.outlier_probability(before)
         assert ((before > 0) == (after > 0)).all()
         assert more[before > 0.2].min() > 0.9 and more.max() < 6.0

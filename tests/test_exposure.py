@@ -1,13 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""A depth map shows the moment it is asked for: camera and movers are where they were then."""
+"""A depth map shows the moment it is asked for, and optical flow leads to the next exposure.
+
+Against the analytic street, OpenCV's projection, and as KITTI's PNG.
+"""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
+from densify.depth.exposure import Exposure
+from densify.depth.views import optical_flow
+from densify.geometry import poses
+from densify.geometry.types import Camera, Cloud, DepthMap, Reason
+from densify.outputs.depth_png import write_flow_png
 from densify.pipeline.run import run
+from tests.depth_scenes import at_pixel, make_cloud
 from tests.scenes import (
+    CAMERA,
     SWEEP_S,
     Arc,
     Box,
@@ -16,10 +27,124 @@ from tests.scenes import (
     TinySequence,
     World,
     by_flow,
-    car,
     street,
 )
-from tests.small_street import KEY, POSES_GIVEN, one_car
+from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
+
+SMALL = Camera("cam", 8, 6, np.array([[10.0, 0, 3.5], [0, 11.0, 2.5], [0, 0, 1]]), np.eye(4))
+T_CAM_KEY = poses.exp(np.array([0.1, -0.2, 0.05, 0.3, 0.1, -0.2]))
+T_OTHER_KEY = poses.exp(np.array([0.12, -0.15, 0.02, 0.1, 0.1, -0.6]))
+
+
+def seen(pixel, depth_m, velocity_m_s=(0, 0, 0)) -> Cloud:
+    """Points at these (N,2) image coordinates and camera depths."""
+    points_cam = at_pixel(SMALL, *np.transpose(pixel), np.asarray(depth_m, float))
+    cloud = make_cloud(poses.transform(poses.inverse(T_CAM_KEY), points_cam))
+    cloud.velocity_m_s[:] = velocity_m_s
+    return cloud
+
+
+def map_of(pixel, depth_m, kept=None) -> DepthMap:
+    """kept: which of the cloud's points the pixels show; all if None."""
+    kept = np.ones(len(pixel), bool) if kept is None else np.array(kept)
+    reason = np.where(kept, Reason.KEPT, Reason.HIDDEN).astype(np.uint8)
+    image = np.zeros((SMALL.height_px, SMALL.width_px), np.float32)
+    u, v = np.rint(pixel).astype(int).T
+    image[v, u] = depth_m
+    return DepthMap("cam", image, image, image, np.zeros(image.shape, np.int32), reason=reason)
+
+
+def flow_of(cloud: Cloud, depth: DepthMap, seconds: float = 0.1, T_other=T_OTHER_KEY):
+    target = Exposure(SMALL, T_other, late_s=seconds)
+    return optical_flow(cloud, depth, Exposure(SMALL, T_CAM_KEY), target)
+
+
+@pytest.mark.parametrize("velocity_m_s", [(0, 0, 0), (3.0, -2.0, 1.0)])
+def test_flow_is_the_difference_of_two_projections(velocity_m_s):
+    pixel, z = np.array([[1.2, 2.4], [6.0, 0.8], [3.7, 4.9], [4.0, 1.0]]), np.array([5.0, 9, 3, 20])
+    cloud = seen(pixel, z, velocity_m_s)
+    found = flow_of(cloud, map_of(pixel, z), seconds=-0.1)
+    later = cloud.points - 0.1 * np.array(velocity_m_s)
+    rotation = cv2.Rodrigues(T_OTHER_KEY[:3, :3])[0]
+    there, _ = cv2.projectPoints(later, rotation, T_OTHER_KEY[:3, 3], SMALL.K, None)
+    u, v = np.rint(pixel).astype(int).T
+    np.testing.assert_allclose(found[v, u], there[:, 0] - pixel, atol=1e-4)
+    assert found.dtype == np.float32 and np.isfinite(found).all(axis=2).sum() == 4
+
+
+def test_unknown_where_nothing_was_measured_or_it_falls_behind_the_other_camera():
+    cloud = seen([[2, 2], [5, 3]], [4.0, 4.0])
+    depth = map_of([[2, 2]], [4.0], kept=[True, False])
+    assert np.flatnonzero(np.isfinite(flow_of(cloud, depth)[..., 0])).tolist() == [2 * 8 + 2]
+    ahead = poses.exp(np.array([0, 0, 0, 0, 0, -9.0])) @ T_CAM_KEY
+    assert np.isnan(flow_of(cloud, depth, T_other=ahead)).all()
+    nothing = map_of([[2, 2]], [4.0], kept=[])
+    assert np.isnan(flow_of(cloud.select(np.zeros(2, bool)), nothing)).all()
+
+
+def true_flow(sequence, other: int) -> tuple[np.ndarray, np.ndarray]:
+    """(H,W,2) of what each pixel's centre shows, and where that moves."""
+    depth = sequence.truth.depth_m("front", KEY).astype(float)
+    moving = sequence.truth.moving_mask("front", KEY)
+    v, u = np.indices(depth.shape)
+    ray = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(CAMERA.K).T
+    T_cam_world = [
+        CAMERA.T_cam_lidar
+        @ poses.inverse(sequence.scene.T_world_lidar(f * SWEEP_S + sequence.late_s))
+        for f in (KEY, other)
+    ]
+    world = poses.transform(poses.inverse(T_cam_world[0]), (ray * depth[..., None]).reshape(-1, 3))
+    world[moving.ravel(), 0] += CAR.path.speed_m_s * (other - KEY) * SWEEP_S
+    there = poses.transform(T_cam_world[1], world) @ CAMERA.K.T
+    there = (there[:, :2] / there[:, 2:]).reshape(*depth.shape, 2)
+    return there - np.stack([u, v], -1), moving
+
+
+def test_flow_to_both_neighbours_is_that_of_the_street():
+    late_s = 0.04
+    sequence = one_car(late_s=late_s)
+    result = by_flow(sequence, KEY, 1, config=POSES_GIVEN | {"output": {"optical_flow": True}})
+    assert set(result.optical_flow["front"]) == {"previous", "next"}
+    for name, other in (("previous", KEY - 1), ("next", KEY + 1)):
+        found = result.optical_flow["front"][name]
+        known = np.isfinite(found).all(axis=2)
+        measured = result.depth["front"].depth_m > 0
+        assert not (known & ~measured).any() and known.sum() == measured.sum()
+        true, moving = true_flow(sequence, other)
+        off_px = np.linalg.norm(found - true, axis=2)
+        for part in (moving, ~moving):
+            assert (known & part).sum() > 200
+            assert np.median(off_px[known & part]) < 0.1
+            assert (off_px[known & part] < 1).mean() > 0.95
+        # neither is trivial: the street flows by, and the car goes its own way
+        assert np.median(np.linalg.norm(true, axis=2)[known & ~moving]) > 0.5
+        alone = true_flow(one_car((), late_s), other)[0]
+        still = np.linalg.norm(true - alone, axis=2)[known & moving]
+        assert np.median(still) > 0.5
+
+
+def test_at_the_end_of_the_window_one_neighbour_is_missing():
+    sequence = one_car()
+    config = POSES_GIVEN | {"output": {"optical_flow": True}}
+    assert set(run(sequence, 0, 1, "icp", config=config).optical_flow["front"]) == {"next"}
+    assert run(sequence, KEY, 0, "icp", config=config).optical_flow == {"front": {}}
+    assert run(sequence, KEY, 0, "icp", config=POSES_GIVEN).optical_flow == {}
+
+
+def test_flow_png_is_kittis(tmp_path):
+    rng = np.random.default_rng(0)
+    flow = rng.uniform(-500, 500, (20, 30, 2)).astype(np.float32)
+    flow[3, :5] = np.nan
+    flow[4, 0, 1] = np.nan
+    write_flow_png(tmp_path / "f.png", flow)
+    # KITTI: flow_u = (I(:,:,1) - 2^15) / 64, flow_v of the second channel, valid the third
+    raw = cv2.imread(str(tmp_path / "f.png"), cv2.IMREAD_UNCHANGED)
+    assert raw.dtype == np.uint16 and raw.shape == (20, 30, 3)
+    read, valid = (raw[..., :0:-1].astype(float) - 2**15) / 64, raw[..., 0]
+    known = np.isfinite(flow).all(axis=2)
+    assert known.sum() == 594 and np.array_equal(valid, known)
+    assert np.abs(read - flow)[known].max() <= 1 / 128
+    assert not raw[~known].any()
 
 
 @pytest.mark.parametrize("late_s", [-0.04, 0.05])
@@ -40,21 +165,6 @@ def test_an_image_of_another_moment_sees_from_where_the_camera_was(late_s):
     np.testing.assert_allclose(maps.age_s[found > 0], np.abs(since_s - late_s), atol=1e-6)
     assert len(np.unique(since_s)) == 3
     np.testing.assert_array_equal(np.isnan(maps.age_s), maps.filled_m == 0)
-
-
-def test_a_mover_is_shown_where_it_was_at_the_exposure():
-    """Oncoming at 20 m/s it is 1 m nearer after 50 ms."""
-    scene = Scene(
-        World((*street(), car(40, 0.5, 20, 1, yaw=np.pi))),
-        Arc(0, -1.5),
-        Scanner(num_azimuths=1200, sigma_m=0.01),
-    )
-    sequence = TinySequence(scene, range(13), late_s=0.05)
-    found = by_flow(sequence, 6, 2, config=POSES_GIVEN).depth["front"].depth_m
-    truth = sequence.truth.depth_m("front", 6)
-    on = sequence.truth.moving_mask("front", 6) & (found > 0)
-    assert on.sum() > 50
-    assert abs(np.median(found[on] - truth[on])) < 0.3
 
 
 def test_at_the_sweeps_time_the_shutter_does_not_matter():

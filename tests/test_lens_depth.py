@@ -6,12 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure
-from densify.depth.project import project
 from densify.geometry.cameras import converted, rays
 from densify.geometry.types import Camera, Patches, Reason
-from tests.test_project import make_camera, make_cloud
+from tests.depth_scenes import depth_map, make_camera, make_cloud
 
 K = np.array([[124.0, 0, 199.5], [0, 124.0, 199.5], [0, 0, 1]])
 FISHEYE = Camera(
@@ -27,8 +25,7 @@ def seen_from(camera, points, normal, spacing_m, measure):
         np.broadcast_to(np.asarray(spacing_m, np.float32), (n, 2)).copy(),
     )
     exposure = Exposure(camera, np.eye(4), measure=measure)
-    cloud = make_cloud(points)
-    return project(cloud, exposure.sees(cloud), ProjectSettings(), patches, filled=False)
+    return depth_map(make_cloud(points), exposure, patches, filled=False)
 
 
 def pixels(camera, step=1):

@@ -8,17 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, Delaunay
-from test_project import KEY, T_CAM_LIDAR, make_camera, make_cloud, patches_of
-from test_seen_through import fired
 
-from densify.config import ProjectSettings
-from densify.depth import hulls
 from densify.depth import moving_bodies as stage
+from densify.depth import rays as hulls
 from densify.depth.exposure import Exposure
-from densify.depth.moving_bodies import moving_bodies, without_sweep
-from densify.depth.project import project
-from densify.depth.seen_through import Rays
+from densify.depth.rays import Rays, moving_bodies, without_sweep
 from densify.geometry.types import Stretch
+from tests.depth_scenes import (
+    KEY,
+    T_CAM_LIDAR,
+    depth_map,
+    make_camera,
+    make_cloud,
+    patches_of,
+    registered,
+)
 
 CAMERA = make_camera(width=420, height=160, focal=400.0)
 EXPOSURE = Exposure(CAMERA, T_CAM_LIDAR)
@@ -62,7 +66,7 @@ def scanned(dark, passes):
         known = ~(meets & dark(y, z))
         own = (meets & ~through)[known]
         at = at[known] + rng.normal(0, 0.01, (known.sum(), 3))
-        sweeps.append(fired(frame, at, np.eye(4), np.zeros(6)))
+        sweeps.append(registered(frame, at, np.eye(4), np.zeros(6)))
         cloud = make_cloud(at, frame)
         cloud.moving[:], cloud.instance[:] = own, np.where(own, 0, -1)
         cloud.velocity_m_s[own] = [0, STEP_M / 0.1, 0]
@@ -76,22 +80,16 @@ def scanned(dark, passes):
 def maps(dark, passes):
     """The map without and with bodies, true depth of the box (0 none), y and z of its front."""
     cloud, rays = scanned(dark, passes)
-    exposure, surface = EXPOSURE, patches_of(cloud)
+    surface = patches_of(cloud)
     v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px]
     ray = np.stack([np.ones(u.shape), (CAMERA.K[0, 2] - u) / 400, (CAMERA.K[1, 2] - v) / 400], -1)
     enter, leave = enters(np.zeros(3), ray.reshape(-1, 3), LOW, HIGH)
     true_m = np.where(enter < leave, enter, 0).reshape(u.shape)
-    knobs = ProjectSettings()
-    before = project(cloud, exposure.sees(cloud), knobs, surface, rays=rays)
-    bodies = moving_bodies(cloud, rays, [exposure])
+    before = depth_map(cloud, EXPOSURE, surface, rays=rays)
+    bodies = moving_bodies(cloud, rays, [EXPOSURE])
     assert bodies.keys() == {0}
-    after = project(cloud, exposure.sees(cloud), knobs, surface, rays=rays, bodies=bodies)
+    after = depth_map(cloud, EXPOSURE, surface, rays=rays, bodies=bodies)
     return before, after, true_m, *(ray * LOW[0])[..., 1:].transpose(2, 0, 1)
-
-
-def far_from(where, pixels):
-    """Pixels of ``where`` (H,W) that are farther than so many from any other."""
-    return stage._well_inside(where, pixels)
 
 
 def test_nothing_shines_through_a_closed_box():
@@ -102,8 +100,8 @@ def test_nothing_shines_through_a_closed_box():
         return within(y, z, PANE) & (pane.random(len(y)) < 0.4)
 
     before, after, true_m, y, z = maps(lambda y, z: within(y, z, DOOR), passes)
-    box, beside = true_m > 0, far_from(true_m == 0, 4)
-    assert not ((after.filled_m > 1.2 * true_m) & far_from(box, 2)).any()
+    box, beside = true_m > 0, stage._well_inside(true_m == 0, 4)
+    assert not ((after.filled_m > 1.2 * true_m) & stage._well_inside(box, 2)).any()
     known = box & (after.filled_m > 0)
     assert known.sum() > 0.95 * box.sum() and (before.filled_m > 0)[box].mean() < 0.5
     assert np.abs(after.filled_m / np.where(box, true_m, 1) - 1)[known].max() < 0.05
@@ -111,7 +109,7 @@ def test_nothing_shines_through_a_closed_box():
     same = after.filled_m[beside] == before.filled_m[beside]
     assert same.mean() > 0.999
     measured = box & (after.depth_m > 0)
-    assert not (measured & far_from(within(y, z, DOOR), 3)).any()  # filled, not measured
+    assert not (measured & stage._well_inside(within(y, z, DOOR), 3)).any()  # filled, not measured
     assert (after.frame[measured] >= 0).all()
 
 
@@ -120,9 +118,9 @@ def test_an_open_frame_stays_open():
         lambda y, z: np.zeros(len(y), bool), lambda y, z: within(y, z, HOLE)
     )
     hole, frame = within(y, z, HOLE), (true_m > 0) & ~within(y, z, HOLE)
-    open_m = after.filled_m[far_from(hole, 9)]
+    open_m = after.filled_m[stage._well_inside(hole, 9)]
     assert (np.abs(open_m - WALL_M) < 0.5).mean() > 0.95
-    shown = after.filled_m[far_from(frame, 3)]
+    shown = after.filled_m[stage._well_inside(frame, 3)]
     assert (np.abs(shown / 10 - 1) < 0.2).mean() > 0.95
 
 
@@ -152,34 +150,28 @@ def test_a_smooth_offset_is_the_least_of_its_sum():
     def cost(o):
         across = (np.diff(o, axis=1)[inside[:, 1:] & inside[:, :-1]] ** 2).sum()
         down = (np.diff(o, axis=0)[inside[1:] & inside[:-1]] ** 2).sum()
-        return (
-            ((o - offset)[known] ** 2).sum()
-            + stage._STIFF * (across + down)
-            + stage._HELD * (o[inside] ** 2).sum()
-        )
+        small = stage._HELD * (o[inside] ** 2).sum()
+        return ((o - offset)[known] ** 2).sum() + stage._STIFF * (across + down) + small
 
-    found = stage._smooth(offset, known, inside)
+    smooth = stage._smooth(offset, known, inside)
     for _ in range(50):
-        assert cost(found + np.where(inside, rng.normal(0, 0.01, inside.shape), 0)) > cost(found)
+        assert cost(smooth + np.where(inside, rng.normal(0, 0.01, inside.shape), 0)) > cost(smooth)
 
 
-def test_only_what_lies_far_behind_the_front_is_inside():
+def test_a_body_is_in_view_has_a_front_and_loses_the_rays_of_a_sweep():
     cloud, rays = scanned(lambda y, z: within(y, z, DOOR), lambda y, z: np.zeros(len(y), bool))
-    body, exposure = moving_bodies(cloud, rays, [EXPOSURE])[0], EXPOSURE
+    backwards = Exposure(CAMERA, T_CAM_LIDAR @ np.diag([-1.0, -1, 1, 1]))
+    assert moving_bodies(cloud, rays, [backwards]) == {}
+    body = moving_bodies(cloud, rays, [backwards, EXPOSURE])[0]
     shape, middle = (CAMERA.height_px, CAMERA.width_px), (CAMERA.height_px // 2, 210)
-    for depth_m, inside in ((10.1, False), (11.0, True)):
-        far = stage.far_inside([body], exposure, np.full(shape, depth_m, np.float32))
+    for depth_m, inside in ((10.1, False), (11.0, True)):  # seats are far behind the front
+        far = stage.far_inside([body], EXPOSURE, np.full(shape, depth_m, np.float32))
         assert far[middle] == inside and not far[0].any()
-
-
-def test_a_body_without_a_sweep_has_none_of_its_rays_and_points():
-    cloud, rays = scanned(lambda y, z: within(y, z, DOOR), lambda y, z: np.zeros(len(y), bool))
-    body = moving_bodies(cloud, rays, [EXPOSURE])[0]
-    others = cloud.select(cloud.frame != KEY)
-    told = without_sweep({0: body}, others, KEY)[0]
-    assert set(told.frame) == set(body.frame) - {KEY}
-    assert len(told.entries) == len(told.ends) == len(told.frame)
-    assert set(map(tuple, told.corners)) <= set(map(tuple, others.points))
+    other_sweeps = cloud.select(cloud.frame != KEY)
+    reduced = without_sweep({0: body}, other_sweeps, KEY)[0]
+    assert set(reduced.frame) == set(body.frame) - {KEY}
+    assert len(reduced.entries) == len(reduced.ends) == len(reduced.frame)
+    assert set(map(tuple, reduced.corners)) <= set(map(tuple, other_sweeps.points))
 
 
 @pytest.mark.parametrize("num", [3, 40])
@@ -187,12 +179,5 @@ def test_flat_and_tiny_objects_have_no_body(num):
     points = np.random.default_rng(2).uniform(size=(num, 3)) * [0, 0.4, 0.4] + [9, 0, 0]
     cloud = make_cloud(points)
     cloud.moving[:], cloud.instance[:] = True, 0
-    sweep = fired(KEY, points, np.eye(4), np.zeros(6))
+    sweep = registered(KEY, points, np.eye(4), np.zeros(6))
     assert moving_bodies(cloud, Rays(Stretch((sweep,)), KEY), [EXPOSURE]) == {}
-
-
-def test_objects_out_of_view_have_no_body():
-    cloud, rays = scanned(lambda y, z: within(y, z, DOOR), lambda y, z: np.zeros(len(y), bool))
-    backwards = Exposure(CAMERA, T_CAM_LIDAR @ np.diag([-1.0, -1, 1, 1]))
-    assert moving_bodies(cloud, rays, [backwards]) == {}
-    assert moving_bodies(cloud, rays, [backwards, EXPOSURE]).keys() == {0}

@@ -6,11 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.depth.accumulate import accumulate, object_tracks
-from densify.depth.object_boxes import complete_boxes, grown
-from densify.depth.seen_through import Rays
+from densify.depth.rays import Rays, complete_boxes, grown
 from densify.free_space.ground import HeightMap
 from densify.geometry.types import FlowField, ObjectTrack, RegisteredSweep, Stretch, Sweep
+from densify.pipeline.accumulate import accumulate, object_tracks
 
 AT_M, WIDE_M, TALL_M, GROUND_M = 10.0, 1.8, 1.5, -1.7
 GROUND = HeightMap(np.full((2, 2), GROUND_M), np.array([-100.0, -100.0]), 200.0)
@@ -124,9 +123,5 @@ def test_a_box_stands_on_the_ground() -> None:
 def test_growing_keeps_the_other_end_at_every_pose() -> None:
     track = track_of(rear(), around())
     longer = grown(track, 0, 0.0, 1.0)
-    for before, after in zip(track.T_key_object, longer.T_key_object, strict=True):
-        ends = [
-            T @ [-size / 2, 0, 0, 1]
-            for T, size in ((before, track.size_m[0]), (after, longer.size_m[0]))
-        ]
-        np.testing.assert_allclose(*ends, atol=1e-12)
+    lower = [t.T_key_object @ [-t.size_m[0] / 2, 0, 0, 1] for t in (track, longer)]
+    np.testing.assert_allclose(*lower, atol=1e-12)

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.depth.accumulate import object_tracks
 from densify.geometry import poses
 from densify.geometry.types import FlowField, Stretch
+from densify.pipeline.accumulate import object_tracks
 from tests.exact_motion import CAR, FRAMES, KEY, T_world_lidar, scene, turning
 from tests.exported import street_result
 from tests.small_street import CAR as STREET_CAR

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_project import KEY, make_cloud, patches_of
 
 from densify.depth.patches import patches
 from densify.free_space.sensor import Sensors
-from densify.geometry.types import RegisteredSweep
+from tests.depth_scenes import KEY, make_cloud, patches_of
 from tests.fired import fired
 from tests.scenes import Arc, Box, World
 
@@ -19,17 +18,9 @@ GROUND_M = 1.7
 
 
 def directions(azimuth_deg, beams_deg):
-    azimuth, elevation = (
-        np.radians(a.ravel()) for a in np.meshgrid(np.arange(-90, 90, azimuth_deg), beams_deg)
-    )
-    return np.stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ],
-        axis=1,
-    )
+    azimuth, elevation = np.radians(np.meshgrid(np.arange(-90, 90, azimuth_deg), beams_deg))
+    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    return np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
 
 
 def scanned(ray, origin=(0.0, 0.0, 0.0), wall_m=30.0):
@@ -37,8 +28,7 @@ def scanned(ray, origin=(0.0, 0.0, 0.0), wall_m=30.0):
     with np.errstate(divide="ignore"):
         ground = np.where(ray[:, 2] < 0, -GROUND_M / ray[:, 2], np.inf)
         wall = np.where(ray[:, 0] > 0, wall_m / ray[:, 0], np.inf)
-    range_m = np.minimum(ground, wall)
-    return np.asarray(origin) + ray * range_m[:, None], ground < wall
+    return np.asarray(origin) + ray * np.minimum(ground, wall)[:, None], ground < wall
 
 
 SENSORS = {
@@ -93,26 +83,15 @@ def test_a_post_before_a_wall_faces_the_scanner():
     assert towards[post].min() > 0.99
 
 
-def in_a_room(name):
-    """A deskewed sweep of a scanner in a corner: ground 1.7 m below, a wall 15 m ahead."""
-    wall = World((Box((1.0, 200.0, 40.0), Arc(15.5, 0.0), base_m=-20.0),))
-    return fired(name, wall, share_heard=1.0)
-
-
-def patches_of_sweep(registered: RegisteredSweep):
-    sweep = registered.sweep
-    cloud = replace(make_cloud(sweep.points), lidar=sweep.lidar)
-    sensors = Sensors.of([registered])
-    found = patches(cloud, sensors, {KEY: sensors.origins_m})
-    return found, sensors
-
-
 @pytest.mark.parametrize(("name", "share"), [("panda", 0.8), ("rosette", 0.7), ("dual32", 0.7)])
 def test_normals_are_told_scanner_by_scanner(name, share):
-    registered = in_a_room(name)
-    sweep = registered.sweep
-    found, _ = patches_of_sweep(registered)
-    normal = found.normal / np.linalg.norm(found.normal, axis=1, keepdims=True)
+    # A corner: ground 1.7 m below the scanner, a wall 15 m ahead
+    wall = World((Box((1.0, 200.0, 40.0), Arc(15.5, 0.0), base_m=-20.0),))
+    registered = fired(name, wall, share_heard=1.0)
+    sweep, sensors = registered.sweep, Sensors.of([registered])
+    cloud = replace(make_cloud(sweep.points), lidar=sweep.lidar)
+    normal = patches(cloud, sensors, {KEY: sensors.origins_m}).normal
+    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     on_wall = (np.abs(sweep.points[:, 0] - 15.0) < 0.01) & (sweep.points[:, 2] > -1.2)
     on_ground = (np.abs(sweep.points[:, 2] + 1.7) < 0.01) & (sweep.points[:, 0] < 13)
     near = np.abs(np.arctan2(sweep.points[:, 1], sweep.points[:, 0])) < np.deg2rad(25)
@@ -121,15 +100,3 @@ def test_normals_are_told_scanner_by_scanner(name, share):
         for part, truth in ((on_wall, [1.0, 0, 0]), (on_ground, [0, 0, -1.0])):
             right = np.abs(normal[mine & part] @ truth) > np.cos(np.radians(8))
             assert (mine & part).sum() > 100 and right.mean() > share, (number, truth)
-
-
-def test_spacings_are_of_the_scanner_that_measured_and_from_where_it_stands():
-    registered = in_a_room("panda")
-    sweep = registered.sweep
-    found, sensors = patches_of_sweep(registered)
-    for number, model in sensors.models.items():
-        mine = np.flatnonzero(sweep.lidar == number)
-        azimuth, elevation, range_m = model.directions(sweep.points[mine])
-        expected = range_m[:, None] * model.table.at(azimuth, elevation)
-        close = np.isclose(found.spacing_m[mine], expected, rtol=1e-3).all(axis=1)
-        assert close.mean() > 0.97  # the others stand on the border of a bin

@@ -84,10 +84,8 @@ def test_where_a_prior_deviates_it_is_less_certain():
     right = np.arange(W) >= 120
     ragged = np.exp(0.1 * np.random.default_rng(0).standard_normal((H, W)))
     full = complete(measured(), prior(SAFE * np.where(right, ragged, 1)), AUTO)
-    sure, unsure = (
-        full.confidence[full.from_prior & there & (np.abs(np.arange(W) - 120) > 30)]
-        for there in (~right, right)
-    )
+    away = full.from_prior & (np.abs(np.arange(W) - 120) > 30)
+    sure, unsure = (full.confidence[away & side] for side in (~right, right))
     assert np.percentile(sure, 10) > np.percentile(unsure, 90)
 
 
@@ -102,19 +100,15 @@ def test_a_correction_does_not_cross_depth_edges():
         assert np.percentile(off(full, here), 95) < 0.03
 
 
-def test_sky_stays_empty_by_mask_and_by_distance():
-    value = 5 / np.where(SKY, 1e6, TRUE_M)
-    masked = complete(measured(), Prior(value.astype(np.float32), SKY, "test"), AUTO)
-    unmasked = complete(measured(), Prior(value.astype(np.float32), ~(SKY | ~SKY), "test"), AUTO)
-    for full in (masked, unmasked):
-        assert not full.depth_m[SKY].any() and full.from_prior.sum() > 3000
+CLIPPED = np.where(SKY, 60, np.minimum(TRUE_M, 60))  # at the far limit of the prior
+FAR, NO_SKY = 5 / np.where(SKY, 1e6, TRUE_M), np.zeros_like(SKY)
 
 
-@pytest.mark.parametrize("inverse", [False, True])
-def test_the_priors_own_far_limit_is_no_depth(inverse):
-    clipped = np.where(SKY, 60, np.minimum(TRUE_M, 60)).astype(np.float32)
-    value = 1 / clipped if inverse else clipped
-    full = complete(measured(), Prior(value, np.zeros_like(SKY), "test"), AUTO)
+@pytest.mark.parametrize(
+    ("value", "sky"), [(FAR, SKY), (FAR, NO_SKY), (CLIPPED, NO_SKY), (1 / CLIPPED, NO_SKY)]
+)
+def test_sky_stays_empty_by_mask_by_distance_and_at_the_far_limit(value, sky):
+    full = complete(measured(), Prior(value.astype(np.float32), sky, "test"), AUTO)
     assert full.fit.used and not full.depth_m[SKY].any() and full.from_prior.sum() > 3000
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Projection, visibility and fill: analytic scenes, OpenCV, and slow twins."""
+"""Projection and visibility: analytic scenes and slow twins."""
 
 from __future__ import annotations
 
@@ -12,86 +12,13 @@ from hypothesis import strategies as st
 
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure
-from densify.depth.fill import fill_between as fill_by_spacing
-from densify.depth.image_points import paint
-from densify.depth.patches import patches
-from densify.depth.project import project
-from densify.free_space.sensor import Sensors
+from densify.depth.patches import paint
 from densify.geometry.poses import exp
-from densify.geometry.types import Camera, Cloud, Patches, Reason, RegisteredSweep, Sweep
+from densify.geometry.types import Patches, Reason
+from tests.depth_scenes import KEY, at_pixel, depth_map, make_camera, make_cloud, view
 
-KEY, PERIOD_NS = 10, 100_000_000
 PLAIN = ProjectSettings(visibility=False)
-T_CAM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])  # axes only
-
-
-def make_camera(width=64, height=48, focal=60.0, distortion=()):
-    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-    return Camera("cam", width, height, K, np.eye(4), tuple(distortion))
-
-
-def make_cloud(points, frame=KEY, confidence=1.0):
-    points = np.asarray(points, float).reshape(-1, 3)
-    n = len(points)
-    frame = np.broadcast_to(np.asarray(frame, np.int32), n).copy()
-    return Cloud(
-        points=points,
-        rigid_points=points,
-        frame=frame,
-        since_key_ns=(frame.astype(np.int64) - KEY) * PERIOD_NS,
-        row=np.arange(n),
-        lidar=np.zeros(n, np.uint8),
-        moving=np.zeros(n, bool),
-        instance=np.full(n, -1, np.int32),
-        velocity_m_s=np.zeros((n, 3), np.float32),
-        confidence=np.broadcast_to(np.asarray(confidence, np.float32), n).copy(),
-        intensity=np.zeros(n, np.float32),
-        rgb=np.zeros((n, 3), np.uint8),
-        far=np.zeros(n, bool),
-    )
-
-
-def patches_of(cloud, origins=None):
-    """Patches of a cloud whose own points tell how its scanners sample directions.
-
-    origins: (S,3) of the scanners by frame; one scanner in the key frame's origin without it.
-    """
-    frames = np.unique(cloud.frame).tolist()
-    places = origins or dict.fromkeys(frames, np.zeros((1, 3)))
-    sweeps = []
-    for frame in frames:
-        mine = cloud.select(cloud.frame == frame)
-        points = mine.points - places[frame][0]
-        of_scanners = places[frame] - places[frame][0]
-        sweep = Sweep(
-            *(frame, 0, points, mine.intensity, None, mine.lidar, mine.row, of_scanners),
-        )
-        sweeps.append(RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6)))
-    return patches(cloud, Sensors.of(sweeps), places)
-
-
-def view(cloud, camera, T_cam_key, knobs, origins=None):
-    """`project` with the cloud's patches."""
-    return project(
-        cloud, Exposure(camera, T_cam_key).sees(cloud), knobs, patches_of(cloud, origins)
-    )
-
-
-def take(cloud, index):
-    return Cloud(**{name: column[index] for name, column in vars(cloud).items()})
-
-
-def at_pixel(camera, u, v, z):
-    """Camera-frame points seen at image coordinates (u, v) with depth z."""
-    u, v, z = np.broadcast_arrays(np.asarray(u, float), v, z)
-    x = (u - camera.K[0, 2]) / camera.K[0, 0] * z
-    y = (v - camera.K[1, 2]) / camera.K[1, 1] * z
-    return np.stack([x, y, z], axis=-1).reshape(-1, 3)
-
-
-def on_every_pixel(camera, z, step=1):
-    v, u = np.mgrid[0 : camera.height_px : step, 0 : camera.width_px : step]
-    return at_pixel(camera, u, v, z)
+SWEEPS = range(KEY - 4, KEY + 5)
 
 
 def test_tilted_plane_from_a_known_pose_has_its_analytic_depth():
@@ -168,43 +95,31 @@ def test_order_of_the_points_changes_no_byte(seed):
     knobs = ProjectSettings(rims="keep")
     one = view(cloud, camera, np.eye(4), knobs, origins)
     order = rng.permutation(len(cloud))
-    other = view(take(cloud, order), camera, np.eye(4), knobs, origins)
+    other = view(cloud.select(order), camera, np.eye(4), knobs, origins)
     assert (one.depth_m > 0).any()
     for name in ("depth_m", "filled_m", "confidence", "frame"):
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
     assert (one.reason[order] == other.reason).mean() > 0.95  # equal points may change places
 
 
-def facing(points, spacing_px, focal):
-    """Patches that face the camera at the origin, so many pixels apart."""
-    points = np.asarray(points, float).reshape(-1, 3)
-    normal = np.tile([0, 0, 1.0], (len(points), 1))
-    spacing_m = np.asarray(spacing_px, float) * points[:, 2:] / focal
-    return normal, np.broadcast_to(spacing_m, (len(points), 2))
+def see(camera, points_cam, frame, settings=None, spacing_px=(1.0, 1.0), **columns):
+    """The map of points in the camera's frame, which is the key's, with patches as given.
+
+    columns: ``normal`` of the patches, which face the camera without it, ``filled``, and columns of
+    the cloud.
+    """
+    points_cam = np.asarray(points_cam, float).reshape(-1, 3)
+    normal = columns.pop("normal", np.broadcast_to([0, 0, 1.0], points_cam.shape))
+    filled = columns.pop("filled", True)
+    spacing_m = np.asarray(spacing_px, float) * points_cam[:, 2:] / camera.K[0, 0]
+    cloud = replace(make_cloud(points_cam, frame), **columns)
+    surface = Patches(np.array(normal, np.float32), np.array(spacing_m, np.float32))
+    return depth_map(cloud, Exposure(camera, np.eye(4)), surface, settings, filled=filled)
 
 
-def see(
-    camera,
-    points_cam,
-    frame,
-    knobs,
-    spacing_px=(1.0, 1.0),
-    normal=None,
-    since_key_ns=None,
-    moving=False,
-    filled=True,
-):
-    """`project` of points in the camera's frame, which is the key's, with patches as given."""
-    cloud = make_cloud(points_cam, frame)
-    facing_normal, spacing_m = facing(points_cam, spacing_px, camera.K[0, 0])
-    surface = Patches(
-        normal=np.asarray(facing_normal if normal is None else normal, np.float32),
-        spacing_m=np.asarray(spacing_m, np.float32),
-    )
-    if since_key_ns is not None:
-        cloud = replace(cloud, since_key_ns=np.asarray(since_key_ns))
-    cloud.moving[:] = moving
-    return project(cloud, Exposure(camera, np.eye(4)).sees(cloud), knobs, surface, filled)
+def on_every_pixel(camera, z, step=1):
+    v, u = np.mgrid[0 : camera.height_px : step, 0 : camera.width_px : step]
+    return at_pixel(camera, u, v, z)
 
 
 def test_back_wall_does_not_shine_through_the_gaps_of_the_front_wall():
@@ -215,8 +130,7 @@ def test_back_wall_does_not_shine_through_the_gaps_of_the_front_wall():
     points = np.vstack([front, back])
     frame = [KEY + 4] * len(front) + [KEY] * len(back)
     spacing = np.vstack([np.tile([2.0, 3.0], (len(front), 1)), np.ones((len(back), 2))])
-    knobs = ProjectSettings()
-    depth = see(camera, points, frame, knobs, spacing)
+    depth = see(camera, points, frame, None, spacing)
     left, right = depth.depth_m[:88, :58], depth.depth_m[:, 62:]
     assert not (left > 15).any()
     np.testing.assert_allclose(right, 20, rtol=1e-6)  # and nothing is lost beside it
@@ -230,11 +144,10 @@ def test_slanted_ground_does_not_hide_itself():
     camera.K[1, 2] = 10.0  # the horizon near the top
     v, u = np.mgrid[16:100:2, 0:200:2]
     ground = at_pixel(camera, u, v, 300.0 * 1.6 / (v - 10.0))
-    knobs = ProjectSettings()
     up = np.tile([0, 1.0, 0], (len(ground), 1))
-    tilted = see(camera, ground, KEY, knobs, (8.0, 8.0), normal=up)
+    tilted = see(camera, ground, KEY, None, (8.0, 8.0), normal=up)
     assert (tilted.reason == Reason.KEPT).all()
-    assert (see(camera, ground, KEY, knobs, (8.0, 8.0)).reason == Reason.HIDDEN).mean() > 0.1
+    assert (see(camera, ground, KEY, None, (8.0, 8.0)).reason == Reason.HIDDEN).mean() > 0.1
 
 
 def test_patches_are_painted_like_a_slow_twin():
@@ -263,9 +176,6 @@ def wall(camera, z, frames, noise_m=0.0, step=2):
     return np.vstack(parts), np.array(frame)
 
 
-SWEEPS = range(KEY - 4, KEY + 5)
-
-
 def test_depth_is_the_planes_in_the_middle_of_the_pixel():
     """Of points anywhere in their pixels on a slanted plane: exact, where a point's own is not."""
     camera = make_camera(80, 60, 100.0)
@@ -276,9 +186,8 @@ def test_depth_is_the_planes_in_the_middle_of_the_pixel():
     keep = ray @ n > 0.05
     points = (ray / (ray @ n)[:, None])[keep]
     frame = rng.choice(SWEEPS, len(points))
-    knobs = ProjectSettings()
     normal = np.tile(n, (len(points), 1))
-    depth = see(camera, points, frame, knobs, (2.0, 2.0), normal, filled=False).depth_m
+    depth = see(camera, points, frame, None, (2.0, 2.0), normal=normal, filled=False).depth_m
     row, column = np.nonzero(depth)
     truth = 1 / (at_pixel(camera, column, row, 1.0) @ n)
     assert len(row) > 1500
@@ -294,7 +203,7 @@ def test_nearest_in_time_wins_among_the_visible_only():
     # the key's own point is hidden; of 10.08 and 10 m the one nearer in time, here the farther
     points = np.vstack([points, spot * 1.5, spot, spot * 1.008, spot * 1.009])
     frame = np.append(frame, [KEY, KEY + 3, KEY - 2, KEY + 2])
-    depth = see(camera, points, frame, ProjectSettings(), (2.0, 2.0))
+    depth = see(camera, points, frame, None, (2.0, 2.0))
     assert depth.frame[20, 30] == KEY - 2
     assert [Reason(r).name for r in depth.reason[-4:]] == [
         "HIDDEN",
@@ -316,8 +225,7 @@ def test_stamps_not_numbers_say_which_sweep_is_nearest_in_time(since_key_ms, win
     there = (np.abs(points / points[0, 2] - ray) < 1e-6).all(1) & (frame == KEY + 1)
     points[there] *= 1.008
     since_key_ns = np.where(frame == KEY + 1, *since_key_ms) * 1_000_000
-    knobs = ProjectSettings()
-    depth = see(camera, points, frame, knobs, since_key_ns=since_key_ns)
+    depth = see(camera, points, frame, since_key_ns=since_key_ns)
     assert depth.frame[20, 30] == winner
 
 
@@ -330,7 +238,7 @@ def test_of_the_sweeps_with_rays_there_the_one_nearest_to_the_key_vouches():
         if key_sees_m is not None:
             seen, by_key = wall(camera, key_sees_m, [KEY])
             points, frame = np.vstack([points, seen]), np.append(frame, by_key)
-        depth = see(camera, points, frame, ProjectSettings(), (2.0, 2.0))
+        depth = see(camera, points, frame, None, (2.0, 2.0))
         return (depth.reason[:num] == Reason.KEPT).any()
 
     others = [KEY + 1, KEY + 2, KEY + 3, KEY + 4]
@@ -348,7 +256,7 @@ def test_no_point_is_believed_at_the_edge_of_its_surface():
     panel = (u >= 40) & (u < 80)
     points = np.vstack([front[panel], back])
     frame = np.concatenate([front_frame[panel], back_frame])
-    depth = see(camera, points, frame, ProjectSettings(), (6.0, 6.0), filled=False)
+    depth = see(camera, points, frame, None, (6.0, 6.0), filled=False)
     columns = np.flatnonzero((np.abs(depth.depth_m - 10) < 1)[20:70].any(axis=0))
     assert (columns.min(), columns.max()) == (43, 76)  # 0.35 spacings and 0.015 m from the edge
     fat = see(camera, points, frame, ProjectSettings(rims="keep"), (6.0, 6.0), filled=False)
@@ -361,22 +269,12 @@ def test_no_point_is_believed_at_the_edge_of_its_surface():
     }
 
 
-def test_every_point_has_one_reason():
-    camera = make_camera(60, 40)
-    points, frame = wall(camera, 10.0, SWEEPS)
-    more = np.vstack([[0, 0, -5.0], at_pixel(camera, 31, 21, 30.0)])
-    points, frame = np.vstack([points, more]), [*frame, KEY, KEY]
-    depth = see(camera, points, frame, ProjectSettings(), (2.0, 2.0))
-    assert depth.reason[-2:].tolist() == [Reason.OUTSIDE, Reason.HIDDEN]
-    assert (depth.reason == Reason.KEPT).sum() == (depth.depth_m > 0).sum()
-
-
 def test_threads_change_no_byte():
     camera = make_camera(400, 300, 300.0)  # enough pixels for two threads
     points, frame = wall(camera, 10.0, SWEEPS, noise_m=0.05)
 
     def maps():
-        depth = see(camera, points, frame, ProjectSettings(), (2.0, 2.0))
+        depth = see(camera, points, frame, None, (2.0, 2.0))
         return depth.depth_m.tobytes() + depth.filled_m.tobytes() + depth.confidence.tobytes()
 
     with pytest.MonkeyPatch.context() as patch:
@@ -384,64 +282,3 @@ def test_threads_change_no_byte():
         one = maps()
         patch.setattr("numba.config.NUMBA_NUM_THREADS", 2)
         assert maps() == one
-
-
-def fill_between(depth, reach_px):
-    """The largest window is the same everywhere."""
-    two = (*depth.shape, 2)
-    spacing_px, tilt = np.broadcast_to(np.float32(reach_px), two), np.zeros(two, np.float32)
-    return fill_by_spacing(depth, tilt, spacing_px, 1.0)[0]
-
-
-def ground_map(rng, share=0.4):
-    v, u = np.mgrid[0:40, 0:50]
-    depth = (1 / (0.02 + 0.002 * v + 0.0003 * u)).astype(np.float32)
-    return depth, np.where(rng.uniform(size=depth.shape) < share, depth, 0).astype(np.float32)
-
-
-def test_fill_of_a_plane_is_exact_and_keeps_what_was_measured():
-    depth, sparse = ground_map(np.random.default_rng(4))
-    filled = fill_between(sparse, (2, 3))
-    measured = sparse > 0
-    assert np.array_equal(filled[measured], sparse[measured])
-    added = (filled > 0) & ~measured
-    assert added.sum() > 0.9 * (~measured[4:-4, 4:-4]).sum()
-    # held within what was measured around it, a filled pixel can be off by a few pixels' worth
-    assert np.median(np.abs(filled[added] / depth[added] - 1)) < 1e-3
-    assert np.abs(filled[added] / depth[added] - 1).max() < 0.1
-
-
-def two_sided_twin(measured, reach_u, reach_v):
-    result = np.zeros(measured.shape, bool)
-    for v, u in zip(*np.nonzero(~measured), strict=True):
-        around = [
-            (q - u, p - v)
-            for p in range(max(0, v - reach_v), min(len(measured), v + reach_v + 1))
-            for q in range(max(0, u - reach_u), min(measured.shape[1], u + reach_u + 1))
-            if measured[p, q]
-        ]
-        du, dv = {d for d, _ in around}, {d for _, d in around}
-        result[v, u] = min(du, default=0) < 0 < max(du, default=0) and (
-            min(dv, default=0) < 0 < max(dv, default=0)
-        )
-    return result
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(0.02, 0.6), st.sampled_from([(2, 3), (1, 1), (3, 1)]))
-@settings(max_examples=25, deadline=None)
-def test_two_sided_rule_equals_a_slow_twin(seed, share, reach):
-    measured = np.random.default_rng(seed).uniform(size=(20, 25)) < share
-    depth = measured.astype(np.float32) * 7
-    filled = fill_between(depth, reach)
-    assert np.array_equal((filled > 0) & ~measured, two_sided_twin(measured, *reach))
-    assert np.allclose(filled[filled > 0], 7)
-
-
-@pytest.mark.parametrize("step", [1.3, 2.0, 5.0])
-def test_no_depth_is_invented_between_two_surfaces(step):
-    rng = np.random.default_rng(5)
-    depth = np.where(np.arange(40) < 20, 10.0, 10.0 * step) * np.ones((30, 1))
-    sparse = np.where(rng.uniform(size=depth.shape) < 0.5, depth, 0).astype(np.float32)
-    filled = fill_between(sparse, (2, 3))
-    assert set(np.unique(np.round(filled, 3))) <= {0.0, 10.0, np.float32(10 * step)}
-    assert (filled[5:25, 5:15] > 0).mean() > 0.95

@@ -5,19 +5,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_project import KEY, T_CAM_LIDAR, make_camera, make_cloud, patches_of
 
-from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure
-from densify.depth.project import project
-from densify.depth.seen_through import Rays, crossings
+from densify.depth.project import crossings
+from densify.depth.rays import Rays
 from densify.geometry.poses import exp, transform
-from densify.geometry.types import RegisteredSweep, Stretch, Sweep
+from densify.geometry.types import Stretch
+from tests.depth_scenes import (
+    KEY,
+    T_CAM_LIDAR,
+    depth_map,
+    make_camera,
+    make_cloud,
+    patches_of,
+    registered,
+)
 
 FRONT_M, WALL_M = 12.0, 20.0
 PICKET_M, STEP_M = 0.09, 0.17
 CAMERA = make_camera(width=400, height=60, focal=720.0)
-SETTINGS = ProjectSettings()
 
 
 def fence(y, z):
@@ -46,18 +52,9 @@ def scanned(solid):
         frames.append(np.full(len(at), frame))
         origins[frame], pose = origin[None], np.eye(4)
         pose[:3, 3] = origin
-        sweeps.append(fired(frame, at, pose, np.zeros(6)))
+        sweeps.append(registered(frame, at, pose, np.zeros(6)))
     cloud = make_cloud(np.vstack(points), np.concatenate(frames))
     return cloud, origins, Rays(Stretch(tuple(sweeps)), KEY)
-
-
-def fired(frame, points, pose, twist, offset_ns=None):
-    nothing = np.zeros(len(points))
-    sweep = Sweep(
-        *(frame, 0, points, nothing.astype(np.float32), offset_ns),
-        *(nothing.astype(np.uint8), np.arange(len(points))),
-    )
-    return RegisteredSweep(sweep, pose, twist, 2 * twist)
 
 
 def maps(solid, **knobs):
@@ -69,8 +66,8 @@ def maps(solid, **knobs):
     v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px]
     y = -(u - CAMERA.K[0, 2]) / CAMERA.K[0, 0] * FRONT_M
     z = -(v - CAMERA.K[1, 2]) / CAMERA.K[1, 1] * FRONT_M
-    before = project(cloud, exposure.sees(cloud), SETTINGS, surface)
-    return before, project(cloud, exposure.sees(cloud), SETTINGS, surface, rays=rays), solid(y, z)
+    before = depth_map(cloud, exposure, surface)
+    return before, depth_map(cloud, exposure, surface, rays=rays), solid(y, z)
 
 
 def test_gaps_of_a_fence_are_not_closed():
@@ -125,12 +122,12 @@ def test_rays_cross_a_surface_where_geometry_says(measure):
     assert len(crossings(surface_m, start, before_it, exposure)) == 0
 
 
-def test_rays_start_where_the_scanner_was_when_it_fired():
+def test_rays_start_where_the_scanner_was_when_it_registered():
     rng = np.random.default_rng(2)
     twist, offset_ns = np.array([0.01, 0.02, 0.3, 14.0, 0.5, 0.1]), np.array([-40, 0, 30]) * 10**6
     pose = exp(rng.normal(size=6))
     of_key, other = (
-        fired(f, rng.normal(size=(3, 3)), T, twist, offset_ns)
+        registered(f, rng.normal(size=(3, 3)), T, twist, offset_ns)
         for f, T in ((KEY, np.eye(4)), (KEY + 1, pose))
     )
     cloud = make_cloud(np.zeros((2, 3)), KEY + 1)

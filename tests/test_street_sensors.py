@@ -9,10 +9,10 @@ import pytest
 from densify.geometry.poses import inverse, transform
 from densify.readers import describe
 from densify.readers.street import Street
+from densify.street.lidar import SENSORS, Raster, Rosette, Slots, Spinning, firings
 from densify.street.materials import Material
 from densify.street.mesh import box
 from densify.street.motion import Driving, Rectangles, Still
-from densify.street.sensors import SENSORS, Raster, Rosette, Slots, Spinning, firings
 from densify.street.simulator import Simulator
 from densify.street.terrain import Curve, Ground, Speed, Terrain
 from densify.street.traffic import Scene

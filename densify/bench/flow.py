@@ -22,7 +22,6 @@ import numpy as np
 
 from densify.config import Config, as_mapping, resolve
 from densify.config.errors import InputError, did_you_mean
-from densify.depth.accumulate import accumulate
 from densify.flow.engines import Scene, estimate_motion
 from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.free_space.range_image import RangeImage
@@ -38,6 +37,7 @@ from densify.geometry.types import (
     Truth,
 )
 from densify.outputs.atomic import plain
+from densify.pipeline.accumulate import accumulate
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
 from densify.readers.flow_files import LabelledFlow, labelled_flow

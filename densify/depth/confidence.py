@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from densify.depth.layers import Layers
-from densify.depth.measured_pixels import ALL_ROUND
+from densify.depth.measured_pixels import ALL_ROUND, MapRecord
 from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32, Int
 from densify.scores.depth_metrics import (
     DECADES,
@@ -51,7 +50,7 @@ _NUM_STEPS = 20
 _UNCONFIRMED = 2.7  # found / expected outliers of one sweep alone: 0.9 to 6, on six recordings
 
 
-def features(layers: Layers, since_key_ns: Int, camera: Camera) -> Float32:
+def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
     """Return the (P,10) features of the P pixels with a filled or rejected depth, row by row.
 
     Shares, steps and ages enter by their logarithm to base 10, because probabilities of errors are
@@ -61,40 +60,39 @@ def features(layers: Layers, since_key_ns: Int, camera: Camera) -> Float32:
     neighbouring rays.
 
     Args:
-        layers: The finished map, before `densify.depth.spots`.
+        record: The map, before `densify.depth.fill.measure_spots`.
         since_key_ns: (M,) ns from the key sweep of the points of the cloud.
         camera: Camera of the map.
     """
-    shown, rejected = layers.filled_m > 0, layers.rejected_m > 0
-    some, depth_m = shown | rejected, np.where(shown, layers.filled_m, layers.rejected_m)
-    measured = layers.depth_m > 0
-    gap_px = float(np.median(layers.gap_px))
-    nearest = nearest_measured(layers)
-    age_s = np.abs(since_key_ns[layers.point[nearest]]) * 1e-9 if measured.any() else 0 * depth_m
-    edge = np.where(measured, layers.edge, 0)[nearest]
-    if layers.solid is not None:
-        edge[layers.solid] = ALL_ROUND
-    step = _step(depth_m, layers.filled_m, _size(1, gap_px)) / tolerance(depth_m, camera)
+    shown, rejected = record.filled_m > 0, record.rejected_m > 0
+    has_depth, depth_m = shown | rejected, np.where(shown, record.filled_m, record.rejected_m)
+    measured = record.depth_m > 0
+    gap_px = float(np.median(record.gap_px))
+    nearest = nearest_pixel(measured)
+    age_s = np.abs(since_key_ns[record.point[nearest]]) * 1e-9 if measured.any() else 0 * depth_m
+    edge = np.where(measured, record.edge, 0)[nearest]
+    edge[record.on_body] = ALL_ROUND
+    step = _step(depth_m, record.filled_m, _size(1, gap_px)) / tolerance(depth_m, camera)
     around_px = _size(2, gap_px)
     cover = _mean(shown, around_px) / _mean(np.ones_like(shown), around_px)  # within the image
     columns = [
         np.ones(shown.shape),
         ~measured,
-        _logarithm(1 - layers.votes, _LEAST_VOTES),
-        *(_rejected(layers, _size(reach, gap_px)) for reach in (2, 8)),
+        _logarithm(1 - record.votes, _LEAST_VOTES),
+        *(_rejected(record, _size(reach, gap_px)) for reach in (2, 8)),
         _logarithm(step, _LEAST_STEP),
         _logarithm(age_s, _AGE_S),
         -np.log2(np.maximum(cover, _LEAST_COVER)),
         np.clip(ALL_ROUND - edge, 0, ALL_ROUND - 1),
         rejected,
     ]
-    return np.stack([column[some] for column in columns], axis=1).astype(np.float32)
+    return np.stack([column[has_depth] for column in columns], axis=1).astype(np.float32)
 
 
-def nearest_measured(layers: Layers) -> tuple[Int, Int]:
-    """Return the (H,W) rows and the (H,W) columns of the nearest measured pixel of each pixel."""
+def nearest_pixel(known: Bool) -> tuple[Int, Int]:
+    """Return the (H,W) rows and the (H,W) columns of the nearest known pixel of each pixel."""
     row, column = ndimage.distance_transform_edt(
-        layers.depth_m == 0, return_distances=False, return_indices=True
+        ~known, return_distances=False, return_indices=True
     )
     return row, column
 
@@ -121,9 +119,9 @@ def _mean(mask: Bool, size_px: int) -> Float32:
     return mean
 
 
-def _rejected(layers: Layers, size_px: int) -> Float:
+def _rejected(record: MapRecord, size_px: int) -> Float:
     """Return the (H,W) logarithm of the share of boundary pixels around that are not accepted."""
-    rejected, measured = (layers.rim_m > 0) & (layers.depth_m == 0), layers.depth_m > 0
+    rejected, measured = (record.boundary_m > 0) & (record.depth_m == 0), record.depth_m > 0
     share = _mean(rejected, size_px) / np.maximum(_mean(rejected | measured, size_px), 1e-4)
     return _logarithm(share, _LEAST_SHARE)
 
@@ -144,6 +142,11 @@ def confidence_of(evidence: NDArray[np.floating], weights: Float | None = None) 
     used = np.array([*WEIGHTS.values()]) if weights is None else weights
     log_p = -np.logaddexp(0, -(evidence @ used)) / np.log(10)
     return np.clip(-log_p / DECADES, 0, 1).astype(np.float32)
+
+
+def confidence_by_age(since_key_ns: Int) -> Float32:
+    """Return (M,) relative scores 1 / (1 + t) of 0 to 1, for sweeps t seconds from the key."""
+    return (1 / (1 + np.abs(since_key_ns) * 1e-9)).astype(np.float32)
 
 
 def most_certain(confidence: Float32, max_outliers: float, before: Float32 | None = None) -> Bool:
@@ -177,29 +180,19 @@ def with_max_outliers(maps: DepthMap, max_outliers: float | None) -> DepthMap:
     rejected, shown = maps.rejected, maps.filled_m > 0
     if rejected is None or max_outliers is None:
         return replace(maps, rejected=None)
-    own, none = maps.confidence[shown], np.float32(0)
-    if shown.any() and outlier_probability(own).mean() > max_outliers:
-        kept = shown.copy()
-        kept[shown] = most_certain(own, max_outliers)
-        depth_m, filled_m, confidence = (
-            np.where(kept, values, none)
-            for values in (maps.depth_m, maps.filled_m, maps.confidence)
-        )
-        frame = np.where(kept, maps.frame, -1)
+    kept, back, confidence = shown.copy(), rejected.depth_m > 0, maps.confidence[shown]
+    if shown.any() and outlier_probability(confidence).mean() > max_outliers:
+        kept[shown] = most_certain(confidence, max_outliers)
+        back[:] = False
     else:
-        back = rejected.depth_m > 0
-        back[back] = most_certain(rejected.confidence[back], max_outliers, own)
-        measured = back & (rejected.frame >= 0)
-        depth_m = np.where(measured, rejected.depth_m, maps.depth_m)
-        filled_m = np.where(back, rejected.depth_m, maps.filled_m)
-        confidence = np.where(back, rejected.confidence, maps.confidence)
-        frame = np.where(measured, rejected.frame, maps.frame)
+        back[back] = most_certain(rejected.confidence[back], max_outliers, confidence)
+    measured = back & (rejected.frame >= 0)
     return replace(
         maps,
-        depth_m=depth_m,
-        filled_m=filled_m,
-        confidence=confidence,
-        frame=frame.astype(np.int32),
+        depth_m=np.select([measured, kept], [rejected.depth_m, maps.depth_m]),
+        filled_m=np.select([back, kept], [rejected.depth_m, maps.filled_m]),
+        confidence=np.select([back, kept], [rejected.confidence, maps.confidence]),
+        frame=np.select([measured, kept], [rejected.frame, maps.frame], np.int32(-1)),
         evidence=None,
         rejected=None,
     )
@@ -247,10 +240,8 @@ def expected_outliers(maps: DepthMap) -> dict[str, float | None]:
     """Return the expected share of outliers of the ``measured`` and the ``filled`` map."""
     shares: dict[str, float | None] = {}
     for name, depth_m in (("measured", maps.depth_m), ("filled", maps.filled_m)):
-        some = depth_m > 0
-        shares[name] = (
-            float(outlier_probability(maps.confidence[some]).mean()) if some.any() else None
-        )
+        probability = outlier_probability(maps.confidence[depth_m > 0])
+        shares[name] = float(probability.mean()) if len(probability) else None
     return shares
 
 
@@ -269,13 +260,13 @@ def reliability(maps: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[s
     step = np.minimum((confidence * _NUM_STEPS).astype(np.int64), _NUM_STEPS - 1)
     num = np.bincount(step, minlength=_NUM_STEPS)
     expected = np.bincount(step, outlier_probability(confidence), _NUM_STEPS)
-    found = np.bincount(step, bad, _NUM_STEPS)
+    num_outliers = np.bincount(step, bad, _NUM_STEPS)
     return [
         {
             "confidence": i / _NUM_STEPS,
             "num_compared": int(num[i]),
             "expected": float(expected[i] / num[i]),
-            "outliers": float(found[i] / num[i]),
+            "outliers": float(num_outliers[i] / num[i]),
         }
         for i in np.flatnonzero(num).tolist()
     ]

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from densify.depth.accumulate import confidence_of
+from densify.depth.confidence import confidence_by_age
 from densify.depth.exposure import AT_ONCE, Exposure
-from densify.depth.image_points import HIDDEN_FRACTION
-from densify.depth.patches import tangents
+from densify.depth.patches import AGREE_M, HIDDEN_FRACTION, tangents
 from densify.free_space.range_image import RangeImage
 from densify.free_space.seen_through import FREE_MARGIN
 from densify.free_space.sensor import Sensors
@@ -35,7 +34,8 @@ from densify.geometry.types import (
 )
 
 _MOST_RANGE_M = 60.0
-_MOST_SPACING_M = 0.05  # enough, as many sweeps measure a surface; larger patches hide edges
+# Enough, as many sweeps measure a surface; larger patches hide edges.
+_MOST_SPACING_M = 0.5 * AGREE_M
 _SLACK_M = 0.5
 _PRIME = 2_654_435_761  # its multiples visit any smaller number of points in mixed order
 _FEW_FILLED = 3  # least number of filled cells of nine, for a sweep beyond the window
@@ -105,10 +105,7 @@ def standing(sensors: Sensors, registered: RegisteredSweep, gone: Bool) -> Stand
     """Return a sweep's points that are not ``gone`` (N,), world frame, with their patches."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     source = np.zeros(len(sweep), np.int32)
-    wanted = np.ones(len(source), bool)
-    normal, spacing_m = tangents(
-        sweep.points, sweep.lidar, source, wanted, sensors, [sensors.origins_m]
-    )
+    normal, spacing_m = tangents(sweep.points, sweep.lidar, source, sensors, [sensors.origins_m])
     return StandingWorld(
         points=poses.transform(T_world_lidar, sweep.points).astype(np.float32),
         normal=poses.rotate(T_world_lidar, normal.astype(np.float64)).astype(np.float32),
@@ -184,13 +181,11 @@ def far_cloud(
     needed = np.zeros(len(world), bool)
     for exposure in exposures.values():
         needed[_seen(world.points, rows, T_key_world, exposure)] = True
-    rows = np.flatnonzero(needed)
-    points = poses.transform(T_key_world, world.points.take(rows, axis=0).astype(np.float64))
+    world = world.select(needed)
+    points = poses.transform(T_key_world, world.points.astype(np.float64))
     if standing_only:
-        ends = sorted({stretch.frames[0], stretch.frames[-1]} - {key})
-        is_static = ~_gone(points, stretch, key, ends)
-        rows, points = rows[is_static], points[is_static]
-    world = world.select(rows)
+        is_static = ~_gone(points, stretch, key)
+        world, points = world.select(is_static), points[is_static]
     num, since_key_ns = len(world), world.stamp_ns - stretch[key].sweep.stamp_ns
     cloud = Cloud(
         points=points,
@@ -202,7 +197,7 @@ def far_cloud(
         moving=np.zeros(num, bool),
         instance=np.full(num, -1, np.int32),
         velocity_m_s=np.zeros((num, 3), np.float32),
-        confidence=confidence_of(since_key_ns)[world.source],
+        confidence=confidence_by_age(since_key_ns)[world.source],
         intensity=world.intensity,
         rgb=np.zeros((num, 3), np.uint8),
         far=np.ones(num, bool),
@@ -234,11 +229,10 @@ def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) ->
     return rows[thinned(np.concatenate(cells), mixed, 1.0, 1)]
 
 
-def _gone(points: Float, stretch: Stretch, key: int, witnesses: Sequence[int]) -> Bool:
-    """Return (M,) True for points (M,3), key frame, that a sweep of ``witnesses`` saw through."""
+def _gone(points: Float, stretch: Stretch, key: int) -> Bool:
+    """Return (M,) True for points, key frame, that an end of the window saw through."""
     free = np.zeros(len(points), bool)
-    for frame in witnesses:
+    for frame in {stretch.frames[0], stretch.frames[-1]} - {key}:
         points_sweep = poses.transform(stretch.T_target_source(frame, key), points)
-        image = RangeImage.of(stretch[frame])
-        free |= image.sees_through(points_sweep, *FREE_MARGIN)
+        free |= RangeImage.of(stretch[frame]).sees_through(points_sweep, *FREE_MARGIN)
     return free

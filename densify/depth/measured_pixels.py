@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Compute the depth that the points in an image give its pixels.
+"""Define the record of a depth map in the making, and measure its pixels by the points in an image.
 
 Among the visible points in a pixel, the one measured nearest in time to the key sweep wins. A plane
 is fitted to the surrounding points that agree with it, and the pixel gets the depth of the plane at
@@ -9,28 +9,34 @@ key is among those that agree. Close to a depth discontinuity it becomes a bound
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from densify.depth.image_points import (
+from densify.config import ProjectSettings
+from densify.depth.exposure import InView, PointsInImage, pixel_of, points_in_image
+from densify.depth.patches import (
+    AGREE_FRACTION,
+    AGREE_M,
     FOOTPRINT,
     HIDDEN_FRACTION,
     HIDDEN_M,
-    PointsInImage,
-    distance_behind,
+    add_moments,
+    is_occluded,
+    limited,
+    plane,
     sorted_by_pixel,
 )
-from densify.depth.neighbours import limited, plane
-from densify.geometry.arrays import Bool, Float, Float32, Int
+from densify.depth.rays import MovingBody, Rays
 from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.types import Camera, Reason
+from densify.geometry.types import Bool, Camera, Cloud, Float32, Int, Patches, Reason
 
-AGREE_M, AGREE_FRACTION = 0.1, 0.02
-"""Greatest deviation between points on one surface: metres plus share of the depth."""
 _REACH = 0.65  # radius of the plane and of the sweeps that agree, in spacings of rays
-_SLACK_M = 0.015  # added to the radius of a discontinuity, for errors of registration
+_SLACK_M = 0.15 * AGREE_M  # added to the radius of a discontinuity, for errors of registration
 _EDGE_WINDOW_PX = 1.5  # width beyond the edge in which points must continue the surface
 # Sweeps beyond the window share errors, and continue a surface behind a nearer one.
 _FAR_SWEEPS, _FAR_EDGE = 6, 1.5
@@ -38,124 +44,196 @@ _RIDGE_PX2 = 0.02
 _LEAST_PX, _MOST_PX = 3, 24  # limits of the radius
 ALL_ROUND = 3.0
 """Extent of a surface without a depth discontinuity nearby, in radii of a discontinuity."""
-_NUM_BITS = np.iinfo(np.int64).bits - 1  # sweeps are counted by their frame number modulo 63
+_BLOCK_PX = 16  # blocks within which the density of rays is about constant
+_JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
 
 
-class MeasuredPixels(NamedTuple):
-    """The H·W pixels of an image, row by row."""
+class MapInputs(NamedTuple):
+    """All that one depth map is made of."""
 
-    winner: Int  # (H·W,) index, in `PointsInImage`, of the point that gives the depth; -1 none
-    depth_m: Float32  # (H·W,) float32 depth in metres
-    edge: Float32  # (H·W,) float32 extent of the surface, in radii of a discontinuity
-    inside: Bool  # (H·W,) True if no depth discontinuity is near
+    cloud: Cloud
+    patches: Patches  # surface patches of the cloud's points
+    view: InView  # points of the cloud in the image
+    settings: ProjectSettings  # without ``visibility`` each pixel takes its nearest point
+    filled: bool = True  # fill holes by interpolation
+    lab: Float32 | None = None  # (H,W,3) image in L*a*b*; None accepts no boundary pixel by it
+    rays: Rays | None = None  # of the window; None rejects no pixel as seen through
+    bodies: Mapping[int, MovingBody] = {}  # of moving objects, by instance number
 
-    @staticmethod
-    def at(camera: Camera, pixel: Int, *columns: np.ndarray) -> MeasuredPixels:
-        """Return an image with columns (P,) at flat indices ``pixel`` (P,), empty elsewhere."""
-        num = camera.height_px * camera.width_px
-        images = [np.full(num, -1, np.int64), *(np.zeros(num, c.dtype) for c in columns[1:])]
-        for image, column in zip(images, columns, strict=True):
-            image[pixel] = column
-        return MeasuredPixels(*images)
+    @property
+    def camera(self) -> Camera:
+        """The camera whose view the map has."""
+        return self.view.exposure.camera
 
 
-def nearest_pixels(
-    points: PointsInImage, camera: Camera, reason: NDArray[np.uint8]
-) -> MeasuredPixels:
-    """Return the nearest point of each pixel, without occlusion or support tests.
+@dataclass
+class MapRecord:
+    """One depth map in the making, changed in place by the stages of `densify.depth.project`.
 
-    The ``reason`` (M,) of the points in the cloud becomes NOT_CHOSEN in place.
+    Images are (H,W) with depths in metres, 0 for no depth.
     """
-    start, order = sorted_by_pixel(points, np.zeros(len(points.index), np.int64), camera)
-    pixel = np.flatnonzero(np.diff(start))
-    nearest = order[start[pixel]]
-    reason[points.index] = Reason.NOT_CHOSEN
-    inside, edge = np.ones(len(pixel), bool), np.full(len(pixel), np.float32(ALL_ROUND))
-    return MeasuredPixels.at(camera, pixel, nearest, points.depth[nearest], edge, inside)
+
+    depth_m: Float32  # depth of pixels that are accepted as measured
+    # Depth of boundary pixels, measured so close to a depth discontinuity that they may show the
+    # background. Accepted boundary pixels keep this value too.
+    boundary_m: Float32
+    filled_m: Float32  # depth of accepted and of interpolated pixels
+    rejected_m: Float32  # depth of pixels that rules rejected
+    confidence: Float32  # of pixels with a filled or rejected depth
+    point: NDArray[np.int32]  # index, in the cloud, of the point that measured the pixel; -1 none
+    tilt: Float32  # (H,W,2) slope of the surface's inverse depth to the right and down, 1/m per px
+    # (H,W,2) spacing of neighbouring rays of one sweep, across and down, at all pixels
+    spacing_px: Float32
+    # (H,W) share of the image's votes for the depth of a boundary pixel, a filled or a rejected
+    # pixel; 1 without a vote
+    votes: Float32
+    edge: Float32  # (H,W) distance of measured pixels from a discontinuity, in radii of a spot
+    on_body: Bool  # (H,W) True on bodies of moving objects (`MovingBody`)
+    lab: Float32  # (H,W,3) camera image in L*a*b*, (0,0,3) if there is no image
+    points: PointsInImage  # points of the cloud in the image
+    reason: NDArray[np.uint8]  # (M,) `Reason` of each point of the cloud
+    # (P,10) `densify.depth.confidence.features` of P pixels; None without calibrated confidence
+    evidence: Float32 | None = None
+
+    @property
+    def gap_px(self) -> Float32:
+        """The (H,W) spacing of neighbouring rays, geometric mean of both directions."""
+        return np.sqrt(self.spacing_px[..., 0] * self.spacing_px[..., 1])
+
+    def box(self, box: tuple[slice, slice]) -> MapRecord:
+        """Return a box of rows and columns as views: writing to the box changes this record."""
+        names = {f.name for f in fields(self)} - {"points", "reason", "evidence"}
+        return replace(self, **{name: getattr(self, name)[box] for name in names})
+
+    def reject(self, dropped: Bool) -> None:
+        """Remove the pixels ``dropped`` (H,W) from the filled map.
+
+        Measured pixels among them become boundary pixels that are not accepted.
+        """
+        dropped = dropped & (self.filled_m > 0)
+        np.copyto(self.boundary_m, self.depth_m, where=dropped & (self.depth_m > 0))
+        np.copyto(self.rejected_m, self.filled_m, where=dropped)
+        self.depth_m[dropped] = self.filled_m[dropped] = 0
 
 
-def visible_pixels(
-    points: PointsInImage, camera: Camera, reason: NDArray[np.uint8]
-) -> MeasuredPixels:
-    """Return the pixels that visible points measure; set ``reason`` (M,) of points in the image.
+def measure(inputs: MapInputs) -> MapRecord:
+    """Return the record of a map with its measured pixels and boundary pixels.
 
     Points beyond the window come second. They measure pixels that the window leaves empty, away
     from depth discontinuities.
     """
-    in_window = np.flatnonzero(~points.far)
-    pixels, reasons = _settled(points.select(~points.far), camera)
-    reason[points.index[in_window]] = reasons
-    if len(in_window) == len(points.index):
-        return pixels
-    if len(in_window):
-        winner = np.where(pixels.winner < 0, -1, in_window[pixels.winner])
-        pixels = pixels._replace(winner=winner)
-    beyond, reasons = _settled(points, camera, measured=pixels.inside)
-    reason[points.index[points.far]] = reasons[points.far]
-    better = beyond.inside
-    pairs = zip(pixels, beyond, strict=True)
-    return MeasuredPixels(*(np.where(better, far_value, value) for value, far_value in pairs))  # type: ignore[call-overload]
+    camera, points = inputs.camera, points_in_image(inputs.cloud, inputs.view, inputs.patches)
+    shape = (camera.height_px, camera.width_px)
+    in_window = points.take(np.flatnonzero(~points.far)) if points.far.any() else points
+    zero, no_image = np.zeros(shape, np.float32), np.zeros((0, 0, 3), np.float32)
+    lab = no_image if inputs.lab is None else inputs.lab
+    record = MapRecord(
+        depth_m=zero.copy(),
+        boundary_m=zero.copy(),
+        filled_m=zero.copy(),
+        rejected_m=zero.copy(),
+        confidence=zero.copy(),
+        point=np.full(shape, -1, np.int32),
+        tilt=np.zeros((*shape, 2), np.float32),
+        spacing_px=_spacing_px(points if points.far.all() else in_window, shape),
+        votes=np.ones(shape, np.float32),
+        edge=zero,
+        on_body=np.zeros(shape, bool),
+        lab=np.ascontiguousarray(lab),
+        points=points,
+        reason=np.full(len(inputs.cloud), Reason.OUTSIDE, np.uint8),
+    )
+    if not inputs.settings.visibility:
+        _measure_nearest(record, points, camera)
+        return record
+    _measure_visible(record, in_window, camera)
+    if points.far.any():
+        _measure_visible(record, points, camera, beyond=True)
+    return record
 
 
-def _settled(
-    points: PointsInImage, camera: Camera, measured: Bool | None = None
-) -> tuple[MeasuredPixels, NDArray[np.uint8]]:
-    """Return the pixels that points measure, and the (K,) `Reason` of every point."""
-    hidden = distance_behind(points, camera) > 1
-    reason = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
-    pixel, winner, settled = _fit_surfaces(points, hidden, camera, measured)
-    depth_m, num_sweeps, supported, edge = settled
-    if measured is None:
-        supported = supported > 0
-        inside = edge >= 1
-    else:
-        # Beyond the window the sweep nearest to the key need not agree, but six sweeps must.
-        supported, inside = num_sweeps >= _FAR_SWEEPS, edge >= _FAR_EDGE
-        reason[winner[~inside]] = Reason.EDGE
-    reason[winner[~supported]] = Reason.UNSUPPORTED
-    kept = [column[supported] for column in (winner, depth_m, edge, inside)]
-    return MeasuredPixels.at(camera, pixel[supported], *kept), reason
+def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
+    """Return the (H,W,2) spacing of rays across and down, the mean over blocks of pixels."""
+    height, width = (-(-size // _BLOCK_PX) for size in shape)
+    row, column = pixel_of(points.uv)
+    block = row // _BLOCK_PX * width + column // _BLOCK_PX
+    num = np.bincount(block, minlength=height * width)
+    if not num.any():
+        return np.ones((*shape, 2), np.float32)
+    sums = [np.bincount(block, s, height * width) for s in points.spacing_px.T]
+    mean = (np.stack(sums, axis=1) / np.maximum(num, 1)[:, None]).astype(np.float32)
+    empty = (num == 0).reshape(height, width)
+    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    blocks = mean.reshape(height, width, 2)[tuple(nearest)]
+    # A block takes the downward spacing of the block above or below if that is far larger: the hole
+    # below the last of a scanner's denser rings is as wide.
+    down_px = blocks[..., 1]
+    widest_px = ndimage.maximum_filter1d(down_px, 3, axis=0)
+    blocks[..., 1] = np.where(widest_px > _JUMP * down_px, widest_px, down_px)
+    every = blocks.repeat(_BLOCK_PX, axis=0).repeat(_BLOCK_PX, axis=1)
+    return np.ascontiguousarray(every[: shape[0], : shape[1]])
 
 
-class _Visible(NamedTuple):
-    """K points in an image, sorted by pixel, occluded points last in each pixel."""
-
-    start: Int  # (H·W+1,) index of each pixel's first point, of `sorted_by_pixel`
-    uv: Float  # (K,2) column and row in px
-    inverse: Float  # (K,) inverse depth in 1/m
-    slope: Float  # (K,2) slope of the inverse depth, 1/m per px
-    edge_px: Float  # (K,) radius of a depth discontinuity
-    spacing_px: Float  # (K,2) spacing of neighbouring rays
-    sweep: NDArray[np.integer]  # (K,) frame number of the source sweep modulo 63
-    hidden: Bool
-    age_ns: Int  # (K,) time from the key sweep
+def _measure_nearest(record: MapRecord, points: PointsInImage, camera: Camera) -> None:
+    """Measure each pixel by its nearest point, without occlusion or support tests."""
+    start, order = sorted_by_pixel(points, np.zeros(len(points.rows), np.int64), camera)
+    pixel = np.flatnonzero(np.diff(start))
+    nearest = order[start[pixel]]
+    record.reason[points.rows] = Reason.NOT_CHOSEN
+    record.depth_m.flat[pixel] = points.depth[nearest]
+    record.edge.flat[pixel] = ALL_ROUND
+    _set_source(record, points, pixel, nearest)
 
 
-def _fit_surfaces(
-    points: PointsInImage, hidden: Bool, camera: Camera, measured: Bool | None
-) -> tuple[Int, Int, Float32]:
-    """Return pixels (P,) with visible points, the best point of each, and (4,P) of `_settle`."""
+def _set_source(record: MapRecord, points: PointsInImage, pixel: Int, chosen: Int) -> None:
+    """Set the source of flat pixels (P,): the ``chosen`` (P,) of the points in the image."""
+    record.point.flat[pixel] = points.rows[chosen]
+    record.tilt.reshape(-1, 2)[pixel] = points.slope[chosen]
+
+
+def _measure_visible(
+    record: MapRecord, points: PointsInImage, camera: Camera, beyond: bool = False
+) -> None:
+    """Measure pixels by visible points, and set the reason of each point in the image."""
+    # beyond: with points of sweeps beyond the window; pixels measured before stay
+    hidden = is_occluded(points, camera)
+    reasons = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
     last = int(points.age_ns.max(initial=0)) + 1
     start, order = sorted_by_pixel(points, np.where(hidden, last, points.age_ns), camera)
-    settled = np.zeros((4, len(start) - 1), np.float32)
-    done = np.zeros(len(start) - 1, bool) if measured is None else measured  # left out
-    inverse = points.inverse
-    edge_px = FOOTPRINT * points.spacing_px[:, 0] + _SLACK_M * points.focal_px[:, 0] * inverse
-    visible = _Visible(
-        start,
-        points.uv.take(order, axis=0),
-        inverse[order],
-        points.slope.take(order, axis=0),
-        edge_px[order],
-        points.spacing_px.take(order, axis=0),
-        points.frame[order] % _NUM_BITS,
-        hidden[order],
-        points.age_ns[order],
-    )
-    shape = (camera.height_px, camera.width_px)
-    _settle.over_rows(len(done), visible, shape, done, settled)
+    done = record.depth_m > 0
+    settled = np.zeros((4, done.size), np.float32)
+    by_pixel = _ByPixel(points.take(order), hidden[order], start, done.shape)
+    _settle.over_rows(done.size, by_pixel, done.ravel(), settled)
     pixel = np.flatnonzero(settled[0])
-    return pixel, order[start[pixel]], settled[:, pixel]
+    winner = order[start[pixel]]
+    depth_m, num_sweeps, supported, edge = settled[:, pixel]
+    if beyond:
+        # Beyond the window the sweep nearest to the key need not agree, but six sweeps must.
+        is_supported, inside = num_sweeps >= _FAR_SWEEPS, edge >= _FAR_EDGE
+        reasons[winner[~inside]] = Reason.EDGE
+        used = is_supported & inside
+    else:
+        is_supported, inside = supported > 0, edge >= 1
+        used = is_supported
+    reasons[winner[~is_supported]] = Reason.UNSUPPORTED
+    set_by = points.far if beyond else ~points.far
+    record.reason[points.rows[set_by]] = reasons[set_by]
+    pixel, winner, depth_m, edge, inside = (
+        column[used] for column in (pixel, winner, depth_m, edge, inside)
+    )
+    record.depth_m.flat[pixel] = np.where(inside, depth_m, 0)
+    record.boundary_m.flat[pixel] = np.where(inside, 0, depth_m)
+    record.edge.flat[pixel] = edge
+    _set_source(record, points, pixel, winner)
+
+
+class _ByPixel(NamedTuple):
+    """Points in an image sorted by pixel, occluded points last in each pixel."""
+
+    points: PointsInImage
+    hidden: Bool  # (K,) True for occluded points
+    start: Int  # (H·W+1,) index of each pixel's first point
+    shape: tuple[int, ...]  # height and width of the image
 
 
 @inlined
@@ -184,14 +262,14 @@ def _count(seen):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # type: ignore[no-untyped-def]
+def _look_round(by_pixel, i, u0, v0, centre, agree, outer, m, reach):  # type: ignore[no-untyped-def]
     """Compare the points around pixel (v0, u0) with the tangent plane of point i."""
     # The plane has inverse depth centre (1/m) in the pixel, and visible points within agree (1/m)
     # of it agree. Points farther behind it within outer (px) show a discontinuity. Filled in are
-    # the sums m (9,) of the fit, the first nine arguments of `plane` with the deviation from the
-    # tangent plane as inverse depth, and the extent of the surface, reach (8,).
-    start, uv = points.start, points.uv
-    inverse, hidden, age_ns = points.inverse, points.hidden, points.age_ns
+    # the sums m (9,) of `plane`, of deviations from the tangent plane, and the extent of the
+    # surface, reach (8,).
+    points, hidden, start, shape = by_pixel
+    uv, inverse, age_ns = points.uv, points.inverse, points.age_ns
     su, sv, w0 = points.slope[i, 0], points.slope[i, 1], inverse[i]
     far = (HIDDEN_M + HIDDEN_FRACTION / w0) * w0 * w0
     reach_u = _window(_REACH * points.spacing_px[i, 0])
@@ -211,45 +289,37 @@ def _look_round(points, shape, i, u0, v0, centre, agree, outer, m, reach):  # ty
                 behind |= close and off < -far
                 other_ns = min(other_ns, age_ns[k]) if vouches else other_ns
                 continue
-            # No branches: half of them would be predicted wrongly.
-            seen |= np.int64(vouches) << np.int64(points.sweep[k])
+            # No branches: half of them would be predicted wrongly. A bit of 63 for each sweep.
+            seen |= np.int64(vouches) << np.int64(points.frame[k] % 63)
             agree_ns = min(agree_ns, age_ns[k]) if vouches else agree_ns
             _extend(reach, du if close else 0.0, dv if close else 0.0)
             weight = max(1 - abs(du) / (reach_u + 1), 0.0) * max(1 - abs(dv) / (reach_v + 1), 0.0)
-            m[0] += weight
-            m[1] += weight * du
-            m[2] += weight * dv
-            m[3] += weight * du * du
-            m[4] += weight * du * dv
-            m[5] += weight * dv * dv
-            m[6] += weight * off
-            m[7] += weight * du * off
-            m[8] += weight * dv * off
+            add_moments(m, weight, du, dv, off)
     # A bit for each sweep that agrees; True if no other sweep there is nearer to the key; True if a
     # point is close behind.
     return seen, agree_ns <= other_ns, behind
 
 
 @Kernel
-def _settle(first, last, points, shape, done, settled):  # type: ignore[no-untyped-def]
+def _settle(first, last, by_pixel, done, settled):  # type: ignore[no-untyped-def]
     """Find the depth of each pixel from the surrounding points that agree with its first point."""
     # settled (4,P): depth (m), sweeps that agree, 1 if no sweep nearer to the key disagrees, extent
     # of the surface in radii of discontinuities
     m, reach = np.empty(9), np.empty(8)
+    points, start, width = by_pixel.points, by_pixel.start, by_pixel.shape[1]
     for p in range(first, last):
-        i = points.start[p]
-        if done[p] or i == points.start[p + 1] or points.hidden[i]:
+        i = start[p]
+        if done[p] or i == start[p + 1] or by_pixel.hidden[i]:
             continue
-        v0, u0 = p // shape[1], p % shape[1]
+        v0, u0 = p // width, p % width
         w0, uv, slope = points.inverse[i], points.uv[i], points.slope[i]
         centre = w0 + slope[0] * (u0 - uv[0]) + slope[1] * (v0 - uv[1])
         agree = (AGREE_M + AGREE_FRACTION / w0) * w0 * w0
-        inner = points.edge_px[i]
+        inner = FOOTPRINT * points.spacing_px[i, 0] + _SLACK_M * points.focal_px[i, 0] * w0
+        outer = inner + _EDGE_WINDOW_PX
         m[:], reach[:] = 0.0, 0.0
-        seen, supported, behind = _look_round(
-            points, shape, i, u0, v0, centre, agree, inner + _EDGE_WINDOW_PX, m, reach
-        )
-        off, _, _ = plane(m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], _RIDGE_PX2)
+        seen, supported, behind = _look_round(by_pixel, i, u0, v0, centre, agree, outer, m, reach)
+        off, _, _ = plane(m, _RIDGE_PX2)
         settled[0, p] = 1 / limited(centre + min(max(off, -agree), agree), w0)
         settled[1, p], settled[2, p] = _count(seen), supported
         settled[3, p] = ALL_ROUND

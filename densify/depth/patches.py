@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Compute the surface patch of each accumulated point.
+"""Compute the surface patch of each accumulated point, in space and in an image, and occlusion.
 
 A patch is as large as the spacing of the neighbouring rays of its own sweep, and tangent to the
-neighbouring points. On a plane the inverse range is normal · direction, so its derivatives by
-azimuth and elevation give the normal.
+neighbouring points. It occludes what lies behind it. On a plane the inverse range is normal ·
+direction, so its derivatives by azimuth and elevation give the normal. In an image the inverse
+depth of a plane is linear, so planes are fitted in inverse depth.
 """
 
 from __future__ import annotations
@@ -13,15 +14,33 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.depth.neighbours import slopes
+from densify.depth.exposure import PointsInImage, pixel_of
 from densify.free_space.sensor import Sensors
 from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.types import Bool, Cloud, Float, Patches
+from densify.geometry.types import Bool, Camera, Cloud, Float, Float32, Int, Patches
 
+AGREE_M, AGREE_FRACTION = 0.1, 0.02
+"""Greatest deviation between points on one surface: metres plus share of the depth."""
+HIDDEN_M, HIDDEN_FRACTION = 0.2, 0.06
+"""Least distance of an occluded point behind the nearest surface: metres plus share of depth."""
+FOOTPRINT = 0.35
+"""Half size of a patch, and of the spot of a laser, in spacings of neighbouring rays."""
+_SLACK_M = 0.5 * AGREE_M  # added to the footprint, for errors of registration and flow
 _STEEP = 5.7  # greatest slope, 10 degrees of incidence; a steeper surface on one side is a step
-_BEND_M, _BEND = 0.10, 0.25  # greatest change of the slope, in metres and as a share
+_BEND = 0.25  # greatest change of the slope on one surface, as a share
 _AROUND, _MOST_CELLS = 5.0, 20  # radius of neighbours of unordered rays: spacings, most cells
 _RIDGE = 0.005  # share of the mean square distance of the neighbours
+_MOST = 1.4  # greatest ratio of the extended inverse depth and that at the start
+
+
+def agree_m(depth_m: Float | Float32) -> Float | Float32:
+    """Return the greatest deviation between points on one surface at these depths."""
+    return AGREE_M + AGREE_FRACTION * depth_m
+
+
+def hidden_m(surface_m: Float | Float32) -> Float | Float32:
+    """Return the distance behind surfaces at these depths from which points are occluded."""
+    return HIDDEN_M + HIDDEN_FRACTION * surface_m
 
 
 def patches(
@@ -36,23 +55,21 @@ def patches(
         origins: (S,3) origins of the scanners, key sweep's lidar frame, by frame number.
         wanted: (M,) True for points in view of a camera, None for all. Other points get zeros.
     """
-    frames, inverse = np.unique(cloud.frame, return_inverse=True)
-    sweep: NDArray[np.int32] = inverse.ravel().astype(np.int32)
-    if wanted is None:
-        wanted = np.ones(len(cloud), bool)
-    origin = [origins[int(f)] for f in frames]
-    return tangents(cloud.rigid_points, cloud.lidar, sweep, wanted, sensors, origin)
+    frames, index = np.unique(cloud.frame, return_inverse=True)
+    by_sweep = [origins[int(frame)] for frame in frames]
+    sweep: NDArray[np.int32] = index.ravel().astype(np.int32)
+    return tangents(cloud.rigid_points, cloud.lidar, sweep, sensors, by_sweep, wanted)
 
 
 def tangents(
     points: Float,
     lidar: NDArray[np.uint8],
     sweep: NDArray[np.int32],
-    wanted: Bool,
     sensors: Sensors,
     origins: Sequence[Float],
+    wanted: Bool | None = None,
 ) -> Patches:
-    """Return the patches of M points, with zeros for points that are not ``wanted`` (M,).
+    """Return the patches of M points, see `patches`.
 
     A point p is on the tangent plane if normal · (p - origin) = 1. Spacings are metres between
     neighbouring rays, along the azimuth and along the elevation.
@@ -78,7 +95,7 @@ def tangents(
         find = _tangents_anywhere if model.unordered else _tangents_on_rings
         for rows in members[number::num_scanners]:
             _nearest_in_cells(spherical, rows, grid, cells)
-            rows = rows[wanted[rows]]
+            rows = rows if wanted is None else rows[wanted[rows]]
             find.over_rows(len(rows), rows, spherical, model.table, grid, cells, normal, spacing_m)
     return Patches(normal, spacing_m)
 
@@ -154,7 +171,7 @@ def _slope(slope_a, slope_b, step, range_m):  # type: ignore[no-untyped-def]
     """Return the slope of inverse range per radian from its slopes on both sides (NaN: unknown)."""
     metres = step * range_m * range_m  # of range per step, by a unit of slope
     # On one surface the mean, else the lesser slope, or 0 if that is a step in depth; step in rad
-    if abs(slope_a - slope_b) * metres <= _BEND_M + _BEND * abs(slope_a + slope_b) * metres:
+    if abs(slope_a - slope_b) * metres <= AGREE_M + _BEND * abs(slope_a + slope_b) * metres:
         return 0.5 * (slope_a + slope_b)
     if not abs(slope_a) <= abs(slope_b):  # NaN too
         slope_a = slope_b
@@ -241,7 +258,7 @@ def _tangents_anywhere(first, last, members, spherical, table, grid, cells, norm
                         continue  # the point itself, or its equal
                     num += 1
                     off_m = abs(w - slope_u * u - slope_v * v) * range_m * range_m
-                    if turn and off_m > _BEND_M + _BEND * abs(w) * range_m * range_m:
+                    if turn and off_m > AGREE_M + _BEND * abs(w) * range_m * range_m:
                         continue
                     num_kept += 1
                     uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
@@ -250,3 +267,126 @@ def _tangents_anywhere(first, last, members, spherical, table, grid, cells, norm
             if 2 * num_kept < num:  # no plane: the patch faces the scanner
                 slope_u, slope_v = 0.0, 0.0
         _put(i, spherical, table, slope_u * flatten, slope_v, normal, spacing)
+
+
+def is_occluded(points: PointsInImage, camera: Camera) -> Bool:
+    """Return (K,) True for points clearly behind the nearest patch over their pixel."""
+    slack_px = _SLACK_M * points.focal_px / points.depth[:, None]
+    half_px = np.maximum(FOOTPRINT * points.spacing_px + slack_px, 0.5)
+    nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
+    paint(points.uv, points.inverse, points.slope, half_px, nearest)
+    with np.errstate(divide="ignore"):
+        nearest_m = 1 / nearest[pixel_of(points.uv)].astype(np.float64)  # inf without a patch
+    occluded: Bool = points.depth - nearest_m > hidden_m(nearest_m)
+    return occluded
+
+
+@Kernel
+def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
+    """Raise ``canvas`` (H,W) float32 in place to the greatest inverse depth of the patches there.
+
+    A patch covers the pixel centres within ``half_px`` (K,2) of its point uv (K,2). Its inverse
+    depth is ``inverse + slope · offset``, between half of ``inverse`` and all of it: no patch is
+    nearer than its point. ``inverse`` (K,) is in 1/m, ``slope`` (K,2) in 1/m per px.
+    """
+    height, width = canvas.shape
+    for i in range(len(inverse)):
+        w = inverse[i]
+        left = max(int(np.ceil(uv[i, 0] - half_px[i, 0])), 0)
+        right = min(int(np.floor(uv[i, 0] + half_px[i, 0])), width - 1)
+        top = max(int(np.ceil(uv[i, 1] - half_px[i, 1])), 0)
+        bottom = min(int(np.floor(uv[i, 1] + half_px[i, 1])), height - 1)
+        for v in range(top, bottom + 1):
+            tilt_v = slope[i, 1] * (v - uv[i, 1])
+            covered = canvas[v, left : right + 1]
+            for k in range(len(covered)):
+                tilt = tilt_v + slope[i, 0] * (left + k - uv[i, 0])
+                on_patch = w + min(max(tilt, -0.5 * w), 0.0)
+                covered[k] = max(covered[k], np.float32(on_patch))
+
+
+def sorted_by_pixel(points: PointsInImage, rank: Int, camera: Camera) -> tuple[Int, Int]:
+    """Sort the points by pixel, the best point of each pixel first.
+
+    The lowest ``rank`` (K,) comes first, then the nearest point. Returns ``start`` (H·W+1,) and
+    ``order`` (K,): the points of pixel p are ``order[start[p]:start[p + 1]]``.
+    """
+    row, column = pixel_of(points.uv)
+    start = np.empty(camera.height_px * camera.width_px + 1, np.int64)
+    order = np.empty(len(rank), np.int64)
+    pixel = row * camera.width_px + column
+    _by_pixel(pixel, rank, points.depth, points.frame, points.uv, start, order)
+    return start, order
+
+
+@inlined
+def _wins(a, b, rank, depth, frame, uv):  # type: ignore[no-untyped-def]
+    """Return True if point a wins a pixel over b. Equal points may come in any order."""
+    if rank[a] != rank[b]:
+        return rank[a] < rank[b]
+    if depth[a] != depth[b]:
+        return depth[a] < depth[b]
+    if frame[a] != frame[b]:
+        return frame[a] < frame[b]
+    if uv[a, 0] != uv[b, 0]:
+        return uv[a, 0] < uv[b, 0]
+    return uv[a, 1] < uv[b, 1]
+
+
+@Kernel
+def _by_pixel(pixel, rank, depth, frame, uv, start, order):  # type: ignore[no-untyped-def]
+    """Fill start (num_pixels + 1,) and order (K,) of `sorted_by_pixel`."""
+    start[:] = 0
+    for p in pixel:
+        start[p + 1] += 1
+    for p in range(len(start) - 1):
+        start[p + 1] += start[p]
+    filled = np.empty(len(start) - 1, np.int32)
+    filled[:] = 0
+    for i in range(len(pixel)):
+        p = pixel[i]
+        at = start[p] + filled[p]
+        while at > start[p] and _wins(i, order[at - 1], rank, depth, frame, uv):
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = i
+        filled[p] += 1
+
+
+@inlined
+def limited(inverse, start):  # type: ignore[no-untyped-def]
+    """Return inverse depth ``inverse``, kept between 1 / 1.4 and 1.4 times ``start``."""
+    return min(max(inverse, start / _MOST), _MOST * start)
+
+
+@inlined
+def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
+    """Return both slopes of the least-squares plane from centred second moments of `plane`."""
+    determinant = uu * vv - uv * uv
+    return (vv * uw - uv * vw) / determinant, (uu * vw - uv * uw) / determinant
+
+
+@inlined
+def add_moments(m, weight, u, v, w):  # type: ignore[no-untyped-def]
+    """Add a pixel, at offset (u, v) with inverse depth w, to the sums m (9,) of `plane`."""
+    m[0] += weight
+    m[1] += weight * u
+    m[2] += weight * v
+    m[3] += weight * u * u
+    m[4] += weight * u * v
+    m[5] += weight * v * v
+    m[6] += weight * w
+    m[7] += weight * u * w
+    m[8] += weight * v * w
+
+
+@inlined
+def plane(m, ridge):  # type: ignore[no-untyped-def]
+    """Return inverse depth at the origin and both slopes of the least-squares plane of m (9,)."""
+    # ridge: variance (px²) added in both directions: pixels on one line do not tilt the plane
+    # across the line
+    n = m[0]
+    u, v, w = m[1] / n, m[2] / n, m[6] / n
+    uu, vv, uv = m[3] / n - u * u + ridge, m[5] / n - v * v + ridge, m[4] / n - u * v
+    slope_u, slope_v = slopes(uu, uv, vv, m[7] / n - u * w, m[8] / n - v * w)
+    return w - slope_u * u - slope_v * v, slope_u, slope_v

@@ -55,8 +55,8 @@ def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
         nothing = np.zeros(known.shape, bool)
         return FullDepth(maps.filled_m, confidence, nothing, fit, prior.source)
     log_depth = _log_depth(prior.value, fit)
-    usable = known & (log_depth < np.log(FAR_M))
-    usable &= ~_at_far_limit(prior.value, known, fit)
+    farthest = prior.value[known].min() if fit.kind == "inverse" else prior.value[known].max()
+    usable = known & (log_depth < np.log(FAR_M)) & (prior.value != farthest)  # often the sky
     guide = np.where(usable, log_depth, _EMPTY).astype(np.float32)
     guide = cv2.medianBlur(guide, 5).astype(np.float32)
     farther, nearer = cv2.dilate(guide, _AROUND) - guide, guide - cv2.erode(guide, _AROUND)
@@ -130,13 +130,6 @@ def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
         return fit.scale * np.log(np.maximum(value, np.finfo(np.float64).tiny)) + fit.shift
     logarithm = np.log(np.maximum(fit.scale * value + fit.shift, np.exp(-_EMPTY)))
     return -logarithm if fit.kind == "inverse" else logarithm
-
-
-def _at_far_limit(value: Float32, known: Bool, fit: PriorFit) -> Bool:
-    """Return (H,W) True where the prior has its farthest value, which often means the sky."""
-    if not known.any():
-        return known
-    return known & (value == (value[known].min() if fit.kind == "inverse" else value[known].max()))
 
 
 class _Cells(NamedTuple):

@@ -1,185 +1,182 @@
 # SPDX-License-Identifier: MIT
-"""Make one depth map from the accumulated cloud, stage by stage.
+"""Make one depth map from the accumulated cloud: one record that passes an ordered table of stages.
 
 The order of the points has no effect. Planes are fitted in inverse depth, or in inverse range if
-depth is the range.
+depth is the range. The last part is the stage that rejects pixels that rays passed through, such as
+pixels in the gaps of a fence. The image cannot decide this: a background measured from elsewhere
+lies behind the car in the image too. Every ray is followed to its crossing with the map's own
+surface, and counts there (free-space evidence as in occupancy grids: Thrun et al., "Probabilistic
+Robotics", 2005, ch. 9).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from densify.config import ProjectSettings
-from densify.depth.boundary_pixels import accept_boundary_pixels
-from densify.depth.confidence import confidence_of, features, nearest_measured
-from densify.depth.exposure import Exposure, InView
-from densify.depth.fill import fill, fill_stars
-from densify.depth.image_points import PointsInImage, points_in_image
-from densify.depth.layers import Layers
-from densify.depth.measured_pixels import MeasuredPixels, nearest_pixels, visible_pixels
-from densify.depth.moving_bodies import MovingBody, close_bodies
-from densify.depth.seen_through import Rays, without_seen_through
-from densify.depth.spots import measure_spots
-from densify.geometry.types import (
-    Bool,
-    Camera,
-    Cloud,
-    DepthMap,
-    Float32,
-    Patches,
-    Reason,
-    Rejected,
-)
+from densify.depth.confidence import confidence_of, features, nearest_pixel
+from densify.depth.exposure import Exposure, InView, pixel_of
+from densify.depth.fill import accept_boundary_pixels, fill, fill_stars, measure_spots
+from densify.depth.measured_pixels import MapInputs, MapRecord, measure
+from densify.depth.moving_bodies import close_bodies
+from densify.depth.patches import FOOTPRINT, agree_m, hidden_m
+from densify.depth.rays import Rays
+from densify.geometry import poses
+from densify.geometry.types import Bool, Camera, Cloud, DepthMap, Float, Float32, Reason, Rejected
 
-_BLOCK_PX = 16  # blocks within which the density of rays is about constant
-_JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
 _LEAST_CONFIDENCE = np.float32(1) / np.iinfo(np.uint8).max  # stored as 1; 0 is no depth
+_SHARE = 0.25  # share of passing rays above which a pixel is rejected
+_NUM_STEPS = 6
+
+_Stage = tuple[bool, Callable[..., None], tuple[Any, ...]]
 
 
-def project(
-    cloud: Cloud,
-    view: InView,
-    settings: ProjectSettings,
-    patches: Patches,
-    filled: bool = True,
-    lab: Float32 | None = None,
-    rays: Rays | None = None,
-    bodies: Mapping[int, MovingBody] | None = None,
-) -> DepthMap:
+def project(inputs: MapInputs) -> DepthMap:
     """Return the depth map of a cloud in the view of a camera.
 
-    Moving objects are shown at their position at the view's time. Without ``settings.visibility``
-    each pixel takes its nearest point.
-
-    Args:
-        filled: False leaves out the fill.
-        lab: (H,W,3) image in L*a*b*. If None, no boundary pixel is accepted by it.
-        rays: Rays of the window. If None, no pixel is rejected as seen through.
-        bodies: Bodies of moving objects by instance number.
+    Moving objects are shown at their position at the view's time.
     """
-    exposure, camera, visible = view.exposure, view.exposure.camera, settings.visibility
-    points = points_in_image(cloud, view, patches)
-    reason = np.full(len(cloud), Reason.OUTSIDE, np.uint8)
-    if visible:
-        pixels = visible_pixels(points, camera, reason)
-    else:
-        pixels = nearest_pixels(points, camera, reason)
-    layers = accept_boundary_pixels(_layers_of(pixels, points, camera, lab), settings.rims)
-    if filled:
-        layers = fill(layers, settings.fill_reach)
-        layers = fill_stars(layers)
-        if visible and bodies:
-            layers = close_bodies(layers, cloud, exposure, bodies)
-    if visible and rays is not None:
-        layers = without_seen_through(layers, cloud, view, rays, reason)
-    layers = replace(layers, rejected_m=np.where(layers.filled_m > 0, 0, layers.rejected_m))
-    has_depth, evidence = (layers.filled_m > 0) | (layers.rejected_m > 0), None
-    confidence = np.zeros(has_depth.shape, np.float32)
-    if visible:
-        evidence = features(layers, cloud.since_key_ns, camera)
-        confidence[has_depth] = confidence_of(evidence)
-    elif has_depth.any():
-        confidence[has_depth] = cloud.confidence[layers.point[nearest_measured(layers)]][has_depth]
-    confidence[has_depth] = np.maximum(confidence[has_depth], _LEAST_CONFIDENCE)
-    _set_reasons(layers, reason)
-    if visible and filled:
-        layers = measure_spots(layers, points)
-    return _finished(layers, cloud, exposure, reason, confidence, evidence)
+    record = measure(inputs)
+    for applies, stage, arguments in _stages(inputs):
+        if applies:
+            stage(record, *arguments)
+    return _finished(record, inputs)
 
 
-def _layers_of(
-    pixels: MeasuredPixels, points: PointsInImage, camera: Camera, lab: Float32 | None
-) -> Layers:
-    """Return measured pixels as layers; pixels near a depth discontinuity are boundary pixels."""
-    shape = (camera.height_px, camera.width_px)
-    known, inside = pixels.winner >= 0, pixels.inside
-    winner = pixels.winner[known]
-
-    def image(values: np.ndarray, none: float = 0) -> np.ndarray:
-        """Return (H,W,…) values of the points that give pixels their depth."""
-        by_pixel = np.full((known.size, *values.shape[1:]), none, values.dtype)
-        by_pixel[known] = values[winner]
-        return by_pixel.reshape(*shape, *values.shape[1:])
-
-    depth_m = np.where(inside, pixels.depth_m, np.float32(0)).reshape(shape)
-    in_window = points if points.far.all() else points.select(~points.far)
-    return Layers(
-        depth_m=depth_m,
-        rim_m=np.where(inside, np.float32(0), pixels.depth_m).reshape(shape),
-        filled_m=depth_m,
-        point=image(points.index.astype(np.int32), -1),
-        tilt=image(points.slope.astype(np.float32)),
-        spacing_px=_spacing_px(in_window, shape),
-        votes=np.ones(shape, np.float32),
-        edge=pixels.edge.reshape(shape),
-        rejected_m=np.zeros(shape, np.float32),
-        lab=lab,
+def _stages(inputs: MapInputs) -> tuple[_Stage, ...]:
+    """Return the stages in their order: if each applies, its function, and its arguments."""
+    cloud, view, settings = inputs.cloud, inputs.view, inputs.settings
+    filled, visible, rays = inputs.filled, settings.visibility, inputs.rays
+    return (
+        (True, accept_boundary_pixels, (settings.rims,)),
+        (filled, fill, (settings.fill_reach,)),
+        (filled, fill_stars, ()),
+        (filled and visible, close_bodies, (cloud, view.exposure, inputs.bodies)),
+        (visible and rays is not None, reject_seen_through, (cloud, view, rays)),
+        (visible, _rate, (cloud, inputs.camera)),
+        (not visible, _rate_by_age, (cloud,)),
+        (True, _set_reasons, ()),
+        (filled and visible, measure_spots, ()),
     )
 
 
-def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
-    """Return the (H,W,2) spacing of rays across and down, the mean over blocks of pixels."""
-    height, width = (-(-size // _BLOCK_PX) for size in shape)
-    column, row = np.rint(points.uv).astype(np.int64).T // _BLOCK_PX
-    block = row * width + column
-    num = np.bincount(block, minlength=height * width)
-    if not num.any():
-        return np.ones((*shape, 2), np.float32)
-    sums = [np.bincount(block, s, height * width) for s in points.spacing_px.T]
-    mean = (np.stack(sums, axis=1) / np.maximum(num, 1)[:, None]).astype(np.float32)
-    empty = (num == 0).reshape(height, width)
-    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
-    blocks = mean.reshape(height, width, 2)[tuple(nearest)]
-    # A block takes the downward spacing of the block above or below if that is far larger: the hole
-    # below the last of a scanner's denser rings is as wide.
-    down_px = blocks[..., 1]
-    widest_px = ndimage.maximum_filter1d(down_px, 3, axis=0)
-    blocks[..., 1] = np.where(widest_px > _JUMP * down_px, widest_px, down_px)
-    every = blocks.repeat(_BLOCK_PX, axis=0).repeat(_BLOCK_PX, axis=1)
-    return np.ascontiguousarray(every[: shape[0], : shape[1]])
+def _rate(record: MapRecord, cloud: Cloud, camera: Camera) -> None:
+    """Set the confidence of pixels with a filled or rejected depth, and its evidence."""
+    record.rejected_m[record.filled_m > 0] = 0
+    has_depth = (record.filled_m > 0) | (record.rejected_m > 0)
+    record.evidence = features(record, cloud.since_key_ns, camera)
+    confidence = confidence_of(record.evidence)
+    record.confidence[has_depth] = np.maximum(confidence, _LEAST_CONFIDENCE)
 
 
-def _set_reasons(layers: Layers, reason: NDArray[np.uint8]) -> None:
-    """Set the ``reason`` (M,) in place for points in the map and points removed from it."""
-    reason[layers.point[layers.rim_m > 0]] = Reason.EDGE
-    reason[layers.point[layers.depth_m > 0]] = Reason.KEPT
+def _rate_by_age(record: MapRecord, cloud: Cloud) -> None:
+    """Set the confidence of each pixel to that of the point that measured the nearest pixel."""
+    shown = record.filled_m > 0
+    if shown.any():
+        of_point = cloud.confidence[record.point[nearest_pixel(record.depth_m > 0)]][shown]
+        record.confidence[shown] = np.maximum(of_point, _LEAST_CONFIDENCE)
 
 
-def _finished(
-    layers: Layers,
-    cloud: Cloud,
-    exposure: Exposure,
-    reason: NDArray[np.uint8],
-    confidence: Float32,
-    evidence: Float32 | None,
-) -> DepthMap:
-    """Return the layers as a depth map, with the sweep that measured each pixel."""
-    measured, shown = layers.depth_m > 0, layers.filled_m > 0
+def _set_reasons(record: MapRecord) -> None:
+    """Set the reason of points in the map and of points removed from it."""
+    record.reason[record.point[record.boundary_m > 0]] = Reason.EDGE
+    record.reason[record.point[record.depth_m > 0]] = Reason.KEPT
+
+
+def _finished(record: MapRecord, inputs: MapInputs) -> DepthMap:
+    """Return the record as a depth map, with the sweep that measured each pixel."""
+    shown, rejected, none = record.filled_m > 0, record.rejected_m > 0, np.float32(0)
 
     def frames(mask: Bool) -> NDArray[np.int32]:
         frame = np.full(mask.shape, -1, np.int32)
-        frame[mask] = cloud.frame[layers.point[mask]]
+        frame[mask] = inputs.cloud.frame[record.point[mask]]
         return frame
 
-    none = np.float32(0)
-    rejected = Rejected(
-        layers.rejected_m,
-        np.where(shown, none, confidence),
-        frames((layers.rejected_m > 0) & (layers.rim_m > 0)),
+    rejected_pixels = Rejected(
+        record.rejected_m,
+        np.where(shown, none, record.confidence),
+        frames(rejected & (record.boundary_m > 0)),
     )
     return DepthMap(
-        camera=exposure.camera.name,
-        depth_m=layers.depth_m,
-        filled_m=layers.filled_m,
-        confidence=np.where(shown, confidence, none),
-        frame=frames(measured),
-        reason=reason,
-        measure=exposure.measure,
-        evidence=evidence,
-        rejected=rejected if evidence is not None else None,
+        camera=inputs.camera.name,
+        depth_m=record.depth_m,
+        filled_m=record.filled_m,
+        confidence=np.where(shown, record.confidence, none),
+        frame=frames(record.depth_m > 0),
+        reason=record.reason,
+        measure=inputs.view.exposure.measure,
+        evidence=record.evidence,
+        rejected=None if record.evidence is None else rejected_pixels,
     )
+
+
+def reject_seen_through(record: MapRecord, cloud: Cloud, view: InView, rays: Rays) -> None:
+    """Reject the pixels that rays passed through.
+
+    The ray of an occluded static point (by its reason) passed through where it crosses the surface
+    of the map, clearly before its end. The ray of any other point ended in its pixel. Both are
+    blurred by a third of the ray spacing. A pixel is rejected if more than a quarter of the rays
+    passed through. Moving bodies stay.
+    """
+    counts = np.isin(cloud.frame, rays.stretch.frames) & (record.reason != Reason.OUTSIDE)
+    stopped = counts & (record.reason != Reason.HIDDEN)
+    passed = cloud.select(counts & ~stopped & ~cloud.moving)
+    blur_px, shape = FOOTPRINT * float(np.median(record.gap_px)), record.filled_m.shape
+    through = crossings(record.filled_m, rays.starts(passed), passed.points, view.exposure)
+    num = _counts(through, shape, blur_px)
+    num_stopped = _counts(view.uv[stopped[view.rows]], shape, blur_px)
+    record.reject((num > _SHARE * (num + num_stopped)) & ~record.on_body)
+
+
+def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
+    """Return (H,W) the number of positions uv (K,2) in each pixel, blurred by ``blur_px``."""
+    row, column = pixel_of(uv)
+    counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
+    size = 2 * round(2.5 * blur_px) + 1
+    pixels = counts.reshape(shape).astype(np.float32)
+    blurred = cv2.GaussianBlur(pixels, (size, size), blur_px, borderType=cv2.BORDER_REFLECT)
+    return blurred.astype(np.float32, copy=False)
+
+
+def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Exposure) -> Float:
+    """Return the (P,2) px where rays cross the surface of a map clearly before they end.
+
+    The search starts at the end of the ray. It goes to the point of the ray at the surface's depth
+    in the present pixel, and repeats this until the depth stays the same. The rays go ``from_key``
+    (K,3) ``to_key`` (K,3), key sweep's lidar frame. ``surface_m`` (H,W) is in metres, 0 none.
+    """
+    start = poses.transform(exposure.T_cam_key, from_key)
+    end = poses.transform(exposure.T_cam_key, to_key)
+    end_m, still = exposure.depth_m(end), np.zeros(to_key.shape, np.float32)
+    sight = exposure.see(to_key, still)
+    uv, valid = sight.uv, sight.inside
+    depth_m = np.full(len(to_key), np.inf)
+    for _ in range(_NUM_STEPS):
+        before_m, pixel = depth_m, pixel_of(np.where(valid[:, None], uv, 0))
+        depth_m = surface_m[pixel].astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            same = abs(depth_m - before_m) <= agree_m(before_m)
+        share = _share(start, end, depth_m, exposure.measure)
+        valid &= (depth_m > 0) & (share > 0) & (share < 1)
+        share = np.where(valid, share, 1.0)[:, None]
+        sight = exposure.see(from_key + share * (to_key - from_key), still)
+        uv, valid = sight.uv, valid & sight.inside
+    crosses: Float = uv[valid & same & (end_m - depth_m > hidden_m(depth_m))]
+    return crosses
+
+
+def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
+    """Return the (P,) share of the path at this depth, camera frame, NaN if it is not reached."""
+    path = end - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if measure == "z":
+            share: Float = (depth_m - start[:, 2]) / path[:, 2]
+            return share
+        length_squared, along = (path**2).sum(axis=1), (start * path).sum(axis=1)
+        discriminant = along**2 - length_squared * ((start**2).sum(axis=1) - depth_m**2)
+        share = (np.sqrt(discriminant) - along) / length_squared
+        return share

@@ -12,21 +12,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from densify.config import Config, ProjectSettings
-from densify.depth.boundary_pixels import lab
-from densify.depth.confidence import reliability, tolerance, with_max_outliers
-from densify.depth.exposure import Exposure, InView, Shot
+from densify.depth.confidence import nearest_pixel, reliability, tolerance, with_max_outliers
+from densify.depth.exposure import Exposure, InView, Shot, pixel_of
 from densify.depth.far import far_cloud
-from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
-from densify.depth.moving_bodies import (
-    MovingBody,
-    far_inside,
-    moving_bodies,
-    outlines,
-    without_sweep,
-)
-from densify.depth.patches import patches
+from densify.depth.measured_pixels import MapInputs
+from densify.depth.moving_bodies import far_inside, fronts
+from densify.depth.patches import hidden_m, patches
 from densify.depth.project import project
-from densify.depth.seen_through import Rays
+from densify.depth.rays import MovingBody, Rays, moving_bodies, without_sweep
+from densify.depth.votes import lab
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.cameras import converted
@@ -140,9 +134,8 @@ class Views:
         self, world: StandingWorld, T_key_world: Float, stretch: Stretch, standing_only: bool
     ) -> SeenCloud:
         """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`."""
-        cloud, surface = far_cloud(
-            world, T_key_world, stretch, self.key, self.exposures, standing_only
-        )
+        of_key = stretch, self.key, self.exposures
+        cloud, surface = far_cloud(world, T_key_world, *of_key, standing_only)
         return SeenCloud(cloud, surface, self.in_view(cloud))
 
     def depth(
@@ -156,8 +149,9 @@ class Views:
         settings = replace(self.settings, visibility=visible)
         maps = {}
         for name, view in seen.in_view.items():
-            shown = self.lab.get(name), self.rays, seen.bodies
-            depth_map = project(seen.cloud, view, settings, seen.patches, filled, *shown)
+            evidence = self.lab.get(name), self.rays, seen.bodies
+            inputs = MapInputs(seen.cloud, seen.patches, view, settings, filled, *evidence)
+            depth_map = project(inputs)
             maps[name] = replace(depth_map, warnings=(_OFF,)) if name in self.off else depth_map
         return maps
 
@@ -175,11 +169,11 @@ class Views:
         rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
             view = seen.in_view[name]
-            u, v = np.rint(view.uv).astype(np.int64).T
-            surface_m = depth[name].filled_m[v, u]
-            reach_m = surface_m + HIDDEN_M + HIDDEN_FRACTION * surface_m
+            pixel = pixel_of(view.uv)
+            surface_m = depth[name].filled_m[pixel]
+            reach_m = surface_m + hidden_m(surface_m)
             shows = (surface_m > 0) & (view.exposure.depth_m(view.points_cam) <= reach_m)
-            rgb[view.rows[shows]] = image[v[shows], u[shows]]
+            rgb[view.rows[shows]] = image[pixel][shows]
         return replace(seen.cloud, rgb=rgb)
 
     def confident(self, seen: SeenCloud, cloud: Cloud, depth: Mapping[str, DepthMap]) -> Cloud:
@@ -194,11 +188,11 @@ class Views:
         """
         confidence = np.zeros(len(cloud), np.float32)
         for name, view in seen.in_view.items():
-            maps, (u, v) = depth[name], np.rint(view.uv).astype(np.int64).T
-            surface_m = maps.filled_m[v, u]
+            maps, pixel = depth[name], pixel_of(view.uv)
+            surface_m = maps.filled_m[pixel]
             off_m = abs(view.exposure.depth_m(view.points_cam) - surface_m)
             agrees = off_m <= surface_m * tolerance(surface_m, view.exposure.camera)
-            of_pixel = np.where(agrees & (surface_m > 0), maps.confidence[v, u], 0)
+            of_pixel = np.where(agrees & (surface_m > 0), maps.confidence[pixel], 0)
             confidence[view.rows] = np.maximum(confidence[view.rows], of_pixel)
         return replace(cloud, confidence=confidence)
 
@@ -244,9 +238,8 @@ class Views:
             farthest_first = np.argsort(-depth_m, kind="stable")
             lost = np.isin(reason[farthest_first], [Reason.KEPT, Reason.NOT_CHOSEN], invert=True)
             rejected = farthest_first[lost]
-            column, row = np.rint(view.uv[rejected]).astype(np.int64).T
             maps[name] = np.zeros(depth[name].depth_m.shape, np.uint8)
-            maps[name][row, column] = reason[rejected]
+            maps[name][pixel_of(view.uv[rejected])] = reason[rejected]
         return maps
 
     def movers(
@@ -275,15 +268,13 @@ def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, target: Expo
     chosen = np.flatnonzero(depth.reason == Reason.KEPT)
     points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
     uv = exposure.see(points, velocity_m_s).uv
-    column, row = np.rint(uv).astype(np.int64).T
     flow = np.full((*depth.depth_m.shape, 2), np.nan, np.float32)
-    flow[row, column] = target.see(points, velocity_m_s).uv - uv
     hit = np.zeros(depth.depth_m.shape, bool)
-    hit[row, column] = True
+    flow[pixel_of(uv)] = target.see(points, velocity_m_s).uv - uv
+    hit[pixel_of(uv)] = True
     covered = (depth.depth_m > 0) & ~hit
     if covered.any():
-        nearest = ndimage.distance_transform_edt(~hit, return_distances=False, return_indices=True)
-        flow[covered] = flow[tuple(nearest)][covered]
+        flow[covered] = flow[nearest_pixel(hit)][covered]
     return flow
 
 
@@ -295,16 +286,11 @@ def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: f
     """
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
     age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
-    measured = depth.depth_m > 0
-    frames, frame_index = np.unique(depth.frame[measured], return_inverse=True)
+    measured, shown = depth.depth_m > 0, depth.filled_m > 0
     ages = np.full(measured.shape, np.nan, np.float32)
-    ages[measured] = np.array([age_s[int(f)] for f in frames])[frame_index]
-    filled = (depth.filled_m > 0) & ~measured
-    if len(frames) and filled.any():
-        row, column = ndimage.distance_transform_edt(
-            ~measured, return_distances=False, return_indices=True
-        )[:, filled]
-        ages[filled] = ages[row, column]
+    if measured.any():
+        frames, index = np.unique(depth.frame[nearest_pixel(measured)][shown], return_inverse=True)
+        ages[shown] = np.array([age_s[int(f)] for f in frames])[index]
     return replace(depth, age_s=ages)
 
 
@@ -323,20 +309,12 @@ class HeldOut:
         """Return the ground truth of a key sweep; ``cloud`` has its moving points' velocities."""
         settings = replace(views.settings, rims="strict", visibility=True)
         key_cloud = cloud.select(cloud.frame == views.key)
-
-        def alone(returns: SeenCloud) -> dict[str, DepthMap]:
-            """Return the maps of returns of the key sweep."""
-            return {
-                name: project(returns.cloud, view, settings, returns.patches, filled=False)
-                for name, view in returns.in_view.items()
-            }
-
-        seen = views.see(key_cloud)
-        key_alone = alone(seen)
-        moving = {
-            name: (maps.depth_m > 0) & (maps.depth_m == key_alone[name].depth_m)
-            for name, maps in alone(views.see(key_cloud.select(key_cloud.moving))).items()
-        }
+        seen, key_alone, moving = views.see(key_cloud), {}, {}
+        for name, view in seen.in_view.items():
+            maps = project(MapInputs(key_cloud, seen.patches, view, settings, filled=False))
+            moves = (maps.reason == Reason.KEPT) & key_cloud.moving
+            key_alone[name], moving[name] = maps, np.zeros(maps.depth_m.shape, bool)
+            moving[name][pixel_of(view.uv[moves[view.rows]])] = True
         gap_rad = seen.patches.spacing_m[:, 1] / np.linalg.norm(key_cloud.points, axis=1)
         known = gap_rad[np.isfinite(gap_rad) & (gap_rad > 0)]
         return HeldOut(views, key_alone, moving, float(np.median(known)) if len(known) else 0.0)
@@ -390,6 +368,6 @@ class HeldOut:
         away_px = ndimage.distance_transform_edt(self.key_alone[name].depth_m == 0)
         unjudged = away_px > self.gap_rad * self.views.exposures[name].camera.focal_px
         filled = maps.filled_m > 0
-        moving = outlines(bodies.values(), self.views.exposures[name])
+        moving = fronts(bodies.values(), self.views.exposures[name]) > 0
         masks = {"all": filled, "moving": filled & moving, "static": filled & ~moving}
         return {n: float(unjudged[p].mean()) if p.any() else None for n, p in masks.items()}

@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 
 from densify.config.errors import InputError
-from densify.depth.object_boxes import corners_of, grown
+from densify.depth.rays import corners_of, grown
 from densify.geometry import cameras, poses
 from densify.geometry.types import CameraView, DepthMap, Float, ObjectTrack
 from densify.outputs.atomic import plain, write_file, write_json

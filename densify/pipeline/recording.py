@@ -26,9 +26,7 @@ from densify.config import Config
 from densify.config.cache import Cache, code_digest, kept
 from densify.config.errors import InputError, SweepError, UnfitSweepError
 from densify.config.plugins import engine as engine_row
-from densify.depth.accumulate import accumulate, object_tracks
-from densify.depth.object_boxes import complete_boxes
-from densify.depth.seen_through import Rays
+from densify.depth.rays import Rays, complete_boxes
 from densify.flow.engines import Scene, SharedMotion, estimate_motion
 from densify.free_space.ground import HeightMap, ground
 from densify.free_space.raw_sweeps import MAP_FRAME_REMEDY, in_map_frame
@@ -47,6 +45,7 @@ from densify.geometry.types import (
     Sweep,
     Trajectory,
 )
+from densify.pipeline.accumulate import accumulate, object_tracks
 from densify.pipeline.process import Watch
 from densify.pipeline.road import Road, views_of
 from densify.pipeline.sweeps import Cut, Sweeps

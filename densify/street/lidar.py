@@ -13,10 +13,10 @@ from scipy.special import ndtr, ndtri
 
 from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, Float32, Int
+from densify.street.lidar import Sensor, firings
 from densify.street.materials import REFLECTIVITY, Material, noise
 from densify.street.mesh import across, lengths
 from densify.street.motion import Driving, poses_at
-from densify.street.sensors import Sensor, firings
 from densify.street.world import ABSORBED, PASSES, STOPS, Hits, Meeting, Optics, Rays, World
 
 _PARTS = (Material.BODYWORK, Material.FRAME, Material.GLASS)

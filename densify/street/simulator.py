@@ -15,9 +15,8 @@ from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, SweepTruth
 from densify.street.actors import DURATION_S
 from densify.street.cameras import CAMERAS, SHUTTERS, Picture, expose
-from densify.street.lidar import Returns, T_ego_lidar, at_offsets, scan
-from densify.street.presets import crossing, highway, static_street, street
-from densify.street.sensors import Sensor
+from densify.street.lidar import Returns, Sensor, T_ego_lidar, at_offsets, scan
+from densify.street.scenes import crossing, highway, static_street, street
 from densify.street.traffic import Scene
 from densify.street.world import Body
 

@@ -8,14 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from densify.depth.confidence import confidence_by_age
 from densify.flow.tracking.objects import LONG_M
 from densify.geometry import poses
 from densify.geometry.types import (
     Cloud,
     Float,
-    Float32,
     FlowField,
-    Int,
     ObjectTrack,
     Stretch,
 )
@@ -52,13 +51,8 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
         cloud.points[cloud_rows] += poses.rotate(T_key_lidar, flow.total[rows])
         if flow.velocity_m_s is not None:
             cloud.velocity_m_s[cloud_rows] = poses.rotate(T_key_lidar, flow.velocity_m_s[rows])
-    cloud.confidence[:] = confidence_of(cloud.since_key_ns)
+    cloud.confidence[:] = confidence_by_age(cloud.since_key_ns)
     return cloud
-
-
-def confidence_of(since_key_ns: Int) -> Float32:
-    """Return (M,) relative scores 1 / (1 + t) of 0 to 1, for sweeps t seconds from the key."""
-    return (1 / (1 + np.abs(since_key_ns) * 1e-9)).astype(np.float32)
 
 
 def _empty_cloud(num: int) -> Cloud:

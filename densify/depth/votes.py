@@ -1,28 +1,27 @@
 # SPDX-License-Identifier: MIT
-"""Decide by the camera image which pixels close to a depth discontinuity are kept.
+"""Let the known pixels around a pixel vote on its depth, by their surfaces and the camera image.
 
-Known pixels around a boundary pixel vote on its measured depth (`vote`). A vote weighs less the
-more the image's colours change between both pixels, as in a bilateral grid or in geodesic matting.
-Two pixels without an image edge between them belong to the same surface.
+The first known pixel in each of 16 directions votes. A vote weighs less the more the image's
+colours change between both pixels, as in a bilateral grid or in geodesic matting. Two pixels
+without an image edge between them belong to the same surface.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.depth.image_points import HIDDEN_FRACTION, HIDDEN_M
-from densify.depth.layers import Layers
-from densify.depth.neighbours import DIRECTIONS, NONE, extended, first_known, offset
-from densify.geometry.arrays import Float32, Int
+from densify.depth.measured_pixels import MapRecord
+from densify.depth.patches import HIDDEN_FRACTION, HIDDEN_M, limited
+from densify.geometry.arrays import Bool, Float32, Int
 from densify.geometry.compiled import Kernel, inlined
 
-LEAST_SHARE = 0.97  # share of the votes for a pixel that is kept
+NONE = int(np.iinfo(np.uint8).max)
+"""Value of the number of steps if no known pixel is within 254 steps."""
 _BLUR_PX = 0.6  # standard deviation; it removes noise and the pattern of the colour filter
 _LEAST_LIGHT = 70.0  # L of the lightest hundredth; a darker image is lightened
 VOTERS_REACH = 6.0
@@ -45,87 +44,110 @@ def lab(image: NDArray[np.uint8]) -> Float32:
     return colours * np.float32(max(1.0, _LEAST_LIGHT / max(light, 1.0)))
 
 
-def accept_boundary_pixels(layers: Layers, rims: str) -> Layers:
-    """Return the layers with the boundary pixels (``rim_m``) accepted that the image confirms.
+def _directions() -> NDArray[np.int64]:
+    """Return (16,2,2) offsets as in `DIRECTIONS`."""
+    axis, diagonal = (1, 0), (1, 1)
+    quarter = [(axis, (2, 0)), (axis, (2, 1)), (diagonal, (2, 2)), ((0, 1), (1, 2))]
+    turn = np.array([[0, -1], [1, 0]])
+    table = [np.array(quarter) @ np.linalg.matrix_power(turn, k).T for k in range(4)]
+    return np.concatenate(table).astype(np.int64)
 
-    With ``rims=image`` a pixel is accepted if 97 % of the votes are for its depth. ``keep`` accepts
-    all pixels, ``strict`` none. The others become ``rejected_m``.
+
+DIRECTIONS = _directions()
+"""(16,2,2) offsets (columns, rows) after one step and after two steps in 16 directions, clockwise
+from the right. Each step goes to one of the eight neighbours."""
+
+
+def first_known(known: Bool) -> NDArray[np.uint8]:
+    """Return (16,H,W) steps to the first known pixel by `DIRECTIONS`: 0 at one, else `NONE`."""
+    padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
+    steps = padded[:, 2:-2, 2:-2]
+    steps[:] = np.where(known, np.uint8(0), np.uint8(NONE))
+    _march(padded)
+    return steps
+
+
+@Kernel
+def _march(steps):  # type: ignore[no-untyped-def]
+    """Fill in steps (16,H+4,W+4), 0 at known pixels; the border of two pixels stays unchanged."""
+    height, width = steps.shape[1:]
+    for d in range(len(DIRECTIONS)):
+        u1, v1, u2, v2 = DIRECTIONS[d].ravel()
+        for i in range(2, height - 2):
+            row = height - 1 - i if v2 > 0 else i  # rows two steps on are done before
+            line = steps[d, row, 2 : width - 2]
+            if v2 == 0:
+                for j in range(len(line)):
+                    column = len(line) - 1 - j if u2 > 0 else j
+                    before = steps[d, row, 2 + column + u1]
+                    line[column] = 0 if line[column] == 0 else min(before, 254) + 1
+                continue
+            first = steps[d, row + v1, 2 + u1 : width - 2 + u1]
+            second = steps[d, row + v2, 2 + u2 : width - 2 + u2]
+            for j in range(len(line)):
+                beyond = min(second[j], np.uint8(253)) + np.uint8(2)
+                beyond = np.uint8(1) if first[j] == 0 else np.uint8(beyond)
+                line[j] = np.uint8(0) if line[j] == 0 else beyond
+
+
+@inlined
+def offset(d, k):  # type: ignore[no-untyped-def]
+    """Return the offset in columns and rows after k steps in direction d."""
+    du = (k // 2) * DIRECTIONS[d, 1, 0] + (k % 2) * DIRECTIONS[d, 0, 0]
+    dv = (k // 2) * DIRECTIONS[d, 1, 1] + (k % 2) * DIRECTIONS[d, 0, 1]
+    return du, dv
+
+
+@inlined
+def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
+    """Return the inverse depth of a pixel if the surface of pixel (v, u) is extended to it.
+
+    Pixel (v, u) is du columns and dv rows away. ``inverse`` (H,W) is in 1/m, ``tilt`` (H,W,2) is
+    its slope to the right and down in 1/m per px.
     """
-    pixel = np.flatnonzero(layers.rim_m)
-    share = np.full(len(pixel), np.float32(0.5))
-    if layers.lab is not None:
-        known = voters(layers.depth_m, layers.tilt)
-        share = vote(layers, known, pixel, layers.rim_m.flat[pixel], surely=True)
-    accepted = np.full(len(pixel), rims == "keep")
-    if rims == "image":
-        accepted = share >= LEAST_SHARE
-    depth_m, votes = layers.depth_m.copy(), layers.votes.copy()
-    depth_m.flat[pixel[accepted]] = layers.rim_m.flat[pixel[accepted]]
-    votes.flat[pixel] = share
-    rejected_m = np.where(depth_m > 0, np.float32(0), layers.rim_m)
-    return replace(layers, depth_m=depth_m, filled_m=depth_m, votes=votes, rejected_m=rejected_m)
-
-
-def least_votes(
-    layers: Layers,
-    known_m: Sequence[Float32],
-    pixel: Int,
-    depth_m: Float32,
-    surely: bool = False,
-) -> Float32:
-    """Return the (P,) least share of the votes for the given depth of a pixel, see `vote`.
-
-    ``known_m`` are maps (H,W) with the depth in metres of the pixels that vote, 0 for other pixels.
-    The least share of the maps counts. All have the same depths where they vote. The other
-    arguments are as in `vote`.
-    """
-    least_share = np.ones(len(pixel), np.float32)
-    steps = None
-    for map_m in known_m:
-        known = voters(map_m, layers.tilt)
-        other_voters = True if steps is None else (known.steps != steps).any(axis=0).flat[pixel]
-        rows, steps = np.flatnonzero(other_voters & (least_share > 0)), known.steps
-        share = vote(layers, known, pixel[rows], depth_m[rows], surely)
-        least_share[rows] = np.minimum(least_share[rows], share)
-    return least_share
+    known = inverse[v, u]
+    return limited(known - tilt[v, u, 0] * du - tilt[v, u, 1] * dv, known)
 
 
 class Voters(NamedTuple):
     """Pixels with a known depth, which vote on the depths of pixels around them."""
 
-    # (16,H,W) number of steps from each pixel to the first known pixel in 16 directions, from
-    # `densify.depth.neighbours.first_known`
-    steps: NDArray[np.uint8]
+    steps: NDArray[np.uint8]  # (16,H,W) of `first_known`
     inverse: Float32  # (H,W) inverse depth in 1/m, 0 where the depth is unknown
     tilt: Float32  # (H,W,2) slope of the inverse depth to the right and down, 1/m per px
 
 
-def voters(known_m: Float32, tilt: Float32) -> Voters:
-    """Return the pixels with a depth ``known_m`` (H,W) above 0, in metres, as voters."""
-    inverse = np.divide(1, known_m, out=np.zeros_like(known_m), where=known_m > 0)
-    return Voters(first_known(known_m > 0), inverse, np.ascontiguousarray(tilt))
+def inverse_of(depth_m: Float32) -> Float32:
+    """Return the inverse depths (H,W) in 1/m, 0 where there is no depth."""
+    return np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
 
 
-def vote(layers: Layers, voters: Voters, pixel: Int, depth_m: Float32, surely: bool) -> Float32:
+def votes_for(
+    record: MapRecord, maps_m: Sequence[Float32], pixel: Int, depth_m: Float32, surely: bool
+) -> Float32:
     """Return the (P,) weighted share of the votes, 0 to 1, that confirm the depth of each pixel.
 
-    The first known pixel in each of 16 directions votes for the depth if its own surface, extended
-    to the pixel, has that depth. Otherwise it votes against. Edges of the image weaken votes.
+    A known pixel votes for the depth if its own surface, extended to the pixel, has that depth.
+    Otherwise it votes against. Edges of the image weaken votes.
 
     Args:
+        maps_m: Depths (H,W) of the pixels that vote, 0 for other pixels. The least share of the
+            maps counts.
         pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
         depth_m: (P,) depths to confirm.
         surely: True takes the least share of five positions of the image (unshifted, and shifted by
             0.6 ray spacings to each side), with a small constant vote. False takes the unshifted
             image; the share is 0 without voters.
     """
-    share = np.zeros(len(pixel), np.float32)
-    # of one layout, or `_vote` is compiled for each
-    lab = (
-        np.zeros((0, 0, 3), np.float32) if layers.lab is None else np.ascontiguousarray(layers.lab)
-    )
-    _vote.over_rows(len(pixel), pixel, 1 / depth_m, voters, lab, layers.gap_px, surely, share)
-    return share
+    shares = np.ones((len(maps_m), len(pixel)), np.float32)
+    # Arrays of one layout: the kernel is compiled for each.
+    tilt, inverse = np.ascontiguousarray(record.tilt), 1 / depth_m
+    colours, gap_px = np.ascontiguousarray(record.lab), record.gap_px
+    for map_m, share in zip(maps_m, shares, strict=True):
+        voters = Voters(first_known(map_m > 0), inverse_of(map_m), tilt)
+        _vote.over_rows(len(pixel), pixel, inverse, voters, colours, gap_px, surely, share)
+    least_share: Float32 = shares.min(axis=0)
+    return least_share
 
 
 @inlined
