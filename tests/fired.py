@@ -8,7 +8,7 @@ import numpy as np
 
 from densify.geometry import poses
 from densify.geometry.types import RegisteredSweep, Sweep
-from densify.street.sensors import SENSORS, firings
+from densify.street.lidar import SENSORS, firings
 from tests.scenes import World
 
 PERIOD_NS = 100_000_000

@@ -16,7 +16,7 @@ from densify.free_space.rings import Aimed, aimed, find_rings, fires_by_azimuth
 from densify.free_space.sensor import SensorModel, Sensors
 from densify.geometry.types import RegisteredSweep
 from densify.readers import checks
-from densify.street.sensors import SENSORS, Spinning
+from densify.street.lidar import SENSORS, Spinning
 from tests.fired import fired
 from tests.scenes import ROOM, Arc, Scanner, Scene, World, on_sphere
 

@@ -7,19 +7,19 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from densify.street.actors import WHEELBASE_M
+from densify.street.materials import Material
+from densify.street.sensors import SENSORS, firings
+from densify.street.traffic import EGO_BOX, Scene
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse, transform
 from densify.readers.street import Street
-from densify.street.actors import WHEELBASE_M
 from densify.street.cameras import through_glass
 from densify.street.lidar import laser
-from densify.street.materials import Material
 from densify.street.mesh import Mesh, box
 from densify.street.motion import Poses, Still, Towed
-from densify.street.sensors import SENSORS, firings
 from densify.street.simulator import Simulator, build_scene, seconds
-from densify.street.traffic import EGO_BOX, Scene
 from densify.street.world import STOPS, Body, Rays, World
 
 KEY = 120

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-
-from densify.geometry.types import Float, Int
 from densify.street.actors import car_mesh
-from densify.street.cameras import CAMERAS, expose
-from densify.street.lidar import LIDAR_HEIGHT_M, patches, scan, share_lost
 from densify.street.materials import Material
-from densify.street.mesh import Mesh, box
-from densify.street.motion import Driving, Still, upright
 from densify.street.sensors import Scanner, Sensor, Spinning, firings
 from densify.street.terrain import Curve, Speed, Terrain
+
+from densify.geometry.types import Float, Int
+from densify.street.cameras import CAMERAS, expose
+from densify.street.lidar import LIDAR_HEIGHT_M, patches, scan, share_lost
+from densify.street.mesh import Mesh, box
+from densify.street.motion import Driving, Still, upright
 from densify.street.world import STOPS, Body, Rays, World
 
 # Percent of the rays that should meet a moving car: no return, on its surface, from behind it.

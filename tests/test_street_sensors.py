@@ -5,17 +5,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from densify.street.materials import Material
+from densify.street.sensors import SENSORS, Raster, Rosette, Slots, Spinning, firings
+from densify.street.terrain import Curve, Ground, Speed, Terrain
+from densify.street.traffic import Scene
 
 from densify.geometry.poses import inverse, transform
 from densify.readers.describe import describe
 from densify.readers.street import Street
-from densify.street.materials import Material
 from densify.street.mesh import box
 from densify.street.motion import Driving, Rectangles, Still
-from densify.street.sensors import SENSORS, Raster, Rosette, Slots, Spinning, firings
 from densify.street.simulator import Simulator
-from densify.street.terrain import Curve, Ground, Speed, Terrain
-from densify.street.traffic import Scene
 from densify.street.world import Body, World
 
 PERIOD_NS = 100_000_000

@@ -37,7 +37,7 @@ from densify.readers.recorded_poses import PoseTrack
 from densify.readers.street import Street
 from densify.readers.truth_files import write_bodies, write_depth, write_points
 from densify.street.cameras import CAMERAS, T_RECTIFIED_LIDAR, USUAL, T_level_lidar
-from densify.street.sensors import SENSORS
+from densify.street.lidar import SENSORS
 from densify.street.simulator import EPOCH_NS, Bodies
 
 FORMATS = ("kitti", "folder")

@@ -25,9 +25,9 @@ from densify.config.errors import InputError
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
 from densify.street.cameras import CAMERAS, USUAL, Picture, cameras_beside
-from densify.street.lidar import Returns
-from densify.street.sensors import SENSORS
-from densify.street.simulator import PRESETS, VERSION, Bodies, Simulator
+from densify.street.lidar import SENSORS, Returns
+from densify.street.scenes import PRESETS
+from densify.street.simulator import VERSION, Bodies, Simulator
 
 T = TypeVar("T")
 _progress = logging.getLogger("densify.progress")
@@ -44,7 +44,7 @@ class Street:
         # street, highway, static (only the ego vehicle moves) or crossing (the ego vehicle stands)
         preset: str = "street",
         seed: int = 0,  # of the random scene
-        sensor: str = "hdl64",  # a lidar in `densify.street.sensors.SENSORS`
+        sensor: str = "hdl64",  # a lidar in `densify.street.lidar.SENSORS`
         hz: int = 10,  # sweeps per second: 5, 10 or 20
         tilt_deg: float = 0.0,  # pitch of the lidar's mount, nose down; cameras are not tilted
         cameras: tuple[str, ...] = USUAL,  # in `densify.street.cameras.CAMERAS`

@@ -5,28 +5,62 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.geometry.types import Float
-from densify.street.materials import Material
+from densify.geometry.types import Float, Int
 
-Tint = tuple[float, float, float]
+Tint = Sequence[float]
+Point = Sequence[float]
 WHITE: Tint = (1.0, 1.0, 1.0)
-_IS_HIGH = np.array(  # (6,4,3) of a box's corners, side by side
-    (
-        ((0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)),
-        ((1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)),
-        ((1, 1, 0), (0, 1, 0), (0, 1, 1), (1, 1, 1)),
-        ((0, 1, 0), (0, 0, 0), (0, 0, 1), (0, 1, 1)),
-        ((0, 1, 0), (1, 1, 0), (1, 0, 0), (0, 0, 0)),
-        ((0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)),
-    ),
-    bool,
-)
-_HALVES = np.array([0, 1, 2, 0, 2, 3])  # the triangles of a quad
+_TINY = 1e-9
+
+
+class Material(IntEnum):
+    """A material: colour, reflectivity at 905 nm, and the share of the sky that it mirrors."""
+
+    def __new__(
+        cls, colour: tuple[float, float, float], reflectivity: float, gloss: float = 0.0
+    ) -> Material:
+        """Return the next member, numbered from 0."""
+        material = int.__new__(cls, len(cls.__members__))
+        material._value_ = len(cls.__members__)
+        material.colour, material.reflectivity, material.gloss = colour, reflectivity, gloss
+        return material
+
+    colour: tuple[float, float, float]
+    reflectivity: float
+    gloss: float
+    ASPHALT = (0.25, 0.25, 0.26), 0.16
+    PAVING = (0.47, 0.45, 0.43), 0.30
+    KERB = (0.58, 0.57, 0.55), 0.38
+    GRASS = (0.26, 0.38, 0.14), 0.40
+    PAINT = (0.86, 0.86, 0.84), 0.85
+    BRICK = (0.56, 0.27, 0.20), 0.42
+    PLASTER = (0.80, 0.76, 0.66), 0.60
+    ROOF = (0.42, 0.20, 0.15), 0.30
+    PANE = (0.16, 0.20, 0.25), 0.08, 0.25  # window of a house: dark, no ray passes
+    WOOD = (0.45, 0.33, 0.21), 0.45
+    METAL = (0.52, 0.54, 0.56), 0.55
+    BARK = (0.30, 0.23, 0.17), 0.35
+    LEAF = (0.22, 0.36, 0.12), 0.45
+    BODYWORK = (0.90, 0.90, 0.90), 0.55, 0.06
+    GLASS = (0.10, 0.13, 0.15), 0.10  # of a vehicle
+    RUBBER = (0.06, 0.06, 0.06), 0.08
+    CLOTH = (0.90, 0.90, 0.90), 0.40
+    SKIN = (0.78, 0.58, 0.46), 0.50
+    LAMP = (0.95, 0.93, 0.85), 0.90
+    UPHOLSTERY = (0.16, 0.15, 0.15), 0.20
+    CONCRETE = (0.62, 0.61, 0.58), 0.45
+    FRAME = (0.90, 0.90, 0.90), 0.55, 0.06  # bodywork around and above car windows
+
+
+COLOUR: Float = np.array([material.colour for material in Material])
+REFLECTIVITY: Float = np.array([material.reflectivity for material in Material])
+GLOSS: Float = np.array([material.gloss for material in Material])
 
 
 @dataclass(frozen=True)
@@ -56,12 +90,13 @@ class Mesh:
         """Return a mesh of (K,4,3) quads in order around. Texture x runs along their first side."""
         k = len(corners)
         side, away = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
-        along = side / np.maximum(lengths(side), 1e-9)
+        along = side / np.maximum(lengths(side), _TINY)
         up = away - np.einsum("ki,ki->k", away, along)[:, None] * along
-        axes = np.stack([along, up / np.maximum(lengths(up), 1e-9)], axis=1)
+        axes = np.stack([along, up / np.maximum(lengths(up), _TINY)], axis=1)
+        halves = np.array([0, 1, 2, 0, 2, 3])  # corners of the two triangles of a quad
         return Mesh(
             corners.reshape(-1, 3),
-            (np.arange(0, 4 * k, 4)[:, None] + _HALVES).reshape(-1, 3),
+            (np.arange(0, 4 * k, 4)[:, None] + halves).reshape(-1, 3),
             np.einsum("kci,kai->kca", corners, axes).reshape(-1, 2),
             np.full(2 * k, material, np.int16),
             np.repeat(np.broadcast_to(tint, (k, 3)), 2, axis=0),
@@ -82,28 +117,26 @@ class Mesh:
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
 
-def box(
-    low: Sequence[float], high: Sequence[float], material: Material, tint: Tint = WHITE
-) -> Mesh:
-    """Return an upright box between two corners."""
-    return boxes([(low, high)], material, tint)
-
-
-def boxes(
-    spans: Sequence[tuple[Sequence[float], Sequence[float]]], material: Material, tint: Tint = WHITE
-) -> Mesh:
-    """Return upright boxes, each between its lowest and its highest corner."""
-    span = np.array(spans, float).reshape(-1, 2, 3)
-    faces = np.where(_IS_HIGH, span[:, None, None, 1], span[:, None, None, 0])
+def box(low: Point | Float, high: Point | Float, material: Material, tint: Tint = WHITE) -> Mesh:
+    """Return an upright box between two corners, or K boxes between (K,3) corners."""
+    is_high = np.array(  # x, y, z of the corners of each side
+        [
+            [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)],
+            [(1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)],
+            [(1, 1, 0), (0, 1, 0), (0, 1, 1), (1, 1, 1)],
+            [(0, 1, 0), (0, 0, 0), (0, 0, 1), (0, 1, 1)],
+            [(0, 1, 0), (1, 1, 0), (1, 0, 0), (0, 0, 0)],
+            [(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)],
+        ],
+        bool,
+    )
+    lowest, highest = (np.reshape(corner, (-1, 1, 1, 3)) for corner in (low, high))
+    faces = np.where(is_high, highest, lowest).astype(float)
     return Mesh.quads(faces.reshape(-1, 4, 3), material, tint)
 
 
 def frustum(
-    low: Sequence[float],
-    high: Sequence[float],
-    material: Material,
-    tint: Tint = WHITE,
-    taper: tuple[float, float] = (1.0, 1.0),
+    low: Point, high: Point, material: Material, tint: Tint = WHITE, taper: Point = (1.0, 1.0)
 ) -> Mesh:
     """Return a box whose top is scaled by ``taper`` in x and y about its own centre."""
     a, b = np.asarray(low, float), np.asarray(high, float)
@@ -113,57 +146,42 @@ def frustum(
     top = np.column_stack([middle + ring * half * taper, np.full(4, b[2])])
     after = [1, 2, 3, 0]
     sides = np.stack([bottom, bottom[after], top[after], top], axis=1)
-    caps = np.stack([bottom[[3, 2, 1, 0]], top])
+    caps = np.stack([bottom[::-1], top])
     return Mesh.quads(np.concatenate([sides, caps]), material, tint)
 
 
 def tube(
-    start: Sequence[float],
-    end: Sequence[float],
-    radius_m: float | tuple[float, float],
+    start: Point,
+    end: Point,
+    radius_m: float | Point,
     material: Material,
     tint: Tint = WHITE,
     num_sides: int = 8,
 ) -> Mesh:
-    """Return a closed cylinder or cone between two points, with a radius at each end."""
+    """Return a closed cylinder or cone between two points, with one radius or one at each end."""
     a, b = np.asarray(start, float), np.asarray(end, float)
-    radii = radius_m if isinstance(radius_m, tuple) else (radius_m, radius_m)
+    start_radius_m, end_radius_m = np.broadcast_to(radius_m, 2)
     axis = (b - a) / np.linalg.norm(b - a)
-    helper = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    u = across(helper, axis)
+    is_upright = abs(axis[2]) >= 0.9
+    u = across(np.array([1.0, 0.0, 0.0] if is_upright else [0.0, 0.0, 1.0]), axis)
     u /= np.linalg.norm(u)
     v = across(axis, u)
     angle = 2 * np.pi * np.arange(num_sides)[:, None] / num_sides
     ring, after = np.cos(angle) * u + np.sin(angle) * v, np.roll(np.arange(num_sides), -1)
-    low, high = a + radii[0] * ring, b + radii[1] * ring
+    low, high = a + start_radius_m * ring, b + end_radius_m * ring
     around = (low, low[after], high[after], high)
     caps = ((a, low[after], low, a), (b, high, high[after], b))
     quads = [np.stack(np.broadcast_arrays(*quad), axis=1) for quad in (around, *caps)]
     return Mesh.quads(np.concatenate(quads), material, tint)
 
 
-def across(a: Float, b: Float) -> Float:
-    """Return (...,3) cross products of (...,3) vectors; faster than np.cross."""
-    product = np.empty(a.shape)
-    for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-        np.subtract(a[..., i] * b[..., j], a[..., j] * b[..., i], out=product[..., axis])
-    return product
-
-
-def lengths(vectors: Float) -> Float:
-    """Return (N,1) lengths of (N,3) vectors; faster than np.linalg.norm."""
-    squared = vectors * vectors
-    return np.sqrt(squared[:, :1] + squared[:, 1:2] + squared[:, 2:])
-
-
-def ball(
-    centre: Sequence[float], radius_m: Sequence[float], material: Material, tint: Tint = WHITE
-) -> Mesh:
-    """Return an ellipsoid with radii along x, y and z."""
-    la, lo = np.meshgrid(
-        np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 11), indexing="ij"
+def ball(centre: Point, radius_m: Point, material: Material, tint: Tint = WHITE) -> Mesh:
+    """Return an ellipsoid of 6 rings and 10 sectors with radii along x, y and z."""
+    latitude, longitude = np.meshgrid(
+        np.linspace(-np.pi / 2, np.pi / 2, 6 + 1), np.linspace(0, 2 * np.pi, 10 + 1), indexing="ij"
     )
-    p = np.stack([np.cos(la) * np.cos(lo), np.cos(la) * np.sin(lo), np.sin(la)], axis=2)
+    flat = np.cos(latitude)
+    p = np.stack([flat * np.cos(longitude), flat * np.sin(longitude), np.sin(latitude)], axis=2)
     p = p * np.asarray(radius_m) + np.asarray(centre)
     corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
     return Mesh.quads(corners.reshape(-1, 4, 3), material, tint)
@@ -180,3 +198,28 @@ def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint =
     corners = [centres + half * (i * u + j * v) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     tints = np.asarray(tint) * rng.uniform(0.65, 1.35, (k, 1))
     return Mesh.quads(np.stack(corners, axis=1), Material.LEAF, tints)
+
+
+def across(a: Float, b: Float) -> Float:
+    """Return (...,3) cross products of (...,3) vectors; faster than np.cross."""
+    product = np.empty(a.shape)
+    for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        np.subtract(a[..., i] * b[..., j], a[..., j] * b[..., i], out=product[..., axis])
+    return product
+
+
+def lengths(vectors: Float) -> Float:
+    """Return (N,1) lengths of (N,3) vectors; faster than np.linalg.norm."""
+    squared = vectors * vectors
+    return np.sqrt(squared[:, :1] + squared[:, 1:2] + squared[:, 2:])
+
+
+def noise(i: Int, j: Int) -> Float:
+    """Return (N,) repeatable random numbers in [0, 1), a hash of two (N,) integer arrays."""
+    # xxHash64's first two primes, then the mixing steps and the factor of splitmix64
+    h = i.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    h ^= j.astype(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F)
+    h ^= h >> np.uint64(29)
+    h *= np.uint64(0xBF58476D1CE4E5B9)
+    h ^= h >> np.uint64(32)
+    return (h >> np.uint64(11)) / 2.0**53  # as many bits as a double has

@@ -13,22 +13,17 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, SweepTruth
-from densify.street.actors import DURATION_S
 from densify.street.cameras import CAMERAS, SHUTTERS, Picture, expose
-from densify.street.lidar import Returns, T_ego_lidar, at_offsets, scan
-from densify.street.presets import crossing, highway, static_street, street
-from densify.street.sensors import Sensor
-from densify.street.traffic import Scene
+from densify.street.lidar import Mount, Returns, Sensor, T_ego_lidar, at_offsets, scan
+from densify.street.motion import DURATION_S
+from densify.street.scenes import Scene, build
 from densify.street.world import Body
-
-PRESETS = {"street": street, "static": static_street, "crossing": crossing, "highway": highway}
-"""The function that builds the scene from a random generator."""
 
 
 @lru_cache(maxsize=2)
 def build_scene(preset: str, seed: int) -> Scene:
     """Return the scene of a preset and seed, always the same one. Building takes 1 to 2 s."""
-    return PRESETS[preset](np.random.default_rng([seed, 0]))
+    return build(preset, np.random.default_rng([seed, 0]))
 
 
 @dataclass(frozen=True)
@@ -112,8 +107,8 @@ class Simulator:
         """Return the sweep of a frame."""
         rng = np.random.default_rng([self.seed, 1, frame])
         time_s = seconds(self.stamp_ns(frame))
-        ego, world = self.scene.ego, self.scene.world
-        return scan(world, ego, self.sensor, time_s, rng, self.period_ns, self.tilt_deg)
+        mount = Mount(self.scene.ego, self.sensor, self.period_ns, self.tilt_deg)
+        return scan(self.scene.world, mount, time_s, rng)
 
     def image_stamps_ns(self, camera: str) -> dict[int, int]:
         """Return image number -> exposure time of the middle row, for a camera."""

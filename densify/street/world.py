@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from densify.street.motion import Poses, Trajectory, poses_at
 
 _STEP_M = 2e-3  # from a surface that a ray passes to its next origin
 _MAX_LAYERS = 8  # most layers of glass and leaves that one ray passes
-_STEP_S, _NUM_STEPS = 0.05, 20  # between the positions of a body that bound it, and at once
+_STEP_S, _SLACK_M = 0.05, 0.1  # between positions that bound a body, and beyond them
 _BLOCK = 16  # consecutive rays that are tested together
 _TINY = 1e-9
 
@@ -63,7 +63,7 @@ class Meeting(NamedTuple):
     # (K,) object number of the previous surface that the ray passed, -1 for none
     passed: NDArray[np.int32]
 
-    def place(self, rows: Int) -> Float:
+    def positions(self, rows: Int) -> Float:
         """Return the positions of some of the rays, (R,3) in the frame of the body."""
         return self.origin[rows] + self.distance_m[rows, None] * self.direction[rows]
 
@@ -128,7 +128,6 @@ class World:
 
     def __init__(self, bodies: Sequence[Body], seed: int = 0) -> None:
         self.bodies, self.seed = tuple(bodies), seed
-        self._centres = lru_cache(None)(self._find_centres)
 
     @cached_property
     def triangles(self) -> Triangles:
@@ -209,25 +208,14 @@ class World:
 
     def _balls(self, times_s: Float) -> Iterator[tuple[Float, float]]:
         """Yield centre (3,) and radius of a ball around each moving body at all of these times."""
-        begin, end = (int(t // _STEP_S) for t in (times_s.min(), times_s.max()))
-        parts = range(begin // _NUM_STEPS, (end + 1) // _NUM_STEPS + 1)
-        paths = np.concatenate([self._centres(part) for part in parts])
-        paths = paths[begin % _NUM_STEPS :][: end - begin + 2]
-        low, high = paths.min(axis=0), paths.max(axis=0)
-        moved_m = lengths(high - low)[:, 0]
-        for body, centre, m in zip(self.bodies[1:], (low + high) / 2, moved_m, strict=True):
-            yield centre, float(m + np.linalg.norm(np.subtract(*body.mesh.bounds))) / 2 + 0.1
-
-    def _find_centres(self, part: int) -> Float:
-        """Return the (S,B,3) centres of the moving bodies' bounding boxes at S times."""
-        times_s: Float = (part * _NUM_STEPS + np.arange(_NUM_STEPS)) * np.float64(_STEP_S)
-        return np.stack(
-            [
-                body.trajectory.poses(times_s).apply(np.mean([body.mesh.bounds], axis=1))
-                for body in self.bodies[1:]
-            ],
-            axis=1,
-        )
+        begin_s, end_s = times_s.min(), times_s.max()
+        sampled_s = np.linspace(begin_s, end_s, int((end_s - begin_s) / _STEP_S) + 2)
+        for body in self.bodies[1:]:
+            middles = np.tile(np.mean(body.mesh.bounds, axis=0), (len(sampled_s), 1))
+            path = body.trajectory.poses(sampled_s).apply(middles)
+            low, high = path.min(axis=0), path.max(axis=0)
+            reach_m = np.linalg.norm(high - low) + np.linalg.norm(np.subtract(*body.mesh.bounds))
+            yield (low + high) / 2, float(reach_m) / 2 + _SLACK_M
 
     def _cast_bodies(
         self,
