@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,7 +15,7 @@ from densify.geometry.types import Float
 from densify.street.mesh import Material, Mesh
 from densify.street.motion import Curve, Terrain
 
-Spans = Sequence[tuple[float, float]]
+Spans = Sequence[Sequence[float]]
 _CORNER_RADIUS_M = 9.0  # of the kerb where two roads meet
 _SAMPLE_M, _NUM_STEPS = 2.0, 3  # between points of a road, and steps from there to the foot
 _COARSE_M, _FAR_M = 8.0, 200.0  # cells of the ground far from roads, and their distance beyond it
@@ -179,25 +180,17 @@ class Side:
         return tangent
 
 
-def mark_lanes(
-    ground: Ground, road: Road, dashed: Sequence[float], solid: Sequence[float], spans: Spans
-) -> Mesh:
-    """Paint lines at given offsets to the left of the centreline, only within the spans."""
+def mark_road(ground: Ground, road: Road, row: Any, spans: Spans) -> Mesh:
+    """Paint the lines of a row of ``markings`` in scenes.yaml, only within the spans."""
     dashes = [
         (station, station + _DASH_M)
         for begin, end in spans
         for station in np.arange(begin, end - _DASH_M, _DASH_EVERY_M)
     ]
-    lines = [_strip(ground, road.curve, offset, _LINE_M, dashes) for offset in dashed]
-    lines += [_strip(ground, road.curve, offset, _LINE_M, spans) for offset in solid]
-    return Mesh.join(lines)
-
-
-def zebra(ground: Ground, road: Road, station_m: float) -> Mesh:
-    """Return a pedestrian crossing, 3 m deep, over the whole road: half a metre of paint a metre."""
-    offsets = np.arange(-road.right_m + 0.5, road.left_m - 0.3, 1.0)
-    span = [(station_m - 1.5, station_m + 1.5)]
-    return Mesh.join([_strip(ground, road.curve, float(o), 0.5, span) for o in offsets])
+    lines = [(offset_m, dashes) for offset_m in row.dashed]
+    lines += [(offset_m, spans) for offset_m in row.solid]
+    width_m = getattr(row, "width_m", _LINE_M)
+    return Mesh.join([_strip(ground, road.curve, m, width_m, where) for m, where in lines])
 
 
 def _strip(ground: Ground, curve: Curve, offset_m: float, width_m: float, spans: Spans) -> Mesh:

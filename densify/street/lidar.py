@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Simulate sweeps of the lidars in lidars.yaml: every pulse, and what comes back from it.
 
-A scan pattern has ``num_pulses(period_s)`` and ``directions(slots)`` in the scanner's axes.
+A scan pattern has two methods. ``num_pulses(period_s)`` is the number of pulses in a sweep.
+``directions(number, share, time_s)`` are (N,3) unit vectors in the axes of the scanner, of pulses
+by their (N,) index from 0, firing time minus the reference time in periods, -0.5 to 0.5, and firing
+time in seconds since frame 0.
 """
 
 from __future__ import annotations
@@ -29,15 +32,6 @@ _ROUNDING = 1e-6  # of a number of pulses
 # Scan patterns
 
 
-class Slots(NamedTuple):
-    """The N pulses of a sweep in the order of time."""
-
-    number: Int  # (N,) int64 index of the pulse, from 0
-    share: Float  # (N,) firing time minus the reference time, in periods, -0.5 to 0.5
-    # (N,) firing time in seconds since frame 0, for patterns that continue from sweep to sweep
-    time_s: Float
-
-
 @dataclass(frozen=True)
 class Spinning:
     """A pattern that spins once a sweep, clockwise from above, forward at the reference time."""
@@ -53,10 +47,10 @@ class Spinning:
         """Return the number of pulses in a sweep."""
         return int(self.columns_per_s * period_s + _ROUNDING) * len(self.elevation_deg)
 
-    def directions(self, slots: Slots) -> Float:
-        """Return (N,3) unit vectors in the axes of the scanner."""
-        azimuth = -2 * np.pi * (slots.share + self.phase)
-        beam = slots.number % len(self.elevation_deg)
+    def directions(self, number: Int, share: Float, time_s: Float) -> Float:
+        """Return the unit vectors of pulses."""
+        azimuth = -2 * np.pi * (share + self.phase)
+        beam = number % len(self.elevation_deg)
         return _pointing(azimuth, np.radians(self.elevation_deg)[beam])
 
 
@@ -79,12 +73,12 @@ class Raster(_Steady):
     height_deg: float  # height of the field of view
     lines_per_s: int  # swings of the fast mirror per second, counting each direction
 
-    def directions(self, slots: Slots) -> Float:
-        """Return (N,3) unit vectors in the axes of the scanner."""
-        line = slots.number * (self.lines_per_s / self.pulses_per_s)
+    def directions(self, number: Int, share: Float, time_s: Float) -> Float:
+        """Return the unit vectors of pulses."""
+        line = number * (self.lines_per_s / self.pulses_per_s)
         swing = 1 - np.abs(line % 2 - 1)  # 0 to 1 and back
         azimuth = np.radians(self.width_deg) * (0.5 - swing)
-        return _pointing(azimuth, np.radians(self.height_deg) * -slots.share)
+        return _pointing(azimuth, np.radians(self.height_deg) * -share)
 
 
 @dataclass(frozen=True)
@@ -96,9 +90,9 @@ class Rosette(_Steady):
     # their sum.
     turns_per_s: tuple[float, float]
 
-    def directions(self, slots: Slots) -> Float:
-        """Return (N,3) unit vectors in the axes of the scanner."""
-        first, second = (np.pi * rate * slots.time_s for rate in self.turns_per_s)
+    def directions(self, number: Int, share: Float, time_s: Float) -> Float:
+        """Return the unit vectors of pulses."""
+        first, second = (np.pi * rate * time_s for rate in self.turns_per_s)
         off_axis = np.radians(self.width_deg / 2) * np.cos(first - second)
         roll, flat = first + second, np.sin(off_axis)
         return np.stack([np.cos(off_axis), flat * np.cos(roll), flat * np.sin(roll)], axis=1)
@@ -198,9 +192,9 @@ def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
         number = np.arange(num, dtype=np.int64)
         offset_ns = -period_ns // 2 + number * period_ns // num
         share: Float = offset_ns / period_ns
-        slots = Slots(number, share, time_s + share * period_ns * 1e-9)
-        lidar = np.full(num, index, np.uint8)
-        pulses.append((scanner.pattern.directions(slots), offset_ns, lidar))
+        fired_s = time_s + share * period_ns * 1e-9
+        direction = scanner.pattern.directions(number, share, fired_s)
+        pulses.append((direction, offset_ns, np.full(num, index, np.uint8)))
     direction, offset_ns, lidar = (np.concatenate(column) for column in zip(*pulses, strict=True))
     order = np.argsort(offset_ns, kind="stable")
     return Firings(direction[order], offset_ns[order], lidar[order])

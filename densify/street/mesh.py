@@ -103,6 +103,10 @@ class Mesh:
             np.full(2 * k, -1, np.int32),
         )
 
+    def moved(self, offset: Point) -> Mesh:
+        """Return the mesh moved by a (3,) offset."""
+        return replace(self, vertices=self.vertices + offset)
+
     def posed(self, T_a_mesh: Float) -> Mesh:
         """Return the mesh moved by a (4,4) rigid motion."""
         return replace(self, vertices=self.vertices @ T_a_mesh[:3, :3].T + T_a_mesh[:3, 3])

@@ -7,7 +7,7 @@ The origin of a vehicle mesh is on the ground midway between the axles, x forwar
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -33,9 +33,7 @@ from densify.street.motion import DURATION_S, Driving, Limb, Towed
 from densify.street.world import Body
 
 _SHAPES = read_table("models")
-_SOLIDS: dict[str, Callable[..., Mesh]] = {
-    "box": box, "frustum": frustum, "tube": tube, "ball": ball,
-}  # fmt: skip
+_MIRROR = np.array([1.0, -1.0, 1.0])
 WHEELBASE_M: dict[str, float] = vars(_SHAPES.wheelbase_m)
 SPAN_S = (-1.0, DURATION_S + 1.0)  # times with poses
 _CACHED_MODELS = 256
@@ -67,16 +65,18 @@ def panel(name: str, length_m: float, **named: Any) -> Mesh:
 
 def _solid(row: Any, named: dict[str, Any]) -> Mesh:
     fields = {name: resolve(value, named) for name, value in vars(row).items()}
-    material = fields.pop("material")
+    material = fields["material"]
     fields["material"] = material if isinstance(material, Material) else Material[material]
     make, offsets = _SOLIDS[fields.pop("solid")], fields.pop("at", None)
     if "spaced" in fields:
-        spaced = {key: resolve(value, named) for key, value in vars(fields.pop("spaced")).items()}
-        x = np.arange(spaced["first"], spaced["end"], spaced["step_m"])
+        spaced = vars(fields.pop("spaced"))
+        x = np.arange(*(resolve(spaced[name], named) for name in ("first", "end", "step_m")))
         offsets = np.column_stack([x, 0 * x, 0 * x])
-    if offsets is not None:
-        fields |= {end: np.add(fields[end], offsets) for end in ("low", "high")}
-    return make(**fields)
+    if offsets is None:
+        return make(**fields)
+    if make is box:  # many at once
+        return box(**fields | {end: np.add(fields[end], offsets) for end in ("low", "high")})
+    return Mesh.join([make(**fields).moved(offset) for offset in offsets])
 
 
 def resolve(value: Any, named: Mapping[str, Any]) -> Any:
@@ -102,89 +102,33 @@ def _any_cloth(rng: np.random.Generator) -> Tint:
     )
 
 
-# Vehicles
-
-
-def _wheels(row: Any) -> list[Mesh]:
-    """Return the tyres and rims on both sides of the axles."""
-    meshes, z = [], row.radius_m
-    for x in row.axles_m:
-        for y in (-row.half_track_m, row.half_track_m):
-            for ring in _SHAPES.wheel:
-                right, left = (
-                    y + sign * row.width_m / 2 + sign * ring.stands_out_m for sign in (-1, 1)
-                )
-                radius_m, material = z * ring.radius_share, Material[ring.material]
-                meshes.append(
-                    tube((x, right, z), (x, left, z), radius_m, material, WHITE, ring.num_sides)
-                )
-    return meshes
-
-
 def _panels(low: Float, high: Float) -> Float:
     """Return (K-1,4,3) quads between a lower and an upper line of (K,3) points."""
     return np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
 
 
-def _both_sides(left: Float, material: Material, tint: Tint) -> Mesh:
-    """Return a mesh of (K,4,3) quads on the left and their mirror images on the right."""
-    right = left * [1.0, -1.0, 1.0]
-    return Mesh.quads(np.concatenate([left, right]), material, tint)
+def _sides(low: Any, high: Any, material: Material, tint: Tint = WHITE) -> Mesh:
+    """Return panels between two lines on the left, and their mirror images on the right."""
+    left = _panels(np.array(low), np.array(high))
+    return Mesh.quads(np.concatenate([left, left * _MIRROR]), material, tint)
 
 
-def _sheet(row: Any, named: dict[str, Any], paint: Tint) -> Mesh:
-    """Return a sheet across the car through its lines (x, z, half width)."""
-    left = np.array(resolve(row.lines, named))[:, [0, 2, 1]]
-    tint = WHITE if hasattr(row, "unpainted") else paint
-    return Mesh.quads(_panels(left * [1.0, -1.0, 1.0], left), Material[row.material], tint)
+def _sheet(left: Any, material: Material, tint: Tint = WHITE) -> Mesh:
+    """Return a sheet from a line on the left to its mirror image on the right."""
+    line = np.array(left)
+    return Mesh.quads(_panels(line * _MIRROR, line), material, tint)
 
 
-def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
-    """Return a saloon or estate, 4.2 to 4.7 m long: shell, glass, interior and wheels."""
-    shape = _SHAPES.car
-    style = "estate" if bool(rng.random() < shape.estate_share) else "saloon"
-    front = shape.front_m + rng.uniform(*shape.longer_m)
-    rear = shape.rear_m - rng.uniform(*shape.longer_m)
-    roof = shape.roof_m + rng.uniform(*shape.estate_higher_m) * (style == "estate")
-    named = {
-        "front": front, "rear": rear, "roof": roof, "belt": shape.belt_m,
-        "wide": shape.half_width_m, "narrow": shape.roof_half_width_m,
-        "cowl": shape.cowl_m, "screen": shape.screen_m,
-        "deck": rear + getattr(shape.deck_ahead_of_rear_m, style),
-        "rear_roof": rear + getattr(shape.rear_roof_ahead_of_rear_m, style),
-    }  # fmt: skip
-    x = [resolve(line.x, named) for line in shape.sides]
-    shoulder, sill = (
-        np.column_stack([x, np.full(len(x), shape.half_width_m), z])
-        for z in zip(*((line.shoulder_m, line.sill_m) for line in shape.sides), strict=True)
-    )
-    edge = np.minimum(shoulder, (np.inf, np.inf, shape.frame_from_m))
-    band = _panels(_pillars(named, "deck", "cowl", "wide", "belt"),
-                   _pillars(named, "rear_roof", "screen", "narrow", "roof"))  # fmt: skip
-    return Mesh.join(
-        [
-            _both_sides(_panels(sill, edge), Material.BODYWORK, paint),
-            _both_sides(_panels(edge, shoulder), Material.FRAME, paint),
-            *(_sheet(row, named, paint) for row in shape.shell),
-            _both_sides(band[::2], Material.FRAME, paint),
-            _both_sides(band[1::2], Material.GLASS, paint),
-            *(_sheet(row, named, paint) for row in shape.windows),
-            model("car_inside"),
-            *_wheels(shape.wheels),
-            model("car_lights", front=front, rear=rear),
-        ]
-    )
+def _quads(corners: Any, material: Material, tint: Tint = WHITE) -> Mesh:
+    return Mesh.quads(np.array(corners, float), material, tint)
 
 
-def _pillars(named: dict[str, float], rear: str, front: str, half_width: str, z: str) -> Float:
-    """Return (6,3) ends of the rear, door and front pillars along the left side of a car."""
-    begin, end, shape = named[rear], named[front], _SHAPES.car
-    door_rear, door_front = shape.door_pillar_m
-    x = [
-        begin, begin + shape.rear_pillar_share * (door_rear - begin), door_rear,
-        door_front, end - shape.front_pillar_share * (end - door_front), end,
-    ]  # fmt: skip
-    return np.array([(along, named[half_width], named[z]) for along in x])
+_SOLIDS: dict[str, Callable[..., Mesh]] = {
+    "box": box, "frustum": frustum, "tube": tube, "ball": ball,
+    "sides": _sides, "sheet": _sheet, "quads": _quads,
+}  # fmt: skip
+
+# Vehicles and people
 
 
 def parked_car(instance: int, rng: np.random.Generator) -> Mesh:
@@ -192,78 +136,81 @@ def parked_car(instance: int, rng: np.random.Generator) -> Mesh:
     return car_mesh(_any_paint(rng), rng).of_instance(instance)
 
 
+def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
+    """Return a saloon or estate, 4.2 to 4.7 m long: shell, glass, interior and wheels."""
+    shape = _SHAPES.car
+    style = "estate" if rng.random() < shape.estate_share else "saloon"
+    front = shape.front_m + rng.uniform(*shape.longer_m)
+    rear = shape.rear_m - rng.uniform(*shape.longer_m)
+    roof = shape.roof_m + rng.uniform(*shape.estate_higher_m) * (style == "estate")
+    named = {"front": front, "rear": rear, "roof": roof, "paint": paint, "belt": shape.belt_m}
+    named |= {"wide": shape.half_width_m, "narrow": shape.roof_half_width_m}
+    named |= {"cowl": shape.cowl_m, "screen": shape.screen_m}
+    named["deck"] = rear + getattr(shape.deck_ahead_of_rear_m, style)
+    named["rear_roof"] = rear + getattr(shape.rear_roof_ahead_of_rear_m, style)
+    door_rear, door_front = shape.door_pillar_m
+    for height, begin, end in (("low", "deck", "cowl"), ("high", "rear_roof", "screen")):
+        behind_m, ahead_m = door_rear - named[begin], named[end] - door_front
+        named[f"{height}_rear_pillar"] = named[begin] + shape.rear_pillar_share * behind_m
+        named[f"{height}_front_pillar"] = named[end] - shape.front_pillar_share * ahead_m
+    lights = model("car_lights", front=front, rear=rear)
+    return Mesh.join([model("car_body", **named), model("car_inside"), lights])
+
+
 def car(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a driving car."""
-    return Actor("car", (Body(parked_car(instance, rng), motion, instance),))
+    return Actor("car", (Body(car_mesh(_any_paint(rng), rng), motion, instance),))
 
 
 def truck(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a 16 m articulated truck. The trailer follows the tractor through turns."""
-    shape, paint, tarpaulin = _SHAPES.truck, _any_paint(rng), _any_cloth(rng)
-    glass = Mesh.quads(np.array(shape.glass), Material.GLASS, paint)
-    cab = [model("truck_cab", paint=paint), glass, model("truck_chassis"), *_wheels(shape.wheels)]
-    load = [model("truck_load", tarpaulin=tarpaulin), *_wheels(shape.trailer_wheels)]
-    towed = Towed(motion, shape.kingpin_m, WHEELBASE_M["trailer"], *SPAN_S)
-    bodies = (Body(Mesh.join(cab), motion, instance), Body(Mesh.join(load), towed, instance))
-    return Actor("truck", bodies, num_solid=2)
-
-
-# People
+    cab = model("truck_cab", paint=_any_paint(rng))
+    load = model("truck_load", tarpaulin=_any_cloth(rng))
+    towed = Towed(motion, _SHAPES.truck.kingpin_m, WHEELBASE_M["trailer"], *SPAN_S)
+    return Actor("truck", (Body(cab, motion, instance), Body(load, towed, instance)), num_solid=2)
 
 
 def walker(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a pedestrian: a trunk with two legs and two arms that swing in step."""
     shape = _SHAPES.walker
-    hip_m, cloth, trousers = (
-        shape.hip_m + rng.uniform(*shape.taller_m), _any_cloth(rng), _any_cloth(rng),
-    )  # fmt: skip
-    hair = tuple(channel * rng.random() for channel in shape.darkest_hair)
-    trunk = model("walker_trunk", hip=hip_m, cloth=cloth, hair=hair)
-    foot_m = -(hip_m + shape.leg_shorter_than_hip_m)
-    meshes = {
-        "leg": model("leg", foot=foot_m, radius=tuple(shape.leg_radius_m), cloth=trousers),
-        "arm": model("arm", cloth=cloth),
-    }
-    hinge_m = {"leg": hip_m, "arm": hip_m + shape.shoulder_above_hip_m}
-    bodies = [Body(trunk, motion, instance)]
-    for side, phase in ((1, 0.0), (-1, np.pi)):
-        for limb, behind in (("leg", 0.0), ("arm", np.pi)):
-            hinge = (0.0, getattr(shape.half_width_m, limb) * side, hinge_m[limb])
-            swing = getattr(shape.swing_rad, limb)
-            limb_motion = Limb(motion, hinge, swing, shape.stride_m, phase + behind)
-            bodies.append(Body(meshes[limb], limb_motion, instance))
-    return Actor("walker", tuple(bodies))
+    hip_m = shape.hip_m + rng.uniform(*shape.taller_m)
+    named = {"hip": hip_m, "foot": -(hip_m - shape.leg_shorter_than_hip_m)}
+    named |= {"cloth": _any_cloth(rng), "trousers": _any_cloth(rng)}
+    named["hair"] = tuple(channel * rng.random() for channel in shape.darkest_hair)
+    trunk = Body(model("walker_trunk", **named), motion, instance)
+    return Actor("walker", (trunk, *_limbs(shape, named, trunk)))
 
 
 def cyclist(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a bicycle with a rider whose legs pedal."""
-    shape, paint, cloth = _SHAPES.cyclist, _any_cloth(rng), _any_cloth(rng)
-    frame = model("bicycle_and_rider", paint=paint, cloth=cloth, helmet=_any_cloth(rng))
+    shape = _SHAPES.cyclist
+    names = ("paint", "cloth", "helmet", "left_cloth", "right_cloth")
+    named = {name: _any_cloth(rng) for name in names}
     wheels = [tube for x in shape.wheel.x_m for tube in _spoked_wheel(shape.wheel, x)]
-    bodies = [Body(Mesh.join([*wheels, frame]), motion, instance)]
-    x, y, z = shape.hip_m
-    for side, phase in ((1, 0.0), (-1, np.pi)):
-        pedalling = Limb(motion, (x, y * side, z), shape.swing_rad, shape.stride_m, phase)
-        radius_m, cloth = tuple(shape.leg_radius_m), _any_cloth(rng)
-        leg = model("leg", foot=-shape.leg_m, radius=radius_m, cloth=cloth)
-        bodies.append(Body(leg, pedalling, instance))
-    return Actor("cyclist", tuple(bodies))
+    frame = Mesh.join([*wheels, model("bicycle_and_rider", **named)])
+    trunk = Body(frame, motion, instance)
+    return Actor("cyclist", (trunk, *_limbs(shape, named, trunk)))
+
+
+def _limbs(shape: Any, named: dict[str, Any], trunk: Body) -> Iterator[Body]:
+    """Yield the limbs of a walker or cyclist."""
+    for row in shape.limbs:
+        hinge_m, phase = resolve(row.hinge_m, named), 2 * np.pi * row.phase
+        motion = Limb(trunk.trajectory, hinge_m, row.swing_rad, shape.stride_m, phase)
+        yield Body(model(row.model, **named), motion, trunk.instance)
 
 
 def _spoked_wheel(row: Any, x: float) -> list[Mesh]:
     angle = np.linspace(0, 2 * np.pi, row.num_sides + 1)
     circle = row.radius_m * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
-    rim = circle + (x, 0, row.hub_m)
-    half = row.num_sides // 2
-    tyre = [
-        tube(*ends, row.tyre_m, Material.RUBBER, num_sides=row.num_tube_sides)
-        for ends in pairwise(rim)
+    rim, half = circle + (x, 0, row.hub_m), row.num_sides // 2
+    spokes = [(rim[i], rim[i + half]) for i in range(0, half, 2)]
+    tubes = [(row.tyre_m, Material.RUBBER, ends) for ends in pairwise(rim)]
+    tubes += [(row.spoke_m, Material.METAL, ends) for ends in spokes]
+    return [
+        tube(*ends, radius_m, material, num_sides=row.num_tube_sides)
+        for radius_m, material, ends in tubes
     ]
-    spokes = [
-        tube(rim[i], rim[i + half], row.spoke_m, Material.METAL, num_sides=row.num_tube_sides)
-        for i in range(0, half, 2)
-    ]
-    return [*tyre, *spokes]
 
 
 # Houses and plants
@@ -276,26 +223,13 @@ def house(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
     height = shape.storey_m * storeys + shape.attic_m
     wall = Material.BRICK if rng.random() < shape.brick_share else Material.PLASTER
     tint = tuple(rng.uniform(*getattr(shape.tint, wall.name), 3).tolist())
-    w, d = width_m / 2, depth_m / 2
+    right, rear = width_m / 2, depth_m / 2
     ridge = height + rng.uniform(*shape.ridge_share) * depth_m
-    chimney = float(rng.uniform(*shape.chimney_share)) * w
-    eaves, top = height + shape.eaves_m, ridge + shape.gable_below_ridge_m
-    x, y = w + shape.overhang_m, d + shape.overhang_m
-    front = np.array([(-x, -y, eaves), (x, -y, eaves), (x, 0, ridge), (-x, 0, ridge)])
-    gables = np.array(
-        [[(s, -d, height), (s, d, height), (s, 0, top), (s, 0, top)] for s in (-w, w)]
-    )
-    return Mesh.join(
-        [
-            box((-w, -d, shape.foundation_m), (w, d, height), wall, tint),
-            Mesh.quads(np.array([front, front * (-1, -1, 1)]), Material.ROOF, tint),
-            Mesh.quads(gables, wall, tint),
-            *_windows(w, d, storeys),
-            model(
-                "house_details", front=-d, height=height, ridge=ridge, chimney=chimney, tint=tint
-            ),
-        ]
-    )
+    named = {"height": height, "ridge": ridge, "wall": wall, "tint": tint}
+    named |= {"left": -right, "right": right, "front": -rear, "rear": rear}
+    named["chimney"] = float(rng.uniform(*shape.chimney_share)) * right
+    windows = _windows(right, rear, storeys)
+    return Mesh.join([model("house_shell", **named), *windows, model("house_details", **named)])
 
 
 def _windows(w: float, d: float, storeys: int) -> list[Mesh]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Build the scenes of scenes.yaml: roads, static objects beside them, and traffic without collisions.
+"""Build the scenes of scenes.yaml: roads, static objects beside them, traffic that never collides.
 
 Time 0 is frame 0. The actors are around the ego vehicle at the meeting time.
 """
@@ -14,26 +14,11 @@ from typing import Any
 import numpy as np
 
 from densify.geometry.types import Float
-from densify.street import models, read_table
-from densify.street.ground import Ground, Road, Side, mark_lanes, zebra
+from densify.street import models, motion, read_table
+from densify.street.ground import Ground, Road, Side, mark_road
 from densify.street.mesh import Material, Mesh
 from densify.street.models import SPAN_S, WHEELBASE_M, Actor, model, panel, resolve
-from densify.street.motion import (
-    STEP_M,
-    Curve,
-    Driving,
-    Lane,
-    Poses,
-    Rectangles,
-    Speed,
-    Still,
-    Terrain,
-    left_of,
-    on_ground,
-    overlap,
-    polyline,
-    upright,
-)
+from densify.street.motion import Curve, Driving, Lane, Rectangles, Speed, left_of, upright
 from densify.street.world import Body, World
 
 _TABLES = read_table("scenes")
@@ -66,7 +51,7 @@ def build(preset: str, rng: np.random.Generator) -> Scene:
     has_traffic, table = preset != "static", PRESETS[preset]
     curves, stations = _LAYOUTS[preset](table, rng)
     roads = {name: Road(curves[name], **vars(sides)) for name, sides in vars(table.roads).items()}
-    terrain = Terrain.hilly(rng, table.ground.max_slope, getattr(table.ground, "scale", 1.0))
+    terrain = motion.Terrain.hilly(rng, table.ground.max_slope, getattr(table.ground, "scale", 1.0))
     ground = Ground(terrain, tuple(roads.values()), table.ground.kerb_m, table.ground.pavement_m)
     scenery = Scenery(ground, rng)
     stations["end"] = roads["main"].curve.length_m - _ROAD_END_M
@@ -77,9 +62,7 @@ def build(preset: str, rng: np.random.Generator) -> Scene:
     meshes = [ground.mesh(table.ground.margin_m, table.ground.cell_m)]
     for row in table.markings:
         spans = resolve(row.spans, stations)
-        meshes.append(mark_lanes(ground, roads[row.road], row.dashed, row.solid, spans))
-    if hasattr(table, "zebra_m"):
-        meshes.append(zebra(ground, roads["main"], table.zebra_m))
+        meshes.append(mark_road(ground, roads[row.road], row, spans))
     ego_lane = getattr(table.lanes, table.ego.lane)
     lane = Lane(curves[ego_lane.road], ego_lane.offset_m)
     ego = Driving(
@@ -92,7 +75,7 @@ def build(preset: str, rng: np.random.Generator) -> Scene:
     traffic = Traffic(ego, scenery, vars(table.lanes), curves)
     for row in table.traffic if has_traffic else ():
         traffic.add_row(Journey(**vars(row)), stations)
-    static = Body(Mesh.join([*meshes, *scenery.meshes]), Still())
+    static = Body(Mesh.join([*meshes, *scenery.meshes]), motion.Still())
     bodies = [static, *(body for actor in traffic.actors for body in actor.bodies)]
     footprints = Rectangles.joined(scenery.footprints)
     world = World(bodies, int(rng.integers(2**31)))
@@ -123,7 +106,7 @@ def _lay_street(table: Any, rng: np.random.Generator) -> tuple[dict[str, Curve],
 
     main = Curve.bending(table.length_m, curvature, table.start_m)
     mouth = np.array([table.stations.mouth])
-    along_m = np.arange(0.0, table.side_road_m + STEP_M, STEP_M)
+    along_m = np.arange(0.0, table.side_road_m + motion.STEP_M, motion.STEP_M)
     side = Curve(main(mouth)[0] + main.normal(mouth)[0] * along_m[:, None])
     turn, turn_m = _turn(table, main, side)
     return {"main": main, "side": side, "turn": turn}, {**vars(table.stations), "turn": turn_m}
@@ -133,13 +116,13 @@ def _turn(table: Any, main: Curve, side: Curve) -> tuple[Curve, float]:
     """Return the path from the oncoming lane into the side road, and where it begins to turn."""
     shape = table.turn
     oncoming = Lane(main, table.lanes.oncoming.offset_m, forward=False).curve
-    xy = oncoming(np.arange(0.0, oncoming.length_m, STEP_M))
+    xy = oncoming(np.arange(0.0, oncoming.length_m, motion.STEP_M))
     origin, out = side(np.zeros(1))[0], side.tangent(np.zeros(1))[0]
     along = -left_of(out)  # direction of the ego vehicle
     is_near = np.abs(xy - origin).sum(axis=1) < shape.search_m
     straight = xy[is_near & ((xy - origin) @ along > shape.straight_to_m)]
     corner = origin + along + out * float((straight[-1] - origin) @ out)
-    bend = polyline([straight[-1], corner, corner + shape.beyond_m * out], shape.radius_m)
+    bend = motion.polyline([straight[-1], corner, corner + shape.beyond_m * out], shape.radius_m)
     curve = Curve(np.concatenate([straight[:-1], bend]))
     straight_m, arc_m = shape.beyond_m - shape.radius_m, shape.radius_m * np.pi / 2
     return curve, curve.length_m - straight_m - arc_m
@@ -150,7 +133,7 @@ def _lay_crossing(
 ) -> tuple[dict[str, Curve], dict[str, float]]:
     """Return the straight roads and paths of the crossroads."""
     curves = {
-        name: Curve(polyline(path.corners, getattr(path, "radius_m", 0.0)))
+        name: Curve(motion.polyline(path.corners, getattr(path, "radius_m", 0.0)))
         for name, path in vars(table.paths).items()
     }
     return curves, dict(vars(table.stations))
@@ -191,7 +174,7 @@ class Scenery:
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
         self._stand(mesh, upright((*xy, z), heading), solid or mesh)
 
-    def _stand(self, mesh: Mesh, pose: Poses, solid: Mesh) -> None:
+    def _stand(self, mesh: Mesh, pose: motion.Poses, solid: Mesh) -> None:
         self.meshes.append(mesh.posed(pose.matrix()))
         self.footprints.append(Rectangles.of(solid, pose))
 
@@ -200,7 +183,7 @@ class Scenery:
         outline = Rectangles.of(mesh, upright((*xy, 0.0), heading), _CLEAR_M)
         if self.footprints:
             self.footprints = [Rectangles.joined(self.footprints)]
-            if overlap(self.footprints[0], outline).any():
+            if motion.overlap(self.footprints[0], outline).any():
                 return False
         forward = outline.forward[0]
         grid = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)], float)
@@ -219,7 +202,9 @@ class Scenery:
         mesh = models.parked_car(FIRST_PARKED + self._num_parked, self.rng)
         self._num_parked += 1
         half = forward * WHEELBASE_M["car"] / 2
-        pose = on_ground(self.ground.terrain, (xy - half)[None], (xy + half)[None], np.zeros(1))
+        pose = motion.on_ground(
+            self.ground.terrain, (xy - half)[None], (xy + half)[None], np.zeros(1)
+        )
         self._stand(mesh, pose, mesh)
 
     def row(
@@ -453,11 +438,11 @@ class Traffic:
 
     def _touches(self, outline: Rectangles) -> bool:
         """Return True if an outline, by time, overlaps one of what stands or moves."""
-        if overlap(outline, self._moving).any():
+        if motion.overlap(outline, self._moving).any():
             return True
         x, y = (self._standing.centre[:, i] - outline.centre[:, i, None] for i in (0, 1))
         time, near = np.nonzero(x * x + y * y < _TOUCH_M**2)
-        return bool(overlap(outline.rows(time), self._standing.rows(near)).any())
+        return bool(motion.overlap(outline.rows(time), self._standing.rows(near)).any())
 
     def _drive(self, journey: Journey, station: float, speed: Speed) -> Actor:
         """Draw a vehicle beside a station of the road at the meeting time."""
@@ -469,8 +454,8 @@ class Traffic:
             speed = Speed((0.0, journey.m_s + rng.uniform(-journey.vary_m_s, journey.vary_m_s)))
         wheelbase_m = WHEELBASE_M[journey.kind]
         terrain, meeting_s = self._ground.terrain, _TABLES.meeting_s
-        motion = Driving(lane.curve, speed, arc_m, meeting_s, terrain, wheelbase_m)
-        return _VEHICLES[journey.kind](motion, len(self.actors), rng)
+        driving = Driving(lane.curve, speed, arc_m, meeting_s, terrain, wheelbase_m)
+        return _VEHICLES[journey.kind](driving, len(self.actors), rng)
 
     def _walk(self, journey: Journey, station: float) -> Actor:
         """Draw a pedestrian between two offsets of a lane, on and off the kerb."""
@@ -484,11 +469,11 @@ class Traffic:
             beyond_m = ground.distance(lane.curve(arc_m))
             return ground.kerb_m * np.clip(beyond_m / _KERB_RAMP_M, 0, 1)
 
-        motion = Driving(
+        driving = Driving(
             lane.curve, Speed((0.0, rng.uniform(*_WALK_M_S))), arc_m, _TABLES.meeting_s,
             ground.terrain, WHEELBASE_M["walker"], lift, upright=True,
         )  # fmt: skip
-        return models.walker(motion, len(self.actors), rng)
+        return models.walker(driving, len(self.actors), rng)
 
 
 PRESETS = {
