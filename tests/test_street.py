@@ -216,32 +216,29 @@ _LATTICE = np.stack(np.meshgrid(*[np.linspace(0, 1, k) for k in (9, 5, 3)]), -1)
 
 def _check_no_contact(scene: Scene) -> None:
     """A twin of the placement's own test: no point of one's upright box in that of another."""
-    boxes = [
-        Body(model("ego_vehicle"), scene.ego),
-        *(b for actor in scene.actors for b in actor.bodies),
-    ]
+    bodies = [b for actor in scene.actors for b in actor.bodies]
     owner = np.array([-1, *(i for i, actor in enumerate(scene.actors) for _ in actor.bodies)])
+    boxes = [Body(model("ego_vehicle"), scene.ego), *bodies]
     bounds = [b.mesh.bounds for b in boxes]
-    lattices = [low + _LATTICE * (high - low) for low, high in bounds]
-    times = np.arange(0.0, 16.0, 0.4)
-    poses = [b.trajectory.poses(times) for b in boxes]
     standing = scene.footprints
-    left = np.stack([-standing.forward[:, 1], standing.forward[:, 0]], axis=1)
-    for k, time in enumerate(times):
-        matrices = [p.matrix(k) for p in poses]
-        clouds = [transform(T, lattice) for T, lattice in zip(matrices, lattices, strict=True)]
+    sideways = np.stack([-standing.forward[:, 1], standing.forward[:, 0]], axis=1)
+    axes = np.stack([standing.forward, sideways], axis=1)
+    for time in np.arange(0.0, 16.0, 0.4):
+        matrices = [b.trajectory.poses(np.array([time])).matrix() for b in boxes]
+        clouds = [
+            transform(T, low + _LATTICE * (high - low))
+            for T, (low, high) in zip(matrices, bounds, strict=True)
+        ]
         centres = np.array([c.mean(axis=0) for c in clouds])
         for i, (low, high) in enumerate(bounds):
-            T_body_world = inverse(matrices[i])
             near = np.linalg.norm(centres - centres[i], axis=1) < 20
             for j in np.flatnonzero(near & (owner != owner[i])):
-                p = transform(T_body_world, clouds[j])
+                p = transform(inverse(matrices[i]), clouds[j])
                 assert not ((p > low) & (p < high)).all(axis=1).any(), (time, owner[i], owner[j])
             close = np.linalg.norm(standing.centre - centres[i][:2], axis=1) < 20
             away = clouds[i][:, None, :2] - standing.centre[close]
-            along = np.abs((away * standing.forward[close]).sum(-1)) < standing.half_m[close, 0]
-            across = np.abs((away * left[close]).sum(-1)) < standing.half_m[close, 1]
-            assert not (along & across).any(), (time, owner[i])
+            offsets = np.einsum("pni,nai->pna", away, axes[close])
+            assert not (np.abs(offsets) < standing.half_m[close]).all(axis=-1).any(), time
 
 
 def test_nobody_touches_anybody(street, crossing, highway):
@@ -261,12 +258,6 @@ def test_all_stand_on_the_ground(street, crossing):
                 feet = vertices[vertices[:, 2] < vertices[:, 2].min() + 0.15]
                 gap = vertices[:, 2].min() - scene.ground.height(feet[:, :2]).mean()
                 assert -0.2 < gap < 0.2, (actor.name, time, gap)
-    terrain = street.simulator.scene.ground.terrain
-    xy = np.random.default_rng(0).uniform(-200, 200, (500, 2))
-    assert np.linalg.norm(terrain.slope(xy), axis=1).max() <= 0.05
-    step = 1e-4
-    numeric = (terrain.height(xy + [step, 0]) - terrain.height(xy - [step, 0])) / (2 * step)
-    np.testing.assert_allclose(terrain.slope(xy)[:, 0], numeric, atol=1e-6)
 
 
 def test_ego_vehicles_drive_as_the_presets_say(street, crossing, highway):

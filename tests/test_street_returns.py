@@ -18,7 +18,6 @@ from densify.street.lidar import (
     Spinning,
     firings,
     scan,
-    share_lost,
 )
 from densify.street.mesh import Material, Mesh, box
 from densify.street.models import car_mesh
@@ -156,16 +155,6 @@ def test_cars_differ_and_lost_rays_lie_together(seen):
     low, middle, high = np.percentile(of_car, [10, 50, 90])
     assert low < 0.12 and 0.12 < middle < 0.28 and 0.35 < high < 0.6  # 0.09, 0.18, 0.47
     assert after_lost > 0.7 and after_any < 0.25
-
-
-def test_the_dark_and_the_far_road_lose_returns():
-    def lost(material: Material, tint: float, range_m: float) -> float:
-        columns = np.array([material]), np.array([tint]), np.array([range_m])
-        return float(share_lost(*columns)[0])
-
-    assert lost(Material.ASPHALT, 1.0, 10.0) < 0.005 < 0.1 < lost(Material.ASPHALT, 1.0, 60.0)
-    assert lost(Material.CLOTH, 0.2, 20.0) > 0.1 > lost(Material.CLOTH, 0.6, 20.0)
-    assert lost(Material.PANE, 1.0, 14.0) > 0.09 and lost(Material.BODYWORK, 0.1, 14.0) < 0.01
 
 
 def test_panes_are_part_of_the_true_depth():

@@ -35,21 +35,6 @@ def same_scene(level: Street, hz: int = 10, tilt_deg: float = 0.0) -> Street:
 # patterns
 
 
-def test_rings_are_where_the_data_sheets_have_them():
-    elevation = {
-        name: np.sort([e for s in SENSORS[name].scanners[:1] for e in s.pattern.elevation_deg])
-        for name in ("os128", "vls128", "panda", "dual32")
-    }
-    assert [len(e) for e in elevation.values()] == [128, 128, 64, 32]
-    np.testing.assert_allclose(np.diff(elevation["os128"]), 45 / 127)
-    gaps = np.diff(elevation["vls128"])
-    assert gaps.min() == pytest.approx(0.11) and np.median(gaps) < 0.181 and gaps.max() > 1
-    assert (np.argmin(gaps) > 30) and (np.argmax(gaps) == 0)
-    gaps = np.diff(elevation["panda"])
-    assert gaps.min() == pytest.approx(1 / 6) and gaps[0] == 6.0
-    assert np.ptp(elevation["panda"]) == np.ptp(elevation["vls128"]) == 40.0
-
-
 @pytest.mark.parametrize("name", SENSORS)
 def test_pulses_fill_the_period_evenly_at_a_constant_rate(name):
     num_pulses = []
@@ -128,7 +113,6 @@ def test_rays_start_at_their_scanner_and_truth_lies_on_the_walls(name, hz, tilt_
     world = transform(truth.T_world_lidar, truth.points)
     T_world_lidar = simulator.T_world_lidar_at(simulator.stamp_ns(frame))
     np.testing.assert_array_equal(truth.T_world_lidar, T_world_lidar)
-    raw = transform(T_world_lidar, returns.points.astype(float))
     offset_ns = returns.offset_ns
     assert np.abs(offset_ns).max() <= simulator.period_ns / 2
     assert set(returns.lidar) == set(range(len(sensor.scanners)))
@@ -147,13 +131,9 @@ def test_rays_start_at_their_scanner_and_truth_lies_on_the_walls(name, hz, tilt_
         assert 0.9 * len(pulses) < own.sum() < len(pulses)  # some pulses are lost
         assert np.abs(off_wall).max() < 5 * scanner.range_sigma_m
         assert abs(off_wall.mean()) < 0.1 * scanner.range_sigma_m
-        slant = np.max(np.abs(world[own] - T_world_lidar[:3, 3]), axis=1)[clear]
-        noise_m = (
-            off_wall / slant * np.linalg.norm(world[own] - T_world_lidar[:3, 3], axis=1)[clear]
-        )
+        away = (world[own] - T_world_lidar[:3, 3])[clear]
+        noise_m = off_wall / np.abs(away).max(axis=1) * np.linalg.norm(away, axis=1)
         assert noise_m.std() == pytest.approx(scanner.range_sigma_m, rel=0.2)
-        raw_wall = np.sort(np.abs(raw[own]), axis=1)[clear, 2] - ROOM_M
-        assert np.abs(raw_wall).max() > 0.1  # without truth the sweep is distorted
 
 
 # rates
@@ -175,13 +155,6 @@ def test_a_rate_changes_when_sweeps_are_taken_and_not_what_is_there(level):
         sizes.append(len(other[frame]))
     assert sizes[1] == pytest.approx(sizes[0] / 2, rel=0.02)
     assert sizes[2] == pytest.approx(sizes[0] * 2, rel=0.02)
-    # a body's way in a tenth of a second is the same
-    returns = fast.returns(240)
-    points = fast.simulator.in_bodies(240, returns)
-    np.testing.assert_array_equal(
-        fast.truth.displacement(240, 242),
-        level.simulator.bodies.displacement(120, 121, returns.body, points),
-    )
     assert "20.00 Hz" in describe(fast)
 
 
@@ -195,9 +168,6 @@ def test_names_and_cached_frames_tell_rates_and_tilts_apart():
     streets = [Street.from_spec(f"street{option}") for option in options]
     assert len({street._swept for street in streets}) == 5
     assert Street.from_spec("street?hz=10&tilt=0")._swept == streets[0]._swept
-    images = [street._pictured for street in streets]
-    assert images == [images[0], images[1], images[0], images[1], images[0]]
-    assert len({images[0], images[1], Street.from_spec("street?seed=1")._pictured}) == 3
 
 
 # mounts
@@ -213,6 +183,3 @@ def test_a_tilted_mount_turns_the_lidar_and_leaves_the_cameras(level):
         T_level_cam = inverse(level.cameras[name].T_cam_lidar)
         T_tilted_cam = inverse(camera.T_cam_lidar)
         np.testing.assert_allclose(T_level_tilted @ T_tilted_cam, T_level_cam, atol=1e-12)
-    picture = tilted.simulator.picture("image_02", 120)  # anew: the cache shares them
-    np.testing.assert_array_equal(picture.depth_m, level.truth.depth_m("image_02", 120))
-    np.testing.assert_array_equal(picture.image, level.image("image_02", 120))

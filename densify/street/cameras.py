@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +25,9 @@ _LEFT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _MAX_DEPTH_M = 120.0
 _GAMMA = 2.2  # of the display
 _OFF_SURFACE_M = 0.015  # from a surface to the origin of its ray to the sun
-_NUM_OCTAVES = 3  # of the noise of clouds
-
-
-class Shutter(NamedTuple):
-    """The exposure times of a camera."""
-
-    delay_ns: int  # exposure of the first image minus frame 0's reference time
-    period_ns: int | None = None  # time between images; None for one image per sweep
+_NUM_OCTAVES, _OCTAVE_SHIFT = 3, 7  # of the noise of clouds
+_GRAIN = 0.4  # share of grains beside blotches
+_DARKEST, _CONTRAST = 0.82, 0.36  # of the brightness of bricks
 
 
 def _pose(R_cam_lidar: Float, lidar_m: Float) -> Float:
@@ -66,8 +61,9 @@ def _pinhole(name: str, row: Any) -> Camera:
 def _fisheye(row: Any) -> Camera:
     u, v = ((size - 1) / 2 for size in row.size_px)
     K, T_cam_lidar = _intrinsics(row.focal_px, u, v), _pose(_LEFT, row.lidar_m)
+    width_px, height_px = row.size_px
     return Camera(
-        "fisheye", *row.size_px, K, T_cam_lidar, tuple(row.distortion),
+        "fisheye", width_px, height_px, K, T_cam_lidar, tuple(row.distortion),
         model="fisheye", max_angle_deg=row.max_angle_deg,
     )  # fmt: skip
 
@@ -76,10 +72,8 @@ CAMERAS = {name: _pinhole(name, row) for name, row in vars(_TABLES.pinhole).item
 CAMERAS["fisheye"] = _fisheye(_FISHEYE)
 """The cameras, beside a level mount."""
 
-SHUTTERS = {
-    name: Shutter(row.delay_ns, getattr(row, "period_ns", None))
-    for name, row in (*vars(_TABLES.pinhole).items(), ("fisheye", _FISHEYE))
-}
+EXPOSURES: dict[str, Any] = {**vars(_TABLES.pinhole), "fisheye": _FISHEYE}
+"""The rows of cameras.yaml that tell when a camera exposes."""
 
 USUAL = ("image_02", "image_03")
 """Those that are there unless others are asked for."""
@@ -199,7 +193,7 @@ def _sky(direction: Float) -> Float:
     blue = np.array(sky.horizon) * low + np.array(sky.zenith) * (1 - low)
     height = (direction[:, 2:] + cloud.above_horizon).clip(cloud.least)
     flat = direction[:, :2] / height * cloud.size
-    octaves = [_smooth_noise(flat + 7 * i, 0.5**i) / 2**i for i in range(_NUM_OCTAVES)]
+    octaves = [_smooth_noise(flat + _OCTAVE_SHIFT * i, 0.5**i) / 2**i for i in range(_NUM_OCTAVES)]
     density = sum(octaves) / sum(0.5**i for i in range(_NUM_OCTAVES))
     cover = np.clip((density - cloud.begins) * cloud.contrast, 0, cloud.most)[:, None]
     cover = cover * np.clip(up * cloud.fade, 0, 1)
@@ -223,7 +217,7 @@ def _painted(world: World, triangle: Int, barycentric: Float32) -> Float:
 def _grains(uv: Float, texture: Any) -> Float:
     """Return the (N,) brightness, around 1, of grains and blotches at (N,2) metres."""
     grain = noise(*np.floor(uv.T / texture.grain_m).astype(np.int64))
-    mix = 0.4 * grain + 0.6 * _smooth_noise(uv, texture.blotch_m)
+    mix = _GRAIN * grain + (1 - _GRAIN) * _smooth_noise(uv, texture.blotch_m)
     return 1 + texture.contrast * (2 * mix - 1)
 
 
@@ -236,7 +230,7 @@ def _bricks(uv: Float, texture: Any) -> Float:
     beside_m, above_m = (along - column) * length_m, uv[:, 1] - row * height_m
     is_joint = (beside_m < texture.joint_m) | (above_m < texture.joint_m)
     brick = noise(column.astype(np.int64), row.astype(np.int64))
-    return np.where(is_joint, texture.joint, 0.82 + 0.36 * brick)
+    return np.where(is_joint, texture.joint, _DARKEST + _CONTRAST * brick)
 
 
 def _smooth_noise(uv: Float, cell_m: float) -> Float:

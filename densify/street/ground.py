@@ -20,6 +20,7 @@ _CORNER_RADIUS_M = 9.0  # of the kerb where two roads meet
 _SAMPLE_M, _NUM_STEPS = 2.0, 3  # between points of a road, and steps from there to the foot
 _COARSE_M, _FAR_M = 8.0, 200.0  # cells of the ground far from roads, and their distance beyond it
 _BORDER_M = 4.0  # of the grid beyond the margin of the roads
+_OVERLAP_M = 1.5 * _COARSE_M  # of the fine and the coarse ground
 _SUNK_M = -1.0  # height of the coarse ground below the fine one
 _BELOW_KERB_M = -0.05  # height of the coarse ground beside the fine one over the raised ground
 _LINE_M, _DASH_M, _DASH_EVERY_M = 0.12, 3.0, 9.0  # width of lane markings, dashes, their distance
@@ -139,7 +140,7 @@ class Ground:
     def _coarse(self, low: Float, high: Float, margin_m: float) -> Mesh:
         """Return large quads, sunk where fine triangles cover them."""
         corners, quads = _grid(low - _FAR_M, high + _FAR_M, _COARSE_M)
-        covered = self.distance(corners) < margin_m - 1.5 * _COARSE_M
+        covered = self.distance(corners) < margin_m - _OVERLAP_M
         beside_m = self.kerb_m + _BELOW_KERB_M
         z = self.terrain.height(corners) + np.where(covered, _SUNK_M, beside_m)
         return Mesh.quads(np.column_stack([corners, z])[quads], Material.GRASS)
@@ -187,7 +188,7 @@ def mark_road(ground: Ground, road: Road, row: Any, spans: Spans) -> Mesh:
         for begin, end in spans
         for station in np.arange(begin, end - _DASH_M, _DASH_EVERY_M)
     ]
-    lines = [(offset_m, dashes) for offset_m in row.dashed]
+    lines: list[tuple[float, Spans]] = [(offset_m, dashes) for offset_m in row.dashed]
     lines += [(offset_m, spans) for offset_m in row.solid]
     width_m = getattr(row, "width_m", _LINE_M)
     return Mesh.join([_strip(ground, road.curve, m, width_m, where) for m, where in lines])

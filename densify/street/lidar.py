@@ -28,6 +28,8 @@ from densify.street.world import ABSORBED, PASSES, STOPS, Hits, Meeting, Optics,
 
 _TABLES = read_table("lidars")
 _ROUNDING = 1e-6  # of a number of pulses
+_WIDENING = 1.5  # exponent of growing steps
+_S_PER_NS = 1e-9
 
 # Scan patterns
 
@@ -147,12 +149,13 @@ def _elevations_deg(row: Any) -> Float:
         return np.array(row.values)
     steps = np.arange(1, row.num + 1)
     if hasattr(row, "between"):
-        degrees = np.linspace(*row.between, row.num)
+        highest, lowest = row.between
+        degrees = np.linspace(highest, lowest, row.num)
     elif hasattr(row, "beyond"):
         degrees = row.beyond + row.step * steps
     else:
         first, last = row.widening
-        degrees = first + (last - first) * (steps / row.num) ** 1.5
+        degrees = first + (last - first) * (steps / row.num) ** _WIDENING
     return degrees[::-1] if hasattr(row, "backwards") else degrees
 
 
@@ -188,11 +191,11 @@ def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
     """Return all pulses of the sweep that lasts ``period_ns`` around ``time_s``, evenly in time."""
     pulses = []
     for index, scanner in enumerate(sensor.scanners):
-        num = scanner.pattern.num_pulses(period_ns * 1e-9)
+        num = scanner.pattern.num_pulses(period_ns * _S_PER_NS)
         number = np.arange(num, dtype=np.int64)
         offset_ns = -period_ns // 2 + number * period_ns // num
         share: Float = offset_ns / period_ns
-        fired_s = time_s + share * period_ns * 1e-9
+        fired_s = time_s + share * period_ns * _S_PER_NS
         direction = scanner.pattern.directions(number, share, fired_s)
         pulses.append((direction, offset_ns, np.full(num, index, np.uint8)))
     direction, offset_ns, lidar = (np.concatenate(column) for column in zip(*pulses, strict=True))
@@ -231,17 +234,19 @@ def laser(world: World, luck: Float) -> Optics:
         outcome[rows[(material == Material.GLASS) & inside]] = PASSES
         outside = (material != Material.LEAF) & ~inside
         rows, material, instance = rows[outside], material[outside], instance[outside]
-        part = np.argmax(material[:, None] == np.array(_VEHICLES), axis=1)
+        vehicle_part = np.argmax(material[:, None] == np.array(_VEHICLES), axis=1)
         tint = surfaces.mean_tint[met.triangle[rows]]
         brightness = np.digitize(tint, _TABLES.vehicles.brightness)
         cosine = np.clip(np.abs(met.facing[rows]), 0.0, 1.0)
         incidence_deg = np.degrees(np.arccos(cosine))
         lost, passes = (
-            _between(table[part, brightness], incidence_deg) for table in (_LOST, _PASSES)
+            _between(table[vehicle_part, brightness], incidence_deg) for table in (_LOST, _PASSES)
         )
-        level = patches(met.positions(rows), world.seed + 3 * instance.astype(np.int64) + part)
-        outcome[rows[level > 1 - passes]] = PASSES
-        outcome[rows[level < lost]] = ABSORBED
+        threshold = patches(
+            met.positions(rows), world.seed + 3 * instance.astype(np.int64) + vehicle_part
+        )
+        outcome[rows[threshold > 1 - passes]] = PASSES
+        outcome[rows[threshold < lost]] = ABSORBED
         return outcome
 
     return optics
@@ -250,12 +255,12 @@ def laser(world: World, luck: Float) -> Optics:
 def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
     """Return the (N,) share of pulses without a return, besides pulses that vehicles absorb."""
     table = _TABLES.lost_elsewhere
-    ground, dark, other = (
-        np.interp(range_m, table.range_m, lost) for lost in (table.ground, table.dark, table.other)
+    ground, dark, bright = (
+        np.interp(range_m, table.range_m, lost) for lost in (table.ground, table.dark, table.bright)
     )
     is_vehicle = np.isin(material, _VEHICLES)
     is_dark = (REFLECTIVITY[material] * tint < _DARK) & ~is_vehicle
-    return np.where(material <= Material.PAINT, ground, np.where(is_dark, dark, other))
+    return np.where(material <= Material.PAINT, ground, np.where(is_dark, dark, bright))
 
 
 def patches(position: Float, owner: Int) -> Float:
@@ -271,12 +276,12 @@ def patches(position: Float, owner: Int) -> Float:
         noise(across_key[first] + x, up_key[first] + y + _LARGE_PRIME * z)
         for x, y, z in product((0, 1), repeat=3)
     ]
-    level = ndtri(np.clip(corners, _RARE, 1 - _RARE)).T.take(cell_of, axis=0).T
+    normal = ndtri(np.clip(corners, _RARE, 1 - _RARE)).T.take(cell_of, axis=0).T
     for axis_share in share.T:  # halves the corners, axis by axis
-        low, high = np.split(level, 2)
-        level = low + axis_share * (high - low)
+        low, high = np.split(normal, 2)
+        normal = low + axis_share * (high - low)
     spread = np.prod(share**2 + (1 - share) ** 2, axis=1)
-    smooth: Float = ndtr(level[0] / np.sqrt(spread))
+    smooth: Float = ndtr(normal[0] / np.sqrt(spread))
     return smooth
 
 
@@ -370,7 +375,7 @@ def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) ->
 
 def at_offsets(time_s: float, offset_ns: Int) -> Float:
     """Return (N,) times in seconds from (N,) offsets in ns and a reference time in seconds."""
-    times: Float = np.asarray(time_s + offset_ns * 1e-9, dtype=np.float64)
+    times: Float = np.asarray(time_s + offset_ns * _S_PER_NS, dtype=np.float64)
     return times
 
 

@@ -12,55 +12,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.geometry.types import Float, Int
+from densify.street import read_table
 
 Tint = Sequence[float]
 Point = Sequence[float]
 WHITE: Tint = (1.0, 1.0, 1.0)
 _TINY = 1e-9
+_UPRIGHT = 0.9  # z of a unit vector that is not level enough to be crossed with z
+_LEAF_SIZES, _LEAF_TINTS = (0.35, 0.65), (0.65, 1.35)  # half sizes and tints of leaves vary
 
 
 class Material(IntEnum):
-    """A material: colour, reflectivity at 905 nm, and the share of the sky that it mirrors."""
+    """A material of materials.yaml."""
 
-    def __new__(
-        cls, colour: tuple[float, float, float], reflectivity: float, gloss: float = 0.0
-    ) -> Material:
-        """Return the next member, numbered from 0."""
-        material = int.__new__(cls, len(cls.__members__))
-        material._value_ = len(cls.__members__)
-        material.colour, material.reflectivity, material.gloss = colour, reflectivity, gloss
-        return material
-
-    colour: tuple[float, float, float]
-    reflectivity: float
-    gloss: float
-    ASPHALT = (0.25, 0.25, 0.26), 0.16
-    PAVING = (0.47, 0.45, 0.43), 0.30
-    KERB = (0.58, 0.57, 0.55), 0.38
-    GRASS = (0.26, 0.38, 0.14), 0.40
-    PAINT = (0.86, 0.86, 0.84), 0.85
-    BRICK = (0.56, 0.27, 0.20), 0.42
-    PLASTER = (0.80, 0.76, 0.66), 0.60
-    ROOF = (0.42, 0.20, 0.15), 0.30
-    PANE = (0.16, 0.20, 0.25), 0.08, 0.25  # window of a house: dark, no ray passes
-    WOOD = (0.45, 0.33, 0.21), 0.45
-    METAL = (0.52, 0.54, 0.56), 0.55
-    BARK = (0.30, 0.23, 0.17), 0.35
-    LEAF = (0.22, 0.36, 0.12), 0.45
-    BODYWORK = (0.90, 0.90, 0.90), 0.55, 0.06
-    GLASS = (0.10, 0.13, 0.15), 0.10  # of a vehicle
-    RUBBER = (0.06, 0.06, 0.06), 0.08
-    CLOTH = (0.90, 0.90, 0.90), 0.40
-    SKIN = (0.78, 0.58, 0.46), 0.50
-    LAMP = (0.95, 0.93, 0.85), 0.90
-    UPHOLSTERY = (0.16, 0.15, 0.15), 0.20
-    CONCRETE = (0.62, 0.61, 0.58), 0.45
-    FRAME = (0.90, 0.90, 0.90), 0.55, 0.06  # bodywork around and above car windows
+    ASPHALT = 0
+    PAVING = 1
+    KERB = 2
+    GRASS = 3
+    PAINT = 4
+    BRICK = 5
+    PLASTER = 6
+    ROOF = 7
+    PANE = 8  # window of a house: dark, no ray passes
+    WOOD = 9
+    METAL = 10
+    BARK = 11
+    LEAF = 12
+    BODYWORK = 13
+    GLASS = 14  # of a vehicle
+    RUBBER = 15
+    CLOTH = 16
+    SKIN = 17
+    LAMP = 18
+    UPHOLSTERY = 19
+    CONCRETE = 20
+    FRAME = 21  # bodywork around and above car windows
 
 
-COLOUR: Float = np.array([material.colour for material in Material])
-REFLECTIVITY: Float = np.array([material.reflectivity for material in Material])
-GLOSS: Float = np.array([material.gloss for material in Material])
+_SURFACES = [getattr(read_table("materials"), material.name) for material in Material]
+COLOUR, REFLECTIVITY, GLOSS = (
+    np.array([getattr(surface, column) for surface in _SURFACES])
+    for column in ("colour", "reflectivity", "gloss")
+)
 
 
 @dataclass(frozen=True)
@@ -166,7 +159,7 @@ def tube(
     a, b = np.asarray(start, float), np.asarray(end, float)
     start_radius_m, end_radius_m = np.broadcast_to(radius_m, 2)
     axis = (b - a) / np.linalg.norm(b - a)
-    is_upright = abs(axis[2]) >= 0.9
+    is_upright = abs(axis[2]) >= _UPRIGHT
     u = across(np.array([1.0, 0.0, 0.0] if is_upright else [0.0, 0.0, 1.0]), axis)
     u /= np.linalg.norm(u)
     v = across(axis, u)
@@ -198,9 +191,9 @@ def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint =
     u /= lengths(u)
     v = across(u, rng.normal(size=(k, 3)))
     v /= lengths(v)
-    half = (size_m * rng.uniform(0.35, 0.65, k))[:, None]
+    half = (size_m * rng.uniform(*_LEAF_SIZES, k))[:, None]
     corners = [centres + half * (i * u + j * v) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    tints = np.asarray(tint) * rng.uniform(0.65, 1.35, (k, 1))
+    tints = np.asarray(tint) * rng.uniform(*_LEAF_TINTS, (k, 1))
     return Mesh.quads(np.stack(corners, axis=1), Material.LEAF, tints)
 
 
@@ -218,12 +211,17 @@ def lengths(vectors: Float) -> Float:
     return np.sqrt(squared[:, :1] + squared[:, 1:2] + squared[:, 2:])
 
 
+# xxHash64's first two primes, then the factor of splitmix64
+_PRIMES = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F], np.uint64)
+_FACTOR = np.uint64(0xBF58476D1CE4E5B9)
+_DOUBLE_BITS = 53
+
+
 def noise(i: Int, j: Int) -> Float:
     """Return (N,) repeatable random numbers in [0, 1), a hash of two (N,) integer arrays."""
-    # xxHash64's first two primes, then the mixing steps and the factor of splitmix64
-    h = i.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    h ^= j.astype(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F)
+    h = i.astype(np.uint64) * _PRIMES[0]
+    h ^= j.astype(np.uint64) * _PRIMES[1]
     h ^= h >> np.uint64(29)
-    h *= np.uint64(0xBF58476D1CE4E5B9)
+    h *= _FACTOR
     h ^= h >> np.uint64(32)
-    return (h >> np.uint64(11)) / 2.0**53  # as many bits as a double has
+    return (h >> np.uint64(64 - _DOUBLE_BITS)) / 2.0**_DOUBLE_BITS

@@ -21,7 +21,6 @@ from densify.street.mesh import (
     WHITE,
     Material,
     Mesh,
-    Point,
     Tint,
     ball,
     box,
@@ -36,7 +35,7 @@ _SHAPES = read_table("models")
 _MIRROR = np.array([1.0, -1.0, 1.0])
 WHEELBASE_M: dict[str, float] = vars(_SHAPES.wheelbase_m)
 SPAN_S = (-1.0, DURATION_S + 1.0)  # times with poses
-_CACHED_MODELS = 256
+_CACHED_MODELS = 32
 
 
 @dataclass(frozen=True)
@@ -69,14 +68,21 @@ def _solid(row: Any, named: dict[str, Any]) -> Mesh:
     fields["material"] = material if isinstance(material, Material) else Material[material]
     make, offsets = _SOLIDS[fields.pop("solid")], fields.pop("at", None)
     if "spaced" in fields:
-        spaced = vars(fields.pop("spaced"))
-        x = np.arange(*(resolve(spaced[name], named) for name in ("first", "end", "step_m")))
-        offsets = np.column_stack([x, 0 * x, 0 * x])
+        offsets = _spaced(fields.pop("spaced"), named)
     if offsets is None:
         return make(**fields)
     if make is box:  # many at once
         return box(**fields | {end: np.add(fields[end], offsets) for end in ("low", "high")})
     return Mesh.join([make(**fields).moved(offset) for offset in offsets])
+
+
+def _spaced(row: Any, named: dict[str, Any]) -> Float:
+    """Return the (N,3) offsets of solids that repeat along an axis."""
+    steps = np.arange(resolve(row.first, named), resolve(row.end, named), row.step_m)
+    gap_m = resolve(getattr(row, "from_middle_m", 0.0), named)
+    offsets = np.zeros((np.count_nonzero(np.abs(steps) >= gap_m), 3))
+    offsets[:, "xyz".index(row.axis)] = steps[np.abs(steps) >= gap_m]
+    return offsets
 
 
 def resolve(value: Any, named: Mapping[str, Any]) -> Any:
@@ -178,7 +184,7 @@ def walker(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     named |= {"cloth": _any_cloth(rng), "trousers": _any_cloth(rng)}
     named["hair"] = tuple(channel * rng.random() for channel in shape.darkest_hair)
     trunk = Body(model("walker_trunk", **named), motion, instance)
-    return Actor("walker", (trunk, *_limbs(shape, named, trunk)))
+    return Actor("walker", (trunk, *_limbs(shape, named, motion, instance)))
 
 
 def cyclist(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
@@ -189,15 +195,15 @@ def cyclist(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     wheels = [tube for x in shape.wheel.x_m for tube in _spoked_wheel(shape.wheel, x)]
     frame = Mesh.join([*wheels, model("bicycle_and_rider", **named)])
     trunk = Body(frame, motion, instance)
-    return Actor("cyclist", (trunk, *_limbs(shape, named, trunk)))
+    return Actor("cyclist", (trunk, *_limbs(shape, named, motion, instance)))
 
 
-def _limbs(shape: Any, named: dict[str, Any], trunk: Body) -> Iterator[Body]:
+def _limbs(shape: Any, named: dict[str, Any], motion: Driving, instance: int) -> Iterator[Body]:
     """Yield the limbs of a walker or cyclist."""
     for row in shape.limbs:
         hinge_m, phase = resolve(row.hinge_m, named), 2 * np.pi * row.phase
-        motion = Limb(trunk.trajectory, hinge_m, row.swing_rad, shape.stride_m, phase)
-        yield Body(model(row.model, **named), motion, trunk.instance)
+        limb = Limb(motion, hinge_m, row.swing_rad, shape.stride_m, phase)
+        yield Body(model(row.model, **named), limb, instance)
 
 
 def _spoked_wheel(row: Any, x: float) -> list[Mesh]:
@@ -222,41 +228,19 @@ def house(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
     storeys = int(rng.integers(*shape.num_storeys))
     height = shape.storey_m * storeys + shape.attic_m
     wall = Material.BRICK if rng.random() < shape.brick_share else Material.PLASTER
-    tint = tuple(rng.uniform(*getattr(shape.tint, wall.name), 3).tolist())
+    darkest, brightest = getattr(shape.tint, wall.name)
+    tint = tuple(rng.uniform(darkest, brightest, 3).tolist())
     right, rear = width_m / 2, depth_m / 2
     ridge = height + rng.uniform(*shape.ridge_share) * depth_m
     named = {"height": height, "ridge": ridge, "wall": wall, "tint": tint}
     named |= {"left": -right, "right": right, "front": -rear, "rear": rear}
     named["chimney"] = float(rng.uniform(*shape.chimney_share)) * right
-    windows = _windows(right, rear, storeys)
+    windows = [
+        model("house_windows", **named, sill=shape.sill_m + shape.storey_m * storey,
+              beside_door=shape.beside_door_m if storey == 0 else 0.0)
+        for storey in range(storeys)
+    ]  # fmt: skip
     return Mesh.join([model("house_shell", **named), *windows, model("house_details", **named)])
-
-
-def _windows(w: float, d: float, storeys: int) -> list[Mesh]:
-    """Return the frames and the panes of a house's front and side walls."""
-    shape = _SHAPES.house.window
-    frames: list[Point] = []
-    panes: list[tuple[Point, Point]] = []
-    for storey in range(storeys):
-        z = shape.sill_m + _SHAPES.house.storey_m * storey
-        top = z + shape.height_m
-        for x in np.arange(-w + shape.first_m, w - shape.last_m, shape.step_m):
-            if storey == 0 and abs(x) < shape.door_m:
-                continue
-            frames.append((x, -d, z))
-            for begin_m in shape.casement_m:
-                left = x + begin_m
-                right = left + shape.casement_width_m
-                panes.append(((left, -d - shape.casement_out_m, z), (right, -d, top)))
-        for y in np.arange(-d + shape.side_first_m, d - shape.side_last_m, shape.side_step_m):
-            rear, front = y - shape.side_half_width_m, y + shape.side_half_width_m
-            for x in (-w, w):
-                out_m = shape.side_out_m
-                panes.append(((x - out_m, rear, z), (x + out_m, front, top)))
-    corners = np.array(frames).reshape(-1, 3)
-    low, high = np.array(panes).reshape(-1, 2, 3).swapaxes(0, 1)
-    frame = corners + shape.frame_low_m, corners + shape.frame_high_m
-    return [box(*frame, Material.CONCRETE, shape.frame_tint), box(low, high, Material.PANE)]
 
 
 def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
@@ -265,7 +249,7 @@ def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
     height, spread = rng.uniform(*shape.height_m), rng.uniform(*shape.radius_m)
     crown = max(shape.crown_from_m, shape.crown_share * height)
     thick = shape.trunk_radius.per_m * height + shape.trunk_radius.base_m
-    top = np.array([*rng.uniform(*shape.top_m, 2), height * shape.top_share])
+    top = (rng.uniform(*shape.top_m), rng.uniform(*shape.top_m), height * shape.top_share)
     root = (0, 0, shape.root_m)
     trunk = tube(root, top, (thick, thick * shape.trunk_radius.top_share), Material.BARK)
     meshes = [trunk]
@@ -275,7 +259,9 @@ def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
         reach = spread * rng.uniform(*shape.branch_reach)
         tip = (reach * np.cos(angle), reach * np.sin(angle), z + reach * shape.branch_rise)
         start = (top[0] * z / top[2], top[1] * z / top[2], z)
-        meshes.append(tube(start, tip, shape.branch_radius_m, Material.BARK, num_sides=5))
+        meshes.append(
+            tube(start, tip, shape.branch_radius_m, Material.BARK, num_sides=shape.branch_sides)
+        )
     count = int(shape.leaves_per_m * spread)
     away = rng.normal(size=(count, 3))
     away /= np.linalg.norm(away, axis=1, keepdims=True)

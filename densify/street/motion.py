@@ -15,7 +15,9 @@ from densify.geometry.types import Bool, Float, Int
 from densify.street.mesh import Mesh, across, lengths
 
 DURATION_S = 16  # of every scene
-STEP_M = 0.5  # between the points of a curve
+STEP_M, _FINE_M = 0.5, 0.05  # between the points of a curve, and steps of integration
+_TOW_S = 0.01  # between the positions of a trailer
+_WAVE_M, _WAVE_SHARE = np.array([95.0, 150.0, 240.0]), np.array([0.25, 0.35, 0.4])  # of hills
 
 
 class Curve:
@@ -58,7 +60,7 @@ class Curve:
         length_m: float, curvature: Callable[[Float], Float], origin_m: float = 0.0
     ) -> Curve:
         """Return a curve by curvature (1/m, left positive), through the origin along +x."""
-        step = 0.05
+        step = _FINE_M
         station = np.arange(0.0, length_m + step, step)
         heading = np.concatenate([[0.0], np.cumsum(curvature(station[:-1] + step / 2) * step)])
         middle = (heading[1:] + heading[:-1]) / 2
@@ -141,10 +143,10 @@ class Terrain:
     @staticmethod
     def hilly(rng: np.random.Generator, max_slope: float, scale_m: float = 1.0) -> Terrain:
         """Return three waves in random directions, nowhere steeper than ``max_slope``."""
-        length_m = np.array([95.0, 150.0, 240.0]) * scale_m
+        length_m = _WAVE_M * scale_m
         angle = rng.uniform(0, 2 * np.pi, 3)
         wave = (2 * np.pi / length_m)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
-        share = max_slope * np.array([0.25, 0.35, 0.4])
+        share = max_slope * _WAVE_SHARE
         return Terrain(wave, share / np.linalg.norm(wave, axis=1), rng.uniform(0, 2 * np.pi, 3))
 
     def height(self, xy: Float) -> Float:
@@ -272,7 +274,7 @@ class Towed:
     ) -> None:
         """Build the trailer; the kingpin is ``kingpin_m`` along the x axis of the tractor."""
         self._tractor, self._kingpin_m = tractor, kingpin_m
-        times = np.arange(first_s, last_s, 0.01)
+        times = np.arange(first_s, last_s, _TOW_S)
         pin = self._pin(times)
         axle = np.empty_like(pin)
         axle[0] = pin[0] - wheelbase_m * (pin[1] - pin[0]) / np.linalg.norm(pin[1] - pin[0])
@@ -331,9 +333,9 @@ class Rectangles(NamedTuple):
         return Rectangles(poses.apply(np.tile(middle, (n, 1)))[:, :2], forward, half)
 
     @staticmethod
-    def joined(parts: Sequence[Rectangles]) -> Rectangles:
+    def joined(groups: Sequence[Rectangles]) -> Rectangles:
         """Return all rectangles, concatenated along the first axis."""
-        return Rectangles(*(np.concatenate(c) for c in zip(*parts, strict=True)))
+        return Rectangles(*(np.concatenate(c) for c in zip(*groups, strict=True)))
 
     def rows(self, rows: Int | None) -> Rectangles:
         """Return the rectangles with these indices along the first axis, None for a new axis."""

@@ -23,6 +23,7 @@ from densify.street.world import Body, World
 
 _TABLES = read_table("scenes")
 FIRST_PARKED = 1000  # instances of parked cars count from here
+_NUM_SEEDS = 2**31  # of the random properties of surfaces
 _TRIES = 40  # of an actor that collides
 _TOUCH_M = 25.0  # greatest distance of the centres of two objects that touch
 _ROAD_END_M = 20.0  # nothing stands nearer to the end of a road
@@ -78,7 +79,7 @@ def build(preset: str, rng: np.random.Generator) -> Scene:
     static = Body(Mesh.join([*meshes, *scenery.meshes]), motion.Still())
     bodies = [static, *(body for actor in traffic.actors for body in actor.bodies)]
     footprints = Rectangles.joined(scenery.footprints)
-    world = World(bodies, int(rng.integers(2**31)))
+    world = World(bodies, int(rng.integers(_NUM_SEEDS)))
     return Scene(world, ground, ego, tuple(traffic.actors), footprints)
 
 
@@ -441,8 +442,8 @@ class Traffic:
         if motion.overlap(outline, self._moving).any():
             return True
         x, y = (self._standing.centre[:, i] - outline.centre[:, i, None] for i in (0, 1))
-        time, near = np.nonzero(x * x + y * y < _TOUCH_M**2)
-        return bool(motion.overlap(outline.rows(time), self._standing.rows(near)).any())
+        time, standing = np.nonzero(x * x + y * y < _TOUCH_M**2)
+        return bool(motion.overlap(outline.rows(time), self._standing.rows(standing)).any())
 
     def _drive(self, journey: Journey, station: float, speed: Speed) -> Actor:
         """Draw a vehicle beside a station of the road at the meeting time."""
