@@ -39,8 +39,8 @@ class OtherClock(TinySequence):
         return np.full((CAMERA.height_px, CAMERA.width_px, 3), number, np.uint8)
 
 
-def chosen(images_ms, key, settings=SWEEP, **options):
-    sequence = OtherClock(images_ms, **options)
+def chosen(images_ms, key, settings=SWEEP, frames=range(11)):
+    sequence = OtherClock(images_ms, frames)
     shots = key_shots(sequence, list(sequence.cameras.values()), key, settings)
     return {name: shot.number for name, shot in shots.items()}
 
@@ -53,7 +53,6 @@ HOLE = (0, 1, 2, 3, 4, 9, 10)
     ("images_ms", "key", "number", "frames"),
     [
         ({n: 7 + n * 33.3 for n in range(31)}, 5, 15, TEN_HZ),
-        ({0: 460, 1: 541, 2: 549}, 5, 0, TEN_HZ),
         ({0: 560, 1: 541, 2: 549}, 5, 1, TEN_HZ),
         ({0: 450, 7: 550}, 5, 7, TEN_HZ),  # between two sweeps: the earlier's
         ({3: 497, 4: 503}, 5, 3, TEN_HZ),  # of two equally near ones the earlier
@@ -208,9 +207,6 @@ def test_points_are_seen_when_their_row_or_column_is_exposed(axis, time_s):
     along = sight.uv[:, 1 if axis == "row" else 0]
     middle = np.abs(along - (size - 1) / 2) < 0.5
     np.testing.assert_allclose(sight.uv[middle], still.uv[middle], atol=0.5)
-
-
-# --- the built-in street --------------------------------------------------------------------------
 
 
 STREET_KEY = 60

@@ -32,7 +32,6 @@ _CLEAR_M = 0.3  # between static objects
 _ACTOR_MARGIN_M, _LIMBS_MARGIN_M, _EGO_MARGIN_M = 0.1, 0.3, 0.2
 _OUTLINE_STEP_S = 0.1
 _KERB_RAMP_M = 0.25  # over which a pedestrian steps on the kerb
-_WALK_M_S, _WALK_SLACK_M = (1.1, 1.6), 4.0
 _CONVOY, _CONVOY_VARIES = range(-9, 7), 0.2
 
 
@@ -379,11 +378,10 @@ class Journey:
     kind: str  # "car", "truck", "cyclist" or "walker"
     lane: str
     station: Any  # where the actor is at the meeting time, as in `resolve`
-    slack_m: float | None = None  # greatest random difference from there
+    slack_m: float = 2.0  # greatest random difference from there
     knots: Sequence[tuple[float, float]] = ()  # seconds and metres per second
-    m_s: float = 0.0  # constant speed instead of knots
+    m_s: Any = 0.0  # constant speed instead of knots, or the range of speeds to try
     vary: float = 0.0  # the speed varies by this share
-    vary_m_s: float = 0.0  # the speed varies by this in each try
     gap_m: float | None = None  # distance between the vehicles of a convoy
 
 
@@ -405,19 +403,19 @@ class Traffic:
     def add_row(self, journey: Journey, stations: Mapping[str, float]) -> None:
         """Add the actor or the convoy of a row of scenes.yaml."""
         station = resolve(journey.station, stations)
-        if journey.kind == "walker":
-            self._add(partial(self._walk, journey, station))
-        elif journey.gap_m is None:
-            self._add(partial(self._drive, journey, station, self._speed(journey)))
+        if journey.gap_m is None:
+            self._add(partial(self._draw, journey, station, self._speed(journey)))
         else:
             for number in _CONVOY:
-                gap_m = journey.gap_m * _vary(self._rng, _CONVOY_VARIES)
-                speed = self._speed(journey)
-                self._add(partial(self._drive, journey, station + number * gap_m, speed))
+                ahead_m = number * (journey.gap_m * _vary(self._rng, _CONVOY_VARIES))
+                self._add(partial(self._draw, journey, station + ahead_m, self._speed(journey)))
 
-    def _speed(self, journey: Journey) -> Speed:
+    def _speed(self, journey: Journey) -> Speed | None:
+        """Return the speed of a journey, None if it is drawn in each try."""
         if journey.knots:
             return Speed(*journey.knots)
+        if isinstance(journey.m_s, list):
+            return None
         factor = _vary(self._rng, journey.vary) if journey.vary else 1.0
         return Speed((0.0, journey.m_s * factor))
 
@@ -445,36 +443,24 @@ class Traffic:
         time, standing = np.nonzero(x * x + y * y < _TOUCH_M**2)
         return bool(motion.overlap(outline.rows(time), self._standing.rows(standing)).any())
 
-    def _drive(self, journey: Journey, station: float, speed: Speed) -> Actor:
-        """Draw a vehicle beside a station of the road at the meeting time."""
-        row, rng = self._lanes[journey.lane], self._rng
-        lane = Lane(self._curves[row.road], row.offset_m, getattr(row, "forward", True))
-        slack_m = 2.0 if journey.slack_m is None else journey.slack_m
-        arc_m = lane.at(station + rng.uniform(-slack_m, slack_m))
-        if journey.vary_m_s:
-            speed = Speed((0.0, journey.m_s + rng.uniform(-journey.vary_m_s, journey.vary_m_s)))
-        wheelbase_m = WHEELBASE_M[journey.kind]
-        terrain, meeting_s = self._ground.terrain, _TABLES.meeting_s
-        driving = Driving(lane.curve, speed, arc_m, meeting_s, terrain, wheelbase_m)
-        return _VEHICLES[journey.kind](driving, len(self.actors), rng)
-
-    def _walk(self, journey: Journey, station: float) -> Actor:
-        """Draw a pedestrian between two offsets of a lane, on and off the kerb."""
+    def _draw(self, journey: Journey, station: float, speed: Speed | None) -> Actor:
+        """Draw an actor beside a station of the road at the meeting time."""
         row, rng, ground = self._lanes[journey.lane], self._rng, self._ground
-        offset_m, is_forward = rng.uniform(*row.offset_m), getattr(row, "forward", True)
-        lane = Lane(self._curves[row.road], offset_m, is_forward)
-        slack_m = _WALK_SLACK_M if journey.slack_m is None else journey.slack_m
-        arc_m = lane.at(station + rng.uniform(-slack_m, slack_m))
+        has_range, is_walker = isinstance(row.offset_m, list), journey.kind == "walker"
+        offset_m = rng.uniform(*row.offset_m) if has_range else row.offset_m
+        lane = Lane(self._curves[row.road], offset_m, getattr(row, "forward", True))
+        arc_m = lane.at(station + rng.uniform(-journey.slack_m, journey.slack_m))
 
         def lift(arc_m: Float) -> Float:
             beyond_m = ground.distance(lane.curve(arc_m))
             return ground.kerb_m * np.clip(beyond_m / _KERB_RAMP_M, 0, 1)
 
         driving = Driving(
-            lane.curve, Speed((0.0, rng.uniform(*_WALK_M_S))), arc_m, _TABLES.meeting_s,
-            ground.terrain, WHEELBASE_M["walker"], lift, upright=True,
+            lane.curve, speed or Speed((0.0, rng.uniform(*journey.m_s))), arc_m,
+            _TABLES.meeting_s, ground.terrain, WHEELBASE_M[journey.kind],
+            lift if is_walker else None, upright=is_walker,
         )  # fmt: skip
-        return models.walker(driving, len(self.actors), rng)
+        return _MAKERS[journey.kind](driving, len(self.actors), rng)
 
 
 PRESETS = {
@@ -489,4 +475,9 @@ _LAYOUTS = {
     "crossing": _lay_crossing,
     "highway": _lay_highway,
 }
-_VEHICLES = {"car": models.car, "truck": models.truck, "cyclist": models.cyclist}
+_MAKERS = {
+    "car": models.car,
+    "truck": models.truck,
+    "cyclist": models.cyclist,
+    "walker": models.walker,
+}
