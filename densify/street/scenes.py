@@ -436,7 +436,7 @@ class Traffic:
                 return
 
     def _touches(self, outline: Rectangles) -> bool:
-        """Return True if an outline, by time, overlaps one of what stands or moves."""
+        """Return True if an outline, by time, overlaps a static object or an actor."""
         if motion.overlap(outline, self._moving).any():
             return True
         x, y = (self._standing.centre[:, i] - outline.centre[:, i, None] for i in (0, 1))
