@@ -26,7 +26,7 @@ FIRST_PARKED = 1000  # instances of parked cars count from here
 _NUM_SEEDS = 2**31  # of the random properties of surfaces
 _TRIES = 40  # of an actor that collides
 _TOUCH_M = 25.0  # greatest distance of the centres of two objects that touch
-_ROAD_END_M = 20.0  # nothing stands nearer to the end of a road
+_ROAD_END_M = 20.0  # no object is nearer to the end of a road
 _CLEAR_M = 0.3  # between static objects
 # Width of the margin around an actor's outline: limbs reach beyond the outline of a trunk.
 _ACTOR_MARGIN_M, _LIMBS_MARGIN_M, _EGO_MARGIN_M = 0.1, 0.3, 0.2
@@ -291,7 +291,7 @@ def _close_off(
 
 
 def _any(kind: str, rng: np.random.Generator) -> tuple[Mesh, Mesh | None]:
-    """Return an object that stands at the kerb, and what of it traffic must not touch."""
+    """Return an object for the kerb, and its outline for collisions; None for all of it."""
     if kind == "tree":
         return models.tree(rng)
     return (models.sign_post(rng) if kind == "sign_post" else model(kind)), None
