@@ -382,6 +382,7 @@ class Journey:
     knots: Sequence[tuple[float, float]] = ()  # seconds and metres per second
     m_s: Any = 0.0  # constant speed instead of knots, or the range of speeds to try
     vary: float = 0.0  # the speed varies by this share
+    vary_m_s: float = 0.0  # the speed varies by this in each try
     gap_m: float | None = None  # distance between the vehicles of a convoy
 
 
@@ -414,7 +415,7 @@ class Traffic:
         """Return the speed of a journey, None if it is drawn in each try."""
         if journey.knots:
             return Speed(*journey.knots)
-        if isinstance(journey.m_s, list):
+        if journey.vary_m_s or isinstance(journey.m_s, list):
             return None
         factor = _vary(self._rng, journey.vary) if journey.vary else 1.0
         return Speed((0.0, journey.m_s * factor))
@@ -455,6 +456,9 @@ class Traffic:
             beyond_m = ground.distance(lane.curve(arc_m))
             return ground.kerb_m * np.clip(beyond_m / _KERB_RAMP_M, 0, 1)
 
+        if journey.vary_m_s:
+            m_s = journey.m_s + rng.uniform(-journey.vary_m_s, journey.vary_m_s)
+            speed = Speed((0.0, m_s))
         driving = Driving(
             lane.curve, speed or Speed((0.0, rng.uniform(*journey.m_s))), arc_m,
             _TABLES.meeting_s, ground.terrain, WHEELBASE_M[journey.kind],
