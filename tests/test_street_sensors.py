@@ -9,23 +9,16 @@ import pytest
 from densify.geometry.poses import inverse, transform
 from densify.readers import describe
 from densify.readers.street import Street
-from densify.street.lidar import SENSORS, Raster, Rosette, Slots, Spinning, firings
-from densify.street.materials import Material
-from densify.street.mesh import box
-from densify.street.motion import Driving, Rectangles, Still
+from densify.street.ground import Ground
+from densify.street.lidar import SENSORS, Raster, Rosette, Spinning, firings
+from densify.street.mesh import Material, box
+from densify.street.motion import Curve, Driving, Rectangles, Speed, Still, Terrain
+from densify.street.scenes import Scene
 from densify.street.simulator import Simulator
-from densify.street.terrain import Curve, Ground, Speed, Terrain
-from densify.street.traffic import Scene
 from densify.street.world import Body, World
 
-PERIOD_NS = 100_000_000
 ROOM_M = 15.0
-SETUPS = [
-    ("vlp16", 5, 10.0),
-    ("dual32", 20, 10.0),
-    ("panda", 20, 10.0),
-    ("rosette", 5, -10.0),
-]
+SETUPS = [("dual32", 20, 10.0), ("panda", 20, 10.0), ("rosette", 5, -10.0)]
 
 
 @pytest.fixture(scope="module")
@@ -40,21 +33,6 @@ def same_scene(level: Street, hz: int = 10, tilt_deg: float = 0.0) -> Street:
 
 
 # patterns
-
-
-def test_rings_are_where_the_data_sheets_have_them():
-    elevation = {
-        name: np.sort([e for s in SENSORS[name].scanners[:1] for e in s.pattern.elevation_deg])
-        for name in ("os128", "vls128", "panda", "dual32")
-    }
-    assert [len(e) for e in elevation.values()] == [128, 128, 64, 32]
-    np.testing.assert_allclose(np.diff(elevation["os128"]), 45 / 127)
-    gaps = np.diff(elevation["vls128"])
-    assert gaps.min() == pytest.approx(0.11) and np.median(gaps) < 0.181 and gaps.max() > 1
-    assert (np.argmin(gaps) > 30) and (np.argmax(gaps) == 0)
-    gaps = np.diff(elevation["panda"])
-    assert gaps.min() == pytest.approx(1 / 6) and gaps[0] == 6.0
-    assert np.ptp(elevation["panda"]) == np.ptp(elevation["vls128"]) == 40.0
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -79,7 +57,7 @@ def test_pulses_fill_the_period_evenly_at_a_constant_rate(name):
 def test_a_raster_covers_its_field_of_view_line_by_line():
     raster = Raster(4000, 60.0, 20.0, 100)
     number = np.arange(400)
-    x, y, z = raster.directions(Slots(number, number / 400 - 0.5, number / 4000)).T
+    x, y, z = raster.directions(number, number / 400 - 0.5, number / 4000).T
     azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z))
     np.testing.assert_allclose(elevation, 10 - 0.05 * number, atol=1e-9)
     lines = azimuth.reshape(10, 40)
@@ -94,7 +72,8 @@ def test_a_rosette_is_two_prisms_and_goes_on_from_sweep_to_sweep():
     sweeps = []
     for time_s in (3.0, 3.1):
         times = time_s + 0.1 * share
-        x, y, z = Rosette(200_000, 70.0, rates).directions(Slots(np.arange(num), share, times)).T
+        rosette = Rosette(200_000, 70.0, rates)
+        x, y, z = rosette.directions(np.arange(num), share, times).T
         prisms = sum(np.exp(2j * np.pi * rate * times) for rate in rates) / 2
         off_axis = np.degrees(np.arccos(x))
         np.testing.assert_allclose(off_axis, 35 * np.abs(prisms), atol=1e-5)
@@ -134,7 +113,6 @@ def test_rays_start_at_their_scanner_and_truth_lies_on_the_walls(name, hz, tilt_
     world = transform(truth.T_world_lidar, truth.points)
     T_world_lidar = simulator.T_world_lidar_at(simulator.stamp_ns(frame))
     np.testing.assert_array_equal(truth.T_world_lidar, T_world_lidar)
-    raw = transform(T_world_lidar, returns.points.astype(float))
     offset_ns = returns.offset_ns
     assert np.abs(offset_ns).max() <= simulator.period_ns / 2
     assert set(returns.lidar) == set(range(len(sensor.scanners)))
@@ -153,13 +131,9 @@ def test_rays_start_at_their_scanner_and_truth_lies_on_the_walls(name, hz, tilt_
         assert 0.9 * len(pulses) < own.sum() < len(pulses)  # some pulses are lost
         assert np.abs(off_wall).max() < 5 * scanner.range_sigma_m
         assert abs(off_wall.mean()) < 0.1 * scanner.range_sigma_m
-        slant = np.max(np.abs(world[own] - T_world_lidar[:3, 3]), axis=1)[clear]
-        noise_m = (
-            off_wall / slant * np.linalg.norm(world[own] - T_world_lidar[:3, 3], axis=1)[clear]
-        )
+        away = (world[own] - T_world_lidar[:3, 3])[clear]
+        noise_m = off_wall / np.abs(away).max(axis=1) * np.linalg.norm(away, axis=1)
         assert noise_m.std() == pytest.approx(scanner.range_sigma_m, rel=0.2)
-        raw_wall = np.sort(np.abs(raw[own]), axis=1)[clear, 2] - ROOM_M
-        assert np.abs(raw_wall).max() > 0.1  # without truth the sweep is distorted
 
 
 # rates
@@ -181,13 +155,6 @@ def test_a_rate_changes_when_sweeps_are_taken_and_not_what_is_there(level):
         sizes.append(len(other[frame]))
     assert sizes[1] == pytest.approx(sizes[0] / 2, rel=0.02)
     assert sizes[2] == pytest.approx(sizes[0] * 2, rel=0.02)
-    # a body's way in a tenth of a second is the same
-    returns = fast.returns(240)
-    points = fast.simulator.in_bodies(240, returns)
-    np.testing.assert_array_equal(
-        fast.truth.displacement(240, 242),
-        level.simulator.bodies.displacement(120, 121, returns.body, points),
-    )
     assert "20.00 Hz" in describe(fast)
 
 
@@ -201,9 +168,6 @@ def test_names_and_cached_frames_tell_rates_and_tilts_apart():
     streets = [Street.from_spec(f"street{option}") for option in options]
     assert len({street._swept for street in streets}) == 5
     assert Street.from_spec("street?hz=10&tilt=0")._swept == streets[0]._swept
-    images = [street._pictured for street in streets]
-    assert images == [images[0], images[1], images[0], images[1], images[0]]
-    assert len({images[0], images[1], Street.from_spec("street?seed=1")._pictured}) == 3
 
 
 # mounts
@@ -219,6 +183,3 @@ def test_a_tilted_mount_turns_the_lidar_and_leaves_the_cameras(level):
         T_level_cam = inverse(level.cameras[name].T_cam_lidar)
         T_tilted_cam = inverse(camera.T_cam_lidar)
         np.testing.assert_allclose(T_level_tilted @ T_tilted_cam, T_level_cam, atol=1e-12)
-    picture = tilted.simulator.picture("image_02", 120)  # anew: the cache shares them
-    np.testing.assert_array_equal(picture.depth_m, level.truth.depth_m("image_02", 120))
-    np.testing.assert_array_equal(picture.image, level.image("image_02", 120))

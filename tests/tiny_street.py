@@ -9,6 +9,7 @@ import numpy as np
 
 from densify.geometry.types import Cloud
 from tests.scenes import Arc, Scanner, Scene, TinySequence, World, car, street
+from tests.small_street import POSES_GIVEN  # noqa: F401  for the tests of this street
 
 KEY, WINDOW = 8, 3
 EGO = Arc(0, -1.5, 0, 8.0, 0.08)
@@ -17,12 +18,6 @@ MOVERS = (
     car(45, 1.8, 8, 2, yaw=np.pi),
     car(16, 3.6, 1.5, 3, yaw=-np.pi / 2, size_m=(0.5, 0.5, 1.7)),
 )
-# Small as they are, their scanners stand for such of many points.
-POSES_GIVEN = {
-    "register": {"source": "dataset"},
-    "accumulate": {"far_m": 0.0},
-    "flow": {"look_around_s": 0.0},
-}
 
 
 def tiny(movers=(), late_s=0.0, ego=EGO, **options) -> TinySequence:

@@ -27,7 +27,8 @@ from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTru
 from densify.geometry.types.recordings import in_one_line
 from densify.street.cameras import CAMERAS, USUAL, Picture, cameras_beside
 from densify.street.lidar import SENSORS, Returns
-from densify.street.simulator import PRESETS, VERSION, Bodies, Simulator
+from densify.street.scenes import PRESETS
+from densify.street.simulator import VERSION, Bodies, Simulator
 
 T = TypeVar("T")
 _progress = logging.getLogger("densify.progress")

@@ -1,2 +1,24 @@
 # SPDX-License-Identifier: MIT
 """The built-in street: a seeded lidar and camera simulator with exact ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import yaml
+
+
+def read_table(name: str) -> Any:
+    """Return the data of ``NAME.yaml`` in this folder; mappings become objects with attributes."""
+    text = Path(__file__).with_name(f"{name}.yaml").read_text("utf-8")
+    return _record(
+        yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    )  # C: 10 times faster
+
+
+def _record(value: Any) -> Any:
+    if isinstance(value, dict):
+        return SimpleNamespace(**{key: _record(item) for key, item in value.items()})
+    return [*map(_record, value)] if isinstance(value, list) else value

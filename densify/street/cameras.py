@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Render the images of the vehicle's cameras, with their lenses and exposures."""
+"""Render the images of the cameras in cameras.yaml, with their lenses, exposures and light."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,69 +12,68 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.cameras import rays
 from densify.geometry.poses import inverse
-from densify.geometry.types import Camera, Float, Float32
+from densify.geometry.types import Camera, Float, Float32, Int
+from densify.street import read_table
 from densify.street.lidar import T_ego_lidar
-from densify.street.materials import (
-    COLOUR,
-    GLOSS,
-    Material,
-    shade_factor,
-    smooth_noise,
-)
+from densify.street.mesh import COLOUR, GLOSS, Material, noise
 from densify.street.motion import Driving, poses_at
 from densify.street.world import PASSES, STOPS, Hits, Optics, Rays, World
 
-# mount of KITTI's cameras: axes turned, slightly misaligned, below and in front of the scanner
-_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-_TILT = Rotation.from_rotvec([0.008, -0.012, 0.007]).as_matrix()
-T_RECTIFIED_LIDAR = np.eye(4)
-T_RECTIFIED_LIDAR[:3, :3] = _TILT @ _AXES
-T_RECTIFIED_LIDAR[:3, 3] = [-0.004, -0.076, -0.272]
-FOCAL_PX, CENTRE_PX = 721.5, (609.5, 172.75)
-# metres to the right of the rectified origin
-_LEFT, _RIGHT = -0.06, 0.48
-T_FISHEYE_LIDAR = np.array(  # on the left of the roof, facing left
-    [[1.0, 0.0, 0.0, 0.3], [0.0, 0.0, -1.0, -0.2], [0.0, 1.0, 0.0, -0.6], [0.0, 0.0, 0.0, 1.0]]
+_TABLES = read_table("cameras")
+_FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # axes of cameras
+_LEFT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_MAX_DEPTH_M = 120.0
+_GAMMA = 2.2  # of the display
+_OFF_SURFACE_M = 0.015  # from a surface to the origin of its ray to the sun
+_NUM_OCTAVES, _OCTAVE_SHIFT = 3, 7  # of the noise of clouds
+_GRAIN = 0.4  # share of grains beside blotches
+_DARKEST, _CONTRAST = 0.82, 0.36  # of the brightness of bricks
+
+
+def _pose(R_cam_lidar: Float, lidar_m: Float) -> Float:
+    T_cam_lidar = np.eye(4)
+    T_cam_lidar[:3, :3], T_cam_lidar[:3, 3] = R_cam_lidar, lidar_m
+    return T_cam_lidar
+
+
+def _intrinsics(focal_px: float, u: float, v: float) -> Float:
+    return np.array([[focal_px, 0, u], [0, focal_px, v], [0, 0, 1.0]])
+
+
+_RECTIFIED, _FISHEYE = _TABLES.rectified, _TABLES.fisheye
+T_RECTIFIED_LIDAR = _pose(
+    Rotation.from_rotvec(_RECTIFIED.tilt_rad).as_matrix() @ _FORWARD, _RECTIFIED.lidar_m
 )
 
 
-class Shutter(NamedTuple):
-    """The exposure times of a camera."""
-
-    delay_ns: int  # exposure of the first image minus frame 0's reference time
-    period_ns: int | None = None  # time between images; None for one image per sweep
-
-
-def _pinhole(name: str, right_m: float, share: float = 1.0, row_time_s: float = 0.0) -> Camera:
-    """Return a pinhole camera with ``share`` of KITTI's resolution."""
+def _pinhole(name: str, row: Any) -> Camera:
+    """Return a pinhole camera with a share of KITTI's resolution."""
+    share = 1 / getattr(row, "one_in", 1)
+    u, v = ((c + 0.5) * share - 0.5 for c in _RECTIFIED.centre_px)
+    K = _intrinsics(_RECTIFIED.focal_px * share, u, v)
     T_cam_lidar = T_RECTIFIED_LIDAR.copy()
-    T_cam_lidar[0, 3] -= right_m
-    f, (u, v) = FOCAL_PX * share, ((c + 0.5) * share - 0.5 for c in CENTRE_PX)
-    K = np.array([[f, 0, u], [0, f, v], [0, 0, 1.0]])
-    size_px = round(1242 * share), round(375 * share)
-    return Camera(name, *size_px, K, T_cam_lidar, row_time_s=row_time_s)
+    T_cam_lidar[0, 3] -= row.right_m
+    width_px, height_px = (round(size * share) for size in _RECTIFIED.size_px)
+    row_time_s = getattr(row, "row_time_s", 0.0)
+    return Camera(name, width_px, height_px, K, T_cam_lidar, row_time_s=row_time_s)
 
 
-_FISHEYE_K = np.array([[124.0, 0, 199.5], [0, 124.0, 199.5], [0, 0, 1.0]])
-CAMERAS = {
-    "image_02": _pinhole("image_02", _LEFT),
-    "image_03": _pinhole("image_03", _RIGHT),
-    "fast": _pinhole("fast", _LEFT, 1 / 3),
-    "rolling": _pinhole("rolling", _LEFT, 1 / 2, 100e-6),
-    "fisheye": Camera(
-        "fisheye", 400, 400, _FISHEYE_K, T_FISHEYE_LIDAR, (-0.02, 0.003, -0.001, 0.0001),
-        model="fisheye", max_angle_deg=95.0,
-    ),
-}  # fmt: skip
+def _fisheye(row: Any) -> Camera:
+    u, v = ((size - 1) / 2 for size in row.size_px)
+    K, T_cam_lidar = _intrinsics(row.focal_px, u, v), _pose(_LEFT, row.lidar_m)
+    width_px, height_px = row.size_px
+    return Camera(
+        "fisheye", width_px, height_px, K, T_cam_lidar, tuple(row.distortion),
+        model="fisheye", max_angle_deg=row.max_angle_deg,
+    )  # fmt: skip
+
+
+CAMERAS = {name: _pinhole(name, row) for name, row in vars(_TABLES.pinhole).items()}
+CAMERAS["fisheye"] = _fisheye(_FISHEYE)
 """The cameras, beside a level mount."""
 
-SHUTTERS = {
-    "image_02": Shutter(0),
-    "image_03": Shutter(15_000_000),
-    "fast": Shutter(7_000_000, 33_333_333),
-    "rolling": Shutter(20_000_000, 100_000_000),
-    "fisheye": Shutter(-20_000_000, 100_000_000),
-}
+EXPOSURES: dict[str, Any] = {**vars(_TABLES.pinhole), "fisheye": _FISHEYE}
+"""The rows of cameras.yaml that tell when a camera exposes."""
 
 USUAL = ("image_02", "image_03")
 """Those that are there unless others are asked for."""
@@ -89,10 +88,6 @@ def cameras_beside(tilt_deg: float, names: tuple[str, ...] = USUAL) -> dict[str,
     """Return the cameras, which do not tilt, with poses relative to the tilted lidar."""
     T = T_level_lidar(tilt_deg)
     return {n: replace(CAMERAS[n], T_cam_lidar=CAMERAS[n].T_cam_lidar @ T) for n in names}
-
-
-MAX_DEPTH_M = 120.0
-_SUN = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
 
 
 @dataclass(frozen=True)
@@ -122,14 +117,14 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
     is_glass = world.triangles.material[hits.triangle] == Material.GLASS
     glass = np.flatnonzero((hits.triangle >= 0) & is_glass)
     if len(glass):
-        through = Rays(*(column[glass] for column in cast))
-        behind = world.cast(through, through_glass(world))
-        colour[glass] = 0.07 * _sky(through.direction) + 0.6 * _colours(world, through, behind)
+        through, shares = Rays(*(column[glass] for column in cast)), _TABLES.light.glass
+        behind = _colours(world, through, world.cast(through, through_glass(world)))
+        colour[glass] = shares.mirrors * _sky(through.direction) + shares.passes * behind
     depth_m = hits.range_m * ray[:, 2] if camera.measure == "z" else hits.range_m
-    solid = np.isfinite(depth_m) & (depth_m <= MAX_DEPTH_M)
+    solid = np.isfinite(depth_m) & (depth_m <= _MAX_DEPTH_M)
     image, depth = np.zeros((h * w, 3), np.uint8), np.zeros(h * w, np.float32)
     body = np.full(h * w, -1, np.int32)
-    image[seen] = np.rint(255 * np.clip(colour, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+    image[seen] = np.rint(255 * np.clip(colour, 0, 1) ** (1 / _GAMMA)).astype(np.uint8)
     depth[seen] = np.where(solid, depth_m, 0.0)
     body[seen] = np.where(hits.triangle >= 0, world.triangles.body[hits.triangle], -1)
     return Picture(image.reshape(h, w, 3), depth.reshape(h, w), body.reshape(h, w))
@@ -151,45 +146,100 @@ def through_glass(world: World) -> Optics:
 
 def _colours(world: World, rays: Rays, hits: Hits) -> Float:
     """Return (N,3) linear RGB of the ray hits: sun with shadows, sky light and haze."""
-    colour, is_hit = np.empty(rays.direction.shape), hits.triangle >= 0
+    light, is_hit = _TABLES.light, hits.triangle >= 0
+    colour = np.empty(rays.direction.shape)
     colour[~is_hit] = _sky(rays.direction[~is_hit])
     rows = np.flatnonzero(is_hit)
     triangle, direction, normal = hits.triangle[rows], rays.direction[rows], hits.normal[rows]
     material, range_m = world.triangles.material[triangle], hits.range_m[rows, None]
-    a, b = hits.barycentric[rows].astype(np.float64).T[:, :, None]
-    uv = world.triangles.uv[triangle]
-    at = uv[:, 0] * (1 - a - b) + uv[:, 1] * a + uv[:, 2] * b
-    texture = shade_factor(material, at)[:, None]
-    painted = COLOUR[material] * world.triangles.tint[triangle] * texture
     facing = np.einsum("ni,ni->n", normal, direction)
     normal = np.where(facing[:, None] > 0, -normal, normal)
-    towards_sun = normal @ _SUN
-    leafy = material == Material.LEAF  # light shines through leaves too
-    towards_sun = np.where(leafy, 0.35 + 0.4 * np.abs(towards_sun), np.maximum(towards_sun, 0.0))
-    sunny = np.flatnonzero(towards_sun > 0)
-    point = rays.origin[rows] + direction * range_m + 0.015 * normal
-    shadow_rays = Rays(point[sunny], np.tile(_SUN, (len(sunny), 1)), rays.time_s[rows[sunny]])
-    lit = np.zeros(len(rows))
-    lit[sunny] = ~np.isfinite(world.cast(shadow_rays, through_glass(world)).range_m)
-    sun = 1.15 * (lit * towards_sun)[:, None] * np.array([1.0, 0.95, 0.86])
-    ambient = (0.34 + 0.16 * normal[:, 2:]) * np.array([0.88, 0.95, 1.08])
+    point = rays.origin[rows] + direction * range_m + _OFF_SURFACE_M * normal
+    sunlight = _sunlight(world, Rays(point, normal, rays.time_s[rows]), material)
+    sun = light.sun.strength * sunlight[:, None] * np.array(light.sun.colour)
+    ambient = light.ambient.sideways + light.ambient.upwards * normal[:, 2:]
+    ambient = ambient * np.array(light.ambient.colour)
+    painted = np.clip(_painted(world, triangle, hits.barycentric[rows]), 0, 1) ** _GAMMA
+    reflected = painted * (sun + ambient)
     shiny = np.flatnonzero(GLOSS[material])
     direction, normal = direction[shiny], normal[shiny]
     mirrored = direction - 2 * np.einsum("ni,ni->n", direction, normal)[:, None] * normal
-    light = np.clip(painted, 0, 1) ** 2.2 * (sun + ambient)
-    light[shiny] += GLOSS[material[shiny], None] * _sky(mirrored)
-    haze = np.exp(-range_m / 700.0)
-    colour[rows] = light * haze + (1 - haze) * np.array([0.62, 0.72, 0.82])
+    reflected[shiny] += GLOSS[material[shiny], None] * _sky(mirrored)
+    haze = np.exp(-range_m / light.haze.range_m)
+    colour[rows] = reflected * haze + (1 - haze) * np.array(light.haze.colour)
     return colour
+
+
+def _sunlight(world: World, surface: Rays, material: Int) -> Float:
+    """Return (N,) shares of sunlight at points with normals as directions, 0 in a shadow."""
+    light = _TABLES.light
+    sun = np.array(light.towards_sun) / np.linalg.norm(light.towards_sun)
+    cosine = surface.direction @ sun
+    through_leaf = light.leaf.least + light.leaf.facing * np.abs(cosine)
+    share = np.where(material == Material.LEAF, through_leaf, np.maximum(cosine, 0.0))
+    sunny = np.flatnonzero(share > 0)
+    towards = np.tile(sun, (len(sunny), 1))
+    shadow = Rays(surface.origin[sunny], towards, surface.time_s[sunny])
+    lit = np.zeros(len(share))
+    lit[sunny] = ~np.isfinite(world.cast(shadow, through_glass(world)).range_m)
+    return lit * share
 
 
 def _sky(direction: Float) -> Float:
     """Return (N,3) linear RGB of the sky in (N,3) directions."""
+    sky, cloud = _TABLES.light.sky, _TABLES.light.cloud
     up = np.clip(direction[:, 2], 0.0, 1.0)[:, None]
-    blue = np.array([0.72, 0.80, 0.88]) * (1 - up) ** 3 + np.array([0.20, 0.38, 0.72]) * (
-        1 - (1 - up) ** 3
-    )
-    flat = direction[:, :2] / (direction[:, 2:] + 0.12).clip(0.05) * 3.0
-    cloud = sum(smooth_noise(flat + 7 * i, 0.5**i) / 2**i for i in range(3)) / 1.75
-    cover = np.clip((cloud - 0.52) * 4.0, 0, 0.8)[:, None] * np.clip(up * 12, 0, 1)
-    return blue * (1 - cover) + 0.92 * cover
+    low = (1 - up) ** 3
+    blue = np.array(sky.horizon) * low + np.array(sky.zenith) * (1 - low)
+    height = (direction[:, 2:] + cloud.above_horizon).clip(cloud.least)
+    flat = direction[:, :2] / height * cloud.size
+    octaves = [_smooth_noise(flat + _OCTAVE_SHIFT * i, 0.5**i) / 2**i for i in range(_NUM_OCTAVES)]
+    density = sum(octaves) / sum(0.5**i for i in range(_NUM_OCTAVES))
+    cover = np.clip((density - cloud.begins) * cloud.contrast, 0, cloud.most)[:, None]
+    cover = cover * np.clip(up * cloud.fade, 0, 1)
+    return blue * (1 - cover) + cloud.brightness * cover
+
+
+def _painted(world: World, triangle: Int, barycentric: Float32) -> Float:
+    """Return the (N,3) colours of points on triangles: material, tint and texture."""
+    uv, material = world.triangles.uv[triangle], world.triangles.material[triangle]
+    a, b = barycentric.astype(np.float64).T[:, :, None]
+    position = uv[:, 0] * (1 - a - b) + uv[:, 1] * a + uv[:, 2] * b
+    brightness = np.ones(len(material))
+    for name, texture in vars(_TABLES.textures).items():
+        rows = np.flatnonzero(material == Material[name])
+        if len(rows):
+            pattern = _bricks if hasattr(texture, "brick_m") else _grains
+            brightness[rows] = pattern(position[rows], texture)
+    return COLOUR[material] * world.triangles.tint[triangle] * brightness[:, None]
+
+
+def _grains(uv: Float, texture: Any) -> Float:
+    """Return the (N,) brightness, around 1, of grains and blotches at (N,2) metres."""
+    grain = noise(*np.floor(uv.T / texture.grain_m).astype(np.int64))
+    mix = _GRAIN * grain + (1 - _GRAIN) * _smooth_noise(uv, texture.blotch_m)
+    return 1 + texture.contrast * (2 * mix - 1)
+
+
+def _bricks(uv: Float, texture: Any) -> Float:
+    """Return the (N,) brightness, around 1, of bricks in courses at (N,2) metres."""
+    length_m, height_m = texture.brick_m
+    row = np.floor(uv[:, 1] / height_m)
+    along = uv[:, 0] / length_m + 0.5 * (row % 2)
+    column = np.floor(along)
+    beside_m, above_m = (along - column) * length_m, uv[:, 1] - row * height_m
+    is_joint = (beside_m < texture.joint_m) | (above_m < texture.joint_m)
+    brick = noise(column.astype(np.int64), row.astype(np.int64))
+    return np.where(is_joint, texture.joint, _DARKEST + _CONTRAST * brick)
+
+
+def _smooth_noise(uv: Float, cell_m: float) -> Float:
+    """Return (N,) numbers in [0, 1) at (N,2) positions, smooth over cells of ``cell_m``."""
+    x, y = uv.T / cell_m
+    i, j = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    x, y = x - i, y - j
+    x, y = x * x * (3 - 2 * x), y * y * (3 - 2 * y)
+    low, high = noise(i, j), noise(i, j + 1)
+    low += (noise(i + 1, j) - low) * x
+    high += (noise(i + 1, j + 1) - high) * x
+    return low + (high - low) * y

@@ -1,10 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Simulate one sweep: the returns of each ray, and the rays that pass surfaces or are lost."""
+"""Simulate sweeps of the lidars in lidars.yaml: every pulse, and what comes back from it.
+
+A scan pattern has two methods. ``num_pulses(period_s)`` is the number of pulses in a sweep.
+``directions(number, share, time_s)`` are (N,3) unit vectors in the axes of the scanner, of pulses
+by their (N,) index from 0, firing time minus the reference time in periods, -0.5 to 0.5, and firing
+time in seconds since frame 0.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,45 +21,203 @@ from scipy.special import ndtr, ndtri
 
 from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, Float32, Int
-from densify.street.lidar import Sensor, firings
-from densify.street.materials import REFLECTIVITY, Material, noise
-from densify.street.mesh import across, lengths
+from densify.street import read_table
+from densify.street.mesh import REFLECTIVITY, Material, across, lengths, noise
 from densify.street.motion import Driving, poses_at
 from densify.street.world import ABSORBED, PASSES, STOPS, Hits, Meeting, Optics, Rays, World
 
-_PARTS = (Material.BODYWORK, Material.FRAME, Material.GLASS)
-_IS_LEAKY = np.isin(np.arange(len(Material)), (*_PARTS, Material.LEAF))
-_BRIGHTNESS = (0.2, 0.55)  # between dark, middle and bright paint
-_INCIDENCE_DEG = (10.0, 30.0, 50.0, 67.5, 82.5)
-# Percent of rays that are lost, and that pass: for each part, five incidences of dark, middle and
-# bright cars. From 207 moving cars of KITTI's stereo benchmark (Menze and Geiger, "Object Scene
-# Flow for Autonomous Vehicles", CVPR 2015) in sweeps of an HDL-64E, fitted to give simulated cars
-# the same shares (tests/test_street_returns.py): the upper part there is the window band with
-# pillars and roof, here glass alone. Fewer rays pass doors here: there, errors of calibration do.
-_LOST = 0.01 * np.array(
-    [
-        [(8, 18, 22, 35, 35), (5, 6, 13, 18, 8), (2, 8, 10, 0, 0)],
-        [(11, 18, 22, 35, 41), (10, 6, 13, 18, 23), (14, 8, 10, 0, 34)],
-        [(65, 61, 54, 91, 44), (50, 13, 42, 64, 38), (62, 5, 47, 49, 49)],
-    ]
-)
-_PASSES = 0.01 * np.array(
-    [
-        [(1, 1, 4, 4, 4), (1, 1, 4, 4, 4), (1, 1, 4, 4, 4)],
-        [(1, 1, 4, 4, 57), (2, 1, 4, 4, 22), (5, 1, 4, 4, 17)],
-        [(8, 22, 29, 7, 54), (40, 20, 20, 16, 30), (34, 37, 32, 24, 25)],
-    ]
+_TABLES = read_table("lidars")
+_ROUNDING = 1e-6  # of a number of pulses
+_WIDENING = 1.5  # exponent of growing steps
+_S_PER_NS = 1e-9
+
+# Scan patterns
+
+
+@dataclass(frozen=True)
+class Spinning:
+    """A pattern that spins once a sweep, clockwise from above, forward at the reference time."""
+
+    # Beams in firing order, never two at once: every pulse has an azimuth of its own
+    elevation_deg: tuple[float, ...]
+    # Firings per second of each beam. A revolution at 20 Hz has half the columns of a revolution at
+    # 10 Hz.
+    columns_per_s: int
+    phase: float = 0.0  # lead in turns over a scanner that faces forward at the reference time
+
+    def num_pulses(self, period_s: float) -> int:
+        """Return the number of pulses in a sweep."""
+        return int(self.columns_per_s * period_s + _ROUNDING) * len(self.elevation_deg)
+
+    def directions(self, number: Int, share: Float, time_s: Float) -> Float:
+        """Return the unit vectors of pulses."""
+        azimuth = -2 * np.pi * (share + self.phase)
+        beam = number % len(self.elevation_deg)
+        return _pointing(azimuth, np.radians(self.elevation_deg)[beam])
+
+
+@dataclass(frozen=True)
+class _Steady:
+    """A pattern of ``pulses_per_s`` pulses evenly spaced in time."""
+
+    pulses_per_s: int
+
+    def num_pulses(self, period_s: float) -> int:
+        return int(self.pulses_per_s * period_s + _ROUNDING)
+
+
+@dataclass(frozen=True)
+class Raster(_Steady):
+    """A scan pattern that covers a rectangle, line by line, by a fast and a slow mirror."""
+
+    # No two pulses of a sweep have the same elevation.
+    width_deg: float  # width of the field of view, with its centre straight ahead
+    height_deg: float  # height of the field of view
+    lines_per_s: int  # swings of the fast mirror per second, counting each direction
+
+    def directions(self, number: Int, share: Float, time_s: Float) -> Float:
+        """Return the unit vectors of pulses."""
+        line = number * (self.lines_per_s / self.pulses_per_s)
+        swing = 1 - np.abs(line % 2 - 1)  # 0 to 1 and back
+        azimuth = np.radians(self.width_deg) * (0.5 - swing)
+        return _pointing(azimuth, np.radians(self.height_deg) * -share)
+
+
+@dataclass(frozen=True)
+class Rosette(_Steady):
+    """A scan pattern of two equal prisms: a rose that never repeats, as in Livox's scanners."""
+
+    width_deg: float  # diameter of the round field of view
+    # Rotation rates of the two prisms. Petals are drawn at the difference of the rates and turn at
+    # their sum.
+    turns_per_s: tuple[float, float]
+
+    def directions(self, number: Int, share: Float, time_s: Float) -> Float:
+        """Return the unit vectors of pulses."""
+        first, second = (np.pi * rate * time_s for rate in self.turns_per_s)
+        off_axis = np.radians(self.width_deg / 2) * np.cos(first - second)
+        roll, flat = first + second, np.sin(off_axis)
+        return np.stack([np.cos(off_axis), flat * np.cos(roll), flat * np.sin(roll)], axis=1)
+
+
+def _pointing(azimuth: Float, elevation: Float) -> Float:
+    """Return (N,3) unit vectors from (N,) azimuths and (N,) elevations in rad."""
+    flat = np.cos(elevation)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
+
+
+# Sensors
+
+
+@dataclass(frozen=True)
+class Scanner:
+    """One scanner of a sensor."""
+
+    pattern: Spinning | Raster | Rosette
+    max_range_m: float  # greatest range
+    range_sigma_m: float  # standard deviation of the range noise
+    origin_m: Sequence[float] = (0.0, 0.0, 0.0)  # position of the scanner, lidar frame
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One or several scanners whose returns form one sweep."""
+
+    name: str
+    scanners: tuple[Scanner, ...]
+
+    def each(self, field: str) -> Float:
+        """Return the values of a field for all S scanners, (S,) or (S,3)."""
+        return np.array([getattr(scanner, field) for scanner in self.scanners], np.float64)
+
+    @property
+    def origins_m(self) -> Float:
+        """(S,3) positions of the scanners, lidar frame."""
+        return self.each("origin_m")
+
+    @property
+    def azimuth_tells_time(self) -> bool:
+        """True if azimuth determines firing time: one scanner that spins about the origin."""
+        first = self.scanners[0]
+        spins = isinstance(first.pattern, Spinning)
+        return len(self.scanners) == 1 and spins and not any(first.origin_m)
+
+
+def _elevations_deg(row: Any) -> Float:
+    """Return the elevations of a row of ``elevation_deg``."""
+    if hasattr(row, "values"):
+        return np.array(row.values)
+    steps = np.arange(1, row.num + 1)
+    if hasattr(row, "between"):
+        highest, lowest = row.between
+        degrees = np.linspace(highest, lowest, row.num)
+    elif hasattr(row, "beyond"):
+        degrees = row.beyond + row.step * steps
+    else:
+        first, last = row.widening
+        degrees = first + (last - first) * (steps / row.num) ** _WIDENING
+    return degrees[::-1] if hasattr(row, "backwards") else degrees
+
+
+def _scanner(row: Any) -> Scanner:
+    """Return the scanner of a row of ``sensors``."""
+    columns = vars(row).copy()
+    if "spinning" in columns:
+        spinning = vars(columns.pop("spinning")).copy()
+        beams = getattr(_TABLES.elevation_deg, spinning.pop("elevation"))
+        elevation_deg = np.concatenate([_elevations_deg(beam) for beam in beams])
+        return Scanner(Spinning(tuple(elevation_deg.tolist()), **spinning), **columns)
+    if "raster" in columns:
+        return Scanner(Raster(**vars(columns.pop("raster"))), **columns)
+    return Scanner(Rosette(**vars(columns.pop("rosette"))), **columns)
+
+
+SENSORS: dict[str, Sensor] = {
+    name: Sensor(name, tuple(_scanner(row) for row in rows))
+    for name, rows in vars(_TABLES.sensors).items()
+}
+
+
+@dataclass(frozen=True)
+class Firings:
+    """The N pulses of a sweep in the order of time."""
+
+    direction: Float  # (N,3) unit vectors, lidar axes
+    offset_ns: Int  # (N,) int64 firing time minus the reference time
+    lidar: NDArray[np.uint8]  # (N,) uint8 index of the scanner
+
+
+def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
+    """Return all pulses of the sweep that lasts ``period_ns`` around ``time_s``, evenly in time."""
+    pulses = []
+    for index, scanner in enumerate(sensor.scanners):
+        num = scanner.pattern.num_pulses(period_ns * _S_PER_NS)
+        number = np.arange(num, dtype=np.int64)
+        offset_ns = -period_ns // 2 + number * period_ns // num
+        share: Float = offset_ns / period_ns
+        fired_s = time_s + share * period_ns * _S_PER_NS
+        direction = scanner.pattern.directions(number, share, fired_s)
+        pulses.append((direction, offset_ns, np.full(num, index, np.uint8)))
+    direction, offset_ns, lidar = (np.concatenate(column) for column in zip(*pulses, strict=True))
+    order = np.argsort(offset_ns, kind="stable")
+    return Firings(direction[order], offset_ns[order], lidar[order])
+
+
+# Rays that pass a surface, or are lost
+
+_VEHICLES = [Material[name] for name in vars(_TABLES.vehicles.lost_percent)]
+_IS_LEAKY = np.isin(np.arange(len(Material)), (*_VEHICLES, Material.LEAF))
+# (part, brightness, incidence) shares of rays
+_LOST, _PASSES = (
+    0.01 * np.array([[*vars(paints).values()] for paints in vars(percent).values()])
+    for percent in (_TABLES.vehicles.lost_percent, _TABLES.vehicles.passes_percent)
 )
 _PATCH_M = 0.7  # size of a patch that loses its rays together: a car window, half a door
-# Share of pulses that are lost elsewhere, by range: gaps in the rings of KITTI's drives 0013 and
-# 0002 (HDL-64E) between returns of one surface. Beyond 35 m the ground loses more than measured.
-_RANGE_M = (5.0, 14.0, 27.0, 45.0, 75.0, 110.0)
-_GROUND_LOST = (0.003, 0.004, 0.009, 0.4, 0.7, 0.9)
-_DARK_LOST = (0.03, 0.10, 0.12, 0.10, 0.13, 0.20)  # reflectance below 0.1, upright
-_OTHER_LOST = (0.001, 0.003, 0.007, 0.012, 0.06, 0.15)
-_DARK = 0.1
-_LEAF_PASSES = 0.45
-_GOLDEN = 0.6180339887498949
+_DARK = 0.1  # reflectance
+_LEAF_PASSES = 0.45  # share of rays
+_GOLDEN = 0.6180339887498949  # its multiples are spread evenly modulo 1
+_LARGE_PRIME = 1_000_003  # keeps hashed cells apart
+_RARE = 1e-9  # least probability of a level
 
 
 def laser(world: World, luck: Float) -> Optics:
@@ -63,21 +229,24 @@ def laser(world: World, luck: Float) -> Optics:
         rows = np.flatnonzero(_IS_LEAKY[surfaces.material[met.triangle]])
         material, instance = (c[met.triangle[rows]] for c in (surfaces.material, surfaces.instance))
         inside = (instance >= 0) & (instance == met.passed[rows])
-        again = (luck[met.ray[rows]] + met.layer * _GOLDEN) % 1.0
-        outcome[rows[(material == Material.LEAF) & (again < _LEAF_PASSES)]] = PASSES
+        drawn = (luck[met.ray[rows]] + met.layer * _GOLDEN) % 1.0
+        outcome[rows[(material == Material.LEAF) & (drawn < _LEAF_PASSES)]] = PASSES
         outcome[rows[(material == Material.GLASS) & inside]] = PASSES
         outside = (material != Material.LEAF) & ~inside
         rows, material, instance = rows[outside], material[outside], instance[outside]
-        part = np.argmax(material[:, None] == np.array(_PARTS), axis=1)
-        brightness = np.digitize(surfaces.mean_tint[met.triangle[rows]], _BRIGHTNESS)
-        cosine = np.abs(met.facing[rows])
-        incidence_deg = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
+        vehicle_part = np.argmax(material[:, None] == np.array(_VEHICLES), axis=1)
+        tint = surfaces.mean_tint[met.triangle[rows]]
+        brightness = np.digitize(tint, _TABLES.vehicles.brightness)
+        cosine = np.clip(np.abs(met.facing[rows]), 0.0, 1.0)
+        incidence_deg = np.degrees(np.arccos(cosine))
         lost, passes = (
-            _between(table[part, brightness], incidence_deg) for table in (_LOST, _PASSES)
+            _between(table[vehicle_part, brightness], incidence_deg) for table in (_LOST, _PASSES)
         )
-        level = patches(met.place(rows), world.seed + 3 * instance.astype(np.int64) + part)
-        outcome[rows[level > 1 - passes]] = PASSES
-        outcome[rows[level < lost]] = ABSORBED
+        threshold = patches(
+            met.positions(rows), world.seed + 3 * instance.astype(np.int64) + vehicle_part
+        )
+        outcome[rows[threshold > 1 - passes]] = PASSES
+        outcome[rows[threshold < lost]] = ABSORBED
         return outcome
 
     return optics
@@ -85,52 +254,57 @@ def laser(world: World, luck: Float) -> Optics:
 
 def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
     """Return the (N,) share of pulses without a return, besides pulses that vehicles absorb."""
-    ground, dark, other = (
-        np.interp(range_m, _RANGE_M, lost) for lost in (_GROUND_LOST, _DARK_LOST, _OTHER_LOST)
+    table = _TABLES.lost_elsewhere
+    ground, dark, bright = (
+        np.interp(range_m, table.range_m, lost) for lost in (table.ground, table.dark, table.bright)
     )
-    is_dark = (REFLECTIVITY[material] * tint < _DARK) & ~_of_vehicle(material)
-    return np.where(material <= Material.PAINT, ground, np.where(is_dark, dark, other))
+    is_vehicle = np.isin(material, _VEHICLES)
+    is_dark = (REFLECTIVITY[material] * tint < _DARK) & ~is_vehicle
+    return np.where(material <= Material.PAINT, ground, np.where(is_dark, dark, bright))
 
 
-def _of_vehicle(material: Int) -> Bool:
-    return np.isin(material, _PARTS)
-
-
-def patches(place: Float, owner: Int) -> Float:
+def patches(position: Float, owner: Int) -> Float:
     """Return (N,) uniform numbers, 0 to 1, smooth over the surface of each ``owner`` (object)."""
-    cell = np.floor(place / _PATCH_M)
-    share = place / _PATCH_M - cell
+    cell = np.floor(position / _PATCH_M)
+    share = position / _PATCH_M - cell
     share = share * share * (3 - 2 * share)
     i, j, k = cell.astype(np.int64).T
-    one, other = i + 1_000_003 * owner, j + 1_000_003 * k
-    _, first, which = np.unique(noise(one, other), return_index=True, return_inverse=True)
+    across_key, up_key = i + _LARGE_PRIME * owner, j + _LARGE_PRIME * k
+    hashed = noise(across_key, up_key)
+    _, first, cell_of = np.unique(hashed, return_index=True, return_inverse=True)
     corners = [
-        noise(one[first] + x, other[first] + y + 1_000_003 * z)
+        noise(across_key[first] + x, up_key[first] + y + _LARGE_PRIME * z)
         for x, y, z in product((0, 1), repeat=3)
     ]
-    level = ndtri(np.clip(corners, 1e-9, 1 - 1e-9)).T.take(which, axis=0).T
-    for part in share.T:  # halves the corners, axis by axis
-        near, far = np.split(level, 2)
-        level = near + part * (far - near)
+    normal = ndtri(np.clip(corners, _RARE, 1 - _RARE)).T.take(cell_of, axis=0).T
+    for axis_share in share.T:  # halves the corners, axis by axis
+        low, high = np.split(normal, 2)
+        normal = low + axis_share * (high - low)
     spread = np.prod(share**2 + (1 - share) ** 2, axis=1)
-    smooth: Float = ndtr(level[0] / np.sqrt(spread))
+    smooth: Float = ndtr(normal[0] / np.sqrt(spread))
     return smooth
 
 
 def _between(rows: Float, incidence_deg: Float) -> Float:
     """Return (N,) values of (N,5) table rows at (N,) degrees, interpolated."""
-    at = np.interp(incidence_deg, _INCIDENCE_DEG, np.arange(len(_INCIDENCE_DEG)))
-    low, n = np.minimum(at.astype(int), len(_INCIDENCE_DEG) - 2), np.arange(len(at))
-    return rows[n, low] + (at - low) * (rows[n, low + 1] - rows[n, low])
+    columns_deg = _TABLES.vehicles.incidence_deg
+    column = np.interp(incidence_deg, columns_deg, np.arange(len(columns_deg)))
+    low, n = np.minimum(column.astype(int), len(columns_deg) - 2), np.arange(len(column))
+    return rows[n, low] + (column - low) * (rows[n, low + 1] - rows[n, low])
 
+
+# Echoes
 
 LIDAR_HEIGHT_M = 1.73
 _MIN_RANGE_M = 1.0
 _SPOT_RAD = 1.05e-3  # half the spot of a beam, along each axis
 _SPOT = np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # its rays, left and up
 _FLAT_M = 0.10  # distance to the plane of the central echo from which a spot is at an edge
+_EDGE_HEARD = 0.85  # share of echoes at edges
 _MERGE_M = 2.0  # echoes closer than this can melt into one
 _MELT_PROBABILITY = 0.2
+# Brightness of an echo: least share by tint, least share at grazing incidence, relative noise
+_UNTINTED, _GRAZING, _NOISE = 0.6, 0.35, 0.05
 
 
 @dataclass(frozen=True)
@@ -153,61 +327,64 @@ def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
     return T
 
 
-def scan(
-    world: World, ego: Driving, sensor: Sensor, time_s: float, rng: np.random.Generator,
-    period_ns: int = 100_000_000, tilt_deg: float = 0.0,
-) -> Returns:  # fmt: skip
-    """Simulate one sweep around ``time_s``, seconds since frame 0, as long as ``period_ns``."""
-    T = T_ego_lidar(tilt_deg)
-    fired = firings(sensor, time_s, period_ns)
+class Mount(NamedTuple):
+    """A sensor on the ego vehicle."""
+
+    ego: Driving
+    sensor: Sensor
+    period_ns: int = 100_000_000  # of the sweeps
+    tilt_deg: float = 0.0  # pitch, nose down
+
+
+def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) -> Returns:
+    """Simulate one sweep around ``time_s``, seconds since frame 0."""
+    sensor, T = mount.sensor, T_ego_lidar(mount.tilt_deg)
+    fired = firings(sensor, time_s, mount.period_ns)
     n = len(fired.offset_ns)
     times = at_offsets(time_s, fired.offset_ns)
-    ego_poses = poses_at(ego, times)
+    ego_poses = poses_at(mount.ego, times)
     origin_m = sensor.origins_m[fired.lidar]
     origin = ego_poses.apply(transform(T, sensor.origins_m)[fired.lidar])
     spot = _spot(fired.direction) @ (ego_poses.rotation @ T[:3, :3]).transpose(0, 2, 1)
     luck = rng.random((len(_SPOT), n)).T
-    beams = (np.repeat(column, len(_SPOT), axis=0) for column in (origin, times))
-    echoes = world.cast(
-        Rays(next(beams), spot.reshape(-1, 3), next(beams)),
-        laser(world, luck.ravel()), len(_SPOT), 2 * _SPOT_RAD,
-    )  # fmt: skip
-    range_m, ray, edge = _echo(echoes, spot, rng)
+    rays = Rays(origin.repeat(len(_SPOT), axis=0), spot.reshape(-1, 3), times.repeat(len(_SPOT)))
+    echoes = world.cast(rays, laser(world, luck.ravel()), len(_SPOT), 2 * _SPOT_RAD)
+    range_m, ray, is_edge = _echo(echoes, spot, rng)
     triangle, normal = echoes.triangle[ray], echoes.normal.take(ray, axis=0)
     material, tint = world.triangles.material[triangle], world.triangles.mean_tint[triangle]
-    reflectivity = REFLECTIVITY[material] * (0.6 + 0.4 * tint)
-    grazing = np.abs(np.einsum("ni,ni->n", normal, spot[:, 0]))
-    heard = (1 - share_lost(material, tint, range_m)) * np.where(edge, 0.85, 1.0)
+    heard = (1 - share_lost(material, tint, range_m)) * np.where(is_edge, _EDGE_HEARD, 1.0)
     keep = np.isfinite(range_m) & (rng.random(n) < heard)
     range_m = np.where(keep, range_m, 0.0)
     range_m += sensor.each("range_sigma_m")[fired.lidar] * rng.normal(size=n)
     keep &= (range_m > _MIN_RANGE_M) & (range_m < sensor.each("max_range_m")[fired.lidar])
     points = fired.direction * range_m[:, None]
     np.add(points, origin_m, out=points, where=origin_m != 0)  # a coordinate of -0.0 stays one
-    brightness = reflectivity * (0.35 + 0.65 * grazing) * (1 + 0.05 * rng.normal(size=n))
-    body = world.triangles.body[triangle[keep]]
+    reflectivity = REFLECTIVITY[material] * (_UNTINTED + (1 - _UNTINTED) * tint)
+    cosine = np.abs(np.einsum("ni,ni->n", normal, spot[:, 0]))
+    brightness = reflectivity * (_GRAZING + (1 - _GRAZING) * cosine)
+    brightness *= 1 + _NOISE * rng.normal(size=n)
     return Returns(
         points[keep].astype(np.float32),
         np.clip(np.round(brightness[keep], 2), 0, 1).astype(np.float32),
         fired.offset_ns[keep],
         fired.lidar[keep],
-        body,
+        world.triangles.body[triangle[keep]],
         world.triangles.instance[triangle[keep]],
     )
 
 
 def at_offsets(time_s: float, offset_ns: Int) -> Float:
     """Return (N,) times in seconds from (N,) offsets in ns and a reference time in seconds."""
-    times: Float = np.asarray(time_s + offset_ns * 1e-9, dtype=np.float64)
+    times: Float = np.asarray(time_s + offset_ns * _S_PER_NS, dtype=np.float64)
     return times
 
 
 def _spot(direction: Float) -> Float:
     """Return (N,5,3) ray directions of N beams: spot centre, then four around it."""
-    level = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
-    level /= lengths(level)
-    upward = across(direction, level)
-    rays = [direction + _SPOT_RAD * (a * level + b * upward) for a, b in _SPOT[1:]]
+    left = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
+    left /= lengths(left)
+    upward = across(direction, left)
+    rays = [direction + _SPOT_RAD * (a * left + b * upward) for a, b in _SPOT[1:]]
     return np.stack([direction, *(ray / lengths(ray) for ray in rays)], axis=1)
 
 
@@ -220,16 +397,16 @@ def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, I
     slant = np.einsum("ni,nsi->ns", echoes.normal[::num], spot)
     with np.errstate(divide="ignore", invalid="ignore"):  # a ray without a hit has infinite range
         off_plane = np.abs(range_m - (range_m * slant)[:, :1] / slant)
-    some = np.isfinite(range_m)
-    flat = off_plane < _FLAT_M
-    edge = np.logical_or.reduce([*some.T]) & ~np.logical_and.reduce([*flat.T])
+    is_hit = np.isfinite(range_m)
+    is_flat = off_plane < _FLAT_M
+    is_edge = np.logical_or.reduce([*is_hit.T]) & ~np.logical_and.reduce([*is_flat.T])
     # any of the rays with a hit, all equally likely
-    at = np.flatnonzero(edge)
-    pick = np.argmax(rng.random((num, n))[:, at] * some[at].T, axis=0)
-    chosen, other = range_m[at, pick], range_m[at, rng.integers(num, size=(n,))[at]]
-    merged = np.isfinite(other) & (rng.random((n,))[at] < _MELT_PROBABILITY)
-    merged[merged] = np.abs(other[merged] - chosen[merged]) < _MERGE_M
-    chosen[merged] = (chosen[merged] + other[merged]) / 2
+    edges = np.flatnonzero(is_edge)
+    pick = np.argmax(rng.random((num, n))[:, edges] * is_hit[edges].T, axis=0)
+    chosen, partner = range_m[edges, pick], range_m[edges, rng.integers(num, size=(n,))[edges]]
+    merged = np.isfinite(partner) & (rng.random((n,))[edges] < _MELT_PROBABILITY)
+    merged[merged] = np.abs(partner[merged] - chosen[merged]) < _MERGE_M
+    chosen[merged] = (chosen[merged] + partner[merged]) / 2
     range_m, ray = range_m[:, 0].copy(), np.arange(0, n * num, num)
-    range_m[at], ray[at] = chosen, at * num + pick
-    return range_m, ray, edge
+    range_m[edges], ray[edges] = chosen, edges * num + pick
+    return range_m, ray, is_edge

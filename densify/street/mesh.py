@@ -5,28 +5,55 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.geometry.types import Float
-from densify.street.materials import Material
+from densify.geometry.types import Float, Int
+from densify.street import read_table
 
-Tint = tuple[float, float, float]
+Tint = Sequence[float]
+Point = Sequence[float]
 WHITE: Tint = (1.0, 1.0, 1.0)
-_IS_HIGH = np.array(  # (6,4,3) of a box's corners, side by side
-    (
-        ((0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)),
-        ((1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)),
-        ((1, 1, 0), (0, 1, 0), (0, 1, 1), (1, 1, 1)),
-        ((0, 1, 0), (0, 0, 0), (0, 0, 1), (0, 1, 1)),
-        ((0, 1, 0), (1, 1, 0), (1, 0, 0), (0, 0, 0)),
-        ((0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)),
-    ),
-    bool,
+_TINY = 1e-9
+_UPRIGHT = 0.9  # z of a unit vector that is not level enough to be crossed with z
+_LEAF_SIZES, _LEAF_TINTS = (0.35, 0.65), (0.65, 1.35)  # half sizes and tints of leaves vary
+
+
+class Material(IntEnum):
+    """A material of materials.yaml."""
+
+    ASPHALT = 0
+    PAVING = 1
+    KERB = 2
+    GRASS = 3
+    PAINT = 4
+    BRICK = 5
+    PLASTER = 6
+    ROOF = 7
+    PANE = 8  # window of a house: dark, no ray passes
+    WOOD = 9
+    METAL = 10
+    BARK = 11
+    LEAF = 12
+    BODYWORK = 13
+    GLASS = 14  # of a vehicle
+    RUBBER = 15
+    CLOTH = 16
+    SKIN = 17
+    LAMP = 18
+    UPHOLSTERY = 19
+    CONCRETE = 20
+    FRAME = 21  # bodywork around and above car windows
+
+
+_SURFACES = [getattr(read_table("materials"), material.name) for material in Material]
+COLOUR, REFLECTIVITY, GLOSS = (
+    np.array([getattr(surface, column) for surface in _SURFACES])
+    for column in ("colour", "reflectivity", "gloss")
 )
-_HALVES = np.array([0, 1, 2, 0, 2, 3])  # the triangles of a quad
 
 
 @dataclass(frozen=True)
@@ -56,17 +83,22 @@ class Mesh:
         """Return a mesh of (K,4,3) quads in order around. Texture x runs along their first side."""
         k = len(corners)
         side, away = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
-        along = side / np.maximum(lengths(side), 1e-9)
+        along = side / np.maximum(lengths(side), _TINY)
         up = away - np.einsum("ki,ki->k", away, along)[:, None] * along
-        axes = np.stack([along, up / np.maximum(lengths(up), 1e-9)], axis=1)
+        axes = np.stack([along, up / np.maximum(lengths(up), _TINY)], axis=1)
+        halves = np.array([0, 1, 2, 0, 2, 3])  # corners of the two triangles of a quad
         return Mesh(
             corners.reshape(-1, 3),
-            (np.arange(0, 4 * k, 4)[:, None] + _HALVES).reshape(-1, 3),
+            (np.arange(0, 4 * k, 4)[:, None] + halves).reshape(-1, 3),
             np.einsum("kci,kai->kca", corners, axes).reshape(-1, 2),
             np.full(2 * k, material, np.int16),
             np.repeat(np.broadcast_to(tint, (k, 3)), 2, axis=0),
             np.full(2 * k, -1, np.int32),
         )
+
+    def moved(self, offset: Point) -> Mesh:
+        """Return the mesh moved by a (3,) offset."""
+        return replace(self, vertices=self.vertices + offset)
 
     def posed(self, T_a_mesh: Float) -> Mesh:
         """Return the mesh moved by a (4,4) rigid motion."""
@@ -82,28 +114,26 @@ class Mesh:
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
 
-def box(
-    low: Sequence[float], high: Sequence[float], material: Material, tint: Tint = WHITE
-) -> Mesh:
-    """Return an upright box between two corners."""
-    return boxes([(low, high)], material, tint)
-
-
-def boxes(
-    spans: Sequence[tuple[Sequence[float], Sequence[float]]], material: Material, tint: Tint = WHITE
-) -> Mesh:
-    """Return upright boxes, each between its lowest and its highest corner."""
-    span = np.array(spans, float).reshape(-1, 2, 3)
-    faces = np.where(_IS_HIGH, span[:, None, None, 1], span[:, None, None, 0])
+def box(low: Point | Float, high: Point | Float, material: Material, tint: Tint = WHITE) -> Mesh:
+    """Return an upright box between two corners, or K boxes between (K,3) corners."""
+    is_high = np.array(  # x, y, z of the corners of each side
+        [
+            [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)],
+            [(1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)],
+            [(1, 1, 0), (0, 1, 0), (0, 1, 1), (1, 1, 1)],
+            [(0, 1, 0), (0, 0, 0), (0, 0, 1), (0, 1, 1)],
+            [(0, 1, 0), (1, 1, 0), (1, 0, 0), (0, 0, 0)],
+            [(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)],
+        ],
+        bool,
+    )
+    lowest, highest = (np.reshape(corner, (-1, 1, 1, 3)) for corner in (low, high))
+    faces = np.where(is_high, highest, lowest).astype(float)
     return Mesh.quads(faces.reshape(-1, 4, 3), material, tint)
 
 
 def frustum(
-    low: Sequence[float],
-    high: Sequence[float],
-    material: Material,
-    tint: Tint = WHITE,
-    taper: tuple[float, float] = (1.0, 1.0),
+    low: Point, high: Point, material: Material, tint: Tint = WHITE, taper: Point = (1.0, 1.0)
 ) -> Mesh:
     """Return a box whose top is scaled by ``taper`` in x and y about its own centre."""
     a, b = np.asarray(low, float), np.asarray(high, float)
@@ -113,33 +143,58 @@ def frustum(
     top = np.column_stack([middle + ring * half * taper, np.full(4, b[2])])
     after = [1, 2, 3, 0]
     sides = np.stack([bottom, bottom[after], top[after], top], axis=1)
-    caps = np.stack([bottom[[3, 2, 1, 0]], top])
+    caps = np.stack([bottom[::-1], top])
     return Mesh.quads(np.concatenate([sides, caps]), material, tint)
 
 
 def tube(
-    start: Sequence[float],
-    end: Sequence[float],
-    radius_m: float | tuple[float, float],
+    start: Point,
+    end: Point,
+    radius_m: float | Point,
     material: Material,
     tint: Tint = WHITE,
     num_sides: int = 8,
 ) -> Mesh:
-    """Return a closed cylinder or cone between two points, with a radius at each end."""
+    """Return a closed cylinder or cone between two points, with one radius or one at each end."""
     a, b = np.asarray(start, float), np.asarray(end, float)
-    radii = radius_m if isinstance(radius_m, tuple) else (radius_m, radius_m)
+    start_radius_m, end_radius_m = np.broadcast_to(radius_m, 2)
     axis = (b - a) / np.linalg.norm(b - a)
-    helper = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    u = across(helper, axis)
+    is_upright = abs(axis[2]) >= _UPRIGHT
+    u = across(np.array([1.0, 0.0, 0.0] if is_upright else [0.0, 0.0, 1.0]), axis)
     u /= np.linalg.norm(u)
     v = across(axis, u)
     angle = 2 * np.pi * np.arange(num_sides)[:, None] / num_sides
     ring, after = np.cos(angle) * u + np.sin(angle) * v, np.roll(np.arange(num_sides), -1)
-    low, high = a + radii[0] * ring, b + radii[1] * ring
+    low, high = a + start_radius_m * ring, b + end_radius_m * ring
     around = (low, low[after], high[after], high)
     caps = ((a, low[after], low, a), (b, high, high[after], b))
     quads = [np.stack(np.broadcast_arrays(*quad), axis=1) for quad in (around, *caps)]
     return Mesh.quads(np.concatenate(quads), material, tint)
+
+
+def ball(centre: Point, radius_m: Point, material: Material, tint: Tint = WHITE) -> Mesh:
+    """Return an ellipsoid of 6 rings and 10 sectors with radii along x, y and z."""
+    latitude, longitude = np.meshgrid(
+        np.linspace(-np.pi / 2, np.pi / 2, 6 + 1), np.linspace(0, 2 * np.pi, 10 + 1), indexing="ij"
+    )
+    flat = np.cos(latitude)
+    p = np.stack([flat * np.cos(longitude), flat * np.sin(longitude), np.sin(latitude)], axis=2)
+    p = p * np.asarray(radius_m) + np.asarray(centre)
+    corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
+    return Mesh.quads(corners.reshape(-1, 4, 3), material, tint)
+
+
+def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint = WHITE) -> Mesh:
+    """Return a square leaf (a bunch of leaves) at each of (K,3) centres, turned at random."""
+    k = len(centres)
+    u = rng.normal(size=(k, 3))
+    u /= lengths(u)
+    v = across(u, rng.normal(size=(k, 3)))
+    v /= lengths(v)
+    half = (size_m * rng.uniform(*_LEAF_SIZES, k))[:, None]
+    corners = [centres + half * (i * u + j * v) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    tints = np.asarray(tint) * rng.uniform(*_LEAF_TINTS, (k, 1))
+    return Mesh.quads(np.stack(corners, axis=1), Material.LEAF, tints)
 
 
 def across(a: Float, b: Float) -> Float:
@@ -156,27 +211,17 @@ def lengths(vectors: Float) -> Float:
     return np.sqrt(squared[:, :1] + squared[:, 1:2] + squared[:, 2:])
 
 
-def ball(
-    centre: Sequence[float], radius_m: Sequence[float], material: Material, tint: Tint = WHITE
-) -> Mesh:
-    """Return an ellipsoid with radii along x, y and z."""
-    la, lo = np.meshgrid(
-        np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 11), indexing="ij"
-    )
-    p = np.stack([np.cos(la) * np.cos(lo), np.cos(la) * np.sin(lo), np.sin(la)], axis=2)
-    p = p * np.asarray(radius_m) + np.asarray(centre)
-    corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
-    return Mesh.quads(corners.reshape(-1, 4, 3), material, tint)
+# xxHash64's first two primes, then the factor of splitmix64
+_PRIMES = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F], np.uint64)
+_FACTOR = np.uint64(0xBF58476D1CE4E5B9)
+_DOUBLE_BITS = 53
 
 
-def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint = WHITE) -> Mesh:
-    """Return a square leaf (a bunch of leaves) at each of (K,3) centres, turned at random."""
-    k = len(centres)
-    u = rng.normal(size=(k, 3))
-    u /= lengths(u)
-    v = across(u, rng.normal(size=(k, 3)))
-    v /= lengths(v)
-    half = (size_m * rng.uniform(0.35, 0.65, k))[:, None]
-    corners = [centres + half * (i * u + j * v) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    tints = np.asarray(tint) * rng.uniform(0.65, 1.35, (k, 1))
-    return Mesh.quads(np.stack(corners, axis=1), Material.LEAF, tints)
+def noise(i: Int, j: Int) -> Float:
+    """Return (N,) repeatable random numbers in [0, 1), a hash of two (N,) integer arrays."""
+    h = i.astype(np.uint64) * _PRIMES[0]
+    h ^= j.astype(np.uint64) * _PRIMES[1]
+    h ^= h >> np.uint64(29)
+    h *= _FACTOR
+    h ^= h >> np.uint64(32)
+    return (h >> np.uint64(64 - _DOUBLE_BITS)) / 2.0**_DOUBLE_BITS

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Compute the poses of bodies at any time, and the rectangles that they cover on the ground."""
+"""Compute paths over the hilly ground, and the poses of bodies on them at any time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,151 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.types import Bool, Float, Int
 from densify.street.mesh import Mesh, across, lengths
-from densify.street.terrain import Curve, Speed, Terrain, left_of
+
+DURATION_S = 16  # of every scene
+STEP_M, _FINE_M = 0.5, 0.05  # between the points of a curve, and steps of integration
+_TOW_S = 0.01  # between the positions of a trailer
+_WAVE_M, _WAVE_SHARE = np.array([95.0, 150.0, 240.0]), np.array([0.25, 0.35, 0.4])  # of hills
+
+
+class Curve:
+    """A smooth planar curve, from arc length 0 to ``length_m`` and straight beyond its ends."""
+
+    def __init__(self, xy: Float) -> None:
+        """Build the curve through (N,2) points in metres, neighbours about half a metre apart."""
+        chord_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+        self.length_m = float(chord_m[-1])
+        self.knots_m: Float = chord_m
+        self._spline = CubicSpline(chord_m, xy)
+        self._slope = self._spline.derivative()
+
+    def __call__(self, station_m: Float) -> Float:
+        """Return (N,2) points at (N,) arc lengths."""
+        inside = np.clip(station_m, 0.0, self.length_m)
+        if np.array_equal(inside, station_m):  # the tangent is not needed
+            return self._spline(inside)
+        return self.with_tangent(station_m)[0]
+
+    def with_tangent(self, station_m: Float) -> tuple[Float, Float]:
+        """Return the points (N,2) of the curve at (N,) arc lengths, and its `tangent` there."""
+        inside = np.clip(station_m, 0.0, self.length_m)
+        tangent = self.tangent(inside)
+        return self._spline(inside) + (station_m - inside)[..., None] * tangent, tangent
+
+    def tangent(self, station_m: Float) -> Float:
+        """Return (N,2) unit directions of travel at (N,) arc lengths."""
+        slope = self._slope(np.clip(station_m, 0.0, self.length_m))
+        squared = slope * slope  # faster than np.linalg.norm
+        unit: Float = slope / np.sqrt(squared[..., :1] + squared[..., 1:])
+        return unit
+
+    def normal(self, station_m: Float) -> Float:
+        """Return (N,2) unit vectors to the left of the direction of travel at (N,) arc lengths."""
+        return left_of(self.tangent(station_m))
+
+    @staticmethod
+    def bending(
+        length_m: float, curvature: Callable[[Float], Float], origin_m: float = 0.0
+    ) -> Curve:
+        """Return a curve by curvature (1/m, left positive), through the origin along +x."""
+        step = _FINE_M
+        station = np.arange(0.0, length_m + step, step)
+        heading = np.concatenate([[0.0], np.cumsum(curvature(station[:-1] + step / 2) * step)])
+        middle = (heading[1:] + heading[:-1]) / 2
+        steps = step * np.stack([np.cos(middle), np.sin(middle)], axis=1)
+        xy = np.concatenate([[[0.0, 0.0]], np.cumsum(steps, axis=0)])
+        start = round(origin_m / step)  # at this arc length it passes the origin
+        c, s = np.cos(heading[start]), np.sin(heading[start])
+        xy = (xy - xy[start]) @ np.array([[c, -s], [s, c]])
+        return Curve(xy[:: round(STEP_M / step)])
+
+
+def left_of(forward: Float) -> Float:
+    """Return (...,2) vectors turned to the left by a right angle."""
+    return np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
+
+
+class Lane:
+    """A path along a road: its centreline shifted sideways, possibly driven backwards."""
+
+    def __init__(self, road: Curve, offset_m: float, forward: bool = True) -> None:
+        """Build the lane, ``offset_m`` to the left of the road's centreline."""
+        stations = road.knots_m
+        xy = road(stations) + road.normal(stations) * offset_m
+        self.curve = Curve(xy if forward else xy[::-1])
+        self._abreast_m = self.curve.knots_m[:: 1 if forward else -1]
+        self._stations = stations
+
+    def at(self, station_m: float) -> float:
+        """Return the arc length on this lane beside a station (arc length) of the road."""
+        return float(np.interp(station_m, self._stations, self._abreast_m))
+
+
+def polyline(corners: Sequence[Float | tuple[float, float]], radius_m: float) -> Float:
+    """Return (N,2) points, half a metre apart, along straight lines with rounded corners."""
+    pieces = [np.asarray(corners[0], float)[None]]
+    for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
+        a, b, c = (np.asarray(p, float) for p in (before, corner, after))
+        u, v = (a - b) / np.linalg.norm(a - b), (c - b) / np.linalg.norm(c - b)
+        half = np.arccos(np.clip(u @ v, -1, 1)) / 2
+        centre = b + (u + v) / np.linalg.norm(u + v) * radius_m / np.sin(half)
+        begin, end = b + u * radius_m / np.tan(half), b + v * radius_m / np.tan(half)
+        start, stop = (np.arctan2(*(p - centre)[::-1]) for p in (begin, end))
+        sweep = (stop - start + np.pi) % (2 * np.pi) - np.pi
+        angle = start + np.linspace(0, sweep, max(2, int(abs(sweep) * radius_m / STEP_M)))
+        pieces.append(centre + radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    pieces.append(np.asarray(corners[-1], float)[None])
+    rough = np.concatenate(pieces)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rough, axis=0), axis=1))])
+    even = np.linspace(0, length[-1], int(length[-1] / STEP_M) + 1)
+    return np.stack([np.interp(even, length, rough[:, i]) for i in range(2)], axis=1)
+
+
+class Speed:
+    """A speed profile: linear between knots (t_s, v_m_s), constant before and after."""
+
+    def __init__(self, *knots: tuple[float, float]) -> None:
+        self._t, self._v = (np.array(column, float) for column in zip(*knots, strict=True))
+        steps = np.diff(self._t) * (self._v[1:] + self._v[:-1]) / 2
+        self._travelled = np.concatenate([[0.0], np.cumsum(steps)])
+
+    def distance(self, times_s: Float) -> Float:
+        """Return (N,) metres travelled since the first knot, negative before it."""
+        i = np.clip(np.searchsorted(self._t, times_s, side="right") - 1, 0, len(self._t) - 1)
+        after = np.minimum(i + 1, len(self._t) - 1)
+        span = np.where(after > i, self._t[after] - self._t[i], 1.0)
+        slope = np.where(times_s < self._t[0], 0.0, (self._v[after] - self._v[i]) / span)
+        dt = times_s - self._t[i]
+        travelled: Float = self._travelled[i] + self._v[i] * dt + slope * dt**2 / 2
+        return travelled
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Height of the bare ground as a sum of W waves, ``sum a sin(k·xy + phase)``."""
+
+    wave: Float  # (W,2) wave vectors k in rad/m
+    amplitude_m: Float  # (W,) amplitudes a
+    phase: Float  # (W,) phases in rad
+
+    @staticmethod
+    def hilly(rng: np.random.Generator, max_slope: float, scale_m: float = 1.0) -> Terrain:
+        """Return three waves in random directions, nowhere steeper than ``max_slope``."""
+        length_m = _WAVE_M * scale_m
+        angle = rng.uniform(0, 2 * np.pi, 3)
+        wave = (2 * np.pi / length_m)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+        share = max_slope * _WAVE_SHARE
+        return Terrain(wave, share / np.linalg.norm(wave, axis=1), rng.uniform(0, 2 * np.pi, 3))
+
+    def height(self, xy: Float) -> Float:
+        """Return (N,) heights in metres at (N,2) positions."""
+        z: Float = np.sin(xy @ self.wave.T + self.phase) @ self.amplitude_m
+        return z
+
+    def slope(self, xy: Float) -> Float:
+        """Return (N,2) gradients of the height at (N,2) positions."""
+        gradient: Float = (np.cos(xy @ self.wave.T + self.phase) * self.amplitude_m) @ self.wave
+        return gradient
 
 
 class Poses(NamedTuple):
@@ -28,15 +172,11 @@ class Poses(NamedTuple):
 
     def undo(self, points: Float) -> Float:
         """Return (N,3) world points in the body frames, row by row."""
-        return self.unturn(points - self.position)
+        return np.einsum("nji,nj->ni", self.rotation, points - self.position)
 
     def turn(self, directions: Float) -> Float:
         """Return (N,3) body-frame directions in world axes."""
         return np.einsum("nij,nj->ni", self.rotation, directions)
-
-    def unturn(self, directions: Float) -> Float:
-        """Return (N,3) world directions in body axes."""
-        return np.einsum("nji,nj->ni", self.rotation, directions)
 
     def rows(self, rows: Int) -> Poses:
         """Return the poses at these indices."""
@@ -134,7 +274,7 @@ class Towed:
     ) -> None:
         """Build the trailer; the kingpin is ``kingpin_m`` along the x axis of the tractor."""
         self._tractor, self._kingpin_m = tractor, kingpin_m
-        times = np.arange(first_s, last_s, 0.01)
+        times = np.arange(first_s, last_s, _TOW_S)
         pin = self._pin(times)
         axle = np.empty_like(pin)
         axle[0] = pin[0] - wheelbase_m * (pin[1] - pin[0]) / np.linalg.norm(pin[1] - pin[0])
@@ -193,12 +333,12 @@ class Rectangles(NamedTuple):
         return Rectangles(poses.apply(np.tile(middle, (n, 1)))[:, :2], forward, half)
 
     @staticmethod
-    def joined(parts: Sequence[Rectangles]) -> Rectangles:
+    def joined(groups: Sequence[Rectangles]) -> Rectangles:
         """Return all rectangles, concatenated along the first axis."""
-        return Rectangles(*(np.concatenate(c) for c in zip(*parts, strict=True)))
+        return Rectangles(*(np.concatenate(c) for c in zip(*groups, strict=True)))
 
-    def rows(self, rows: Int | slice) -> Rectangles:
-        """Return the rectangles with these indices along the first axis."""
+    def rows(self, rows: Int | None) -> Rectangles:
+        """Return the rectangles with these indices along the first axis, None for a new axis."""
         return Rectangles(*(column[rows] for column in self))
 
 

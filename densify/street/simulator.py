@@ -13,21 +13,17 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, SweepTruth
-from densify.street.actors import DURATION_S
-from densify.street.cameras import CAMERAS, SHUTTERS, Picture, expose
-from densify.street.lidar import Returns, Sensor, T_ego_lidar, at_offsets, scan
-from densify.street.scenes import crossing, highway, static_street, street
-from densify.street.traffic import Scene
+from densify.street.cameras import CAMERAS, EXPOSURES, Picture, expose
+from densify.street.lidar import Mount, Returns, Sensor, T_ego_lidar, at_offsets, scan
+from densify.street.motion import DURATION_S
+from densify.street.scenes import Scene, build
 from densify.street.world import Body
-
-PRESETS = {"street": street, "static": static_street, "crossing": crossing, "highway": highway}
-"""The function that builds the scene from a random generator."""
 
 
 @lru_cache(maxsize=2)
 def build_scene(preset: str, seed: int) -> Scene:
     """Return the scene of a preset and seed, always the same one. Building takes 1 to 2 s."""
-    return PRESETS[preset](np.random.default_rng([seed, 0]))
+    return build(preset, np.random.default_rng([seed, 0]))
 
 
 @dataclass(frozen=True)
@@ -59,8 +55,8 @@ class Bodies:
     ) -> Float:
         """Return (N,3) true scene flow, as in `densify.geometry.types.Truth.displacement`."""
         self.check(target)
-        there, here = (self.place(f, body, points) for f in (target, frame))
-        return (there - here) @ self.T_world_lidar[frame][:3, :3]
+        after, before = (self.place(f, body, points) for f in (target, frame))
+        return (after - before) @ self.T_world_lidar[frame][:3, :3]
 
     def check(self, frame: int) -> None:
         """Raise InputError for a frame without poses."""
@@ -72,8 +68,9 @@ class Bodies:
 
 
 VERSION = 6  # raise it whenever the same frame would come out differently
+_NS_PER_S = 1_000_000_000
 EPOCH_NS = 1_781_258_400_000_000_000  # 2026-06-12 10:00:00 UTC, frame 0
-_MOVING_M, _MOVING_S = 0.05, 0.5
+_MOVING_M, _MOVING_S = 0.05, 0.5  # an object moves if it goes this far in this time
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ class Simulator:
     @property
     def period_ns(self) -> int:
         """The time from sweep to sweep."""
-        return 1_000_000_000 // self.hz
+        return _NS_PER_S // self.hz
 
     @property
     def num_frames(self) -> int:
@@ -111,15 +108,15 @@ class Simulator:
         """Return the sweep of a frame."""
         rng = np.random.default_rng([self.seed, 1, frame])
         time_s = seconds(self.stamp_ns(frame))
-        ego, world = self.scene.ego, self.scene.world
-        return scan(world, ego, self.sensor, time_s, rng, self.period_ns, self.tilt_deg)
+        mount = Mount(self.scene.ego, self.sensor, self.period_ns, self.tilt_deg)
+        return scan(self.scene.world, mount, time_s, rng)
 
     def image_stamps_ns(self, camera: str) -> dict[int, int]:
         """Return image number -> exposure time of the middle row, for a camera."""
-        delay_ns, own_period_ns = SHUTTERS[camera]
-        period_ns = own_period_ns or self.period_ns
-        first_ns = EPOCH_NS + delay_ns
-        return {n: first_ns + n * period_ns for n in range(DURATION_S * 10**9 // period_ns)}
+        exposure = EXPOSURES[camera]
+        period_ns = getattr(exposure, "period_ns", self.period_ns)
+        first_ns = EPOCH_NS + exposure.delay_ns
+        return {n: first_ns + n * period_ns for n in range(DURATION_S * _NS_PER_S // period_ns)}
 
     def picture(self, camera: str, number: int) -> Picture:
         """Return the image of a camera with this number."""
@@ -136,12 +133,12 @@ class Simulator:
         """The poses of all bodies at every frame's reference time."""
         return self.bodies_at([self.stamp_ns(frame) for frame in range(self.num_frames)])
 
-    def bodies_at(self, stamps_ns: Sequence[int], which: Sequence[int] | None = None) -> Bodies:
-        """Return the poses of bodies (``which``, whole objects; None for all) at these times."""
+    def bodies_at(self, stamps_ns: Sequence[int], indices: Sequence[int] | None = None) -> Bodies:
+        """Return the poses of bodies (``indices``, whole objects; None for all) at these times."""
         times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
-        if which is not None:
-            bodies = tuple(bodies[index] for index in which)
+        if indices is not None:
+            bodies = tuple(bodies[index] for index in indices)
         T_world_body = np.tile(np.eye(4), (len(times), len(bodies), 1, 1))
         for index, body in enumerate(bodies):
             poses = body.trajectory.poses(times)
@@ -161,8 +158,8 @@ class Simulator:
         points = self.scene.ego.poses(times).apply(points)
         for index in np.unique(returns.body[returns.body > 0]):
             rows = np.flatnonzero(returns.body == index)
-            way = self.scene.world.bodies[index].trajectory
-            points[rows] = way.poses(times[rows]).undo(points[rows])
+            trajectory = self.scene.world.bodies[index].trajectory
+            points[rows] = trajectory.poses(times[rows]).undo(points[rows])
         return points
 
 
@@ -174,12 +171,12 @@ def seconds(time_ns: int) -> float:
 def _moving(bodies: Sequence[Body], times_s: Float) -> Bool:
     """Return (F,B) True if the body is part of an object that moves around that time."""
 
-    def places(shift_s: float) -> Float:
+    def positions(shift_s: float) -> Float:
         return np.stack([b.trajectory.poses(times_s + shift_s).position for b in bodies], axis=1)
 
-    here, shifts_s = places(0.0), _MOVING_S * np.array([-1, -0.5, 0.5, 1])
-    gone_m = [np.linalg.norm(places(shift_s) - here, axis=2) for shift_s in shifts_s]
-    moving: Bool = np.max(gone_m, axis=0) >= _MOVING_M
+    now, shifts_s = positions(0.0), _MOVING_S * np.array([-1, -0.5, 0.5, 1])
+    moved_m = [np.linalg.norm(positions(shift_s) - now, axis=2) for shift_s in shifts_s]
+    moving: Bool = np.max(moved_m, axis=0) >= _MOVING_M
     instance = np.array([body.instance for body in bodies])
     for one in np.unique(instance[instance >= 0]):
         moving[:, instance == one] = moving[:, instance == one].any(axis=1, keepdims=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,9 +17,10 @@ from densify.street.motion import Poses, Trajectory, poses_at
 
 _STEP_M = 2e-3  # from a surface that a ray passes to its next origin
 _MAX_LAYERS = 8  # most layers of glass and leaves that one ray passes
-_STEP_S, _NUM_STEPS = 0.05, 20  # between the positions of a body that bound it, and at once
+_STEP_S, _SLACK_M = 0.05, 0.1  # between positions that bound a body, and beyond them
 _BLOCK = 16  # consecutive rays that are tested together
 _TINY = 1e-9
+_FLAT_M2 = 1e-7  # twice the area of a triangle that is left out
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Meeting(NamedTuple):
     # (K,) object number of the previous surface that the ray passed, -1 for none
     passed: NDArray[np.int32]
 
-    def place(self, rows: Int) -> Float:
+    def positions(self, rows: Int) -> Float:
         """Return the positions of some of the rays, (R,3) in the frame of the body."""
         return self.origin[rows] + self.distance_m[rows, None] * self.direction[rows]
 
@@ -83,7 +84,7 @@ class Triangles:
         corners = single.astype(np.float64)
         normal = across(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = lengths(normal)
-        keep = np.flatnonzero(length[:, 0] > 1e-7)
+        keep = np.flatnonzero(length[:, 0] > _FLAT_M2)
         counts = [len(m.triangles) for m in meshes]
         self.body = np.repeat(np.arange(len(meshes), dtype=np.int32), counts)[keep]
         # Index of the first triangle of each body
@@ -100,23 +101,23 @@ class Triangles:
         self.scenes = [_raycasting_scene(corners) for corners in each]
 
     def first_hit(
-        self, parts: Iterable[tuple[int, int]], origin: Float, direction: Float
+        self, spans: Iterable[tuple[int, int]], origin: Float, direction: Float
     ) -> tuple[Int, Int, Float]:
         """Return the rays that hit their body, the first triangle that each hits, and u, v there.
 
-        ``parts`` has body and end of its rays, ascending. Rays (N,3) are in the frames of bodies.
+        ``spans`` has body and end of its rays, ascending. Rays (N,3) are in the frames of bodies.
         """
         start, ray = origin.astype(np.float32), direction.astype(np.float32)
         met, triangle, barycentric, begin = [], [], [], 0
-        for index, end in parts:
+        for index, end in spans:
             if end > begin:
-                found = self.scenes[index].run(
+                traced = self.scenes[index].run(
                     start[begin:end], ray[begin:end], query="INTERSECT", output=True
                 )
-                rows = np.flatnonzero(found["primID"] >= 0)
+                rows = np.flatnonzero(traced["primID"] >= 0)
                 met.append(rows + begin)
-                triangle.append(found["primID"][rows] + self.first[index])
-                barycentric.append(np.stack([found["u"][rows], found["v"][rows]], axis=1))
+                triangle.append(traced["primID"][rows] + self.first[index])
+                barycentric.append(np.stack([traced["u"][rows], traced["v"][rows]], axis=1))
             begin = end
         if not met:
             return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))
@@ -128,7 +129,6 @@ class World:
 
     def __init__(self, bodies: Sequence[Body], seed: int = 0) -> None:
         self.bodies, self.seed = tuple(bodies), seed
-        self._centres = lru_cache(None)(self._find_centres)
 
     @cached_property
     def triangles(self) -> Triangles:
@@ -144,12 +144,12 @@ class World:
         best = self._cast_bodies([(0, len(every))], rays.origin, rays.direction, every, optics)
         groups = Rays(*(column[::num_together] for column in rays))
         farthest_m = np.maximum.reduce([*best.range_m.reshape(-1, num_together).T])
-        near = [
+        candidates = [
             (index, rows, poses_at(self.bodies[index].trajectory, groups.time_s[rows]))
             for index, rows in self._near(groups, farthest_m, spread)
         ]
-        if near:
-            self._add_moving(best, rays, near, optics, num_together)
+        if candidates:
+            self._add_moving(best, rays, candidates, optics, num_together)
         best.range_m[best.absorbed] = np.inf
         return best
 
@@ -157,28 +157,28 @@ class World:
         self,
         best: Hits,
         rays: Rays,
-        near: Sequence[tuple[int, Int, Poses]],
+        candidates: Sequence[tuple[int, Int, Poses]],
         optics: Optics,
         num: int,
     ) -> None:
         """Enter the hits of moving bodies that are nearer than those in ``best``."""
-        # near: index of each body, the groups of num rays that may hit it, and its poses then.
-        poses = [pose for _, _, pose in near]
-        groups = np.concatenate([rows for _, rows, _ in near])
-        ends = num * np.cumsum([len(rows) for _, rows, _ in near])
-        parts = [(index, end) for (index, _, _), end in zip(near, ends.tolist(), strict=True)]
+        # candidates: index of each body, groups of num rays that may hit it, its poses then.
+        poses = [pose for _, _, pose in candidates]
+        groups = np.concatenate([rows for _, rows, _ in candidates])
+        ends = num * np.cumsum([len(rows) for _, rows, _ in candidates])
+        spans = [(index, end) for (index, _, _), end in zip(candidates, ends.tolist(), strict=True)]
         at = Poses(*(np.concatenate(column) for column in zip(*poses, strict=True)))
         rows = (groups[:, None] * num + np.arange(num)).ravel()
         origin = at.undo(rays.origin.take(groups * num, axis=0)).repeat(num, axis=0)
         direction = rays.direction.take(rows, axis=0).reshape(-1, num, 3) @ at.rotation
-        found = self._cast_bodies(parts, origin, direction.reshape(-1, 3), rows, optics)
+        hits = self._cast_bodies(spans, origin, direction.reshape(-1, 3), rows, optics)
         begin = 0
-        for pose, (_, end) in zip(poses, parts, strict=True):
-            new = np.flatnonzero(found.range_m[begin:end] < best.range_m[rows[begin:end]])
-            found.normal[begin + new] = pose.rows(new // num).turn(found.normal[begin + new])
+        for pose, (_, end) in zip(poses, spans, strict=True):
+            new = np.flatnonzero(hits.range_m[begin:end] < best.range_m[rows[begin:end]])
+            hits.normal[begin + new] = pose.rows(new // num).turn(hits.normal[begin + new])
             new += begin
             for name in Hits._fields:
-                getattr(best, name)[rows[new]] = getattr(found, name)[new]
+                getattr(best, name)[rows[new]] = getattr(hits, name)[new]
             begin = end
 
     def _near(self, rays: Rays, farthest_m: Float, spread: float) -> Iterator[tuple[int, Int]]:
@@ -209,29 +209,18 @@ class World:
 
     def _balls(self, times_s: Float) -> Iterator[tuple[Float, float]]:
         """Yield centre (3,) and radius of a ball around each moving body at all of these times."""
-        begin, end = (int(t // _STEP_S) for t in (times_s.min(), times_s.max()))
-        parts = range(begin // _NUM_STEPS, (end + 1) // _NUM_STEPS + 1)
-        paths = np.concatenate([self._centres(part) for part in parts])
-        paths = paths[begin % _NUM_STEPS :][: end - begin + 2]
-        low, high = paths.min(axis=0), paths.max(axis=0)
-        moved_m = lengths(high - low)[:, 0]
-        for body, centre, m in zip(self.bodies[1:], (low + high) / 2, moved_m, strict=True):
-            yield centre, float(m + np.linalg.norm(np.subtract(*body.mesh.bounds))) / 2 + 0.1
-
-    def _find_centres(self, part: int) -> Float:
-        """Return the (S,B,3) centres of the moving bodies' bounding boxes at S times."""
-        times_s: Float = (part * _NUM_STEPS + np.arange(_NUM_STEPS)) * np.float64(_STEP_S)
-        return np.stack(
-            [
-                body.trajectory.poses(times_s).apply(np.mean([body.mesh.bounds], axis=1))
-                for body in self.bodies[1:]
-            ],
-            axis=1,
-        )
+        begin_s, end_s = times_s.min(), times_s.max()
+        sampled_s = np.linspace(begin_s, end_s, int((end_s - begin_s) / _STEP_S) + 2)
+        for body in self.bodies[1:]:
+            middles = np.tile(np.mean(body.mesh.bounds, axis=0), (len(sampled_s), 1))
+            path = body.trajectory.poses(sampled_s).apply(middles)
+            low, high = path.min(axis=0), path.max(axis=0)
+            reach_m = np.linalg.norm(high - low) + np.linalg.norm(np.subtract(*body.mesh.bounds))
+            yield (low + high) / 2, float(reach_m) / 2 + _SLACK_M
 
     def _cast_bodies(
         self,
-        parts: Sequence[tuple[int, int]],
+        spans: Sequence[tuple[int, int]],
         origin: Float,
         direction: Float,
         number: Int,
@@ -246,9 +235,9 @@ class World:
         )  # fmt: skip
         rows, start, ray, passed = np.arange(n), origin, direction, np.full(n, -1, np.int32)
         for layer in range(_MAX_LAYERS):
-            ends = np.searchsorted(rows, [end for _, end in parts]).tolist()
-            spans = zip((index for index, _ in parts), ends, strict=True)
-            met, triangle, barycentric = surfaces.first_hit(spans, start, ray)
+            ends = np.searchsorted(rows, [end for _, end in spans]).tolist()
+            left = zip((index for index, _ in spans), ends, strict=True)
+            met, triangle, barycentric = surfaces.first_hit(left, start, ray)
             if not len(met):
                 break
             rows, passed, ray = rows[met], passed[met], ray.take(met, axis=0)

@@ -1,0 +1,487 @@
+# SPDX-License-Identifier: MIT
+"""Build the scenes of scenes.yaml: roads, static objects beside them, traffic that never collides.
+
+Time 0 is frame 0. The actors are around the ego vehicle at the meeting time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from densify.geometry.types import Float
+from densify.street import models, motion, read_table
+from densify.street.ground import Ground, Road, Side, mark_road
+from densify.street.mesh import Material, Mesh
+from densify.street.models import SPAN_S, WHEELBASE_M, Actor, model, panel, resolve
+from densify.street.motion import Curve, Driving, Lane, Rectangles, Speed, left_of, upright
+from densify.street.world import Body, World
+
+_TABLES = read_table("scenes")
+FIRST_PARKED = 1000  # instances of parked cars count from here
+_NUM_SEEDS = 2**31  # of the random properties of surfaces
+_TRIES = 40  # of an actor that collides
+_TOUCH_M = 25.0  # greatest distance of the centres of two objects that touch
+_ROAD_END_M = 20.0  # no object is nearer to the end of a road
+_CLEAR_M = 0.3  # between static objects
+# Width of the margin around an actor's outline: limbs reach beyond the outline of a trunk.
+_ACTOR_MARGIN_M, _LIMBS_MARGIN_M, _EGO_MARGIN_M = 0.1, 0.3, 0.2
+_OUTLINE_STEP_S = 0.1
+_KERB_RAMP_M = 0.25  # over which a pedestrian steps on the kerb
+_CONVOY, _CONVOY_VARIES = range(-9, 7), 0.2
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A world and its moving actors."""
+
+    world: World
+    ground: Ground
+    ego: Driving
+    actors: tuple[Actor, ...]
+    footprints: Rectangles  # rectangles of the static objects that traffic must not touch
+
+
+def build(preset: str, rng: np.random.Generator) -> Scene:
+    """Return a scene; ``preset`` is a key of `PRESETS`."""
+    has_traffic, table = preset != "static", PRESETS[preset]
+    curves, stations = _LAYOUTS[preset](table, rng)
+    roads = {name: Road(curves[name], **vars(sides)) for name, sides in vars(table.roads).items()}
+    terrain = motion.Terrain.hilly(rng, table.ground.max_slope, getattr(table.ground, "scale", 1.0))
+    ground = Ground(terrain, tuple(roads.values()), table.ground.kerb_m, table.ground.pavement_m)
+    scenery = Scenery(ground, rng)
+    stations["end"] = roads["main"].curve.length_m - _ROAD_END_M
+    if hasattr(table, "plots"):
+        _line_with_plots(scenery, table, roads, stations)
+    else:
+        _line_motorway(scenery, roads["main"], stations["end"])
+    meshes = [ground.mesh(table.ground.margin_m, table.ground.cell_m)]
+    for row in table.markings:
+        spans = resolve(row.spans, stations)
+        meshes.append(mark_road(ground, roads[row.road], row, spans))
+    ego_lane = getattr(table.lanes, table.ego.lane)
+    lane = Lane(curves[ego_lane.road], ego_lane.offset_m)
+    ego = Driving(
+        lane.curve, Speed(*table.ego.knots), lane.at(table.ego.station), 0.0, terrain,
+        _TABLES.ego_wheelbase_m,
+    )  # fmt: skip
+    if "here" not in stations:
+        ego_m = ego.station(np.array([_TABLES.meeting_s]))[0]
+        stations["here"] = float(np.interp(ego_m, lane.curve.knots_m, curves["main"].knots_m))
+    traffic = Traffic(ego, scenery, vars(table.lanes), curves)
+    for row in table.traffic if has_traffic else ():
+        traffic.add_row(Journey(**vars(row)), stations)
+    static = Body(Mesh.join([*meshes, *scenery.meshes]), motion.Still())
+    bodies = [static, *(body for actor in traffic.actors for body in actor.bodies)]
+    footprints = Rectangles.joined(scenery.footprints)
+    world = World(bodies, int(rng.integers(_NUM_SEEDS)))
+    return Scene(world, ground, ego, tuple(traffic.actors), footprints)
+
+
+# Roads: curves by name, and stations by name
+
+
+def _lay_street(table: Any, rng: np.random.Generator) -> tuple[dict[str, Curve], dict[str, float]]:
+    """Return a main road with two bends, a side road, and the path of the turning truck."""
+    left, right, wiggle = table.left_bend, table.right_bend, table.wiggle
+    left_curvature = 1 / (left.radius_m * _vary(rng, left.vary))
+    right_curvature = _vary(rng, right.vary) / right.radius_m
+    wiggle_curvature = _vary(rng, wiggle.vary) / wiggle.radius_m
+    phase = rng.uniform(0, 2 * np.pi)
+
+    def share(ahead: Float, bend: Any) -> Float:
+        ramps = np.minimum(ahead - bend.begin_m, bend.end_m - ahead) / table.ramp_m
+        return np.clip(ramps, 0, 1)
+
+    def curvature(station: Float) -> Float:
+        ahead = station - table.start_m
+        outside = np.maximum(wiggle.before_m - ahead, ahead - wiggle.after_m) / wiggle.ramp_m
+        bends = left_curvature * share(ahead, left) - right_curvature * share(ahead, right)
+        strongest = np.clip(outside, 0, 1) * wiggle_curvature
+        return bends + strongest * np.sin(station / wiggle.wave_m + phase)
+
+    main = Curve.bending(table.length_m, curvature, table.start_m)
+    mouth = np.array([table.stations.mouth])
+    along_m = np.arange(0.0, table.side_road_m + motion.STEP_M, motion.STEP_M)
+    side = Curve(main(mouth)[0] + main.normal(mouth)[0] * along_m[:, None])
+    turn, turn_m = _turn(table, main, side)
+    return {"main": main, "side": side, "turn": turn}, {**vars(table.stations), "turn": turn_m}
+
+
+def _turn(table: Any, main: Curve, side: Curve) -> tuple[Curve, float]:
+    """Return the path from the oncoming lane into the side road, and where it begins to turn."""
+    shape = table.turn
+    oncoming = Lane(main, table.lanes.oncoming.offset_m, forward=False).curve
+    xy = oncoming(np.arange(0.0, oncoming.length_m, motion.STEP_M))
+    origin, out = side(np.zeros(1))[0], side.tangent(np.zeros(1))[0]
+    along = -left_of(out)  # direction of the ego vehicle
+    is_near = np.abs(xy - origin).sum(axis=1) < shape.search_m
+    straight = xy[is_near & ((xy - origin) @ along > shape.straight_to_m)]
+    corner = origin + along + out * float((straight[-1] - origin) @ out)
+    bend = motion.polyline([straight[-1], corner, corner + shape.beyond_m * out], shape.radius_m)
+    curve = Curve(np.concatenate([straight[:-1], bend]))
+    straight_m, arc_m = shape.beyond_m - shape.radius_m, shape.radius_m * np.pi / 2
+    return curve, curve.length_m - straight_m - arc_m
+
+
+def _lay_crossing(
+    table: Any, rng: np.random.Generator
+) -> tuple[dict[str, Curve], dict[str, float]]:
+    """Return the straight roads and paths of the crossroads."""
+    curves = {
+        name: Curve(motion.polyline(path.corners, getattr(path, "radius_m", 0.0)))
+        for name, path in vars(table.paths).items()
+    }
+    return curves, dict(vars(table.stations))
+
+
+def _lay_highway(table: Any, rng: np.random.Generator) -> tuple[dict[str, Curve], dict[str, float]]:
+    """Return a road of gentle bends in turn."""
+    wiggle = table.wiggle
+    bend, phase = _vary(rng, wiggle.vary) / wiggle.radius_m, rng.uniform(0, 2 * np.pi)
+
+    def curvature(station: Float) -> Float:
+        return bend * np.sin(station / wiggle.wave_m + phase)
+
+    main = Curve.bending(table.length_m, curvature, table.start_m)
+    return {"main": main}, dict(vars(table.stations))
+
+
+def _vary(rng: np.random.Generator, share: float) -> float:
+    """Return a random factor of 1 ± ``share``."""
+    return float(rng.uniform(1 - share, 1 + share))
+
+
+# Static objects
+
+
+class Scenery:
+    """Collector of static objects, as one mesh and as footprints that traffic must not touch."""
+
+    def __init__(self, ground: Ground, rng: np.random.Generator) -> None:
+        self.ground = ground
+        self.rng = rng
+        self.meshes: list[Mesh] = []
+        self.footprints: list[Rectangles] = []
+        self._num_parked = 0
+
+    def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
+        """Place a mesh on the ground; ``solid`` or all of it is tested for collisions."""
+        z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
+        self._stand(mesh, upright((*xy, z), heading), solid or mesh)
+
+    def _stand(self, mesh: Mesh, pose: motion.Poses, solid: Mesh) -> None:
+        self.meshes.append(mesh.posed(pose.matrix()))
+        self.footprints.append(Rectangles.of(solid, pose))
+
+    def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
+        """Return True if the mesh is clear of the carriageway and of all other objects."""
+        outline = Rectangles.of(mesh, upright((*xy, 0.0), heading), _CLEAR_M)
+        if self.footprints:
+            self.footprints = [Rectangles.joined(self.footprints)]
+            if motion.overlap(self.footprints[0], outline).any():
+                return False
+        forward = outline.forward[0]
+        grid = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)], float)
+        around = outline.centre + grid * outline.half_m[0] @ [forward, left_of(forward)]
+        return float(self.ground.distance(around).min()) >= kerb_gap_m
+
+    def put_if_free(
+        self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float, solid: Mesh | None = None
+    ) -> None:
+        """Place the mesh if its position is free, else leave it out."""
+        if self.is_free(solid or mesh, xy, heading, kerb_gap_m):
+            self.put(mesh, xy, heading, solid)
+
+    def park(self, xy: Float, forward: Float) -> None:
+        """Place a parked car, tilted with the slope like a driving car."""
+        mesh = models.parked_car(FIRST_PARKED + self._num_parked, self.rng)
+        self._num_parked += 1
+        half = forward * WHEELBASE_M["car"] / 2
+        pose = motion.on_ground(
+            self.ground.terrain, (xy - half)[None], (xy + half)[None], np.zeros(1)
+        )
+        self._stand(mesh, pose, mesh)
+
+    def row(
+        self, make: Callable[[float], Mesh], start: Float, end: Float, kerb_gap_m: float
+    ) -> None:
+        """Put panels of a fence, wall or hedge from start to end, each at its own height."""
+        length = float(np.linalg.norm(end - start))
+        count = max(1, round(length / _TABLES.plots.panel_m))
+        heading = float(np.arctan2(*(end - start)[::-1]))
+        middles = start + (end - start) * (np.arange(count)[:, None] + 0.5) / count
+        for middle in middles[self.ground.distance(middles) > kerb_gap_m]:
+            self.put(make(length / count), middle, heading)
+
+
+def _line_with_plots(
+    scenery: Scenery, table: Any, roads: Mapping[str, Road], stations: Mapping[str, float]
+) -> None:
+    """Place houses, then lamps and trees at the kerb, then parked cars, along all plots."""
+    sides = [
+        Side(roads[row.road], row.side, row.begin, resolve(row.end, stations))
+        for row in table.plots
+    ]
+    for side in sides:
+        _build_houses(scenery, side)
+    for side, row in zip(sides, table.plots, strict=True):
+        _furnish(scenery, side, table.lamps_every_m, getattr(row, "trees", True))
+    parking = table.parking
+    for side in sides[: parking.num_plots]:
+        free = parking.free_left if side.side > 0 else parking.free_right
+        _park_cars(scenery, side, parking.share, free)
+
+
+def _build_houses(scenery: Scenery, side: Side) -> None:
+    """Place houses behind front gardens, each enclosed by a hedge, a wall or a fence."""
+    rng, pavement_m, table = scenery.rng, scenery.ground.pavement_m, _TABLES.plots
+    boundary = pavement_m + table.boundary_beyond_pavement_m
+    station = side.begin_m
+    while station < side.end_m - table.shortest_m:
+        width = rng.uniform(*table.width_m)
+        middle = station + width / 2
+        heading = side.heading(middle)
+        garden = rng.uniform(*table.garden_m)
+        depth = rng.uniform(*table.depth_m)
+        home = models.house(rng, width - rng.uniform(*table.beside_house_m), depth)
+        centre = side.at(middle, boundary + garden + depth / 2)
+        is_built = scenery.is_free(
+            home, centre, heading, pavement_m + table.house_beyond_pavement_m
+        )
+        if is_built:
+            scenery.put(home, centre, heading)
+        if rng.random() < (table.tree.share if is_built else 1.0):
+            shoot, foot = models.tree(rng)
+            inset_m = table.tree.from_ends_m
+            along = station + rng.uniform(inset_m, width - inset_m)
+            xy = side.at(along, boundary + rng.uniform(*table.tree.behind_boundary_m))
+            scenery.put_if_free(shoot, xy, 0.0, pavement_m, foot)
+        _close_off(scenery, side, (station, station + width), boundary, has_gate=is_built)
+        station += width
+
+
+def _close_off(
+    scenery: Scenery, side: Side, span: tuple[float, float], beyond_m: float, has_gate: bool
+) -> None:
+    """Enclose a plot by a boundary of a random kind."""
+    rng, table = scenery.rng, _TABLES.plots
+    chosen = int(rng.integers(len(table.boundaries)))
+    light = float(rng.uniform(*table.paint))
+    height_m = [float(rng.uniform(*row.height_m)) for row in table.boundaries][chosen]
+    row, make = table.boundaries[chosen], partial(models.hedge, rng, height_m)
+    if row.kind == "wall":
+        make = partial(panel, "wall", height=height_m, material=Material[row.material])
+    elif row.kind == "picket_fence":
+        low_m, high_m = (share * height_m for share in row.rails)
+        make = partial(
+            panel, "picket_fence", height=height_m, low_rail=low_m, high_rail=high_m,
+            tint=(light, light, light),
+        )  # fmt: skip
+    begin, end = span
+    middle, half_m = (begin + end) / 2, table.gate_half_m
+    spans = [(begin, middle - half_m), (middle + half_m, end)] if has_gate else [span]
+    for a, b in spans:
+        start, stop = side.at(a, beyond_m), side.at(b, beyond_m)
+        scenery.row(make, start, stop, beyond_m - table.fence_clear_m)
+
+
+def _any(kind: str, rng: np.random.Generator) -> tuple[Mesh, Mesh | None]:
+    """Return an object for the kerb, and its outline for collisions; None for all of it."""
+    if kind == "tree":
+        return models.tree(rng)
+    return (models.sign_post(rng) if kind == "sign_post" else model(kind)), None
+
+
+def _furnish(scenery: Scenery, side: Side, spacing_m: float, has_trees: bool) -> None:
+    """Place lamp posts, trees, signs and bins along the kerb."""
+    rng = scenery.rng
+    first_m = side.begin_m + rng.uniform(*_TABLES.first_lamp_m)
+    for station in np.arange(first_m, side.end_m, spacing_m):
+        for row in _TABLES.furniture:
+            if row.kind == "tree" and not has_trees:
+                continue
+            if hasattr(row, "share") and rng.random() >= row.share:
+                continue
+            mesh, solid = _any(row.kind, rng)
+            ahead_m = row.ahead_m if hasattr(row, "ahead_m") else row.ahead_share * spacing_m
+            heading = 0.0 if row.kind == "tree" else side.heading(station)
+            if row.kind == "sign_post" and side.side > 0:
+                heading += np.pi  # signs face the traffic
+            xy = side.at(station + ahead_m, row.beyond_kerb_m)
+            scenery.put_if_free(mesh, xy, heading, row.clear_of_kerb_m, solid)
+
+
+def _park_cars(
+    scenery: Scenery, side: Side, share: float, keep_free: Sequence[Sequence[float]]
+) -> None:
+    """Park cars along the kerb, in a share of the parking spaces."""
+    rng, table = scenery.rng, _TABLES.parked
+    station = side.begin_m + table.from_ends_m
+    while station < side.end_m - table.from_ends_m:
+        is_taken = rng.random() < share
+        xy = side.at(station, table.beyond_kerb_m + rng.uniform(*table.vary_m))
+        gap_m = table.from_gap_m
+        is_kept_free = any(a - gap_m < station < b + gap_m for a, b in keep_free)
+        is_at_kerb = float(scenery.ground.distance(xy[None])[0]) > table.on_edge_m
+        if is_taken and not is_kept_free and is_at_kerb:
+            scenery.park(xy, side.forward(station))
+        station += rng.uniform(*table.space_m)
+
+
+def _line_motorway(scenery: Scenery, road: Road, end_m: float) -> None:
+    """Place guard rails, lamps, signs, a noise barrier, trees and bushes along the highway."""
+    rng, table = scenery.rng, _TABLES.motorway
+    left, right = (Side(road, side, 0.0, end_m) for side in (1, -1))
+    rail, barrier = (panel(name, table.panel_m) for name in ("guard_rail", "noise_barrier"))
+    panels = np.arange(table.begin_m, end_m, table.panel_m)
+    median_m = -road.left_m + table.rails_beside_median_m
+    for station in panels:
+        for beyond_m in (table.rails_beyond_edge_m, median_m):
+            for side in (left, right):
+                scenery.put(rail, side.at(station, beyond_m), side.heading(station))
+    for station in np.arange(table.lamps.begin_m, end_m, table.lamps.every_m):
+        lamp_xy = left.at(station, -road.left_m)
+        scenery.put(model("lamp_post"), lamp_xy, left.heading(station))
+        for side in (left, right):
+            sign_m = float(station * _vary(rng, table.signs.vary))
+            sign_xy = side.at(sign_m, table.signs.beyond_edge_m)
+            scenery.put(models.sign_post(rng), sign_xy, side.heading(sign_m))
+    begin_m, stop_m = rng.uniform(*table.barrier.begin_m), rng.uniform(*table.barrier.end_m)
+    for side in (left, right):
+        for station in panels:
+            heading = side.heading(station)
+            if side is left and begin_m < station < stop_m:
+                scenery.put(barrier, side.at(station, table.barrier.beyond_edge_m), heading)
+            elif rng.random() < table.tree.share:
+                shoot, foot = models.tree(rng)
+                beyond_m = rng.uniform(*table.tree.beyond_edge_m)
+                scenery.put(shoot, side.at(station, beyond_m), solid=foot)
+            elif rng.random() < table.bush.share:
+                height_m = float(rng.uniform(*table.bush.height_m))
+                bush = models.hedge(rng, height_m, rng.uniform(*table.bush.length_m))
+                beyond_m = rng.uniform(*table.bush.beyond_edge_m)
+                scenery.put(bush, side.at(station, beyond_m), heading)
+
+
+# Traffic
+
+
+@dataclass(frozen=True)
+class Journey:
+    """A row of ``traffic`` in scenes.yaml."""
+
+    kind: str  # "car", "truck", "cyclist" or "walker"
+    lane: str
+    station: Any  # where the actor is at the meeting time, as in `resolve`
+    slack_m: float = 2.0  # greatest random difference from there
+    knots: Sequence[tuple[float, float]] = ()  # seconds and metres per second
+    m_s: Any = 0.0  # constant speed instead of knots, or the range of speeds to try
+    vary: float = 0.0  # the speed varies by this share
+    vary_m_s: float = 0.0  # the speed varies by this in each try
+    gap_m: float | None = None  # distance between the vehicles of a convoy
+
+
+class Traffic:
+    """Collector of actors that never collide with each other or with static objects."""
+
+    def __init__(
+        self, ego: Driving, scenery: Scenery, lanes: Mapping[str, Any], curves: Mapping[str, Curve]
+    ) -> None:
+        self.actors: list[Actor] = []
+        self._ground, self._rng, self._lanes, self._curves = (
+            scenery.ground, scenery.rng, lanes, curves,
+        )  # fmt: skip
+        self._times = np.arange(*SPAN_S, _OUTLINE_STEP_S)
+        self._standing = Rectangles.joined(scenery.footprints)
+        outline = Rectangles.of(model("ego_vehicle"), ego.poses(self._times), _EGO_MARGIN_M)
+        self._moving = outline.rows(None)
+
+    def add_row(self, journey: Journey, stations: Mapping[str, float]) -> None:
+        """Add the actor or the convoy of a row of scenes.yaml."""
+        station = resolve(journey.station, stations)
+        if journey.gap_m is None:
+            self._add(partial(self._draw, journey, station, self._speed(journey)))
+        else:
+            for number in _CONVOY:
+                ahead_m = number * (journey.gap_m * _vary(self._rng, _CONVOY_VARIES))
+                self._add(partial(self._draw, journey, station + ahead_m, self._speed(journey)))
+
+    def _speed(self, journey: Journey) -> Speed | None:
+        """Return the speed of a journey, None if it is drawn in each try."""
+        if journey.knots:
+            return Speed(*journey.knots)
+        if journey.vary_m_s or isinstance(journey.m_s, list):
+            return None
+        factor = _vary(self._rng, journey.vary) if journey.vary else 1.0
+        return Speed((0.0, journey.m_s * factor))
+
+    def _add(self, draw: Callable[[], Actor]) -> None:
+        """Add an actor, drawn again until it fits, or none if every random draw collides."""
+        for _ in range(_TRIES):
+            actor = draw()
+            has_limbs = len(actor.bodies) > actor.num_solid
+            margin_m = _LIMBS_MARGIN_M if has_limbs else _ACTOR_MARGIN_M
+            outlines = [
+                Rectangles.of(body.mesh, body.trajectory.poses(self._times), margin_m)
+                for body in actor.bodies[: actor.num_solid]
+            ]
+            if not any(self._touches(outline) for outline in outlines):
+                self.actors.append(actor)
+                new = [outline.rows(None) for outline in outlines]
+                self._moving = Rectangles.joined([self._moving, *new])
+                return
+
+    def _touches(self, outline: Rectangles) -> bool:
+        """Return True if an outline, by time, overlaps a static object or an actor."""
+        if motion.overlap(outline, self._moving).any():
+            return True
+        x, y = (self._standing.centre[:, i] - outline.centre[:, i, None] for i in (0, 1))
+        time, standing = np.nonzero(x * x + y * y < _TOUCH_M**2)
+        return bool(motion.overlap(outline.rows(time), self._standing.rows(standing)).any())
+
+    def _draw(self, journey: Journey, station: float, speed: Speed | None) -> Actor:
+        """Draw an actor beside a station of the road at the meeting time."""
+        row, rng, ground = self._lanes[journey.lane], self._rng, self._ground
+        has_range, is_walker = isinstance(row.offset_m, list), journey.kind == "walker"
+        offset_m = rng.uniform(*row.offset_m) if has_range else row.offset_m
+        lane = Lane(self._curves[row.road], offset_m, getattr(row, "forward", True))
+        arc_m = lane.at(station + rng.uniform(-journey.slack_m, journey.slack_m))
+
+        def lift(arc_m: Float) -> Float:
+            beyond_m = ground.distance(lane.curve(arc_m))
+            return ground.kerb_m * np.clip(beyond_m / _KERB_RAMP_M, 0, 1)
+
+        if journey.vary_m_s:
+            m_s = journey.m_s + rng.uniform(-journey.vary_m_s, journey.vary_m_s)
+            speed = Speed((0.0, m_s))
+        driving = Driving(
+            lane.curve, speed or Speed((0.0, rng.uniform(*journey.m_s))), arc_m,
+            _TABLES.meeting_s, ground.terrain, WHEELBASE_M[journey.kind],
+            lift if is_walker else None, upright=is_walker,
+        )  # fmt: skip
+        return _MAKERS[journey.kind](driving, len(self.actors), rng)
+
+
+PRESETS = {
+    "street": _TABLES.street,
+    "static": _TABLES.street,  # only the ego vehicle moves
+    "crossing": _TABLES.crossing,
+    "highway": _TABLES.highway,
+}
+_LAYOUTS = {
+    "street": _lay_street,
+    "static": _lay_street,
+    "crossing": _lay_crossing,
+    "highway": _lay_highway,
+}
+_MAKERS = {
+    "car": models.car,
+    "truck": models.truck,
+    "cyclist": models.cyclist,
+    "walker": models.walker,
+}
