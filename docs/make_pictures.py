@@ -257,13 +257,18 @@ def make_pandaset(runs: Path, pandaset: Path | None) -> None:
     write_opening([key.run(runs, pandaset) for key in OPENING])
 
 
+def num_sweeps_of(folder: Path) -> int:
+    """Return the number of sweeps in the window of a run."""
+    return len(json.loads((folder / "scene/scene.json").read_text())["sweeps"])
+
+
 def write_opening(folders: Sequence[Path]) -> None:
-    """Write the animation of the README: the window opens from one sweep to eleven.
+    """Write the animation of the README: the window opens, as far as the recording goes.
 
     Both maps are measured, not filled, and each depth covers 3 x 3 pixels.
     """
     first = folders[0], "scene/none", "scene/none", 1
-    opened = [(folder, "scene/icp", "depth", 3 + 2 * n) for n, folder in enumerate(folders)]
+    opened = [(folder, "scene/icp", "depth", num_sweeps_of(folder)) for folder in folders]
     frames = []
     for folder, rigid, ours, num_sweeps in [first, *opened]:
         shown = []

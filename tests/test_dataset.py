@@ -76,6 +76,15 @@ def test_a_set_is_what_it_says(border_set: Path, capsys) -> None:
     assert json.loads(capsys.readouterr().out)["scores"]["parts"]["all"]["outliers"] == 0.0
 
 
+def test_a_preview_is_a_part_of_the_set(border_drive: Path, tmp_path: Path, capsys) -> None:
+    arguments = ("--data", border_drive, *CHEAP, "--out", tmp_path / "out")
+    assert exit_code("dataset", *arguments, "--preview", "3") == 0
+    shown = capsys.readouterr().out
+    assert keys_of(maps_in(tmp_path / "out")) == set(FRAMES[::3])
+    assert (tmp_path / "out" / "report.html").is_file()
+    assert f"the other {len(FRAMES) - 3} keys take about" in shown
+
+
 def test_shards_workers_and_a_killed_run_make_what_one_makes(
     empty_cache: Path, tmp_path: Path, monkeypatch
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,9 +15,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from densify.bench import doctor as bench
-from densify.config import Config
+from densify.config import Config, RegisterSettings, resolve
 from densify.config.errors import InputError
-from densify.doctor import CHECKS, Sample, Spot, Verdict, cameras, motion, stored
+from densify.doctor import CHECKS, Finding, Sample, Spot, Verdict, cameras, motion, stored
 from densify.doctor.sample import choose_frames
 from densify.free_space.raw_sweeps import lost_deg
 from densify.geometry import poses
@@ -396,3 +397,18 @@ def test_the_order_of_quaternions_is_named(stored_as: str) -> None:
         numbers, mistake = [w, x, y, z], "their quaternions are w x y z, read as x y z w"
     read[:3, :3] = Rotation.from_quat(numbers).as_matrix()
     np.testing.assert_allclose(motion.HYPOTHESES[mistake](read), T, atol=1e-12)
+
+
+def test_remedies_that_are_settings_make_the_doctor_content(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def vehicle(sample: Sample) -> list[Finding]:
+        near_m = sample.settings.min_range_m
+        remedy = "raise it: --set register.min_range_m=3.5, or --set register.deskew=false"
+        return [] if near_m == 3.5 else [Finding("own vehicle", Verdict.WRONG, "near", remedy, {})]
+
+    monkeypatch.setattr("densify.doctor.CHECKS", (vehicle,))
+    settings = tmp_path / "mended.yaml"
+    assert exit_code("doctor", "street", "--write", settings) == 2
+    assert resolve(settings).register == RegisterSettings(min_range_m=3.5, deskew=False)
+    assert exit_code("doctor", "street", "--config", settings) == 0

@@ -173,7 +173,7 @@ def measure(
     luck: dict[str, dict[str, float]] = {}
     for number, key in enumerate(chosen):
         if key not in PAIRS:
-            subject = _Subject.of(key, folder, cache)
+            subject = Subject.of(key, folder, cache)
             figures[key.name] = subject.figures(kinds)
             moved = [subject.figures(kinds, seed) for seed in range(draws)]
             luck[key.name] = _luck(figures[key.name], moved)
@@ -202,7 +202,7 @@ def judged_maps(
 ) -> Iterator[JudgedMap]:
     """Yield the depth map of each of `KEYS` with its ground truth; arguments as for `measure`."""
     for key in _chosen(KEYS, folder, names):
-        subject = _Subject.of(key, folder, cache)
+        subject = Subject.of(key, folder, cache)
         focal_px = subject.camera.focal_px
         depth, truth = subject.depth_and_truth(subject.recording, through_glass=False)
         truth = truth._replace(by_disparity=True)
@@ -244,7 +244,7 @@ def _luck(still: Mapping[str, Any], moved: list[dict[str, Any]]) -> dict[str, fl
     return {k: round(float(np.std([c[k] for c in changes], ddof=1)), 5) for k in changes[0]}
 
 
-class _Subject(NamedTuple):
+class Subject(NamedTuple):
     """A key as it is measured."""
 
     key: GateKey
@@ -253,7 +253,7 @@ class _Subject(NamedTuple):
     truth: TruthMap | None  # None where returns of the key sweep are held out instead
 
     @staticmethod
-    def of(key: GateKey, folder: Path | None, cache: Cache | None) -> _Subject:
+    def of(key: GateKey, folder: Path | None, cache: Cache | None) -> Subject:
         """Open the recording of a key, and read or measure its true depth."""
         whole, config = _opened(key, folder), resolve(None)
         sequence = without_scanner(whole, 1) if key.truth == "scanner" else whole
@@ -268,7 +268,7 @@ class _Subject(NamedTuple):
         elif key.truth == "exact":
             key_sweep = recording.window(key.key)[key.key].sweep
             truth = exact_truth(sequence, key_sweep, shots, config)[key.camera]
-        return _Subject(key, whole, recording, truth)
+        return Subject(key, whole, recording, truth)
 
     @property
     def camera(self) -> Camera:

@@ -6,21 +6,24 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Iterable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 
-from densify.bench import gate, paper
+from densify.bench import baselines, gate, paper
 from densify.bench.depth import bench_depth
 from densify.bench.doctor import bench_doctor
 from densify.bench.flow import DEFAULT_METHODS, bench_flow, tables
 from densify.bench.verdicts import Verdict, verdicts
 from densify.cli.options import config_of, recording_of, recordings_of
-from densify.cli.screen import Answer, aligned, numbers_table, progress_on_stderr
+from densify.cli.screen import Answer, aligned, numbers_table, percent, progress_on_stderr
 from densify.config import as_mapping, resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.readers import open_sequence
+from densify.scores.depth_metrics import DepthErrors
 
 _KEYS = [120]
+_LEAST_PIXELS = 200  # a share of fewer pixels is no result
 _UNSEEN = (
     "street?seed=41@70",
     "street:crossing?seed=42@90",
@@ -71,6 +74,33 @@ def answer_bench_gate(options: argparse.Namespace) -> Iterator[Answer]:
         merged = gate.Stored(stored.figures | now.figures, stored.luck | luck)
         gate.write(options.write, merged)
         yield Answer(files=[options.write])
+
+
+def answer_bench_baselines(options: argparse.Namespace) -> Iterator[Answer]:
+    """Compare simpler maps with ours on real and exact truth."""
+    named = os.environ.get("DENSIFY_TEST_DATA")
+    folder = options.data or (Path(named) if named else None)
+    titles = ["", "part", "pixels", "coverage", "outliers", "over 1 px", "MAE"]
+    for truth, keys in baselines.GROUPS.items():
+        if folder is None and keys[0].is_real:
+            continue
+        errors = baselines.errors_of_methods(keys, folder)
+        rows = [
+            [f"{truth}: {method}", part, *_error_cells(of_part)]
+            for method, parts in errors.items()
+            for part, of_part in parts.items()
+        ]
+        facts = {m: {p: asdict(e) for p, e in parts.items()} for m, parts in errors.items()}
+        yield Answer(aligned([titles, *rows]) + "\n", {truth: facts})
+
+
+def _error_cells(errors: DepthErrors) -> list[str]:
+    """Return cells of a table; a share of few pixels is not shown."""
+    cells = [f"{errors.num_pixels:,}", percent(errors.coverage)]
+    if errors.num_compared < _LEAST_PIXELS or errors.mae_m is None:
+        return [*cells, "–", "–", "–"]
+    shares = [percent(errors.outliers), percent(errors.outliers_1_px)]
+    return [*cells, *shares, f"{errors.mae_m:.2f} m"]
 
 
 def _verdict_cells(v: Verdict) -> list[str]:

@@ -91,7 +91,10 @@ _USUAL = (
         "doctor",
         "recordings",
         "check whether a recording is read correctly, and print remedies",
-        _RECORDING + _CONFIG,
+        f"""
+{_RECORDING}{_CONFIG}
+--write FILE  write the remedies that are settings to a YAML file, for densify run --config FILE
+""",
         "Reads fifteen sweeps and some images from all over the recording. Each check prints a "
         "verdict (fine, unknown, suspicious, wrong), its evidence, and the option or the line that "
         "mends it. The exit code is 2 if something is wrong.",
@@ -120,7 +123,7 @@ _USUAL = (
 {_KEY_OPTIONS}
 --methods NAME,…  none (single sweep), icp (rigid accumulation), icp-far (icp with sweeps beyond
     the window), icp-visible (icp with visibility), flow-plain (flow without visibility), paper
-    (the published scene flow), flow (scene flow). Default: none,icp,icp-far,paper,flow
+    (the published scene flow), flow (scene flow). Default: none,icp,flow
 """,
         f"Every setting, with its default and its effect: {_SETTINGS_FILE}",
     ),
@@ -139,6 +142,8 @@ _USUAL = (
     accepts holders of a certificate. tcp://host:8786 lets everybody on the network run programs
     here
 --shard i/n  make the i-th of n parts, for several machines
+--preview N  make N keys spread over the recordings, with the page of the set, and say how long the
+    others take; the same command without it continues the set
 --status DIR  say how far the set in DIR is, and make nothing
 --verify  compare finished files with the hashes in the manifest. Damaged files are made again, or
     with --status listed (exit code 1)
@@ -329,6 +334,15 @@ TRUTH  a PNG or a folder
         "Each camera and the poses of each recording get one error after another, in both "
         "directions. The table has the shares that the doctor calls fine, unknown, suspicious and "
         "wrong.",
+    ),
+    Verb(
+        "bench baselines",
+        "bench",
+        "compare simpler maps with ours on real and exact truth",
+        "--data DIR  folder of real recordings (default: $DENSIFY_TEST_DATA; without, the street)",
+        "Methods: single sweep and rigid accumulation, each measured and filled as densify fills; "
+        "the single sweep filled as IP-Basic does (Ku et al., CRV 2018); densify. Outliers are "
+        "KITTI's (3 px and 5 %). Shares of fewer than 200 pixels are not shown.",
     ),
     Verb(
         "bench gate",

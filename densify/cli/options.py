@@ -158,19 +158,21 @@ def config_of(options: argparse.Namespace) -> Config:
     return resolve(options.config, [*(options.set or []), *short])
 
 
-def check_new_file(path: Path, overwrite: bool, suffix: str = "") -> None:
+def check_new_file(path: Path, overwrite: bool, suffix: str = "", option: str = "--out") -> None:
     """Raise InputError, before the computation, if a file exists or cannot be created."""
     if path.suffix != (suffix or path.suffix):
-        raise InputError(f"--out {path}: expected a name that ends in {suffix}")
+        raise InputError(f"{option} {path}: expected a name that ends in {suffix}")
     if path.is_dir():
         raise InputError(
-            f"--out {path}: is a folder, expected the name of a {suffix or 'new'} file"
+            f"{option} {path}: is a folder, expected the name of a {suffix or 'new'} file"
         )
     if path.exists() and not overwrite:
-        raise InputError(f"--out {path}: already there and kept; give --overwrite or another name")
+        raise InputError(
+            f"{option} {path}: already there and kept; give --overwrite or another name"
+        )
     parent = next(folder for folder in path.parents if os.path.lexists(folder))
     if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
-        raise InputError(f"--out {path}: cannot write in {parent}; choose another")
+        raise InputError(f"{option} {path}: cannot write in {parent}; choose another")
 
 
 def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:

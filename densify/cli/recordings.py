@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+import re
 import textwrap
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -11,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from densify.cli.options import (
     check_new_file,
@@ -21,10 +24,11 @@ from densify.cli.options import (
     selected_frames,
 )
 from densify.cli.screen import Answer, first_of, log_warnings, percent, progress_on_stderr
-from densify.config import Config, apply_overrides, resolve
+from densify.config import Config, apply_overrides, changed, resolve
 from densify.config.errors import ComputationError, InputError
 from densify.dataset.make import Summary, damaged, make_dataset, status
-from densify.dataset.plan import Gate, Recipe
+from densify.dataset.plan import Gate, Recipe, plan
+from densify.dataset.report import write_report
 from densify.doctor import Diagnosis, Verdict, examine
 from densify.flow.two_clouds import estimate_flow
 from densify.geometry.types import Float
@@ -39,7 +43,9 @@ from densify.readers.point_files import read_table
 from densify.readers.street import Street
 
 _WIDTH = 100
+_SETTING = re.compile(r"--set ([a-z_]+\.[a-z_]+=[^\s,;)]+)")
 _FIRST_OF_SET = {
+    "report.html": "the page of the set, for the browser",
     "README.txt": "what the set holds and how to read it",
     "manifest.jsonl": "every key with its files and scores",
     "dataset.json": "how it was made",
@@ -61,13 +67,21 @@ def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
     """Print the findings about a recording."""
     config, spec = config_of(options), recording_of(options)
     sequence = open_sequence(spec)
+    if options.write is not None:
+        check_new_file(options.write, False, ".yaml", "--write")
     diagnosis = examine(sequence, config)
     facts = {
         "recording": sequence.name,
         "worst": str(diagnosis.worst),
         "findings": [{**asdict(f), "verdict": str(f.verdict)} for f in diagnosis.findings],
     }
-    yield Answer(f"{describe(sequence)}\n\n{_verdicts(diagnosis)}", facts)
+    files = []
+    if options.write is not None:
+        changes = [text for f in diagnosis.findings for text in _SETTING.findall(f.remedy)]
+        settings = changed(resolve(config, changes))
+        write_file(options.write, yaml.safe_dump(settings, sort_keys=False).encode())
+        files = [options.write]
+    yield Answer(f"{describe(sequence)}\n\n{_verdicts(diagnosis)}", facts, files)
     wrong = [f.check for f in diagnosis.findings if f.verdict == Verdict.WRONG]
     if wrong:
         raise InputError(f"{spec}: wrong: {', '.join(wrong)}; the remedies are above")
@@ -147,12 +161,15 @@ def _make_set(options: argparse.Namespace) -> Iterator[Answer]:
     out = options.out
     if out is None:
         raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
-    recipe = _recipe(options)
+    recipe, keys, num_keys = _recipe(options), options.keys, 0
+    if options.preview is not None:
+        num_keys = sum(len(drive.keys) for drive in plan(recordings_of(options), keys, recipe))
+        keys = _spread(keys, math.ceil(num_keys / max(options.preview, 1)))
     with progress_on_stderr() as progress:
         summary = make_dataset(
             recordings_of(options),
             out,
-            options.keys,
+            keys,
             recipe,
             num_workers=options.workers,
             scheduler=options.scheduler,
@@ -161,11 +178,21 @@ def _make_set(options: argparse.Namespace) -> Iterator[Answer]:
             report=lambda so_far: progress("keys", len(so_far.records), so_far.num_keys),
         )
     paths = [out / name for name in _FIRST_OF_SET if (out / name).is_file()]
-    first = first_of(paths, _FIRST_OF_SET)
-    yield Answer(_describe_set(summary), _set_facts(summary), [out], first)
+    text = _describe_set(summary)
+    if options.preview is not None:
+        paths = write_report(out, overwrite=True) + paths
+        num_left, pace_s = num_keys - summary.num_keys, summary.seconds / max(summary.num_made, 1)
+        text += f"\nthe other {num_left:,} keys take about {num_left * pace_s / 60:.0f} min"
+    yield Answer(text, _set_facts(summary), [out], first_of(paths, _FIRST_OF_SET))
     log_warnings((w, r.drive, r.key) for r in summary.records.values() for w in r.warnings)
     if summary.count("failed"):
         raise ComputationError(f"{summary.count('failed')} of {summary.num_keys} keys not made")
+
+
+def _spread(keys: slice | None, every: int) -> slice:
+    """Return every n-th of the keys."""
+    keys = keys or slice(None)
+    return slice(keys.start, keys.stop, (keys.step or 1) * every)
 
 
 def _describe_set(summary: Summary) -> str:

@@ -219,6 +219,16 @@ def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
     return asdict(config)
 
 
+def changed(config: Config) -> dict[str, dict[str, Any]]:
+    """Return ``{section: {key: value}}`` with the settings that differ from their defaults."""
+    defaults = as_mapping(Config())
+    changes = {
+        section: {key: value for key, value in keys.items() if value != defaults[section][key]}
+        for section, keys in as_mapping(config).items()
+    }
+    return {section: keys for section, keys in changes.items() if keys}
+
+
 def presets() -> dict[str, Path]:
     """Return preset name -> its YAML file."""
     package = Path(__file__).parents[1]

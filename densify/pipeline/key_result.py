@@ -63,7 +63,7 @@ visibility too; scene flow without visibility; the published scene flow; our sce
 
 RUN = ("none", "icp", "flow")
 """The methods of `run`; if scored, a method has the methods before it as its baselines."""
-COMPARED = ("none", "icp", "icp-far", "paper", "flow")
+COMPARED = ("none", "icp", "flow")
 """The methods that `compare` shows by default."""
 
 

@@ -50,6 +50,7 @@ class DepthErrors:
     # Share of outliers by the rule of KITTI's 2015 stereo benchmark (Menze and Geiger, "Object
     # Scene Flow for Autonomous Vehicles", CVPR 2015)
     outliers: float | None
+    outliers_1_px: float | None  # share of pixels whose disparity is off by more than 1 px
 
 
 def depth_errors(
@@ -87,6 +88,7 @@ def depth_errors(
         delta_2=_mean(ratio < _DELTA**2),
         delta_3=_mean(ratio < _DELTA**3),
         outliers=_mean(is_outlier_depth(z, t, focal_px, baseline_m)),
+        outliers_1_px=_mean(focal_px * baseline_m * np.abs(1 / z - 1 / t) > 1),
     )
 
 
