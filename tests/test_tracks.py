@@ -54,9 +54,11 @@ def test_starts_in_the_middle_come_before_larger_ones_at_the_ends():
     assert len(worth) == 45 and worth == sorted(worth, reverse=True)
 
 
-@pytest.mark.parametrize(("size", "starts_one"), [(8, 1), (7, 0), (0, 0)])
-def test_few_points_start_nothing(size, starts_one):
-    assert len(starts([clusters([size])])) == starts_one
+@pytest.mark.parametrize(
+    ("size", "seed_share", "starts_one"), [(8, 1, 1), (7, 1, 0), (40, 0.35, 0), (0, 1, 0)]
+)
+def test_few_points_or_few_seeds_start_nothing(size, seed_share, starts_one):
+    assert len(starts([clusters([size], seed_share)])) == starts_one
 
 
 # --- the odds, by their figures -------------------------------------------------------------------

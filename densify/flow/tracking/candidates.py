@@ -19,11 +19,11 @@ from densify.free_space.seen_through import FreeSpace
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import num_threads
-from densify.geometry.nearest import is_near, link, tree_of
+from densify.geometry.nearest import close_to_seeds, link
 from densify.geometry.types import Bool, Float, Int, Stretch
 
 LINK_M = 0.6  # candidates closer to each other are one cluster
-_NEAR_M = 0.4  # from a seed to a candidate
+_NEAR_M, MIN_SEED_SHARE = 0.4, 0.4
 _RING_GAP_M = 0.35
 _STRIP = 32
 
@@ -213,11 +213,10 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
     """Link seeds and points (N,3) within 0.4 m of seeds into clusters.
 
-    Return the number of clusters, and (N,) labels, -1 for points in no cluster.
+    Seeds with few other seeds around them, as in a hedge, do not count. Return the number of
+    clusters, and (N,) labels, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
-    if not seed.any():
-        return 0, cluster
-    rows = np.flatnonzero(is_near(tree_of(points[seed]), points, _NEAR_M))
+    rows = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, MIN_SEED_SHARE))
     num_clusters, cluster[rows] = link(points[rows], LINK_M)
     return num_clusters, cluster

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
-from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles
+from densify.flow.tracking.candidates import LINK_M, MIN_SEED_SHARE, Batch, Obstacles
 from densify.flow.tracking.objects import BESIDE_M, MovingObject, Track
 from densify.free_space.ground import HeightMap
 from densify.geometry.clock import Clock
@@ -223,8 +223,9 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
 
     for n, c in enumerate(batches):
         size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
-        large = np.flatnonzero(size >= MIN_POINTS)
-        starts += [(n, np.flatnonzero(c.cluster == k)) for k in large]
+        seeds = np.bincount(c.cluster[c.candidate & c.seed], minlength=c.num_clusters)
+        good = np.flatnonzero((size >= MIN_POINTS) & (seeds >= MIN_SEED_SHARE * size))
+        starts += [(n, np.flatnonzero(c.cluster == k)) for k in good]
     return sorted(starts, key=worth, reverse=True)
 
 
