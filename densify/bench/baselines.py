@@ -10,8 +10,10 @@ import cv2
 import numpy as np
 
 from densify.bench.gate import KEYS, GateKey, Subject
+from densify.config import resolve
 from densify.geometry.types import Float32
 from densify.pipeline.process import Watch
+from densify.pipeline.recording import Recording
 from densify.pipeline.run import densify
 from densify.scores.depth_metrics import DepthErrors, errors_by_part, mean_errors
 
@@ -19,7 +21,7 @@ _FARTHEST_M = 100.0  # of inverted depths
 _DIAMOND = np.array(
     [[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0]], np.uint8
 )
-_METHODS = {"none": "single sweep", "icp": "rigid (ICP)", "flow": "densify"}
+_SINGLE_SWEEP = {"accumulate": {"far_m": 0}}
 
 
 GROUPS: Mapping[str, tuple[GateKey, ...]] = {
@@ -60,15 +62,19 @@ def errors_of_methods(
 
 def _maps(subject: Subject) -> dict[str, Float32]:
     """Return name of the method -> its map (H,W) in metres."""
-    key, camera, maps = subject.key.key, subject.key.camera, dict[str, Float32]()
-    results = densify(subject.recording, key, list(_METHODS), [camera], Watch())
-    for method, name in _METHODS.items():
-        depth = results[method].depth[camera]
-        maps[f"{name}, measured"] = depth.depth_m
-        maps[f"{name}, filled"] = depth.filled_m
-        if method == "none":
-            maps[f"{name}, IP-Basic"] = ip_basic(depth.depth_m)
-    return maps
+    key, camera = subject.key.key, subject.key.camera
+    results = densify(subject.recording, key, ["none", "icp", "flow"], [camera], Watch())
+    sweep_m, ours = results["none"].depth[camera].depth_m, results["flow"].depth[camera]
+    alone = Recording(subject.recording.sequence, resolve(_SINGLE_SWEEP), 0, [key])
+    single = densify(alone, key, ["flow"], [camera], Watch())["flow"].depth[camera]
+    return {
+        "single sweep": sweep_m,
+        "single sweep, filled": single.filled_m,
+        "single sweep, IP-Basic": ip_basic(sweep_m),
+        "rigid (ICP)": results["icp"].depth[camera].depth_m,
+        "densify, measured": ours.depth_m,
+        "densify, filled": ours.filled_m,
+    }
 
 
 def ip_basic(sparse_m: Float32) -> Float32:

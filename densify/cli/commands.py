@@ -340,9 +340,9 @@ TRUTH  a PNG or a folder
         "bench",
         "compare simpler maps with ours on real and exact truth",
         "--data DIR  folder of real recordings (default: $DENSIFY_TEST_DATA; without, the street)",
-        "Methods: single sweep and rigid accumulation, each measured and filled as densify fills; "
-        "the single sweep filled as IP-Basic does (Ku et al., CRV 2018); densify. Outliers are "
-        "KITTI's (3 px and 5 %). Shares of fewer than 200 pixels are not shown.",
+        "Methods: the single sweep as measured, filled as densify fills, and filled as IP-Basic "
+        "does (Ku et al., CRV 2018); rigid accumulation; densify. Outliers are KITTI's (3 px and "
+        "5 %). Shares of fewer than 200 pixels are not shown.",
     ),
     Verb(
         "bench gate",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.resources import files as package_files
@@ -23,7 +22,7 @@ from densify.config.errors import InputError
 from densify.dataset.manifest import KeyRecord, read_manifests
 from densify.dataset.plan import planned_keys, read_plan
 from densify.outputs.depth_png import metres, read_stored
-from densify.outputs.plots import coloured
+from densify.outputs.plots import coloured, score_figure
 
 _NUM_WORST, _NUM_SPREAD = 6, 18  # keys with pictures: the worst, and others spread over the set
 _NUM_LISTED = 1000  # rows of the table of keys, the worst first
@@ -123,21 +122,10 @@ def _facts(table: Mapping[str, Any]) -> str:
 
 def _plot(score: _Score, records: Sequence[KeyRecord]) -> str:
     """Return the histogram and the timeline of a score as SVG, "" without values."""
-    from matplotlib.figure import Figure
-
-    values = np.array([np.nan if (v := score.of(r)) is None else v for r in records], float)
-    if not np.isfinite(values).any():
+    values = [score.of(record) for record in records]
+    if all(value is None for value in values):
         return ""
-    figure = Figure(figsize=(5.2, 2.2), layout="constrained")
-    histogram, timeline = figure.subplots(1, 2, sharey=True, width_ratios=(1, 3))
-    histogram.hist(values[np.isfinite(values)], bins=20, orientation="horizontal", color="#4662d7")
-    histogram.set(ylabel=score.unit, xlabel="keys")
-    timeline.plot(values, ".", color="#4662d7", markersize=4)
-    timeline.set(title=score.title, xlabel="keys in order of recording and time")
-    file = io.StringIO()
-    figure.savefig(file, format="svg")
-    svg = file.getvalue()
-    return svg[svg.index("<svg") :]
+    return score_figure(score.title, score.unit, np.array(values, float))
 
 
 def _card(root: Path, record: KeyRecord) -> str:

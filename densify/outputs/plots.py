@@ -34,7 +34,8 @@ _MIN_WIDTH_PX = 480
 _POINT_SIZE_PX = 3
 _TITLE_PX, _SCALE_PX, _BAR_PX, _MARGIN_PX = 36, 60, 15, 12
 _FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.6
-_AXES_INCH = (8.6, 4.8)
+_AXES_INCH, _SCORE_INCH = (8.6, 4.8), (5.2, 2.2)
+_BLUE = "#4662d7"
 _FEWEST_OUTLIERS = 1e-4  # the axis is linear below this share and logarithmic above
 _MIN_TRAVEL_M = 1.0
 """A shorter way may be noise of the registration, of a vehicle at rest."""
@@ -149,6 +150,22 @@ def _write(strip: Picture, text: str, left_px: int, right_px: int, centred: bool
         left_px = (left_px + right_px - round(shrink * width_px)) // 2
     at = left_px, (strip.shape[0] + height_px) // 2
     cv2.putText(strip, text, at, _FONT, shrink * _FONT_SCALE, (0, 0, 0), 1, cv2.LINE_AA)
+
+
+def score_figure(title: str, unit: str, values: Float) -> str:
+    """Return the histogram and the timeline of a score of N keys as SVG; NaN is no value."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=_SCORE_INCH, layout="constrained")
+    histogram, timeline = figure.subplots(1, 2, sharey=True, width_ratios=(1, 3))
+    histogram.hist(values[np.isfinite(values)], bins=20, orientation="horizontal", color=_BLUE)
+    histogram.set(ylabel=unit, xlabel="keys")
+    timeline.plot(values, ".", color=_BLUE, markersize=4)
+    timeline.set(title=title, xlabel="keys in order of recording and time")
+    file = io.StringIO()
+    figure.savefig(file, format="svg")
+    svg = file.getvalue()
+    return svg[svg.index("<svg") :]
 
 
 def write_curve(result: Result, folder: Path) -> None:
