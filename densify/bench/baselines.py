@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
 
+from densify.bench.depth import TruthMap
 from densify.bench.gate import KEYS, GateKey, Subject
 from densify.config import resolve
 from densify.geometry.types import Float32
@@ -42,8 +44,8 @@ def errors_of_methods(
     errors: dict[str, dict[str, list[DepthErrors]]] = {}
     for key in keys:
         subject = Subject.of(key, folder, None)
-        assert subject.truth is not None  # none of these keys is held out
-        truth, focal_px = subject.truth, subject.camera.focal_px
+        truth = cast(TruthMap, subject.truth)  # none of these keys is held out
+        focal_px = subject.camera.focal_px
         for method, depth_m in _maps(subject).items():
             parts = errors_by_part(
                 depth_m,

@@ -13,6 +13,7 @@ from densify.config.errors import OutputError
 from densify.outputs.depth_png import Picture, metres
 from densify.outputs.finished_run import FinishedRun
 from densify.outputs.plots import coloured
+from densify.readers.decoded_files import decode_image
 
 _FRAMES_PER_S = 10.0
 _BAR_PX = 6  # height of the bar that shows how far the video is
@@ -45,10 +46,10 @@ def _picture(run: FinishedRun, name: str) -> Picture:
     depth = coloured(metres(run.maps(name)["depth_filled"]))
     panels, jpeg = [depth], run.jpeg(name)
     if jpeg is not None:
-        panels = [cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), depth]
+        panels.insert(0, decode_image(jpeg, run.folder))
     picture = np.concatenate(panels)
     scale = min(1.0, _MOST_WIDTH_PX / picture.shape[1])
     # MPEG-4 needs even sizes.
     size_px = [2 * int(scale * length / 2) for length in picture.shape[1::-1]]
-    picture = cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA)
-    return cv2.copyMakeBorder(picture, 0, _BAR_PX, 0, 0, cv2.BORDER_CONSTANT).astype(np.uint8)
+    shrunk = cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA)
+    return cv2.copyMakeBorder(shrunk, 0, _BAR_PX, 0, 0, cv2.BORDER_CONSTANT).astype(np.uint8)
