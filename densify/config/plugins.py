@@ -250,6 +250,6 @@ EXPORTS = {
     "kitti-tracking": Form("kitti_tree", ("label_02", "calib", "velodyne", "image_02")),
     "rrd": Form("viewers", ("recording.rrd",)),
     "mcap": Form("viewers", ("recording.mcap",)),
-    "mp4": Form("video", ("video",)),
+    "mp4": Form("viewers", ("video",)),
 }
 """Name of an export format of ``densify export`` -> its writer."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Show one key sweep or a drive in viewers: Foxglove (MCAP), rerun (https://rerun.io), open3d.
+"""Show one key sweep or a drive: Foxglove (MCAP), rerun (https://rerun.io), open3d, a video.
 
 docs/formats/writing.md lists the topics and entities.
 """
@@ -10,23 +10,29 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from densify.config.errors import InputError
+from densify.config.errors import InputError, OutputError
 from densify.config.file_content import needed
 from densify.geometry import poses
 from densify.geometry.arrays import table
 from densify.geometry.types import Camera, CameraView, Float, Float32, ObjectTrack
 from densify.outputs.cloud_files import StoredCloud
-from densify.outputs.depth_png import metres
+from densify.outputs.depth_png import Picture, metres
 from densify.outputs.finished_run import FinishedRun, key_poses
+from densify.outputs.plots import coloured
+from densify.readers.decoded_files import decode_image
 
 _NS = 10**9
 _BOX_COLOUR = {"r": 0.84, "g": 0.37, "b": 0.0, "a": 0.4}
 _ROS_LENSES = {8: "rational_polynomial", 5: "plumb_bob", 4: "plumb_bob", 0: "plumb_bob"}
 _KEY = "world/key"
+_FRAMES_PER_S = 10.0
+_BAR_PX = 6  # height of the bar that shows how far the video is
+_MOST_WIDTH_PX = 1280
 _POINT, _SWEEP_POINT = -1.5, -2.5  # radii in points of the screen, as rerun writes them
 
 
@@ -363,3 +369,38 @@ def show_in_open3d(runs: Sequence[FinishedRun]) -> None:
             f"open3d cannot open a window here ({error}): it needs a screen with its drivers; "
             f"densify report makes a page for any browser"
         ) from None
+
+
+def write_mp4(runs: Sequence[FinishedRun], folder: Path) -> None:
+    """Write ``video/CAMERA.mp4`` with a frame for each map, ascending in time."""
+    shots = [(run, name) for run in runs for name in run.cameras]
+    (folder / "video").mkdir()
+    for camera in dict.fromkeys(name.partition("/")[0] for _, name in shots):
+        path = folder / "video" / f"{camera}.mp4"
+        of_camera = [(run, name) for run, name in shots if name.partition("/")[0] == camera]
+        pictures = (_picture(run, name) for run, name in of_camera)
+        first = next(pictures)
+        size_px = first.shape[1], first.shape[0]
+        code = cv2.VideoWriter.fourcc(*"mp4v")
+        video = cv2.VideoWriter(str(path), code, _FRAMES_PER_S, size_px)
+        if not video.isOpened():
+            raise OutputError(f"{path}: this build of OpenCV writes no MPEG-4 video")
+        for number, picture in enumerate([first, *pictures], start=1):
+            frame = picture if picture.shape == first.shape else cv2.resize(picture, size_px)
+            frame[-_BAR_PX:, : size_px[0] * number // len(of_camera)] = 255
+            video.write(frame)
+        video.release()
+
+
+def _picture(run: FinishedRun, name: str) -> Picture:
+    """Return an image above its filled depth, as (h,w,3) blue, green, red, and a black bar."""
+    depth = coloured(metres(run.maps(name)["depth_filled"]))
+    panels, jpeg = [depth], run.jpeg(name)
+    if jpeg is not None:
+        panels.insert(0, decode_image(jpeg, run.folder))
+    picture = np.concatenate(panels)
+    scale = min(1.0, _MOST_WIDTH_PX / picture.shape[1])
+    # MPEG-4 needs even sizes.
+    size_px = [2 * int(scale * length / 2) for length in picture.shape[1::-1]]
+    shrunk = cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA)
+    return cv2.copyMakeBorder(shrunk, 0, _BAR_PX, 0, 0, cv2.BORDER_CONSTANT).astype(np.uint8)
