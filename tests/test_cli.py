@@ -22,7 +22,7 @@ import yaml
 
 from densify.cli import recordings
 from densify.cli.commands import VERBS
-from densify.cli.screen import Answer
+from densify.cli.screen import Answer, progress_on_stderr
 from densify.config import Config, as_mapping, resolve
 from densify.config.errors import ComputationError, InputError
 from tests.command import exit_code, files_in, refused
@@ -353,3 +353,12 @@ def test_arguments_of_python_of_a_wrong_kind() -> None:
         densify.run(street, 120, "1")
     with pytest.raises(InputError, match=r"cameras: got 'image_02', expected a list"):
         densify.run(street, 120, 1, cameras="image_02")
+
+
+def test_without_a_terminal_progress_is_a_line_every_ten_seconds(monkeypatch, capsys) -> None:
+    times_s = iter([0.0, 4.0, 11.0, 11.0, 12.0, *[12.0] * 99])
+    monkeypatch.setattr("time.monotonic", lambda: next(times_s))
+    with progress_on_stderr() as progress:
+        for done in range(3):
+            progress("keys", done, 9)
+    assert capsys.readouterr().err == "densify: keys, 1 of 9\n"

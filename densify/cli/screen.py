@@ -7,6 +7,7 @@ import argparse
 import json
 import logging
 import sys
+import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -24,6 +25,7 @@ _SCHEMA = 1
 """Version of what ``--json`` prints; grows when a key changes its meaning or goes."""
 _MOST_FIRST = 3
 _MOST_WARNINGS = 20
+_LINE_S = 10.0  # least time between two lines of progress without a terminal
 
 
 @dataclass(frozen=True)
@@ -184,13 +186,23 @@ def screen() -> Iterator[Screen]:
 
 @contextmanager
 def progress_on_stderr() -> Iterator[Progress]:
-    """Yield a callback (stage, done, total) that shows progress on stderr."""
+    """Yield a callback (stage, done, total) that shows progress on stderr.
+
+    It is a bar on a terminal. Elsewhere it is a line at most every 10 s.
+    """
     from tqdm import tqdm
 
     is_hidden = not sys.stderr.isatty()
+    shown_s = time.monotonic()
     with tqdm(total=1, file=sys.stderr, leave=False, bar_format=_BAR, disable=is_hidden) as bar:
 
         def show(stage: str, done: int, total: int) -> None:
+            nonlocal shown_s
+            if is_hidden:
+                if time.monotonic() - shown_s >= _LINE_S:
+                    shown_s = time.monotonic()
+                    print(f"densify: {stage}, {done} of {total}", file=sys.stderr, flush=True)
+                return
             if done < bar.n or total != bar.total:  # another stage
                 bar.reset(total)
                 bar.initial = done
