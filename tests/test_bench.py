@@ -114,11 +114,11 @@ def test_methods_of_flow_do_what_they_are_for():
 @pytest.mark.parametrize(
     ("measure", "words"),
     [
-        (lambda: bench_flow(tiny(), 4, 1, CONFIG, ("ours", "magic")), "--methods: got magic"),
-        (lambda: bench_flow(tiny(), 4, 1, CONFIG, ()), "--methods: got none"),
+        (lambda: bench_flow(tiny(), 4, 1, CONFIG, ("ours", "magic")), "methods: got magic"),
+        (lambda: bench_flow(tiny(), 4, 1, CONFIG, ()), "methods: got none"),
         (lambda: bench_flow(tiny(), 4, 0, CONFIG), "no pair to score"),
         (lambda: bench_depth(one_car(), [KEY], 2, {"": CONFIG}, scanner=3), "--scanner 3: .* 3"),
-        (lambda: bench_depth(one_car(), [KEY], 2, {"": CONFIG}, method="best"), "--method best"),
+        (lambda: bench_depth(one_car(), [KEY], 2, {"": CONFIG}, method="best"), "method best"),
     ],
 )
 def test_bad_input_is_named(measure, words):

@@ -187,7 +187,7 @@ def test_the_recording_is_an_argument_or_an_option(border_drive: Path, capsys) -
 
 def test_the_usual_verbs_have_few_options() -> None:
     for verb in VERBS:
-        assert len(re.findall(r"^--", verb.options, re.M)) <= 14, verb.name
+        assert len(re.findall(r"^--", verb.options, re.M)) <= 15, verb.name
 
 
 # One command each that cannot work, and what its one line must say. {tmp} is an empty folder.
@@ -349,7 +349,7 @@ def test_arguments_of_python_of_a_wrong_kind() -> None:
     import densify
 
     street = densify.open_sequence("street")
-    with pytest.raises(InputError, match=r"--window '1': expected a whole number"):
+    with pytest.raises(InputError, match=r"window '1': expected a whole number"):
         densify.run(street, 120, "1")
     with pytest.raises(InputError, match=r"cameras: got 'image_02', expected a list"):
         densify.run(street, 120, 1, cameras="image_02")

@@ -242,7 +242,7 @@ def test_thresholds_leave_exactly_these_points(run: Path, confidence: float, age
         ({"min_confidence": float("nan")}, "--min-confidence nan"),
         ({"max_age_ms": -1}, "--max-age-ms -1"),
         ({"max_age_ms": float("inf")}, "--max-age-ms inf"),
-        ({"cameras": ["image_09"]}, "--camera image_09: expected one of image_02, image_03"),
+        ({"cameras": ["image_09"]}, "camera image_09: expected one of image_02, image_03"),
         ({"run": Path("absent")}, "no run.yaml"),
         ({"out": Path("."), "overwrite": True}, "holds a run and is kept"),
         ({"out": Path("run.yaml/x")}, "not a folder"),

@@ -53,15 +53,15 @@ def test_poses_of_the_data_set_are_checked_too():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"key": 99}, "--key 99"),
-        ({"key": 3.0}, r"--key 3\.0: expected a frame's number"),
-        ({"key": [3]}, "--key .3.: expected a frame's number"),
-        ({"window": True}, "--window True"),
+        ({"key": 99}, "key 99"),
+        ({"key": 3.0}, r"key 3\.0: expected a frame's number"),
+        ({"key": [3]}, "key .3.: expected a frame's number"),
+        ({"window": True}, "window True"),
         ({"cameras": 5}, "cameras: got 5, expected a list of names, such as .'front'."),
-        ({"window": -2}, "--window -2"),
-        ({"cameras": ["back"]}, "--camera back.*front"),
+        ({"window": -2}, "window -2"),
+        ({"cameras": ["back"]}, "camera back.*front"),
         ({"config": {"objective": {"alhpa": 1}}}, "alpha"),
-        ({"method": "paper"}, "--method paper: expected one of none, icp, flow"),
+        ({"method": "paper"}, "method paper: expected one of none, icp, flow"),
     ],
 )
 def test_bad_arguments_are_refused_before_anything_is_read(arguments, message):
@@ -75,7 +75,7 @@ def test_bad_arguments_are_refused_before_anything_is_read(arguments, message):
 def test_unknown_methods_are_refused_before_anything_is_read():
     sequence = one_car(())
     for methods, got in ((("icp", "magic"), "magic: "), ([], ": got no name, ")):
-        with pytest.raises(InputError, match=f"--methods ?{got}expected some of none, icp, "):
+        with pytest.raises(InputError, match=f"methods ?{got}expected some of none, icp, "):
             compare(sequence, KEY, 1, methods=methods)
     assert not sequence.read
 

@@ -140,12 +140,12 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]
         name = drive_folder(sequence.name)
         if name in drives:
             raise InputError(
-                f"--data {spec}: {drives[name].data} is called {name} as well; give every "
+                f"data {spec}: {drives[name].data} is called {name} as well; give every "
                 f"recording once, or make two sets with two --out"
             )
         cameras = {camera.name: camera for camera in choose_cameras(sequence, recipe.cameras)}
         if not cameras:
-            raise InputError(f"--data {spec}: has no camera; expected one to make depth maps for")
+            raise InputError(f"data {spec}: has no camera; expected one to make depth maps for")
         split = recipe.gate.split
         folder = f"{split_of(sequence.name) if split == 'kitti' else split}/{name}"
         if recipe.layout == "densify":

@@ -157,7 +157,7 @@ class FinishedRun:
             raise InputError(f"{self.folder}: no depth maps in it; run densify with a camera first")
         existing = sorted({name.partition("/")[0] for name in names})
         if unknown := {*(self._cameras or ())} - {*existing}:
-            raise InputError(f"--camera {min(unknown)}: expected one of {', '.join(existing)}")
+            raise InputError(f"camera {min(unknown)}: expected one of {', '.join(existing)}")
         return [n for n in names if n.partition("/")[0] in (self._cameras or existing)]
 
     @cached_property

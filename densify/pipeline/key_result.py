@@ -70,7 +70,7 @@ COMPARED = ("none", "icp", "flow")
 def methods_of_run(method: str, settings: Config) -> tuple[str, ...]:
     """Return the method of `RUN`, preceded by its simpler baselines if results are scored."""
     if method not in RUN:
-        raise InputError(f"--method {method}: expected one of {', '.join(RUN)}")
+        raise InputError(f"method {method}: expected one of {', '.join(RUN)}")
     return RUN[: RUN.index(method) + 1] if settings.is_scored else (method,)
 
 
@@ -306,7 +306,7 @@ def _read(files: PriorFiles, shots: Mapping[str, Shot], key: int) -> dict[str, P
         else:
             lacking.append(f"{shot.camera.name} {number} ({files.said_of(shot.camera.name)})")
     if lacking and not priors:
-        raise InputError(f"--prior {files.place}: key {key}: no depth image {', '.join(lacking)}")
+        raise InputError(f"prior {files.place}: key {key}: no depth image {', '.join(lacking)}")
     if lacking:
         _log.warning("key %d: no depth_full: no prior %s", key, ", ".join(lacking))
     return priors

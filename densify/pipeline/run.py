@@ -289,10 +289,10 @@ def _open(
     if isinstance(methods, str):
         raise InputError(f"methods: got {methods!r}, expected a list of names, such as ['flow']")
     if not methods:
-        raise InputError(f"--methods: got no name, expected some of {', '.join(METHODS)}")
+        raise InputError(f"methods: got no name, expected some of {', '.join(METHODS)}")
     for name in methods:
         if name not in METHODS:
-            raise InputError(f"--methods {name}: expected some of {', '.join(METHODS)}")
+            raise InputError(f"methods {name}: expected some of {', '.join(METHODS)}")
     check_engine(settings.flow.engine)
     choose_cameras(sequence, cameras)
     return Recording(sequence, settings, window, keys, cache, None, watch, looks_around(methods))

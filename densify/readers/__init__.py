@@ -84,10 +84,10 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
         from densify.readers.street import Street
 
         return Street.from_spec(parsed.place)
-    reader = _reader_of(parsed, f"--data {spec}")
+    reader = _reader_of(parsed, f"data {spec}")
     if parsed.scene is not None and not reader.scenes:
         raise InputError(
-            f"--data {spec}: {reader.name} recordings have no scenes; leave #{parsed.scene} out"
+            f"data {spec}: {reader.name} recordings have no scenes; leave #{parsed.scene} out"
         )
     module = cast(ReaderModule, reader.work())
     sequence = module.open_recording(parsed.path, parsed.scene)

@@ -45,7 +45,7 @@ class PriorFiles:
     @staticmethod
     def open(path: Path, cameras: Sequence[str]) -> PriorFiles:
         """Find the priors of the given cameras in a folder, or take a single file."""
-        where, example = f"--prior {path}", "0000000120.npy, .exr or .png"
+        where, example = f"prior {path}", "0000000120.npy, .exr or .png"
         if not path.exists():
             raise InputError(f"{where}: no such folder or file; expected DIR/CAMERA/{example}")
         values = {camera: _in(path / camera) for camera in cameras}

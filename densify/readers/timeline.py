@@ -52,7 +52,7 @@ def check_window(window: int) -> None:
     """Raise InputError unless the window is a whole number of sweeps, 0 or more."""
     if isinstance(window, bool) or not isinstance(window, int | np.integer) or window < 0:
         raise InputError(
-            f"--window {window!r}: expected a whole number of sweeps on each side of the key, 0 or "
+            f"window {window!r}: expected a whole number of sweeps on each side of the key, 0 or "
             f"more"
         )
 
@@ -60,7 +60,7 @@ def check_window(window: int) -> None:
 def check_key(key: int) -> None:
     """Raise InputError unless the key frame is a whole number."""
     if isinstance(key, bool) or not isinstance(key, int | np.integer):
-        raise InputError(f"--key {key!r}: expected a frame's number, a whole one")
+        raise InputError(f"key {key!r}: expected a frame's number, a whole one")
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Timeline:
         check_window(window)
         if key not in self.row:
             raise InputError(
-                f"--key {key}: no such frame in {self.name}; it has {format_frames(self.frames)}"
+                f"key {key}: no such frame in {self.name}; it has {format_frames(self.frames)}"
             )
         sides = [self._side(key, step, window, left_out or {}) for step in (-1, 1)]
         (before, cut_before), (after, cut_after) = sides
@@ -233,7 +233,7 @@ def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list
         if name not in sequence.cameras:
             known = ", ".join(sequence.cameras)
             expected = f"expected one of {known}" if known else "it has none; leave --camera out"
-            raise InputError(f"--camera {name}: no such camera in {sequence.name}; {expected}")
+            raise InputError(f"camera {name}: no such camera in {sequence.name}; {expected}")
     if names is None:
         names = [n for n in sequence.cameras if sequence.image_stamps_ns(n)] or [*sequence.cameras]
     return [sequence.cameras[name] for name in names]
