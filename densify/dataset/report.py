@@ -13,14 +13,18 @@ from densify.outputs.report_page import KeyFiles, key_page
 
 
 def write_comparison_page(folder: Path) -> Path:
-    """Write ``compare.html`` into the folder of a key sweep and return its path."""
+    """Write ``compare.html`` of the comparison in a key sweep's folder, and return its path."""
     page = folder / "compare.html"
     write_file(page, key_page(KeyFiles.of_comparison(folder), ""))
     return page
 
 
 def write_report(folder: Path, overwrite: bool = False) -> list[Path]:
-    """Write the HTML pages of a folder, or of the only key sweep in it, and return their paths."""
+    """Write the HTML pages of a folder and return their paths.
+
+    The folder is that of a run, a comparison, a training set, or of a recording with one key sweep.
+    Raise InputError for other folders, or if a page exists and ``overwrite`` is False.
+    """
     pages = _pages(folder)
     for path in pages:
         if path.exists() and not overwrite:
@@ -47,7 +51,9 @@ def _pages(folder: Path) -> dict[Path, Callable[[], bytes]]:
     }
     if pages:
         return pages
-    inside = [p for p in sorted(folder.iterdir()) if any((p / name).is_file() for name in makers)]
+    inside = [
+        path for path in sorted(folder.iterdir()) if any((path / name).is_file() for name in makers)
+    ]
     if len(inside) == 1:
         return _pages(inside[0])
     content = f"{len(inside)} keys; name one of them" if inside else "none of these"

@@ -62,8 +62,9 @@ _SCORES = (
 
 
 def set_page(root: Path) -> bytes:
-    """Return the bytes of the page of a training set in a folder."""
-    table, records = read_plan(root) or {}, list(read_manifests(root).values())
+    """Return the bytes of the HTML page of the training set in a folder."""
+    table = read_plan(root) or {}
+    records = list(read_manifests(root).values())
     done = [record for record in records if record.status == "done"]
     left_out = [record for record in records if record.status != "done"]
     worst_first = sorted(done, key=_badness(done), reverse=True)
@@ -76,7 +77,12 @@ def set_page(root: Path) -> bytes:
         "keys": "\n".join(_card(root, record) for record in _pictured(worst_first)),
         "left_out": _table(("recording", "key", "status", "reason"), map(_reason_row, left_out)),
         "listed": _table(
-            ("recording", "key", *(f"{s.title}, {s.unit}" for s in _SCORES), "warnings"),
+            (
+                "recording",
+                "key",
+                *(f"{score.title}, {score.unit}" for score in _SCORES),
+                "warnings",
+            ),
             map(_score_row, worst_first[:_NUM_LISTED]),
         ),
     }
@@ -91,7 +97,7 @@ def _badness(records: Sequence[KeyRecord]) -> Callable[[KeyRecord], float]:
     ranks: dict[tuple[str, int], float] = {}
     for score in _SCORES:
         values = [(record.name, score.of(record)) for record in records]
-        known = sorted((score.is_bad * v, name) for name, v in values if v is not None)
+        known = sorted((score.is_bad * value, name) for name, value in values if value is not None)
         for rank, (_, name) in enumerate(known if score.is_bad else [], start=1):
             ranks[name] = max(ranks.get(name, 0.0), rank / len(known))
     return lambda record: ranks.get(record.name, 0.0)
@@ -108,11 +114,11 @@ def _summary(records: Sequence[KeyRecord], num_to_make: int) -> str:
     """Return how many keys the set has, and what they cost."""
     counts = Counter[str](record.status for record in records)
     names = {"done": "done", "aside": "put aside", "failed": "failed"}
-    said = [f"{counts[status]:,} {name}" for status, name in names.items() if counts[status]]
-    said += [f"{num_to_make:,} to make"] if num_to_make else []
+    parts = [f"{counts[status]:,} {name}" for status, name in names.items() if counts[status]]
+    parts += [f"{num_to_make:,} to make"] if num_to_make else []
     seconds = [record.seconds for record in records if record.status == "done"]
     cost = f"{np.mean(seconds):.1f} s a key, {sum(seconds) / 60:.1f} min in all" if seconds else ""
-    return html.escape("; ".join(filter(None, [", ".join(said), cost])))
+    return html.escape("; ".join(filter(None, [", ".join(parts), cost])))
 
 
 def _facts(table: Mapping[str, Any]) -> str:
@@ -147,7 +153,7 @@ def _card(root: Path, record: KeyRecord) -> str:
         (("depth_filled", "groundtruth_filled"), _depth_picture),
         (("confidence",), _confidence_picture),
     ):
-        path = next((root / f for f in record.files if {*kinds} & {*Path(f).parts}), None)
+        path = next((root / file for file in record.files if {*kinds} & {*Path(file).parts}), None)
         if path is not None:
             try:
                 pictures.append(_image(draw(path), kinds[0]))
@@ -169,10 +175,12 @@ def _card(root: Path, record: KeyRecord) -> str:
 
 
 def _depth_picture(path: Path) -> NDArray[np.uint8]:
+    """Return the coloured picture of a depth map, small."""
     return coloured(metres(_small(read_stored(path, np.uint16, "a depth map"))))
 
 
 def _confidence_picture(path: Path) -> NDArray[np.uint8]:
+    """Return the coloured picture of a map of confidence, small."""
     stored = _small(read_stored(path, np.uint8, "a map of confidence"))
     picture = np.asarray(cv2.applyColorMap(stored, cv2.COLORMAP_TURBO), np.uint8)
     picture[stored == 0] = 0
@@ -186,15 +194,18 @@ def _small(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _image(picture: NDArray[np.uint8], kind: str) -> str:
+    """Return the HTML element of a picture."""
     data = base64.b64encode(cv2.imencode(".jpg", picture, _JPEG)[1].tobytes()).decode()
     return f'<img alt="{kind}" src="data:image/jpeg;base64,{data}">'
 
 
 def _reason_row(record: KeyRecord) -> tuple[Any, ...]:
+    """Return the cells of a key that is left out."""
     return record.drive, record.key, record.status, record.reason
 
 
 def _score_row(record: KeyRecord) -> tuple[Any, ...]:
+    """Return the cells of a key with its scores."""
     scores = [score.of(record) for score in _SCORES]
     return record.drive, record.key, *scores, "; ".join(record.warnings)
 
