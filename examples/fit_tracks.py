@@ -89,7 +89,7 @@ def tried_in(stretch, heights, truth):
     true = [truth.displacement(s.frame, target)[s.sweep.row] for s, target in steps]
     time_s = scene.space.clock.time_s
 
-    def judged(track, evidence):
+    def record(track, evidence):
         on, off_m, way_m = [], [], []
         for i, rows in track.claimed.items():
             c = obstacles[i]
@@ -103,7 +103,7 @@ def tried_in(stretch, heights, truth):
         means = (np.concatenate(values).mean() for values in (on, off_m, way_m))
         found.append((evidence, *means))
 
-    find_tracks(obstacles, scene.space, heights, judged=judged)
+    find_tracks(obstacles, scene.space, heights, record=record)
     return found
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, PointsInImage
 from densify.depth.measured_pixels import ALL_ROUND, MapInputs, MapRecord
-from densify.depth.patches import patches
+from densify.depth.patches import find_patches
 from densify.depth.project import project
-from densify.depth.votes import lab
+from densify.depth.votes import to_lab
 from densify.free_space.sensor import Sensors
 from densify.geometry.types import Camera, Cloud, RegisteredSweep, Sweep
 
@@ -49,7 +49,7 @@ def record_of(
         votes=np.ones(shape, np.float32),
         edge=np.full(shape, np.float32(ALL_ROUND)),
         on_body=np.zeros(shape, bool),
-        lab=np.zeros((0, 0, 3), np.float32) if image is None else lab(image),
+        lab=np.zeros((0, 0, 3), np.float32) if image is None else to_lab(image),
         points=points,
         reason=np.zeros(known.size, np.uint8),
     )
@@ -96,13 +96,13 @@ def patches_of(cloud, origins=None):
             *(returns.lidar, returns.row, origins[frame] - origins[frame][0]),
         )
         sweeps.append(RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6)))
-    return patches(cloud, Sensors.of(sweeps), origins)
+    return find_patches(cloud, Sensors.of(sweeps), origins)
 
 
 def depth_map(cloud, exposure, surface, settings=None, **inputs):
     """The depth map of a cloud with its patches in the view of an exposure."""
     settings = settings or ProjectSettings()
-    return project(MapInputs(cloud, surface, exposure.sees(cloud), settings, **inputs))
+    return project(MapInputs(cloud, surface, exposure.view_of(cloud), settings, **inputs))
 
 
 def view(cloud, camera, T_cam_key, settings, origins=None):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.doctor.motion import changed
+from densify.doctor.motion import change_pose
 from densify.geometry import poses
 from densify.geometry.types import Float, LidarSequence, Sweep
 
@@ -97,8 +97,8 @@ def _first_third(stamps_ns: Mapping[int, int]) -> Mapping[int, int]:
 FAULTS: dict[str, tuple[str, Changes]] = {
     "poses inverted": ("poses", {"pose": poses.inverse}),
     "poses of a camera": ("poses", {"pose": lambda T: poses.inverse(_BODY_CAM) @ T @ _BODY_CAM}),
-    "poses in millimetres": ("poses", {"pose": changed(scale=1e3)}),
-    "rotations transposed": ("poses", {"pose": changed(np.transpose)}),
+    "poses in millimetres": ("poses", {"pose": change_pose(scale=1e3)}),
+    "rotations transposed": ("poses", {"pose": change_pose(np.transpose)}),
     "points in millimetres": ("unit of points", _points(lambda p: 1e3 * p)),
     "points on a map": ("unit of points", _points(lambda p: p + [5e5, 5.4e6, 200.0])),
     "points in a camera's axes": ("axes", _points(lambda p: p @ _BODY_CAM[:3, :3])),

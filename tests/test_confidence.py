@@ -107,7 +107,7 @@ def test_without_times_a_depth_may_be_moved_by_any_amount_up_to_the_smear():
 def test_a_single_sweep_expects_what_no_other_sweep_contradicts():
     """The factor is between those of six recordings; rejected pixels are less certain too."""
     maps = with_rejected(np.random.default_rng(9))
-    alone = scale.unconfirmed(maps)
+    alone = scale.without_confirmation(maps)
     for before, after in ((maps, alone), (maps.rejected, alone.rejected)):
         before, after = before.confidence, after.confidence
         more = scale.outlier_probability(after) / scale.outlier_probability(before)

@@ -52,7 +52,7 @@ def test_a_map_says_that_its_image_is_off_and_does_not_use_it(recording, scene, 
     shots = key_shots(sequence, [sequence.cameras[CAMERA]], KEY)
     images = {CAMERA: np.roll(scene[2], shift_px, 0)}
     views = Views.of(sequence, stretch, KEY, shots, images, recording.settings)
-    maps = views.depth(views.see(recording.moment(KEY, False, None).cloud))[CAMERA]
+    maps = views.depth_maps(views.see(recording.moment(KEY, False, None).cloud))[CAMERA]
     assert (CAMERA in views.lab) == (shift_px == 0)
     assert [w.split(" (")[0] for w in maps.warnings] == [
         "image edges do not lie on depth discontinuities"

@@ -22,7 +22,7 @@ from densify.depth.fill import (
     measure_spots,
 )
 from densify.depth.patches import HIDDEN_FRACTION, HIDDEN_M
-from densify.depth.votes import DIRECTIONS, NONE, first_known, inverse_of, votes_for
+from densify.depth.votes import DIRECTIONS, NONE, inverse_of, steps_to_known, votes_for
 from tests.depth_scenes import record_of
 
 SHAPE = (60, 80)
@@ -35,7 +35,7 @@ SMALL = (24, 30)  # shape of images for slow twins
 
 def test_pixels_too_far_away_are_not_known():
     known = np.arange(400)[None] == 0
-    assert first_known(known)[8, 0, [0, 1, 254, 255, 399]].tolist() == [0, 1, 254, NONE, NONE]
+    assert steps_to_known(known)[8, 0, [0, 1, 254, 255, 399]].tolist() == [0, 1, 254, NONE, NONE]
 
 
 def vote_twin(record, pixel, depth_m, surely):

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from densify.depth import moving_bodies as stage
 from densify.depth import rays as hulls
 from densify.depth.exposure import Exposure
-from densify.depth.rays import Rays, moving_bodies, without_sweep
+from densify.depth.rays import Rays, find_moving_bodies, without_sweep
 from densify.geometry.types import Stretch
 from tests.depth_scenes import (
     KEY,
@@ -86,7 +86,7 @@ def maps(dark, passes):
     enter, leave = enters(np.zeros(3), ray.reshape(-1, 3), LOW, HIGH)
     true_m = np.where(enter < leave, enter, 0).reshape(u.shape)
     before = depth_map(cloud, EXPOSURE, surface, rays=rays)
-    bodies = moving_bodies(cloud, rays, [EXPOSURE])
+    bodies = find_moving_bodies(cloud, rays, [EXPOSURE])
     assert bodies.keys() == {0}
     after = depth_map(cloud, EXPOSURE, surface, rays=rays, bodies=bodies)
     return before, after, true_m, *(ray * LOW[0])[..., 1:].transpose(2, 0, 1)
@@ -128,7 +128,7 @@ def test_lines_cross_a_hull_where_sampling_finds_them():
     rng = np.random.default_rng(4)
     corners = rng.normal(size=(30, 3))
     start, way = rng.normal(size=(200, 3)) * 3, rng.normal(size=(200, 3)) * 3
-    enter, leave = hulls.crossing(hulls.half_spaces(corners), start, way)
+    enter, leave = hulls.find_crossing(hulls.half_spaces(corners), start, way)
     assert not (hulls.passes_near(corners, start, way) < (enter < leave)).any()
     t, inside = np.linspace(-3, 3, 6001), Delaunay(corners[ConvexHull(corners).vertices])
     for i in range(len(start)):
@@ -161,11 +161,11 @@ def test_a_smooth_offset_is_the_least_of_its_sum():
 def test_a_body_is_in_view_has_a_front_and_loses_the_rays_of_a_sweep():
     cloud, rays = scanned(lambda y, z: within(y, z, DOOR), lambda y, z: np.zeros(len(y), bool))
     backwards = Exposure(CAMERA, T_CAM_LIDAR @ np.diag([-1.0, -1, 1, 1]))
-    assert moving_bodies(cloud, rays, [backwards]) == {}
-    body = moving_bodies(cloud, rays, [backwards, EXPOSURE])[0]
+    assert find_moving_bodies(cloud, rays, [backwards]) == {}
+    body = find_moving_bodies(cloud, rays, [backwards, EXPOSURE])[0]
     shape, middle = (CAMERA.height_px, CAMERA.width_px), (CAMERA.height_px // 2, 210)
     for depth_m, inside in ((10.1, False), (11.0, True)):  # seats are far behind the front
-        far = stage.far_inside([body], EXPOSURE, np.full(shape, depth_m, np.float32))
+        far = stage.find_far_inside([body], EXPOSURE, np.full(shape, depth_m, np.float32))
         assert far[middle] == inside and not far[0].any()
     other_sweeps = cloud.select(cloud.frame != KEY)
     reduced = without_sweep({0: body}, other_sweeps, KEY)[0]
@@ -180,4 +180,4 @@ def test_flat_and_tiny_objects_have_no_body(num):
     cloud = make_cloud(points)
     cloud.moving[:], cloud.instance[:] = True, 0
     sweep = registered(KEY, points, np.eye(4), np.zeros(6))
-    assert moving_bodies(cloud, Rays(Stretch((sweep,)), KEY), [EXPOSURE]) == {}
+    assert find_moving_bodies(cloud, Rays(Stretch((sweep,)), KEY), [EXPOSURE]) == {}

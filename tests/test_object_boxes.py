@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.depth.rays import Rays, complete_boxes, grown
+from densify.depth.rays import Rays, complete_boxes, grow_box
 from densify.free_space.ground import HeightMap
 from densify.geometry.types import FlowField, ObjectTrack, RegisteredSweep, Stretch, Sweep
 from densify.pipeline.accumulate import accumulate, object_tracks
@@ -122,6 +122,6 @@ def test_a_box_stands_on_the_ground() -> None:
 
 def test_growing_keeps_the_other_end_at_every_pose() -> None:
     track = track_of(rear(), around())
-    longer = grown(track, 0, 0.0, 1.0)
+    longer = grow_box(track, 0, 0.0, 1.0)
     lower = [t.T_key_object @ [-t.size_m[0] / 2, 0, 0, 1] for t in (track, longer)]
     np.testing.assert_allclose(*lower, atol=1e-12)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.flow.pair_groups import PairCloud, RigidMotion, _ambiguous, judge
+from densify.flow.pair_groups import PairCloud, RigidMotion, _is_ambiguous, judge
 from densify.flow.two_clouds import estimate_flow
 from densify.geometry import poses
 from tests.scenes import Arc, Scanner, Scene, World, car, street
@@ -38,7 +38,7 @@ def test_a_level_bar_moves_only_as_the_back_of_a_far_car_does(
     num, length_m, direction, slides, yaw
 ):
     way = np.array([np.cos(yaw + direction), np.sin(yaw + direction), 0.0])
-    assert _ambiguous(bar(num, length_m, yaw), way) == slides
+    assert _is_ambiguous(bar(num, length_m, yaw), way) == slides
 
 
 def corner(num: int, seed: int) -> np.ndarray:

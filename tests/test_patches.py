@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.depth.patches import patches
+from densify.depth.patches import find_patches
 from densify.free_space.sensor import Sensors
 from tests.depth_scenes import KEY, make_cloud, patches_of
 from tests.fired import fired
@@ -90,7 +90,7 @@ def test_normals_are_told_scanner_by_scanner(name, share):
     registered = fired(name, wall, share_heard=1.0)
     sweep, sensors = registered.sweep, Sensors.of([registered])
     cloud = replace(make_cloud(sweep.points), lidar=sweep.lidar)
-    normal = patches(cloud, sensors, {KEY: sensors.origins_m}).normal
+    normal = find_patches(cloud, sensors, {KEY: sensors.origins_m}).normal
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     on_wall = (np.abs(sweep.points[:, 0] - 15.0) < 0.01) & (sweep.points[:, 2] > -1.2)
     on_ground = (np.abs(sweep.points[:, 2] + 1.7) < 0.01) & (sweep.points[:, 0] < 13)

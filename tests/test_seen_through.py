@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from densify.depth.exposure import Exposure
-from densify.depth.project import crossings
+from densify.depth.project import find_crossings
 from densify.depth.rays import Rays
 from densify.geometry.poses import exp, transform
 from densify.geometry.types import Stretch
@@ -111,7 +111,7 @@ def test_rays_cross_a_surface_where_geometry_says(measure):
     at, num_known, num_found = start + share * (end - start), 0, 0
     for i in range(len(start)):
         uv = CAMERA.K[:2, 2] - 720 * at[i, 1:] / FRONT_M
-        found = crossings(surface_m, start[i : i + 1], end[i : i + 1], exposure)
+        found = find_crossings(surface_m, start[i : i + 1], end[i : i + 1], exposure)
         assert len(found) == 0 or np.allclose(found[0], uv, atol=0.05)
         ends = CAMERA.K[:2, 2] - 720 * end[i, 1:] / end[i, 0]
         known = [np.all((p > 0) & (p < [300, CAMERA.height_px - 1])) for p in (uv, ends)]
@@ -119,7 +119,7 @@ def test_rays_cross_a_surface_where_geometry_says(measure):
         num_found += all(known) and len(found) == 1
     assert num_known > 12 and num_found >= 0.95 * num_known
     before_it = start + 0.99 * share * (end - start)
-    assert len(crossings(surface_m, start, before_it, exposure)) == 0
+    assert len(find_crossings(surface_m, start, before_it, exposure)) == 0
 
 
 def test_rays_start_where_the_scanner_was_when_it_registered():
@@ -132,6 +132,6 @@ def test_rays_start_where_the_scanner_was_when_it_registered():
     )
     cloud = make_cloud(np.zeros((2, 3)), KEY + 1)
     cloud.row[:] = [2, 0]
-    starts = Rays(Stretch((of_key, other)), KEY).starts(cloud)
+    starts = Rays(Stretch((of_key, other)), KEY).origins_of(cloud)
     for start, when in zip(starts, (0.03 * 2 * twist, -0.04 * twist), strict=True):
         assert np.allclose(start, transform(pose @ exp(when), np.zeros((1, 3)))[0])

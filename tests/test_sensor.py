@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from densify.free_space.range_image import RangeImage
-from densify.free_space.rays import aimed, find_rings, fires_by_azimuth
+from densify.free_space.rays import aim_rays, find_rings, fires_by_azimuth
 from densify.free_space.sensor import SensorModel, Sensors
 from densify.geometry.types import RegisteredSweep, Sweep
 from densify.readers import checks
@@ -93,7 +93,7 @@ def test_a_spinning_scanner_is_found_as_it_is(name, number):
     """Its spacing is at every ring the mean of the gaps above and below, however close."""
     model, pattern = sensors_of(name).models[number], pattern_of(name, number)
     true_deg, step_deg = np.sort(pattern.elevation_deg), 3600 / pattern.columns_per_s
-    assert not model.unordered and fires_by_azimuth(aimed(sweeps_of(name)[0], number))
+    assert not model.unordered and fires_by_azimuth(aim_rays(sweeps_of(name)[0], number))
     np.testing.assert_allclose(np.rad2deg(model.rings_rad), true_deg, atol=0.02)
     assert np.rad2deg(model.azimuth_step_rad) == pytest.approx(step_deg, rel=0.02)
     assert model.azimuth_rad == (-np.pi, np.pi)
@@ -108,7 +108,7 @@ def test_a_spinning_scanner_is_found_as_it_is(name, number):
 def test_lasers_that_share_no_origin_make_lines():
     """As KITTI's HDL-64E: the returns of a ring smear over those of others where they are near."""
     registered = fired("hdl64")
-    rays = aimed(registered, 0)
+    rays = aim_rays(registered, 0)
     ring = np.searchsorted(np.sort(pattern_of("hdl64").elevation_deg), np.rad2deg(rays.elevation))
     range_m = 22 + 18 * np.sin(7 * rays.azimuth + ring)
     aside = np.where(ring % 2, 0.04, -0.04) + 0.002 * (ring - 32)
@@ -133,7 +133,7 @@ def spacing_by_neighbours(rays, at: int, num: int) -> float:
 
 @pytest.mark.parametrize(("name", "number", "num"), [("panda", 1, 24), ("rosette", 0, 60)])
 def test_without_rings_the_spacing_is_that_of_the_neighbours(name, number, num):
-    model, rays = sensors_of(name).models[number], aimed(sweeps_of(name)[0], number)
+    model, rays = sensors_of(name).models[number], aim_rays(sweeps_of(name)[0], number)
     assert model.unordered and model.rings_rad is None
     assert not fires_by_azimuth(rays)
     inside = np.hypot(rays.azimuth, rays.elevation) < np.deg2rad(25)

@@ -107,9 +107,9 @@ def forced(parts: list[Snapshot]) -> Softened:
     """At the softest, whatever held-out parts say."""
     bending = module._Bending(tuple(parts))
     for level in range(len(module._ALPHAS)):
-        bending.bring_beyond()
+        bending.fill_targets()
         bending.refine(level)
-    bent = module._averaged(tuple(parts), *bending.at_points())
+    bent = module._average_both_ways(tuple(parts), *bending.at_points())
     return Softened(tuple(parts), *bent, module._ALPHAS[-1], {})
 
 
@@ -244,12 +244,12 @@ def test_a_solve_minimises_what_the_docstring_says(monkeypatch):
     n = len(bending._source)
     pull = rng.normal(size=(n, 3))
     monkeypatch.setattr(module, "_ANCHOR", 0.0)
-    monkeypatch.setattr(module, "_blurred", lambda p, _, at, m: (pull * (p is at), np.zeros(n)))
+    monkeypatch.setattr(module, "_blur", lambda p, _, at, m: (pull * (p is at), np.zeros(n)))
     bending.refine(3)
 
     # |f_next / dt_next + f_previous / dt_previous|² of the middle part, point by point
     dense = np.eye(n) + module._ALPHAS[3] * bending._laplacian.toarray()
-    rows = {hop: slice(*bending._start[k : k + 2]) for k, hop in enumerate(bending._hops)}
+    rows = {hop: slice(*bending._begins[k : k + 2]) for k, hop in enumerate(bending._hops)}
     velocity = np.array([1 / 0.2, 1 / 0.1])
     velocity *= np.sqrt(2 / (velocity**2).sum())
     for pair in zip(np.arange(n)[rows[1, 2]], np.arange(n)[rows[1, 0]], strict=True):

@@ -63,7 +63,7 @@ def test_drift_is_mended(num_sweeps):
         assert before[1].max() > 0.1 and after[1].max() < 0.05
     else:  # within a submap the drift stays
         assert after[0].max() < 0.6 * before[0].max()
-    assert found.holds.all()
+    assert found.is_reliable.all()
     assert found.T_world_lidar[KNOWN].tobytes() == given[KNOWN].tobytes()
 
 
@@ -71,13 +71,13 @@ def test_a_step_is_corrected():
     _, surfaces, _ = true()
     found = relax_poses(surfaces, displaced(0.7), KNOWN, 1)
     assert errors(found.T_world_lidar)[0].max() < 0.02
-    assert found.holds.all()
+    assert found.is_reliable.all()
 
 
 def test_what_cannot_be_mended_is_left_out():
     _, surfaces, _ = true()
     found = relax_poses(surfaces, displaced(7.0), KNOWN, 1)
-    assert found.holds[:9].all() and not found.holds[9:].any()
+    assert found.is_reliable[:9].all() and not found.is_reliable[9:].any()
     assert errors(found.T_world_lidar)[0][:9].max() < 0.02
 
 
@@ -104,7 +104,7 @@ def test_the_solver_finds_what_a_slow_one_does():
             total += np.log1p(off @ a.information @ off / road_poses._USUAL_M**2)
         return total
 
-    found = graph.relaxed(T)
+    found = graph.relax(T)
     x = np.concatenate(
         [poses.log(poses.inverse(a) @ b) for a, b in zip(T[1:], found[1:], strict=True)]
     )

@@ -77,9 +77,9 @@ def odds(**changed: object) -> float:
         {"violations": Violations(200, 120, 300)},  # the motion does not explain them
         {"before": Places(100, 0), "after": Places(100, 0)},  # a fence goes on, on both sides
         {"after": Places(100, 0)},
-        {"travelled": 1.0},  # a short way
-        {"rough": 1.0},  # off the smooth path
-        {"slender": 5.0},  # a rail that moves along itself
+        {"distance": 1.0},  # a short way
+        {"roughness": 1.0},  # off the smooth path
+        {"slenderness": 5.0},  # a rail that moves along itself
     ],
 )
 def test_each_term_speaks_against_a_track(worse):
@@ -132,7 +132,7 @@ def test_the_weights_separate_the_tracks_of_a_street_that_had_no_part_in_the_fit
     obstacles = [Obstacles.of(stretch, i, c) for i, c in enumerate(found)]
     shares, log_odds = [], []
 
-    def judged(track, evidence):
+    def record(track, evidence):
         on = [
             scene.scan(KEY - 5 + i).instance[obstacles[i].row[rows]] >= 0
             for i, rows in track.claimed.items()
@@ -140,7 +140,7 @@ def test_the_weights_separate_the_tracks_of_a_street_that_had_no_part_in_the_fit
         shares.append(np.concatenate(on).mean())
         log_odds.append(evidence.log_odds(own_table()))
 
-    find_tracks(obstacles, space, heights, judged=judged)
+    find_tracks(obstacles, space, heights, record=record)
     share, moves = np.array(shares), np.array(log_odds) > 0
     assert (share > 0.9).sum() > 5 and (share < 0.1).sum() > 5
     assert not moves[share < 0.1].any() and moves[share > 0.9].mean() > 0.8

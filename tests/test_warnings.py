@@ -17,7 +17,7 @@ from densify.geometry import poses
 from densify.outputs.key_outputs import write_result
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import run
-from densify.pipeline.warnings import of_result
+from densify.pipeline.warnings import warn_of_result
 from densify.readers.timeline import choose_cameras
 from densify.registration.deskew import find_compensated
 from tests.command import exit_code
@@ -222,7 +222,7 @@ def test_more_moving_points_than_there_can_be_are_told():
     result = run(one_car(), KEY, 1, "icp", config=POSES_GIVEN)
     moving = replace(result.cloud, moving=np.arange(len(result.cloud)) % 5 < 2)
     stretch = Recording(one_car(), resolve(POSES_GIVEN), 1, [KEY]).window(KEY)
-    (told,) = of_result(replace(result, cloud=moving), stretch)
+    (told,) = warn_of_result(replace(result, cloud=moving), stretch)
     assert told.startswith("40 % of the points move, more than in any traffic")
 
 

@@ -62,11 +62,12 @@ class TruthMap(NamedTuple):
 
     def outliers(self, depth_m: Float32, known: Bool, focal_px: float) -> Bool:
         """Return (K,) True where the depth (H,W) is an outlier at the K pixels ``known`` (H,W)."""
-        z, t = depth_m[known].astype(np.float64), self.depth_m[known].astype(np.float64)
+        judged_m = depth_m[known].astype(np.float64)
+        true_m = self.depth_m[known].astype(np.float64)
         if self.by_disparity:
-            return is_outlier_depth(z, t, focal_px, self.baseline_m)
-        off_m = np.abs(z - t)
-        outliers: Bool = (off_m > _OUTLIER_M) & (off_m > _OUTLIER_FRACTION * t)
+            return is_outlier_depth(judged_m, true_m, focal_px, self.baseline_m)
+        error_m = np.abs(judged_m - true_m)
+        outliers: Bool = (error_m > _OUTLIER_M) & (error_m > _OUTLIER_FRACTION * true_m)
         return outliers
 
 
@@ -92,32 +93,38 @@ class Altered:
 
 
 def without_scanner(sequence: LidarSequence, scanner: int) -> Any:
-    """Return a recording without the returns of one scanner."""
+    """Return a recording without the returns of the scanner with this index."""
     return Altered(sequence, lambda sweep: sweep.select(sweep.lidar != scanner))
 
 
 def scanner_truth(
     scanner: int, recording: Recording, key: int, shots: Mapping[str, Shot]
 ) -> dict[str, TruthMap]:
-    """Return the depth measured by one scanner in the key sweep, by name of the map."""
-    sequence, config = recording.sequence, recording.settings
+    """Return the depth measured by one scanner in the key sweep, by name of the map.
+
+    ``shots`` has the camera and exposure of each map, by name.
+    """
+    sequence = recording.sequence
+    config = recording.settings
     cloud = recording.moment(key, all_sweeps=True, engine="").cloud
     cloud = cloud.select((cloud.lidar == scanner) & (cloud.frame == key))
     stretch = recording.window(key)
     maps = {}
     for name, shot in shots.items():
-        view = Exposure.of(sequence, stretch, key, shot, config).sees(cloud)
+        view = Exposure.of(sequence, stretch, key, shot, config).view_of(cloud)
         depth_m = view.exposure.depth_m(view.points_cam)
+        # The nearest return of a pixel is written last.
         farthest_first = np.argsort(-depth_m, kind="stable")
         column, row = np.rint(view.uv[farthest_first]).astype(np.int64).T
         shape = (shot.camera.height_px, shot.camera.width_px)
         nearest_m, moving = np.zeros(shape, np.float32), np.zeros(shape, bool)
         nearest_m[row, column] = depth_m[farthest_first]
         moving[row, column] = cloud.moving[view.rows[farthest_first]]
-        before_m = ndimage.minimum_filter(
+        # Returns far behind a nearer return beside them may be occluded.
+        front_m = ndimage.minimum_filter(
             np.where(nearest_m > 0, nearest_m, np.float32(np.inf)), _HIDING_PX
         )
-        nearest_m[nearest_m > (1 + _HIDING_FRACTION) * before_m + _HIDING_M] = 0
+        nearest_m[nearest_m > (1 + _HIDING_FRACTION) * front_m + _HIDING_M] = 0
         maps[name] = TruthMap(nearest_m, moving, by_disparity=False)
     return maps
 
@@ -125,14 +132,22 @@ def scanner_truth(
 def exact_truth(
     sequence: LidarSequence, key_sweep: Sweep, shots: Mapping[str, Shot], config: Config
 ) -> dict[str, TruthMap]:
-    """Return the exact depth within range and view of the scanner, {} for a real recording."""
+    """Return the exact depth within 80 m and below the highest returns of the key sweep.
+
+    ``shots`` has the camera and exposure of each map, by name. A recording without exact ground
+    truth gives {}.
+
+    Returns:
+        Name of the map -> true depth, for maps of existing images.
+    """
     maps: dict[str, TruthMap] = {}
     if sequence.truth is None:
         return maps
-    away = key_sweep.points
+    from_scanner = key_sweep.points
     if key_sweep.scanner_origins is not None:
-        away = away - key_sweep.scanner_origins[key_sweep.lidar]
-    top = np.quantile(away[:, 2] / np.linalg.norm(away[:, :2], axis=1), _TOP_QUANTILE)
+        from_scanner = from_scanner - key_sweep.scanner_origins[key_sweep.lidar]
+    slope = from_scanner[:, 2] / np.linalg.norm(from_scanner[:, :2], axis=1)
+    top = np.quantile(slope, _TOP_QUANTILE)
     for name, shot in shots.items():
         if shot.number is None:
             continue
@@ -168,7 +183,13 @@ def stereo_truth(folder: Path, frame: int, camera: Camera) -> TruthMap:
 
 
 def agrees_beside(truth: TruthMap, depth_m: Float32, reach_px: int, focal_px: float) -> Bool:
-    """Return (H,W) True where the true depth agrees within ``reach_px`` along the row."""
+    """Return (H,W) True where the true depth of a pixel in the same row agrees with a depth map.
+
+    Args:
+        depth_m: (H,W) depth in metres, 0 for none.
+        reach_px: Greatest distance of that pixel along the row.
+        focal_px: Focal length, which outliers by disparity depend on.
+    """
     agrees = np.zeros(depth_m.shape, bool)
     for shift in range(-reach_px, reach_px + 1):
         beside = truth._replace(depth_m=np.roll(truth.depth_m, shift, axis=1))
@@ -191,8 +212,8 @@ def bench_depth(
 
     Args:
         variants: Name -> settings to compare.
-        scanner: Index of the scanner whose returns are the ground truth, None for none. Other
-            arguments as in `densify.pipeline.run.run`.
+        scanner: Index of the scanner whose returns are the ground truth, None for none.
+        method: Name of a method in `densify.pipeline.key_result.METHODS`.
 
     Returns:
         Under ``variants`` by name: ``density``, mean share of pixels with a depth in the measured
@@ -266,7 +287,9 @@ class _Sums:
                 "coverage": compared / num if num else None,
                 "outliers": outliers / compared if compared else None,
             }
-        density = {p: float(np.mean(d)) for p, d in self._densities.items() if d}
+        density = {
+            product: float(np.mean(shares)) for product, shares in self._densities.items() if shares
+        }
         return {"density": density, "seconds": self._seconds / num_keys, "scores": scores}
 
 

@@ -21,6 +21,7 @@ from densify.geometry.types import Camera, Float, LidarSequence, Progress
 from densify.readers.recorded_poses import PoseTrack
 from densify.scores.edge_fit import Silhouettes, View, turned
 
+# Sizes of the errors: rotation and translation of cameras; clocks; scale and climb of poses
 _TURNS_DEG, _SHIFTS_M = (0.5, 1.0, 2.0), (0.02, 0.05, 0.1)
 _CLOCKS_S, _SCALES, _CLIMBS_M_S = (0.01, 0.03, 0.1), (0.01, 0.03, 0.1), (0.2,)
 _AXES = ("pitch", "yaw", "roll")
@@ -41,10 +42,14 @@ def bench_doctor(
         sample = Sample.of(sequence, config.register)
         for mistake, findings in (*_cameras(sample), *_poses(sample)):
             of_clock = "clock" in mistake
-            verdicts = [f.verdict for f in findings if ("clock" in f.check) == of_clock]
+            # An error of a clock is judged by the checks of clocks, others by the other checks.
+            verdicts = [
+                finding.verdict for finding in findings if ("clock" in finding.check) == of_clock
+            ]
             counts.setdefault(mistake, Counter())[max(verdicts, default=Verdict.UNKNOWN)] += 1
     return {
-        mistake: {"of": count.total()} | {str(v): count[v] / count.total() for v in Verdict}
+        mistake: {"of": count.total()}
+        | {str(verdict): count[verdict] / count.total() for verdict in Verdict}
         for mistake, count in counts.items()
     }
 
@@ -89,6 +94,8 @@ def _poses(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
     track = PoseTrack(sequence.name, stamp_ns, T_world_lidar)
 
     def checked(scale: float = 1.0, climb_m_s: float = 0.0, late_s: float = 0.0) -> list[Finding]:
+        """Return the findings about poses of a wrong scale, with a climb, or of a late clock."""
+
         def pose(frame: int) -> Float:
             moment_ns = int(stamp_ns[row[frame]]) - round(1e9 * late_s)
             T = track.at(int(np.clip(moment_ns, stamp_ns[0], stamp_ns[-1]))).copy()

@@ -74,7 +74,7 @@ def bench_flow(
     progress: Progress | None = None,
     truth: Path | None = None,
 ) -> dict[str, Any]:
-    """Run and measure methods of scene flow. The result has plain numbers, None if unknown.
+    """Run and measure methods of scene flow on the window of one key sweep.
 
     Args:
         window: Number of sweeps on each side of the key sweep.
@@ -84,7 +84,8 @@ def bench_flow(
 
     Returns:
         ``data``, ``key``, ``frames``, ``num_pairs``, and ``methods``: name -> ``seconds_per_pair``
-            and the scores ``step``, ``challenge``, ``window`` of `Scorer`.
+            and the scores ``step``, ``challenge``, ``window`` of `Scorer`. Numbers are plain, None
+            if unknown.
     """
     unknown = [method for method in methods if method not in METHODS]
     if unknown or not methods:
@@ -128,14 +129,18 @@ class SweepTruth(NamedTuple):
     @staticmethod
     def of(truth: Truth, stretch: Stretch, frame: int, key: int) -> SweepTruth:
         """Gather the exact ground truth of the sweep ``frame`` (its number) of a window."""
-        rows, frames = stretch[frame].sweep.row, stretch.frames
-        targets = towards(key, frame, frames), key, frames[0], frames[-1]
-        step, to_key, first, last = (truth.displacement(frame, t)[rows] for t in targets)
-        whole = truth.sweep(frame)
-        moving, instance = whole.moving[rows], whole.instance[rows]
+        rows = stretch[frame].sweep.row
+        frames = stretch.frames
+        targets = (towards(key, frame, frames), key, frames[0], frames[-1])
+        step, to_key, to_first, to_last = (
+            truth.displacement(frame, target)[rows] for target in targets
+        )
+        sweep_truth = truth.sweep(frame)
+        moving, instance = sweep_truth.moving[rows], sweep_truth.instance[rows]
+        # One more bin than objects: instance -1, no object, reads the last, empty bin.
         num_returns = np.bincount(instance[instance >= 0], minlength=instance.max(initial=-1) + 2)
         is_large = (instance >= 0) & (num_returns[instance] >= _MIN_RETURNS)
-        travels = np.linalg.norm(last - first, axis=1) >= _LEAST_MOTION_M
+        travels = np.linalg.norm(to_last - to_first, axis=1) >= _LEAST_MOTION_M
         return SweepTruth(step, to_key, moving, instance >= 0, moving & is_large & travels)
 
     def as_label(self) -> LabelledFlow:
@@ -162,9 +167,10 @@ class Scorer:
     def of(
         sequence: LidarSequence, key: int, size: int, config: Config, folder: Path | None
     ) -> Scorer:
-        """Open the window of a key sweep, with ``size`` sweeps on each side.
+        """Register the window of a key sweep and read its ground truth.
 
-        ``folder`` has true flow (`densify.readers.flow_files`); None for exact truth, if any.
+        ``size`` is the number of sweeps on each side of the key sweep, ``folder`` that of true flow
+        (`densify.readers.flow_files`), None for exact truth, if the recording has it.
         """
         recording = Recording(sequence, config, size, [key], looks_around=True)
         stretch = recording.window(key)
@@ -173,7 +179,10 @@ class Scorer:
         for registered in stretch.sweeps:
             points = poses.transform(registered.T_world_lidar, registered.sweep.points)
             above[registered.frame] = heights.above(points) >= ABOVE_GROUND_M
-        sources = tuple(f for f in frames if (f < key if folder is not None else f != key))
+        # Files of true flow hold the flow to the next sweep: towards the key only before it.
+        sources = tuple(
+            frame for frame in frames if (frame < key if folder is not None else frame != key)
+        )
         truths, labels = None, {}
         if sequence.truth is not None:
             truths = {f: SweepTruth.of(sequence.truth, stretch, f, key) for f in frames}
@@ -199,6 +208,8 @@ class Scorer:
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
         """Return the scores of the flow to the neighbouring sweep, pooled over the sources.
+
+        ``steps`` is frame number -> flow to the neighbour towards the key sweep.
 
         ``found`` is the share of ``certain`` moving points that are called moving,
         ``falsely_moving`` that of static points, ground included. End-point errors in metres are
@@ -229,9 +240,9 @@ class Scorer:
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
         """Return the scores of the flow to the key sweep: ghost rate and errors of moving points.
 
-        Given ground truth, end-point errors in metres of points above the ground, by number of
-        sweeps to the key: ``movers_m_by_hops`` of moving points, ``found_movers_m_by_hops`` of
-        those called moving.
+        ``to_key`` is frame number -> flow to the key sweep. With ground truth there are end-point
+        errors in metres of points above the ground, by number of sweeps to the key:
+        ``movers_m_by_hops`` of moving points, ``found_movers_m_by_hops`` of those called moving.
         """
         stretch, key = self.stretch, self.key
         frames = stretch.frames
@@ -285,6 +296,7 @@ def _flows(
 
 
 def _motion(stretch: Stretch, config: Config, asked: Sequence[int] | None = None) -> Motion:
+    """Estimate the motion of a stretch, for the asked frame numbers, None for all."""
     return estimate_motion(Scene(stretch, ground(stretch), asked=asked), config)
 
 
@@ -335,7 +347,10 @@ class _Table(NamedTuple):
 
 
 def tables(names: Sequence[str], progress: Progress | None = None) -> Iterator[str]:
-    """Measure the tables of `names` in `TABLES` (empty for all); yield each Markdown line."""
+    """Measure tables of `TABLES` and yield each line of their Markdown.
+
+    ``names`` are those of the tables, empty for all. Raise InputError for an unknown name.
+    """
     for name in names:
         if name not in TABLES:
             hint = did_you_mean(name, TABLES)
@@ -355,10 +370,12 @@ def tables(names: Sequence[str], progress: Progress | None = None) -> Iterator[s
 
 
 def _line(cells: Sequence[str]) -> str:
+    """Return a row of a Markdown table."""
     return f"| {' | '.join(cells)} |"
 
 
 def _times_100(value: float | None, digits: int, unit: str) -> str:
+    """Return 100 times a value with its unit, a dash for None."""
     return ("–" if value is None else f"{100 * value:.{digits}f}") + unit * (value is not None)
 
 
@@ -387,8 +404,8 @@ def _row_of_registration(scene: KeySweep) -> list[str]:
     """Return root mean square errors of the window's poses relative to the key sweep's pose."""
     sequence, key = open_sequence(scene.data), scene.key
     stretch = Recording(sequence, resolve(None), scene.window, [key]).window(key)
-    off_m, off_deg = window_pose_errors(stretch, key, sequence.T_world_lidar)
-    return [str(scene), f"{1000 * off_m:.0f} mm", f"{off_deg:.3f}°"]
+    error_m, error_deg = window_pose_errors(stretch, key, sequence.T_world_lidar)
+    return [str(scene), f"{1000 * error_m:.0f} mm", f"{error_deg:.3f}°"]
 
 
 TABLES: Mapping[str, _Table] = {

@@ -26,7 +26,7 @@ from densify.config import resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.depth.exposure import key_shots, load_images
-from densify.depth.moving_bodies import far_inside
+from densify.depth.moving_bodies import find_far_inside
 from densify.depth.views import HeldOut
 from densify.flow.two_clouds import estimate_flow
 from densify.geometry import poses
@@ -54,9 +54,9 @@ from densify.scores.pose_metrics import window_pose_errors
 
 KINDS = ("depth", "flow", "registration")
 _WINDOW = 5
-_NUM_DRAWS = 8  # of the pairs
-_MOVED_M, _TURNED_DEG = 0.002, 0.01  # luck of a pose
-_KEPT = 0.98  # share of the returns, for the luck of registration
+_NUM_DRAWS = 8  # random draws of each pair
+_MOVED_M, _TURNED_DEG = 0.002, 0.01  # standard deviations of a moved pose, for luck
+_KEPT = 0.98  # share of the returns that are kept, for the luck of registration
 _ASIDE_PX = 10  # by which the truth of the stereo benchmark widens posts and signs
 _STEREO = "kitti_stereo/truth"
 _DRIVE = "2011_09_26/2011_09_26_drive_0013_sync"
@@ -124,7 +124,7 @@ class Stored(NamedTuple):
 
 
 def read(path: Path) -> Stored:
-    """Return stored figures."""
+    """Return the figures in a file that `write` wrote; raise InputError for other files."""
     try:
         return Stored(**json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, TypeError) as error:
@@ -134,7 +134,7 @@ def read(path: Path) -> Stored:
 
 
 def write(path: Path, stored: Stored) -> None:
-    """Write figures and luck as JSON, a figure a line."""
+    """Write figures and luck as JSON, with one line for each figure."""
     write_file(path, (_as_lines(stored._asdict()) + "\n").encode())
 
 
@@ -230,18 +230,26 @@ def _chosen(
 
 
 def _opened(key: GateKey, folder: Path | None) -> LidarSequence:
+    """Open the recording of a key, a real one in the folder of recordings."""
     return open_sequence(str(folder / key.data) if key.is_real and folder else key.data)
 
 
 def _luck(still: Mapping[str, Any], moved: list[dict[str, Any]]) -> dict[str, float]:
     """Return the standard deviation of each change of figures when the poses move."""
     changes = [
-        {k: v for name in still for k, v in change(name, still[name], figures[name]).items()}
+        {
+            title: value
+            for name in still
+            for title, value in change(name, still[name], figures[name]).items()
+        }
         for figures in moved
     ]
     if len(changes) < 2:
         return {}
-    return {k: round(float(np.std([c[k] for c in changes], ddof=1)), 5) for k in changes[0]}
+    return {
+        title: round(float(np.std([values[title] for values in changes], ddof=1)), 5)
+        for title in changes[0]
+    }
 
 
 class Subject(NamedTuple):
@@ -325,18 +333,18 @@ class Subject(NamedTuple):
         sequence, settings = recording.sequence, recording.settings
         shots = key_shots(sequence, choose_cameras(sequence, [camera]), key, settings.project)
         images, cloud = load_images(sequence, shots), recording.moment(key, True, "").cloud
-        beyond = recording.standing(key)
+        beyond = recording.find_beyond(key)
         scene = scene_of(recording, key, shots, images, beyond, cloud, False, Watch())
         seen = see(scene, "flow", cloud)
         if truth is None:
-            held_out = HeldOut.of(scene.views, cloud).maps(seen, METHODS["flow"].visible)
+            held_out = HeldOut.of(scene.views, cloud).judged_maps(seen, METHODS["flow"].visible)
             depth, truth_m, moving = held_out[camera]
             return depth, TruthMap(truth_m, moving, by_disparity=True)
         if self.key.truth == "scanner" and not through_glass:
             exposure = scene.views.exposures[camera]
-            inside = far_inside(seen.bodies.values(), exposure, truth.depth_m)
+            inside = find_far_inside(seen.bodies.values(), exposure, truth.depth_m)
             truth = truth._replace(depth_m=np.where(inside, np.float32(0), truth.depth_m))
-        return scene.views.depth(seen)[camera], truth
+        return scene.views.depth_maps(seen)[camera], truth
 
 
 class _Moved(Recording):

@@ -75,10 +75,12 @@ def _objective(solver: str, **settings: Any) -> Flow:
 
 
 def _ours(pair: PaperPair, rows: Int, targets: Int) -> Float:
+    """Return this package's flow of the drawn points, estimated from all points."""
     return estimate_flow(pair.source, pair.target, Config()).displacement[rows]
 
 
 def _learned(path: Path) -> Flow:
+    """Return the method that uses the network of a model file."""
     model = read_model(path)
     return lambda pair, rows, targets: model.flow(pair.sweeps)[rows]
 
@@ -103,9 +105,10 @@ def bench_paper(
     num_points: int = NUM_POINTS,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure methods of `METHODS` and files of trained networks on pairs of clouds.
+    """Measure methods and trained networks on pairs of clouds.
 
-    The result has ``num_pairs``, ``num_points`` (of a cloud) and ``methods``: name -> mean scores.
+    Returns:
+        ``num_pairs``, ``num_points`` and ``methods``: name of the method or file -> mean scores.
     """
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
@@ -129,6 +132,7 @@ def bench_paper(
 
 
 def _measured(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float]:
+    """Return the scores and the computing time of a method on one pair."""
     rng = np.random.default_rng(_SEED)
     rows, targets = (_drawn(cloud, num_points, rng) for cloud in (pair.source, pair.target))
     start = time.perf_counter()
@@ -171,13 +175,16 @@ def has_truth(spec: str) -> bool:
 
 
 def pair_of_recording(spec: str, key: int) -> PaperPair:
-    """Return sweep ``key`` and the next; for a real recording, this package estimates the flow."""
+    """Return sweep ``key`` of a recording and the next sweep, with the true flow.
+
+    For a recording without exact ground truth, this package's flow counts as true.
+    """
     sequence = open_sequence(spec)
     teacher, settings = "engine", resolve(None)
     if sequence.truth is not None:
         teacher, settings = "truth", resolve({"register": {"source": "dataset"}})
     clip = make_clip(sequence, key, settings, teacher)
-    row = next(i for i, s in enumerate(clip) if not s.origin_m.any())
+    row = next(row for row, sweep in enumerate(clip) if not sweep.origin_m.any())  # the key's
     if row + 1 == len(clip):
         raise InputError(f"--data {spec}: no sweep after {key}; choose an earlier one")
     sample = sample_of(clip, row, row + 1, _MAX_SWEEPS)

@@ -16,7 +16,7 @@ import numpy as np
 
 from densify.geometry.types import Bool, Float, Float32
 
-_NUM_STEPS = 200  # of a curve
+_NUM_STEPS = 200  # number of steps of a curve
 _BEYOND = 2.0  # standard deviations of luck, and standard errors between keys
 
 Curve = Mapping[str, Any]
@@ -28,13 +28,18 @@ Curve = Mapping[str, Any]
 
 
 def curve(num_true: int, confidence: Float | Float32, outliers: Bool) -> Curve:
-    """Return the outliers over the coverage, of ``num_true`` pixels with a true depth.
+    """Return the curve of outliers over coverage of a map.
 
-    Both arrays (K,) are of the covered ones. Equal confidences share their outliers evenly.
+    Args:
+        num_true: Number of pixels with a true depth.
+        confidence: (K,) confidence of those of them that have a depth. Pixels of equal confidence
+            share their outliers evenly.
+        outliers: (K,) True for outliers among these.
     """
     _, rank, size = np.unique(-confidence, return_inverse=True, return_counts=True)
-    of_rank = np.bincount(rank, outliers, len(size))
-    ends, sums = np.append(0, size.cumsum()), np.append(0, of_rank.cumsum())
+    outliers_of_rank = np.bincount(rank, outliers, len(size))
+    ends = np.append(0, size.cumsum())
+    sums = np.append(0, outliers_of_rank.cumsum())
     steps = np.interp(np.linspace(0, len(confidence), _NUM_STEPS + 1), ends, sums)
     return {"num": num_true, "covered": len(confidence), "outliers": np.round(steps, 2).tolist()}
 
@@ -52,14 +57,18 @@ def outliers_at(outliers: Curve, covered_percent: float) -> float:
 
 
 def change(figure: str, before: Any, now: Any) -> dict[str, float]:
-    """Return name -> change of a figure: of a curve, its outliers at equal coverage and coverage.
+    """Return the change of a figure, by name: of a curve two changes, else one.
 
-    ``before`` and ``now`` are both a `Curve`, a number, or numbers of repeated draws.
+    Those of a curve are of its outliers at equal coverage and of its coverage, in percent.
+
+    Args:
+        figure: Name of the figure.
+        before: A `Curve`, a number, or numbers of repeated draws.
     """
     if isinstance(before, Mapping):
         covered = min(coverage(before), coverage(now))
-        off = outliers_at(now, covered) - outliers_at(before, covered)
-        return {f"{figure} outliers": off, f"{figure} coverage": coverage(now) - coverage(before)}
+        more = outliers_at(now, covered) - outliers_at(before, covered)
+        return {f"{figure} outliers": more, f"{figure} coverage": coverage(now) - coverage(before)}
     return {figure: float(np.mean(now) - np.mean(before))}
 
 
@@ -82,54 +91,78 @@ def verdicts(
 ) -> Iterator[Verdict]:
     """Yield the verdict of each figure over all keys that both measurements have.
 
-    Both map key -> figure -> `Curve`, number or draws; ``luck`` maps key -> name of `change` -> σ.
+    Measurements map key -> figure -> `Curve`, number or draws. ``luck`` maps key -> name of a
+    `change` -> its standard deviation by luck.
     """
-    rows: dict[str, dict[str, tuple[float, float, float, float]]] = defaultdict(dict)
-    for key in [k for k in before if k in now]:
-        for figure in [f for f in before[key] if f in now[key]]:
-            was, value = before[key][figure], now[key][figure]
-            for name, off in change(figure, was, value).items():
+    changes: dict[str, dict[str, _KeyChange]] = defaultdict(dict)
+    for key in [key for key in before if key in now]:
+        for figure in [figure for figure in before[key] if figure in now[key]]:
+            old, new = before[key][figure], now[key][figure]
+            for name, difference in change(figure, old, new).items():
                 sigma = luck.get(key, {}).get(name, 0.0)
-                if isinstance(was, Sequence):
-                    sigma = float(np.hypot(np.std(was), np.std(value)) / math.sqrt(2 * len(was)))
-                rows[name][key] = _plain(name, was), _plain(name, value), off, sigma
-    for name, row in rows.items():
-        was, value, off, sigma = np.array(list(row.values())).T
-        bad = off if _is_cost(name) else -off
-        error = float(off.std(ddof=1) / math.sqrt(len(off))) if len(off) > 1 else math.nan
-        # Both measurements have luck.
-        by_luck = float(np.sqrt(2 * (sigma**2).sum()) / len(off))
-        beyond = _BEYOND * max(by_luck, 0.0 if math.isnan(error) else error)
-        worst, word = int(bad.argmax()), "no difference"
-        if abs(off.mean()) > beyond:
-            word = "worse" if bad.mean() > 0 else "better"
-        yield Verdict(
-            figure=name,
-            keys=list(row),
-            before=float(was.mean()),
-            now=float(value.mean()),
-            change=float(off.mean()),
-            error=error,
-            luck=by_luck,
-            worst=(list(row)[worst], float(off[worst])),
-            word=word,
-        )
+                if isinstance(old, Sequence):  # draws have luck of their own
+                    sigma = float(np.hypot(np.std(old), np.std(new)) / math.sqrt(2 * len(old)))
+                key_change = _KeyChange(_plain(name, old), _plain(name, new), difference, sigma)
+                changes[name][key] = key_change
+    for name, change_of_key in changes.items():
+        yield _verdict(name, change_of_key)
+
+
+class _KeyChange(NamedTuple):
+    """A figure of one key in both measurements."""
+
+    before: float
+    now: float
+    difference: float
+    sigma: float  # standard deviation by luck of one measurement
+
+
+def _verdict(name: str, change_of_key: Mapping[str, _KeyChange]) -> Verdict:
+    """Return the verdict of a figure over its keys."""
+    old, new, difference, sigma = np.array(list(change_of_key.values())).T
+    loss = difference if _is_cost(name) else -difference
+    num_keys = len(difference)
+    error = float(difference.std(ddof=1) / math.sqrt(num_keys)) if num_keys > 1 else math.nan
+    # Both measurements have luck.
+    by_luck = float(np.sqrt(2 * (sigma**2).sum()) / num_keys)
+    limit = _BEYOND * max(by_luck, 0.0 if math.isnan(error) else error)
+    word = "no difference"
+    if abs(difference.mean()) > limit:
+        word = "worse" if loss.mean() > 0 else "better"
+    worst = int(loss.argmax())
+    return Verdict(
+        figure=name,
+        keys=list(change_of_key),
+        before=float(old.mean()),
+        now=float(new.mean()),
+        change=float(difference.mean()),
+        error=error,
+        luck=by_luck,
+        worst=(list(change_of_key)[worst], float(difference[worst])),
+        word=word,
+    )
 
 
 def beyond_luck(
     before: Mapping[str, Any], now: Mapping[str, Any], luck: Mapping[str, float], sigmas: float
 ) -> dict[str, float]:
-    """Return the changes of one key's figures for the worse beyond ``sigmas`` of both lucks."""
+    """Return those changes of one key's figures that are worse by more than luck explains.
+
+    Args:
+        before: Figures of the key by name, first measurement.
+        sigmas: Limit, in standard deviations of the difference of two measurements.
+    """
     worse = {}
     for figure in before:
-        for name, off in change(figure, before[figure], now[figure]).items():
-            bad = off if _is_cost(name) else -off
-            if bad > sigmas * math.sqrt(2) * luck[name]:
-                worse[name] = off
+        for name, difference in change(figure, before[figure], now[figure]).items():
+            loss = difference if _is_cost(name) else -difference
+            if loss > sigmas * math.sqrt(2) * luck[name]:
+                worse[name] = difference
     return worse
 
 
 def _is_cost(name: str) -> bool:
+    """Return True for a figure that is better if it is lower."""
     return not name.endswith(("coverage", "recall %"))
 
 

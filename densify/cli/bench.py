@@ -33,7 +33,7 @@ _UNSEEN = (
 
 
 def answer_bench_flow(options: argparse.Namespace) -> Iterator[Answer]:
-    """Compare scene flow engines."""
+    """Answer ``densify bench flow``: yield the scores of scene flow engines for each key."""
     config = config_of(options)
     methods = DEFAULT_METHODS if options.methods is None else options.methods
     for sequence in [open_sequence(spec) for spec in recordings_of(options)]:
@@ -49,7 +49,7 @@ def answer_bench_flow(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def answer_bench_gate(options: argparse.Namespace) -> Iterator[Answer]:
-    """Judge a change by its figures."""
+    """Answer ``densify bench gate``: yield the verdicts of each group; store figures if asked."""
     kinds = gate.KINDS if options.only is None else options.only
     for kind in kinds:
         if kind not in gate.KINDS:
@@ -62,8 +62,8 @@ def answer_bench_gate(options: argparse.Namespace) -> Iterator[Answer]:
     luck = now.luck if options.draws else stored.luck
     for group, names in gate.GROUPS.items():
         before, after = (
-            {k: f for k, f in figures.items() if k in names}
-            for figures in (stored.figures, now.figures)
+            {key: figures for key, figures in figures_of_key.items() if key in names}
+            for figures_of_key in (stored.figures, now.figures)
         )
         rows = list(verdicts(before, after, luck))
         if rows:
@@ -103,29 +103,32 @@ def _error_cells(errors: DepthErrors) -> list[str]:
     return [*cells, *shares, f"{errors.mae_m:.2f} m"]
 
 
-def _verdict_cells(v: Verdict) -> list[str]:
-    key, change = v.worst
-    numbers = [f"{v.before:.4g}", f"{v.now:.4g}"]
-    numbers += [f"{value:+.4f}" for value in (v.change, v.error, v.luck)]
-    return [v.figure, str(len(v.keys)), *numbers, f"{key} {change:+.4f}", v.word]
+def _verdict_cells(verdict: Verdict) -> list[str]:
+    """Return the cells of a verdict in the table of a group."""
+    key, change = verdict.worst
+    numbers = [f"{verdict.before:.4g}", f"{verdict.now:.4g}"]
+    numbers += [f"{value:+.4f}" for value in (verdict.change, verdict.error, verdict.luck)]
+    worst = f"{key} {change:+.4f}"
+    return [verdict.figure, str(len(verdict.keys)), *numbers, worst, verdict.word]
 
 
 def answer_bench_doctor(options: argparse.Namespace) -> Iterator[Answer]:
-    """Measure how often the doctor finds errors."""
+    """Answer ``densify bench doctor``: yield a table of the doctor's verdicts for each error."""
     config = config_of(options)
     sequences = [open_sequence(spec) for spec in recordings_of(options)]
     with progress_on_stderr() as progress:
-        shares = bench_doctor(sequences, config, progress)
-    titles = list(next(iter(shares.values())))
-    rows = [
-        [mistake, *(format(row[title], "d" if title == "of" else ".0%") for title in titles)]
-        for mistake, row in shares.items()
-    ]
-    yield Answer(aligned([["", *titles], *rows]), {"mistakes": shares})
+        shares_of_mistake = bench_doctor(sequences, config, progress)
+    titles = list(next(iter(shares_of_mistake.values())))
+    rows = []
+    for mistake, shares in shares_of_mistake.items():
+        # "of" is the number of cases, the others are shares of the verdicts.
+        cells = (format(shares[title], "d" if title == "of" else ".0%") for title in titles)
+        rows.append([mistake, *cells])
+    yield Answer(aligned([["", *titles], *rows]), {"mistakes": shares_of_mistake})
 
 
 def answer_bench_depth(options: argparse.Namespace) -> Iterator[Answer]:
-    """Compare depth maps of several settings."""
+    """Answer ``densify bench depth``: yield the scores of depth maps of several settings."""
     variants = {"as configured": config_of(options)}
     for name, *changes in options.variant or []:
         variants[name] = resolve(options.config, [*(options.set or []), *changes])
@@ -148,7 +151,7 @@ def answer_bench_depth(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def answer_bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
-    """Make the tables of the paper."""
+    """Answer ``densify bench paper``: yield the scores of each data set."""
     methods = paper.DEFAULT_METHODS if options.methods is None else options.methods
     for name, pairs in _paper_sets(options).items():
         with progress_on_stderr() as progress:
@@ -163,6 +166,7 @@ def answer_bench_paper(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[paper.PaperPair]]:
+    """Return the pairs of each data set that the options name, by its name."""
     sets: dict[str, Iterable[paper.PaperPair]] = {}
     for name in ("flyingthings", "kitti"):
         if (folder := getattr(options, name)) is not None:
@@ -180,7 +184,7 @@ def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[paper.PaperPa
 
 
 def answer_bench_readme(options: argparse.Namespace) -> Iterator[Answer]:
-    """Make the tables of docs/results.md."""
+    """Answer ``densify bench readme``: yield the lines of the tables of docs/results.md."""
     with progress_on_stderr() as progress:
         for line in tables(options.table, progress):
             yield Answer(line, {"lines": [line]})

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 class Verb(NamedTuple):
     """A verb of the command line."""
 
-    name: str  # the name of its group before it, if it is of one
-    module: str  # module of this package with ``answer_NAME``, options -> answers
-    about: str
-    options: str  # table of `add_options`
-    epilog: str = ""
+    name: str  # name of the verb, after the name of its group if it has one, such as "bench flow"
+    module: str  # module of this package with the function ``answer_NAME``, options -> answers
+    about: str  # description in the list of verbs
+    options: str  # table of the options, as `add_options` reads it
+    epilog: str = ""  # further help
 
     def run(self, options: argparse.Namespace) -> Iterable[Answer]:
         """Import the verb's module and return its answers."""
@@ -376,7 +376,11 @@ _GROUPS = {
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Return the options of one command, with its `Verb` as ``options.verb``; or exit with 2."""
+    """Parse a command line and return its options, with the `Verb` as ``options.verb``.
+
+    ``arguments`` are the words after the program's name, None for those of this process. A wrong
+    command line ends the process with exit code 2.
+    """
     parser = command_line()
     texts = list(sys.argv[1:] if arguments is None else arguments)
     if "" in texts:  # an empty path would be the current folder

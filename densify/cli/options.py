@@ -22,14 +22,14 @@ _MOST_DIGITS = 18
 
 
 def natural(text: str) -> int:
-    """Parse a whole number of at least 0."""
+    """Parse a whole number from 0 up; raise ArgumentTypeError for other texts."""
     if not _are_digits(text):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
     return int(text)
 
 
 def positive(text: str) -> float:
-    """Parse a number above 0."""
+    """Parse a finite number above 0; raise ArgumentTypeError for other texts."""
     try:
         number = float(text)
     except ValueError:
@@ -45,10 +45,15 @@ def words(text: str) -> list[str]:
 
 
 def key_range(text: str, alternative: str = "") -> range:
-    """Parse ``A:B[:S]`` as a range; the message names the ``alternative`` too."""
+    """Parse ``A:B[:S]`` as the range of frame numbers from A to B - 1 with a step of S (1).
+
+    ``alternative`` is another accepted form, such as "all, or ", for the message of the
+    ArgumentTypeError that other texts raise.
+    """
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
-        first, end, step = (*map(int, numbers), 1)[:3]
+        first, end = int(numbers[0]), int(numbers[1])
+        step = int(numbers[2]) if len(numbers) == 3 else 1
         if first < end and step > 0:
             return range(first, end, step)
     raise argparse.ArgumentTypeError(
@@ -63,15 +68,16 @@ def all_or_range(text: str) -> range | None:
 
 
 def shard(text: str) -> tuple[int, int]:
-    """Parse ``i/n`` with i from 1 to n."""
-    i, slash, n = text.partition("/")
-    if slash and _are_digits(i, n) and 1 <= int(i) <= int(n):
-        return int(i), int(n)
+    """Parse ``i/n``, part i of n with i from 1 to n; raise ArgumentTypeError for other texts."""
+    part, slash, count = text.partition("/")
+    if slash and _are_digits(part, count) and 1 <= int(part) <= int(count):
+        return int(part), int(count)
     raise argparse.ArgumentTypeError(f"got {text!r}, expected i/n with i from 1 to n, as in 2/4")
 
 
 def _are_digits(*texts: str) -> bool:
-    return all(t.isascii() and t.isdigit() and len(t) <= _MOST_DIGITS for t in texts)
+    """Return True if all texts are whole numbers of at most 18 digits."""
+    return all(text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS for text in texts)
 
 
 _PARSERS: dict[str, Callable[[str], Any]] = {
@@ -130,7 +136,10 @@ def _settings_of(usage: str) -> dict[str, Any]:
 
 
 def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
-    """Return the specs of the recordings that a command names, else log and return ``default``."""
+    """Return the specifications of the recordings that a command names.
+
+    Without any, log that ``default`` is taken and return it.
+    """
     positional = [options.spec] if isinstance(options.spec, str) else options.spec or []
     specs = [*positional, *(options.data or [])]
     if not specs:
@@ -139,7 +148,7 @@ def recordings_of(options: argparse.Namespace, default: str = "street") -> list[
 
 
 def recording_of(options: argparse.Namespace) -> str:
-    """Return the spec of the one recording that a command names."""
+    """Return the specification of the only recording that a command names."""
     specs = recordings_of(options)
     if len(specs) > 1:
         raise InputError(f"got {len(specs)} recordings, {', '.join(specs)}; expected one")
@@ -159,7 +168,11 @@ def config_of(options: argparse.Namespace) -> Config:
 
 
 def check_new_file(path: Path, overwrite: bool, suffix: str = "", option: str = "--out") -> None:
-    """Raise InputError, before the computation, if a file exists or cannot be created."""
+    """Raise InputError, before the computation, if a file exists or cannot be created.
+
+    ``overwrite`` allows an existing file; ``suffix`` is that which the name must have, "" for any;
+    ``option`` names the file in messages.
+    """
     if path.suffix != (suffix or path.suffix):
         raise InputError(f"{option} {path}: expected a name that ends in {suffix}")
     if path.is_dir():
@@ -189,7 +202,10 @@ def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:
 
 
 def raise_failures(failures: Mapping[int, Exception], num: int, unit: str) -> None:
-    """Raise ComputationError if some of ``num`` keys or sweeps (``unit``), by number, failed."""
+    """Raise ComputationError, with the reasons, if some of ``num`` keys or sweeps failed.
+
+    ``failures`` has the errors by frame number; ``unit`` is "key" or "sweep".
+    """
     if failures:
         reasons = "; ".join(f"{unit} {number}: {error}" for number, error in failures.items())
         raise ComputationError(f"{len(failures)} of {num} {unit}s not made: {reasons}")

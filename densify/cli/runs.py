@@ -70,7 +70,7 @@ _MOST_NAMED = 5
 
 
 def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
-    """Densify one key or several."""
+    """Answer ``densify run``: densify the keys and yield an answer for each."""
     config, spec = config_of(options), Spec.parse(recording_of(options)).absolute()
     sequence = open_sequence(spec)
     keys = _keys_of(sequence, options)
@@ -114,6 +114,7 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
+    """Return the ascending key frame numbers of the options; raise InputError for wrong ones."""
     keys = {*(options.key or [])}
     if options.keys is not None:
         keys |= {*selected_frames(sequence, options.keys)}
@@ -131,12 +132,14 @@ def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
 def _front_first(paths: Sequence[Path], result: Result) -> list[Path]:
     """Return the files of a run, those of the camera that looks ahead first."""
     names = front_first([*result.depth], result.views, result.T_key_lidar)
-    front = [p for p in paths if names and p.with_suffix("").as_posix().endswith(f"/{names[0]}")]
+    front = [
+        path for path in paths if names and path.with_suffix("").as_posix().endswith(f"/{names[0]}")
+    ]
     return [*front, *(path for path in paths if path not in front)]
 
 
 def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
-    """Densify one key by several methods."""
+    """Answer ``densify compare``: densify one key by several methods and yield their scores."""
     config, spec = config_of(options), Spec.parse(recording_of(options)).absolute()
     sequence = open_sequence(spec)
     out = options.out or default_folder(sequence.name)
@@ -254,7 +257,7 @@ def _comparison(results: Mapping[str, Result]) -> str:
 
 
 def answer_export(options: argparse.Namespace) -> Iterator[Answer]:
-    """Export a finished run."""
+    """Answer ``densify export``: write a finished run in another format."""
     exported = export_run(
         options.run,
         options.to,
@@ -283,12 +286,12 @@ def _export_summary(exported: Export) -> str:
 
 
 def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
-    """Write the page of a folder."""
+    """Answer ``densify report``: write the HTML pages of a folder."""
     yield Answer(files=write_report(options.dir, options.overwrite))
 
 
 def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
-    """Show finished runs in a viewer."""
+    """Answer ``densify view``: show finished runs in a viewer until it is closed."""
     runs = finished_runs(options.dir, Thresholds(cameras=options.camera))
     viewers = {"rerun": show_in_rerun, "open3d": show_in_open3d}
     viewers[vars(options)["with"]](runs)
@@ -297,7 +300,7 @@ def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def answer_evaluate(options: argparse.Namespace) -> Iterator[Answer]:
-    """Score depth maps against ground truth."""
+    """Answer ``densify evaluate``: yield the scores of depth maps against ground truth."""
     pairs = pair_depth_files(options.predicted, options.truth, options.mask, filled=options.filled)
     with progress_on_stderr() as progress:
         scores = evaluate(pairs, options.focal_px, options.baseline_m, progress)

@@ -18,6 +18,7 @@ from densify.config.file_content import parse_yaml, read_yaml
 from densify.config.plugins import check_engine_spec
 
 _FEW_POINTS_PER_S = 800_000  # 64 rings have 1.2 million, 32 have 700,000
+# Time around the window in which motion is searched, for sparse and for dense sweeps
 _AROUND_FEW_S, _AROUND_S = 0.5, 0.3
 
 
@@ -27,7 +28,7 @@ def within(default: float | None, low: float, high: float) -> Any:
 
 
 def one_of(*words: str) -> Any:
-    """Return a dataclass field for a choice of words, the first word by default."""
+    """Return a dataclass field for a choice among words; the default is the first word."""
     return field(default=words[0], metadata={"words": words})
 
 
@@ -42,7 +43,12 @@ class Section:
 
 
 def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
-    """Return a user's value converted to the type of its setting; errors begin with ``where``."""
+    """Return a user's value converted to the type of its setting.
+
+    Args:
+        section: Class with the setting.
+        value: Value as parsed from YAML.
+    """
     knob = section.__dataclass_fields__[key]
     kind, _, optional = str(knob.type).partition(" | ")
     if optional and value is None:
@@ -98,8 +104,13 @@ class FlowSettings(Section):
         check_engine_spec(self.engine)
 
     def around(self, points_per_s: float) -> tuple[float, float]:
-        """Return how far around the window motion is searched, and those sweeps' spacing, s."""
-        # Sparse sweeps show little of a moving object: every one is searched (spacing 0), farther.
+        """Return where motion is searched beyond the window, for a number of points per second.
+
+        Returns:
+            Greatest time from the window in s, and time between the searched sweeps in s, 0 for
+            every sweep.
+        """
+        # Sparse sweeps show little of a moving object, so more of them are searched, and farther.
         is_sparse = points_per_s < _FEW_POINTS_PER_S
         needed_s, step_s = (_AROUND_FEW_S, 0.0) if is_sparse else (_AROUND_S, _AROUND_S)
         return needed_s if self.look_around_s is None else self.look_around_s, step_s
@@ -198,6 +209,9 @@ def resolve(
             YAML file of that form; or a str, the name of a preset or else of a file. Settings that
             are not given have their defaults.
         overrides: Texts ``section.key=value``, with values as in YAML; later overrides win.
+
+    Raises:
+        InputError: A file, section, key or value is unknown or does not fit.
     """
     values = as_mapping(config if isinstance(config, Config) else Config())
     if isinstance(config, Mapping):
@@ -230,7 +244,7 @@ def changed(config: Config) -> dict[str, dict[str, Any]]:
 
 
 def presets() -> dict[str, Path]:
-    """Return preset name -> its YAML file."""
+    """Return the YAML file of each preset, by name."""
     package = Path(__file__).parents[1]
     inside = package / "configs"  # installed
     folder = inside if inside.is_dir() else package.parent / "configs"  # checkout
@@ -238,6 +252,7 @@ def presets() -> dict[str, Path]:
 
 
 def _config_path(name: str | Path) -> Path:
+    """Return the file of a preset or the named file; raise InputError if there is none."""
     path = presets().get(name, Path(name)) if isinstance(name, str) else name
     if path.is_file():
         return path
@@ -250,7 +265,13 @@ def apply_overrides(
     overrides: Iterable[str],
     sections: Mapping[str, type[Section]] = _SECTIONS,
 ) -> None:
-    """Overwrite settings ``{section: {key: value}}`` in place by texts ``section.key=value``."""
+    """Overwrite settings in place by texts ``section.key=value``.
+
+    Args:
+        values: The settings, ``{section: {key: value}}``.
+        overrides: Texts, with values as in YAML.
+        sections: Class of each section, by name.
+    """
     for override in overrides:
         where = f"--set {override}"
         name, equals, text = override.partition("=")
@@ -284,6 +305,7 @@ def _apply_changes(
 
 
 def _mapping(value: Any, where: str, content: str) -> Iterable[tuple[Any, Any]]:
+    """Return the items of a mapping; raise InputError for other values."""
     if not isinstance(value, Mapping):
         raise InputError(
             f"{where}: got {value!r}, expected a mapping of {content}, for example "
@@ -293,4 +315,5 @@ def _mapping(value: Any, where: str, content: str) -> Iterable[tuple[Any, Any]]:
 
 
 def _expected(got: str, known: Mapping[str, Any], kind: str) -> str:
+    """Return the end of a message: the name most similar to ``got``, and all known names."""
     return f"{did_you_mean(got, known)}expected a {kind}: {', '.join(known)}"

@@ -47,15 +47,25 @@ class Cache:
     """A folder of cached results."""
 
     def __init__(self, limit_bytes: int = 10 * 1024**3, folder: Path | None = None) -> None:
-        """Open the folder of entries, by default the user's; `trim` keeps ``limit_bytes`` of it."""
-        self._folder, self._limit_bytes = folder or own_folder("steps"), limit_bytes
+        """Open a folder of entries, by default the user's; `trim` limits it to ``limit_bytes``.
+
+        A folder that cannot be made gives a warning, and nothing is kept.
+        """
+        self._folder = folder or own_folder("steps")
+        self._limit_bytes = limit_bytes
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             _log.warning("%s: %s; nothing is kept for later", self._folder, error.strerror or error)
 
     def get(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
-        """Return a step's cached result for these inputs (as `digest` accepts), else make it."""
+        """Return the cached result of a step, or make and keep it.
+
+        Args:
+            step: Name of the step, with which the entry's file name begins.
+            inputs: All that the result depends on, of types that `digest` accepts.
+            make: Function that makes the result.
+        """
         path = self._folder / f"{step}-{digest((__version__, inputs))}.npz"
         if (entry := _read(path)) is not None:
             return cast(T, entry[0])
@@ -77,12 +87,12 @@ class Cache:
             with suppress(OSError):  # another process deletes too
                 status = path.stat()
                 entries.append((status.st_mtime_ns, path, status.st_size))
-        left = sum(num_bytes for *_, num_bytes in entries)
-        for number, (_, path, num_bytes) in enumerate(sorted(entries)):
-            if left > self._limit_bytes or len(entries) - number > _MOST_ENTRIES:
+        bytes_left = sum(num_bytes for *_, num_bytes in entries)
+        for num_passed, (_, path, num_bytes) in enumerate(sorted(entries)):
+            if bytes_left > self._limit_bytes or len(entries) - num_passed > _MOST_ENTRIES:
                 with suppress(OSError):
                     path.unlink()
-                left -= num_bytes
+                bytes_left -= num_bytes
 
 
 def _read(path: Path) -> tuple[Any] | None:
@@ -120,14 +130,18 @@ def _only_maker(path: Path) -> Iterator[None]:
 @lru_cache(maxsize=1)
 def code_digest() -> str:
     """Return a hash of the code that makes the pipeline's cached results."""
-    state, package = hashlib.blake2b(digest_size=20), Path(__file__).parents[1]
+    state = hashlib.blake2b(digest_size=20)
+    package = Path(__file__).parents[1]
     for path in sorted(path for room in _STEP_ROOMS for path in package.glob(room)):
         state.update(path.read_bytes())
     return state.hexdigest()
 
 
 def kept(cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:
-    """Return the result from the cache if one is given, else from ``make``; see `Cache.get`."""
+    """Return `Cache.get` of a cache, or without a cache (None) the result of ``make``.
+
+    ``inputs`` is a function, called only with a cache.
+    """
     return make() if cache is None else cache.get(step, inputs(), make)
 
 
@@ -144,7 +158,7 @@ def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def digest(value: Any) -> str:
-    """Return a hash of arrays, numbers, text, dataclasses, sequences and mappings."""
+    """Return a hash of a value made of arrays, numbers, text, dataclasses, sequences, mappings."""
     text, arrays = _packed(value)
     state = hashlib.blake2b(text, digest_size=20)
     for array in arrays.values():
@@ -197,7 +211,10 @@ def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 
 def own_folder(name: str) -> Path:
-    """Return the folder of this name in DENSIFY_CACHE_DIR, else in the user's cache directory."""
+    """Make and return the folder of this name in DENSIFY_CACHE_DIR or the user's cache directory.
+
+    Raise InputError if other users can write to it.
+    """
     named = os.environ.get("DENSIFY_CACHE_DIR")
     root = Path(named or platformdirs.user_cache_dir("densify"))
     for folder in (root, root / name):

@@ -19,6 +19,7 @@ def brief(message: str) -> str:
 
 
 def _cut(text: str, num_characters: int) -> str:
+    """Return begin and end of a text, in this number of characters."""
     end = num_characters // 4
     return f"{text[: num_characters - end - 3]}...{text[-end:]}"
 

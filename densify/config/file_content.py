@@ -27,7 +27,7 @@ _MALFORMED = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a regular file, no Git LFS pointer, for reading; the caller closes it."""
+    """Open a file for reading; the caller closes it."""
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
@@ -43,7 +43,7 @@ def open_file(path: Path) -> BinaryIO:
 
 
 def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return the content of a file."""
+    """Return the content of a file; raise InputError if it cannot be read or is too large."""
     with open_file(path) as file:
         check_size(os.fstat(file.fileno()).st_size, path, most_bytes)
         try:
@@ -53,7 +53,7 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return decompressed gzip data, ``most_bytes`` at most; errors begin with ``where``."""
+    """Return decompressed gzip data."""
     try:
         with gzip.open(io.BytesIO(data)) as file:
             content = file.read(most_bytes + 1)
@@ -85,7 +85,7 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
 
 
 def decode_text(data: bytes, where: Path | str) -> str:
-    """Return UTF-8 text without a byte order mark; errors begin with ``where``."""
+    """Return UTF-8 text without a byte order mark; raise InputError, with ``where`` first, else."""
     # Every second byte of plain words in UTF-16 is zero.
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or data[:2].count(0) == 1:
         raise InputError(f"{where}: is text in UTF-16, expected UTF-8; save it as UTF-8")
@@ -96,7 +96,7 @@ def decode_text(data: bytes, where: Path | str) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file."""
+    """Return the content of a JSON file; raise InputError if it is damaged."""
     return parse_json(read_bytes(path), path)
 
 
@@ -111,22 +111,27 @@ def parse_json(data: bytes, where: Path | str) -> Any:
 
 
 def read_yaml(path: Path) -> tuple[Any, dict[str, int]]:
-    """Return the values of `parse_yaml` for a file."""
+    """Return the content of a YAML file and the line of each key, as `parse_yaml` does."""
     return parse_yaml(read_text(path, _MOST_YAML_BYTES), path)
 
 
 def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
-    """Return the content of YAML text, None if empty, and dotted key (``a.b``) -> its line."""
+    """Parse YAML text; raise InputError, with ``where`` first, if it is invalid.
+
+    Returns:
+        The content, None if empty, and the line number of each key, by dotted name (``a.b``).
+    """
     import yaml
 
     try:
-        aliases = sum(isinstance(e, yaml.AliasEvent) for e in yaml.parse(text, yaml.SafeLoader))
+        events = yaml.parse(text, yaml.SafeLoader)
+        num_aliases = sum(isinstance(event, yaml.AliasEvent) for event in events)
         loader = yaml.SafeLoader(text)
         root = loader.get_single_node()
         if root is None:
             return None, {}
-        if aliases > _MOST_ALIASES:
-            raise ValueError(f"expected {_MOST_ALIASES} aliases at most, got {aliases}")
+        if num_aliases > _MOST_ALIASES:
+            raise ValueError(f"expected {_MOST_ALIASES} aliases at most, got {num_aliases}")
         lines: dict[str, int] = {}
         _note_lines(root, "", lines)
         return loader.construct_document(root), lines
@@ -137,6 +142,7 @@ def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
 
 
 def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
+    """Enter the line of each key below a node; raise ValueError for a repeated key."""
     for key, value in node.value if node.id == "mapping" else ():
         full = f"{name}.{key.value}" if name else str(key.value)
         line = key.start_mark.line + 1
@@ -147,7 +153,13 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
 
 
 def needed(module: str, extra: str, needed_by: str) -> Any:
-    """Import and return an optional module; the error says that ``needed_by`` need ``extra``."""
+    """Import and return an optional module; raise InputError if it is not installed.
+
+    Args:
+        module: Import path.
+        extra: Extra of this package that installs it, for the message.
+        needed_by: Begin of the message, such as "EXR files".
+    """
     package = module.partition(".")[0]
     try:
         return import_module(module)

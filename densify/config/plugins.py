@@ -29,8 +29,8 @@ class Plugin:
     Another package's module may set the other fields: ``recognises``, ``HOLDS``, ``BOXES`` etc.
     """
 
-    name: str  # that users write
-    module: str  # import path
+    name: str  # name, as users write it
+    module: str  # import path of its module
     # Reader: returns True if a path holds its recordings, judged by file names
     recognises: Callable[[Path], bool] = lambda path: False
     # Reader: kind of recording, for messages
@@ -61,7 +61,7 @@ class Table:
     built_in: tuple[Plugin, ...]  # plug-ins of densify
 
     def names(self) -> list[str]:
-        """Return the built-in names, then the names from other packages."""
+        """Return the names of all plug-ins, the built-in ones first; import none."""
         return [*self._rows()]
 
     def require(self, name: str, where: str) -> None:
@@ -75,7 +75,10 @@ class Table:
             )
 
     def row(self, name: str, where: str) -> Plugin:
-        """Return the plug-in of this name; the module of another package is imported."""
+        """Return the plug-in of this name; raise InputError, with ``where`` first, without one.
+
+        The module of another package is imported.
+        """
         self.require(name, where)
         return self._loaded(self._rows()[name])
 
@@ -110,9 +113,13 @@ class Table:
                 f"{label}: {point.value} is no module with {', '.join(self.members)}; mend or "
                 f"uninstall the package"
             )
-        attrs = {f.name: f.name.upper() for f in fields(Plugin)} | {"recognises": "recognises"}
+        # Field of `Plugin` -> name in the module
+        attributes = {field.name: field.name.upper() for field in fields(Plugin)}
+        attributes["recognises"] = "recognises"
         values = {
-            key: getattr(module, attr) for key, attr in attrs.items() if hasattr(module, attr)
+            name: getattr(module, attribute)
+            for name, attribute in attributes.items()
+            if hasattr(module, attribute)
         }
         return Plugin(**{**values, "name": point.name, "module": module.__name__})
 
@@ -133,7 +140,12 @@ ENGINES = Table(
 
 
 def check_engine_spec(spec: str) -> tuple[str, str]:
-    """Return name and argument of an engine's ``NAME[:ARGUMENT]``, without importing it."""
+    """Split an engine's ``NAME[:ARGUMENT]`` into name and argument; the engine is not imported.
+
+    "network:flow.npz" gives ("network", "flow.npz"), "groups" gives ("groups", ""). Raise
+    InputError for an unknown name, a missing argument, or an argument that the engine does not
+    take.
+    """
     name, _, argument = spec.partition(":")
     ENGINES.require(name, "flow.engine")
     for row in ENGINES.built_in:
@@ -143,7 +155,10 @@ def check_engine_spec(spec: str) -> tuple[str, str]:
 
 
 def engine(spec: str) -> tuple[Plugin, str]:
-    """Return the plug-in and the argument of an engine's ``NAME[:ARGUMENT]``."""
+    """Return the plug-in and the argument ("" for none) of an engine's ``NAME[:ARGUMENT]``.
+
+    Raise InputError as `check_engine_spec` does.
+    """
     name, argument = check_engine_spec(spec)
     return ENGINES.row(name, "flow.engine"), argument
 
@@ -160,10 +175,12 @@ def _suffix(*suffixes: str) -> Callable[[Path], bool]:
 
 
 def _capture(with_metadata: bool) -> Callable[[Path], bool]:
+    """Return a function that recognises a .pcap file with or without .json files beside it."""
     return lambda path: path.suffix == ".pcap" and any(path.parent.glob("*.json")) == with_metadata
 
 
 def _is_odometry(path: Path) -> bool:
+    """Return True for a sequence of KITTI odometry, or a folder with ``sequences``."""
     if (path / "velodyne").is_dir():
         return path.resolve().parent.name == "sequences" or (path / "times.txt").is_file()
     return any(path.glob("sequences/*/velodyne"))

@@ -80,7 +80,11 @@ def call_all(
 
 @contextmanager
 def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
-    """Append log messages of ``densify`` to a file in the block: of all threads or of one."""
+    """Append the log messages of ``densify`` to a file within the block.
+
+    ``thread`` is the identifier of the only thread whose messages are written, None for all. Raise
+    OutputError if the file cannot be written.
+    """
     try:
         handler = logging.FileHandler(path, encoding="utf-8")
     except OSError as error:
@@ -100,7 +104,10 @@ def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
 
 
 def share_of_cores(num_workers: int) -> dict[str, str]:
-    """Return environment variables that limit the threads of a worker to its share of the cores."""
+    """Return environment variables that limit the threads of one of ``num_workers`` workers.
+
+    Each worker gets an equal share of the cores.
+    """
     share = str(max(1, len(os.sched_getaffinity(0)) // num_workers))
     names = [f"{library}_NUM_THREADS" for library in ("NUMBA", "OMP", "OPENBLAS", "MKL")]
     return dict.fromkeys([*names, "OPENCV_FOR_THREADS_NUM"], share)
@@ -128,8 +135,9 @@ def _until_a_death(
             except BrokenExecutor:
                 is_broken = True
             done = wait(running, return_when=FIRST_COMPLETED).done
-            if is_broken or any(isinstance(f.exception(), BrokenExecutor) for f in done):
-                is_broken, done = True, wait(running).done
+            if is_broken or any(isinstance(future.exception(), BrokenExecutor) for future in done):
+                is_broken = True
+                done = wait(running).done
             for future in done:
                 yield running.pop(future), _outcome(future.result)
 

@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 from densify.config.errors import InputError
 from densify.dataset.manifest import read_manifests
 from densify.dataset.plan import Drive, drives_of, read_plan
-from densify.depth.confidence import most_certain
+from densify.depth.confidence import choose_most_certain
 from densify.depth.exposure import key_shots
 from densify.geometry.types import Camera, Float, LidarSequence
 from densify.outputs.depth_png import read_depth_png, read_stored
@@ -127,7 +127,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
         confidence = np.where(dense_m > 0, (stored - np.float32(1)) / 254, np.float32(0)).clip(0)
         if self._max_outliers is not None:
             kept = dense_m > 0
-            kept[kept] = most_certain(confidence[kept], self._max_outliers)
+            kept[kept] = choose_most_certain(confidence[kept], self._max_outliers)
             dense_m, confidence = dense_m * kept, confidence * kept
         return {
             "image": self._image(name, camera, frame).transpose(2, 0, 1) / np.float32(255),

@@ -144,19 +144,24 @@ def make_dataset(
 
 
 def status(out: Path) -> Summary:
-    """Return the progress of a training set from its files."""
+    """Return the progress of a training set from its files; raise InputError if it is none."""
     table = read_plan(out)
     if table is None:
         raise InputError(f"--status {out}: no dataset.json in it; expected a set's folder")
     keys = planned_keys(table)
-    records = {name: r for name, r in read_manifests(out).items() if name in keys}
+    records = {name: record for name, record in read_manifests(out).items() if name in keys}
     return Summary(records, len(keys))
 
 
 def damaged(out: Path) -> list[str]:
-    """Return the finished key sweeps' missing or changed (by hash) files, relative to ``out``."""
-    records = read_manifests(out).values()
-    return [name for r in records if r.status != "failed" for name in damaged_files(r, out)]
+    """Return the files of finished key sweeps that are missing or changed, relative to ``out``.
+
+    Contents are compared with the hashes in the manifest.
+    """
+    finished_records = (
+        record for record in read_manifests(out).values() if record.status != "failed"
+    )
+    return [name for record in finished_records for name in damaged_files(record, out)]
 
 
 # The command's process
@@ -194,14 +199,17 @@ def _free_bytes() -> float:
 
 def _blocks(drives: Sequence[Drive], shard: Shard | None) -> list[tuple[Drive, tuple[int, ...]]]:
     """Return the key frame numbers of all blocks, or of the consecutive blocks of one shard."""
-    i, n = shard or (1, 1)
+    number, num_shards = shard or (1, 1)
     blocks = [(drive, keys) for drive in drives for keys in drive.blocks]
-    return blocks[len(blocks) * (i - 1) // n : len(blocks) * i // n]
+    begin = len(blocks) * (number - 1) // num_shards
+    end = len(blocks) * number // num_shards
+    return blocks[begin:end]
 
 
 def _finished(
     blocks: Sequence[tuple[Drive, tuple[int, ...]]], out: Path, verify: bool
 ) -> dict[Key, KeyRecord]:
+    """Return the records of the key sweeps in these blocks that are finished, sorted by key."""
     wanted = {(drive.name, key) for drive, keys in blocks for key in keys}
     before = read_manifests(out)
     return {name: before[name] for name in sorted(wanted & finished(before.values(), out, verify))}
@@ -260,10 +268,15 @@ def _record(
 
 
 def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) -> dict[Key, str]:
-    """Return finished keys with far more ghosts or outliers than their neighbours -> reason.
+    """Return the finished keys with far more ghosts or outliers than their neighbours, and why.
 
-    A limit for all recordings passes keys that are bad for their own, such as cut windows at its
-    ends. ``max_ratio`` is the greatest share, as a multiple of the median of the neighbours.
+    A limit for all recordings lets keys pass that are bad for their own recording, such as keys
+    with cut windows at its ends.
+
+    ``max_ratio`` is the greatest share, as a multiple of the median of the neighbouring keys.
+
+    Returns:
+        Key -> reason, for the keys beyond the ratio.
     """
     drives: dict[str, list[KeyRecord]] = defaultdict(list)
     for record in records.values():
@@ -286,12 +299,13 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) ->
 
 
 def _outlying(shares: Sequence[float], num_beside: int, max_ratio: float) -> Iterator[int]:
-    """Yield the rows whose share exceeds the median of ``num_beside`` rows around by the ratio."""
+    """Yield the rows whose share exceeds the median of ``num_beside`` neighbours by the ratio."""
     for row, share in enumerate(shares):
+        # At the ends, all neighbours are on one side.
         begin = max(0, min(row - num_beside // 2, len(shares) - num_beside - 1))
         beside = np.array([*shares[begin:row], *shares[row + 1 : begin + num_beside + 1]])
         beside = beside[np.isfinite(beside)]
-        # Two keys do not tell which of them is unusual.
+        # With a single neighbour it is unknown which of the two keys is unusual.
         if len(beside) > 1 and share > max(_LEAST_SHARE, max_ratio * float(np.median(beside))):
             yield row
 
@@ -311,7 +325,10 @@ class Job:
 
 
 def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
-    """Densify and write one key and return its record, ``failed`` on any error but OutputError."""
+    """Densify and write one key, and return its record.
+
+    On an error the status of the record is ``failed``; only OutputError is raised.
+    """
     job, key = job_and_key
     start_s = time.perf_counter()
     try:
@@ -367,10 +384,10 @@ def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
         "num_points": metrics["num_points"],
         "num_moving": metrics["num_moving"],
         "ghost": metrics["ghosts"]["all"],
-        "density": {n: d["measured"] for n, d in metrics["density"].items()},
-        "density_filled": {n: d["filled"] for n, d in metrics["density"].items()},
-        "outliers": {n: e["outliers"] for n, e in errors.items()},
-        "mae_m": {n: e["mae_m"] for n, e in errors.items()},
+        "density": {name: shares["measured"] for name, shares in metrics["density"].items()},
+        "density_filled": {name: shares["filled"] for name, shares in metrics["density"].items()},
+        "outliers": {name: scores["outliers"] for name, scores in errors.items()},
+        "mae_m": {name: scores["mae_m"] for name, scores in errors.items()},
     }
 
 
@@ -386,6 +403,7 @@ def _write(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
 
 @lru_cache(maxsize=1)
 def _opened(job: Job) -> tuple[Recording, Cache]:
+    """Return a job's recording with its cache; raise ComputationError for another version."""
     if job.version != __version__:
         raise ComputationError(
             f"the worker on {platform.node()} has densify {__version__}, the command has "

@@ -60,10 +60,10 @@ class KeyRecord:
         return self.drive, self.key
 
     def values_of(self, score: str) -> list[float]:
-        """Return the known values of a score, of one that has a value for each camera all."""
-        value = self.scores.get(score)
-        values = value.values() if isinstance(value, Mapping) else [value]
-        return [v for v in values if v is not None]
+        """Return the known values of a score: one for each camera, or a single one."""
+        score_value = self.scores.get(score)
+        values = score_value.values() if isinstance(score_value, Mapping) else [score_value]
+        return [value for value in values if value is not None]
 
     def to_line(self) -> bytes:
         """Return the record as a line of JSON with its newline. Equal records give equal bytes."""
@@ -86,7 +86,7 @@ class KeyRecord:
                 status=_STATUSES[_STATUSES.index(fields["status"])],
                 reason=fields["reason"],
                 frames=tuple(map(int, fields["frames"])),
-                files={name: FileRecord(f["bytes"], f["sha256"]) for name, f in files},
+                files={name: FileRecord(file["bytes"], file["sha256"]) for name, file in files},
                 scores=dict(fields["scores"].items()),
                 seconds=float(fields["seconds"]),
                 warnings=tuple(map(str, fields.get("warnings", ()))),
@@ -130,7 +130,10 @@ def read_manifests(root: Path) -> dict[Key, KeyRecord]:
 
 
 def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> list[str]:
-    """Return the missing or changed files of a record, relative to ``root``, by size and hash."""
+    """Return the missing or changed files of a record, relative to ``root``.
+
+    Sizes are compared, and hashes of the contents too if ``by_content``.
+    """
     damaged = []
     for name, file in record.files.items():
         try:
@@ -145,12 +148,15 @@ def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> lis
 
 
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
-    """Return the keys done or aside whose files exist (and match their hashes if ``verify``)."""
+    """Return the names of the records that are done or aside and whose files exist in ``root``.
+
+    If ``verify``, the contents of the files must match their hashes too.
+    """
     return {
-        r.name
-        for r in records
-        if r.status == "aside" or (r.status == "done" and r.files)
-        if not damaged_files(r, root, verify)
+        record.name
+        for record in records
+        if record.status == "aside" or (record.status == "done" and record.files)
+        if not damaged_files(record, root, verify)
     }
 
 
@@ -190,9 +196,9 @@ class Manifest:
             os.fsync(file.fileno())
 
     def set_aside(self, reasons: Mapping[Key, str]) -> list[KeyRecord]:
-        """Delete the files of finished key sweeps of this manifest, and record why.
+        """Delete the files of finished key sweeps, record the reasons, and return the new records.
 
-        Key sweeps that are recorded elsewhere stay. The new records are returned.
+        ``reasons`` has the reason for each key. Key sweeps that another manifest records stay.
         """
         aside = []
         for name, (record, _) in _read(self.path).items():
@@ -207,6 +213,7 @@ class Manifest:
         return aside
 
     def _put_in_order(self) -> None:
+        """Sort the lines of the file, the last line of each key sweep alone."""
         data = b"".join(line for _, (_, line) in sorted(_read(self.path).items()))
         if not self.path.exists() or read_bytes(self.path) != data:
             write_file(self.path, data)

@@ -66,7 +66,10 @@ class Gate(Section):
     split: str = one_of("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
-        """Return why a key sweep with these scores of a manifest line is not written, else None."""
+        """Return the reason why a key sweep is not written, None if it is within all limits.
+
+        ``scores`` are those of a manifest line, ``num_sweeps`` the sweeps in its window.
+        """
         ghost, outliers = scores["ghost"], scores["outliers"]
         if self.min_sweeps is not None and num_sweeps < self.min_sweeps:
             return f"{num_sweeps} sweeps, expected at least {self.min_sweeps}"
@@ -133,7 +136,11 @@ class Drive:
 
 
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]:
-    """Open every recording and choose its key sweeps; arguments as in `make_dataset`."""
+    """Open every recording and choose its key sweeps.
+
+    The arguments are as in `densify.dataset.make.make_dataset`. Raise InputError for a recording
+    that is given twice, has no camera, or has none of the keys.
+    """
     drives: dict[str, Drive] = {}
     for spec in data:
         sequence = open_sequence(spec)
@@ -158,6 +165,7 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]
 
 
 def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, ...]:
+    """Return the chosen frame numbers of a recording; raise InputError if there are none."""
     if keys is None:
         return tuple(sequence.frames)
     first, last = min(sequence.frames), max(sequence.frames)
@@ -167,7 +175,7 @@ def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, 
     if not all(isinstance(number, int) for number in (start, stop, step)) or step < 1:
         raise InputError(f"keys: got {keys}, expected whole numbers and a step of 1 or more")
     wanted = range(start, stop, step)
-    chosen = tuple(f for f in sequence.frames if f in wanted)
+    chosen = tuple(frame for frame in sequence.frames if frame in wanted)
     if not chosen or (start < first or wanted[-1] > last):
         text = f"{start}:{stop}" + ("" if step == 1 else f":{step}")
         raise InputError(
@@ -217,7 +225,7 @@ def drives_of(table: Mapping[str, Any]) -> dict[str, Drive]:
             name,
             drive["data"],
             drive["folder"],
-            {n: _read_camera(n, stored) for n, stored in drive["cameras"].items()},
+            {camera: _read_camera(camera, stored) for camera, stored in drive["cameras"].items()},
             (tuple(_frames(drive["frames"])),),
         )
         for name, drive in table["drives"].items()
@@ -230,6 +238,7 @@ def planned_keys(table: Mapping[str, Any]) -> set[tuple[str, int]]:
 
 
 def _table(recipe: Recipe, drives: Sequence[Drive]) -> dict[str, Any]:
+    """Return the content of dataset.json."""
     table = {
         "schema_version": SCHEMA_VERSION,
         "densify": __version__,
@@ -295,6 +304,7 @@ def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str,
 
 
 def _read_camera(name: str, stored: Mapping[str, Any]) -> Camera:
+    """Return a camera from its entry in dataset.json."""
     columns = {column: stored[column] for column in _CAMERA if column in stored}
     columns["K"] = np.array(stored["K"], np.float64).reshape(3, 3)
     columns["T_cam_lidar"] = np.array(stored["T_cam_lidar"], np.float64).reshape(4, 4)
@@ -303,6 +313,7 @@ def _read_camera(name: str, stored: Mapping[str, Any]) -> Camera:
 
 
 def _as_runs(frames: Iterable[int]) -> list[list[int]]:
+    """Return ascending frame numbers as runs [first, last]."""
     return [[run[0], run[-1]] for run in runs(frames)]
 
 

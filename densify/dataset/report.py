@@ -78,7 +78,12 @@ def _set_page(root: Path) -> bytes:
         "keys": "\n".join(_card(root, record) for record in _pictured(worst_first)),
         "left_out": _table(("recording", "key", "status", "reason"), map(_reason_row, left_out)),
         "listed": _table(
-            ("recording", "key", *(f"{s.title}, {s.unit}" for s in _SCORES), "warnings"),
+            (
+                "recording",
+                "key",
+                *(f"{score.title}, {score.unit}" for score in _SCORES),
+                "warnings",
+            ),
             map(_score_row, worst_first[:_NUM_LISTED]),
         ),
     }
@@ -93,7 +98,7 @@ def _badness(records: Sequence[KeyRecord]) -> Callable[[KeyRecord], float]:
     ranks: dict[tuple[str, int], float] = {}
     for score in _SCORES:
         values = [(record.name, score.of(record)) for record in records]
-        known = sorted((score.is_bad * v, name) for name, v in values if v is not None)
+        known = sorted((score.is_bad * value, name) for name, value in values if value is not None)
         for rank, (_, name) in enumerate(known if score.is_bad else [], start=1):
             ranks[name] = max(ranks.get(name, 0.0), rank / len(known))
     return lambda record: ranks.get(record.name, 0.0)
@@ -110,11 +115,11 @@ def _summary(records: Sequence[KeyRecord], num_to_make: int) -> str:
     """Return how many keys the set has, and what they cost."""
     counts = Counter[str](record.status for record in records)
     names = {"done": "done", "aside": "put aside", "failed": "failed"}
-    said = [f"{counts[status]:,} {name}" for status, name in names.items() if counts[status]]
-    said += [f"{num_to_make:,} to make"] if num_to_make else []
+    parts = [f"{counts[status]:,} {name}" for status, name in names.items() if counts[status]]
+    parts += [f"{num_to_make:,} to make"] if num_to_make else []
     seconds = [record.seconds for record in records if record.status == "done"]
     cost = f"{np.mean(seconds):.1f} s a key, {sum(seconds) / 60:.1f} min in all" if seconds else ""
-    return html.escape("; ".join(filter(None, [", ".join(said), cost])))
+    return html.escape("; ".join(filter(None, [", ".join(parts), cost])))
 
 
 def _facts(table: Mapping[str, Any]) -> str:
@@ -138,7 +143,7 @@ def _card(root: Path, record: KeyRecord) -> str:
         (("depth_filled", "groundtruth_filled"), _depth_picture),
         (("confidence",), _confidence_picture),
     ):
-        path = next((root / f for f in record.files if {*kinds} & {*Path(f).parts}), None)
+        path = next((root / file for file in record.files if {*kinds} & {*Path(file).parts}), None)
         if path is not None:
             try:
                 pictures.append(_image(draw(path), kinds[0]))
@@ -205,14 +210,18 @@ def _text(value: Any) -> str:
 
 
 def write_comparison_page(folder: Path) -> Path:
-    """Write ``compare.html`` into the folder of a key sweep and return its path."""
+    """Write ``compare.html`` of the comparison in a key sweep's folder, and return its path."""
     page = folder / "compare.html"
     write_file(page, key_page(KeyFiles.of_comparison(folder), ""))
     return page
 
 
 def write_report(folder: Path, overwrite: bool = False) -> list[Path]:
-    """Write the HTML pages of a folder, or of the only key sweep in it, and return their paths."""
+    """Write the HTML pages of a folder and return their paths.
+
+    The folder is that of a run, a comparison, a training set, or of a recording with one key sweep.
+    Raise InputError for other folders, or if a page exists and ``overwrite`` is False.
+    """
     pages = _pages(folder)
     for path in pages:
         if path.exists() and not overwrite:
@@ -239,7 +248,9 @@ def _pages(folder: Path) -> dict[Path, Callable[[], bytes]]:
     }
     if pages:
         return pages
-    inside = [p for p in sorted(folder.iterdir()) if any((p / name).is_file() for name in makers)]
+    inside = [
+        path for path in sorted(folder.iterdir()) if any((path / name).is_file() for name in makers)
+    ]
     if len(inside) == 1:
         return _pages(inside[0])
     content = f"{len(inside)} keys; name one of them" if inside else "none of these"

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Compute the confidence of pixels: the probability that a pixel is an outlier by KITTI's rule.
+"""Compute the confidence of pixels from the probability that a pixel is an outlier (KITTI's rule).
 
 The probability P is that of a logistic regression (Cox, "The regression analysis of binary
 sequences", 1958) on physical features of the pixel:
 
     P = 1 / (1 + exp(-(w0 + w1 x1 + ... + w9 x9)))
 
-The weights `WEIGHTS` were fitted to exact truth of simulated streets and to the truth of real
-recordings, each recording with equal weight, by ``examples/fit_confidence.py``.
+The confidence is -log10(P) / 5, limited to 0 to 1. The weights `WEIGHTS` were fitted to exact truth
+of simulated streets and to the truth of real recordings, each recording with equal weight, by
+``examples/fit_confidence.py``.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ WEIGHTS: Mapping[str, float] = {
 }
 """Weight of each feature, see `features`."""
 _LEAST_VOTES, _LEAST_SHARE, _LEAST_STEP = 0.001, 0.005, 0.03  # smaller values are not told apart
-_AGE_S, _LEAST_COVER = 0.03, 0.05
-_NUM_STEPS = 20
+_AGE_S, _LEAST_COVER = 0.03, 0.05  # smaller values are not told apart either
+_NUM_STEPS = 20  # number of intervals of confidence
 _UNCONFIRMED = 2.7  # found / expected outliers of one sweep alone: 0.9 to 6, on six recordings
 
 
@@ -65,21 +66,26 @@ def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
         camera: Camera of the map.
     """
     shown, rejected = record.filled_m > 0, record.rejected_m > 0
-    has_depth, depth_m = shown | rejected, np.where(shown, record.filled_m, record.rejected_m)
+    has_depth = shown | rejected
+    depth_m = np.where(shown, record.filled_m, record.rejected_m)
     measured = record.depth_m > 0
     gap_px = float(np.median(record.gap_px))
+
     nearest = nearest_pixel(measured)
     age_s = np.abs(since_key_ns[record.point[nearest]]) * 1e-9 if measured.any() else 0 * depth_m
     edge = np.where(measured, record.edge, 0)[nearest]
     edge[record.on_body] = ALL_ROUND
-    step = _step(depth_m, record.filled_m, _size(1, gap_px)) / tolerance(depth_m, camera)
-    around_px = _size(2, gap_px)
-    cover = _mean(shown, around_px) / _mean(np.ones_like(shown), around_px)  # within the image
+
+    step = _log_step(depth_m, record.filled_m, _window_px(1, gap_px)) / tolerance(depth_m, camera)
+    cover_px = _window_px(2, gap_px)
+    within_image = np.ones_like(shown)
+    cover = _mean(shown, cover_px) / _mean(within_image, cover_px)
     columns = [
         np.ones(shown.shape),
         ~measured,
         _logarithm(1 - record.votes, _LEAST_VOTES),
-        *(_rejected(record, _size(reach, gap_px)) for reach in (2, 8)),
+        _log_rejected_share(record, _window_px(2, gap_px)),
+        _log_rejected_share(record, _window_px(8, gap_px)),
         _logarithm(step, _LEAST_STEP),
         _logarithm(age_s, _AGE_S),
         -np.log2(np.maximum(cover, _LEAST_COVER)),
@@ -89,11 +95,9 @@ def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
     return np.stack([column[has_depth] for column in columns], axis=1).astype(np.float32)
 
 
-def nearest_pixel(known: Bool) -> tuple[Int, Int]:
-    """Return the (H,W) rows and the (H,W) columns of the nearest known pixel of each pixel."""
-    row, column = ndimage.distance_transform_edt(
-        ~known, return_distances=False, return_indices=True
-    )
+def nearest_pixel(mask: Bool) -> tuple[Int, Int]:
+    """Return the (H,W) rows and the (H,W) columns of the nearest True pixel of each pixel."""
+    row, column = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
     return row, column
 
 
@@ -105,51 +109,65 @@ def tolerance(depth_m: Float32, camera: Camera) -> Float:
 
 
 def _logarithm(values: Float | Float32, least: float) -> Float:
+    """Return the logarithms to base 10 of values from 0; values below ``least`` are close to 0."""
     logarithm: Float = np.log10(values / least + 1)
     return logarithm
 
 
-def _size(spacings: float, gap_px: float) -> int:
+def _window_px(spacings: float, gap_px: float) -> int:
     """Return the width in pixels of a window that reaches so many spacings to all sides."""
-    return 2 * max(2, round(spacings * gap_px)) + 1
+    return 2 * max(2, round(spacings * gap_px)) + 1  # the central pixel, and as many on each side
 
 
 def _mean(mask: Bool, size_px: int) -> Float32:
+    """Return the (H,W) share of the mask in the window around each pixel; outside it is False."""
     mean: Float32 = ndimage.uniform_filter(mask.astype(np.float32), size_px, mode="constant")
     return mean
 
 
-def _rejected(record: MapRecord, size_px: int) -> Float:
+def _log_rejected_share(record: MapRecord, size_px: int) -> Float:
     """Return the (H,W) logarithm of the share of boundary pixels around that are not accepted."""
-    rejected, measured = (record.boundary_m > 0) & (record.depth_m == 0), record.depth_m > 0
+    measured = record.depth_m > 0
+    rejected = (record.boundary_m > 0) & ~measured
     share = _mean(rejected, size_px) / np.maximum(_mean(rejected | measured, size_px), 1e-4)
     return _logarithm(share, _LEAST_SHARE)
 
 
-def _step(depth_m: Float32, around_m: Float32, size_px: int) -> Float32:
-    """Return the (H,W) logarithm of the greatest by the least depth of a pixel and those around."""
-    far_m, near_m = np.maximum(depth_m, around_m), np.where(around_m > 0, around_m, np.inf)
-    near_m = np.minimum(near_m, np.where(depth_m > 0, depth_m, np.inf)).astype(np.float32)
-    far_m = np.maximum(ndimage.maximum_filter(around_m, size_px), far_m)
-    near_m = np.minimum(ndimage.minimum_filter(near_m, size_px), near_m)
+def _log_step(depth_m: Float32, filled_m: Float32, size_px: int) -> Float32:
+    """Return the (H,W) logarithm of the greatest by the least depth of a pixel and those around.
+
+    ``depth_m`` is the filled or rejected depth, ``filled_m`` the filled depth alone. The greatest
+    depth around is of filled pixels only.
+    """
+    own_m = np.where(depth_m > 0, depth_m, np.inf)
+    near_m = np.minimum(np.where(filled_m > 0, filled_m, np.inf), own_m).astype(np.float32)
+    nearest_m = np.minimum(ndimage.minimum_filter(near_m, size_px), near_m)
+    far_m = np.maximum(depth_m, filled_m)
+    farthest_m = np.maximum(ndimage.maximum_filter(filled_m, size_px), far_m)
     step = np.zeros_like(depth_m)
-    np.log(far_m / near_m, out=step, where=depth_m > 0)
+    np.log(farthest_m / nearest_m, out=step, where=depth_m > 0)
     return step
 
 
 def confidence_of(evidence: NDArray[np.floating], weights: Float | None = None) -> Float32:
-    """Return the (P,) confidence ``-log10(P) / 5`` of pixels with `features` (P,10)."""
-    used = np.array([*WEIGHTS.values()]) if weights is None else weights
-    log_p = -np.logaddexp(0, -(evidence @ used)) / np.log(10)
+    """Return the (P,) confidence ``-log10(P) / 5`` of pixels with `features` (P,10).
+
+    ``weights`` (10,) replace `WEIGHTS`.
+    """
+    if weights is None:
+        weights = np.array([*WEIGHTS.values()])
+    log_p = -np.logaddexp(0, -(evidence @ weights)) / np.log(10)
     return np.clip(-log_p / DECADES, 0, 1).astype(np.float32)
 
 
 def confidence_by_age(since_key_ns: Int) -> Float32:
-    """Return (M,) relative scores 1 / (1 + t) of 0 to 1, for sweeps t seconds from the key."""
+    """Return (M,) relative scores 1 / (1 + t) of 0 to 1 for points t seconds from the key."""
     return (1 / (1 + np.abs(since_key_ns) * 1e-9)).astype(np.float32)
 
 
-def most_certain(confidence: Float32, max_outliers: float, before: Float32 | None = None) -> Bool:
+def choose_most_certain(
+    confidence: Float32, max_outliers: float, before: Float32 | None = None
+) -> Bool:
     """Return (P,) True at the most certain pixels, as many as keep the expected outliers low.
 
     Args:
@@ -157,110 +175,135 @@ def most_certain(confidence: Float32, max_outliers: float, before: Float32 | Non
         max_outliers: Greatest expected share of outliers, of the chosen pixels and those before.
         before: Confidences of pixels that are chosen already; None for none.
     """
-    first = outlier_probability(np.zeros(0) if before is None else before)
+    before_probability = outlier_probability(np.zeros(0) if before is None else before)
     best_first = np.argsort(-confidence, kind="stable")
-    sums = first.sum() + np.cumsum(outlier_probability(confidence[best_first]))
-    enough = sums <= max_outliers * (len(first) + 1 + np.arange(len(sums)))
+    # Expected outliers if the best pixel is chosen, the two best, and so on
+    expected = before_probability.sum() + np.cumsum(outlier_probability(confidence[best_first]))
+    num_pixels = len(before_probability) + 1 + np.arange(len(expected))
+    is_low = expected <= max_outliers * num_pixels
+    num_chosen = int(np.flatnonzero(is_low).max(initial=-1)) + 1
     chosen = np.zeros(len(confidence), bool)
-    chosen[best_first[: int(np.flatnonzero(enough).max(initial=-1)) + 1]] = True
+    chosen[best_first[:num_chosen]] = True
     return chosen
 
 
-def with_max_outliers(maps: DepthMap, max_outliers: float | None) -> DepthMap:
-    """Return the map with as many pixels as keep the expected share of outliers at a value.
+def with_max_outliers(depth_map: DepthMap, max_outliers: float | None) -> DepthMap:
+    """Return the map with as many pixels as possible at this expected share of outliers.
 
     If the map expects fewer outliers, the most certain of its rejected pixels are given back. If it
     expects more, its least certain pixels are left out. A map without calibrated confidence stays.
 
     Args:
-        maps: Map of the rules with its ``rejected`` pixels.
-        max_outliers: Greatest expected share of outliers of the filled map; None for the map of the
-            rules.
+        depth_map: A map with its ``rejected`` pixels.
+        max_outliers: Greatest expected share of outliers of the filled map; None leaves its pixels
+            as they are.
     """
-    rejected, shown = maps.rejected, maps.filled_m > 0
+    rejected = depth_map.rejected
     if rejected is None or max_outliers is None:
-        return replace(maps, rejected=None)
-    kept, back, confidence = shown.copy(), rejected.depth_m > 0, maps.confidence[shown]
+        return replace(depth_map, rejected=None)
+    shown = depth_map.filled_m > 0
+    confidence = depth_map.confidence[shown]
+    keep = shown.copy()
+    give_back = rejected.depth_m > 0
     if shown.any() and outlier_probability(confidence).mean() > max_outliers:
-        kept[shown] = most_certain(confidence, max_outliers)
-        back[:] = False
+        keep[shown] = choose_most_certain(confidence, max_outliers)
+        give_back[:] = False
     else:
-        back[back] = most_certain(rejected.confidence[back], max_outliers, confidence)
-    measured = back & (rejected.frame >= 0)
+        give_back[give_back] = choose_most_certain(
+            rejected.confidence[give_back], max_outliers, confidence
+        )
+    give_back_measured = give_back & (rejected.frame >= 0)
     return replace(
-        maps,
-        depth_m=np.select([measured, kept], [rejected.depth_m, maps.depth_m]),
-        filled_m=np.select([back, kept], [rejected.depth_m, maps.filled_m]),
-        confidence=np.select([back, kept], [rejected.confidence, maps.confidence]),
-        frame=np.select([measured, kept], [rejected.frame, maps.frame], np.int32(-1)),
+        depth_map,
+        depth_m=np.select([give_back_measured, keep], [rejected.depth_m, depth_map.depth_m]),
+        filled_m=np.select([give_back, keep], [rejected.depth_m, depth_map.filled_m]),
+        confidence=np.select([give_back, keep], [rejected.confidence, depth_map.confidence]),
+        frame=np.select(
+            [give_back_measured, keep], [rejected.frame, depth_map.frame], np.int32(-1)
+        ),
         evidence=None,
         rejected=None,
     )
 
 
-def without_times(maps: DepthMap, smear_m: float, camera: Camera, share: float = 1.0) -> DepthMap:
+def without_times(
+    depth_map: DepthMap, smear_m: float, camera: Camera, share: float = 1.0
+) -> DepthMap:
     """Return the map with lower confidence at near pixels, for sweeps without times of points.
 
     The vehicle's motion within such a sweep moves depths by an unknown amount up to ``smear_m`` in
     either direction. Near pixels tolerate less of it than far pixels.
 
     Args:
+        depth_map: The map.
         smear_m: Half the travel in metres along the camera's axis from sweep to sweep.
+        camera: Camera of the map.
         share: Share of the sweeps without times.
     """
 
-    def either(probability: Float, depth_m: Float32) -> Float:
+    def outlier_or_smeared(probability: Float, depth_m: Float32) -> Float:
+        """Return the probability of an outlier by other causes or by the motion."""
+        # Any shift up to smear_m is as likely as another.
         tolerated_m = depth_m * tolerance(depth_m, camera)
         smeared = share * np.clip(1 - tolerated_m / max(smear_m, 1e-9), 0, 1)
         return 1 - (1 - probability) * (1 - smeared)
 
-    return _with_probability(maps, either)
+    return _with_probability(depth_map, outlier_or_smeared)
 
 
-def unconfirmed(maps: DepthMap) -> DepthMap:
+def without_confirmation(depth_map: DepthMap) -> DepthMap:
     """Return the map of one sweep alone, with the outliers that no other sweep could contradict."""
-    return _with_probability(maps, lambda probability, _: _UNCONFIRMED * probability)
+    return _with_probability(depth_map, lambda probability, _: _UNCONFIRMED * probability)
 
 
-def _with_probability(maps: DepthMap, changed: Callable[[Float, Float32], Float]) -> DepthMap:
-    """Return the map with each probability P of an outlier changed to ``changed(P, depth_m)``."""
+def _with_probability(depth_map: DepthMap, change: Callable[[Float, Float32], Float]) -> DepthMap:
+    """Return the map with each probability P of an outlier replaced by ``change(P, depth_m)``."""
 
-    def lowered(confidence: Float32, depth_m: Float32) -> Float32:
-        probability = changed(outlier_probability(confidence), depth_m)
-        lower = np.clip(-np.log10(np.maximum(probability, 10.0**-DECADES)) / DECADES, 0, 1)
-        return np.where(depth_m > 0, lower, 0).astype(np.float32)
+    def changed_confidence(confidence: Float32, depth_m: Float32) -> Float32:
+        """Return the (H,W) confidence of the changed probability, 0 where there is no depth."""
+        probability = change(outlier_probability(confidence), depth_m)
+        changed = np.clip(-np.log10(np.maximum(probability, 10.0**-DECADES)) / DECADES, 0, 1)
+        return np.where(depth_m > 0, changed, 0).astype(np.float32)
 
-    rejected, confidence = maps.rejected, lowered(maps.confidence, maps.filled_m)
+    confidence = changed_confidence(depth_map.confidence, depth_map.filled_m)
+    rejected = depth_map.rejected
     if rejected is not None:
-        rejected = rejected._replace(confidence=lowered(rejected.confidence, rejected.depth_m))
-    return replace(maps, confidence=confidence, rejected=rejected)
+        rejected_confidence = changed_confidence(rejected.confidence, rejected.depth_m)
+        rejected = rejected._replace(confidence=rejected_confidence)
+    return replace(depth_map, confidence=confidence, rejected=rejected)
 
 
-def expected_outliers(maps: DepthMap) -> dict[str, float | None]:
-    """Return the expected share of outliers of the ``measured`` and the ``filled`` map."""
+def expected_outliers(depth_map: DepthMap) -> dict[str, float | None]:
+    """Return the expected share of outliers of the ``measured`` and the ``filled`` map.
+
+    It is None for a map without pixels.
+    """
     shares: dict[str, float | None] = {}
-    for name, depth_m in (("measured", maps.depth_m), ("filled", maps.filled_m)):
-        probability = outlier_probability(maps.confidence[depth_m > 0])
+    for name, depth_m in (("measured", depth_map.depth_m), ("filled", depth_map.filled_m)):
+        probability = outlier_probability(depth_map.confidence[depth_m > 0])
         shares[name] = float(probability.mean()) if len(probability) else None
     return shares
 
 
-def reliability(maps: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[str, Any]]:
+def reliability(depth_map: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[str, Any]]:
     """Return expected and true outliers by confidence, over the filled pixels with ground truth.
 
     Each interval of 0.05 with pixels has ``confidence`` (its start), ``num_compared`` pixels, and
     the ``expected`` and the true share of ``outliers``.
 
     Args:
+        depth_map: The map.
         truth_m: (H,W) true depth in metres, 0 none.
+        camera: Camera of the map.
     """
-    compared = (truth_m > 0) & (maps.filled_m > 0)
-    confidence = maps.confidence[compared]
-    bad = is_outlier_depth(maps.filled_m[compared], truth_m[compared], camera.focal_px)
-    step = np.minimum((confidence * _NUM_STEPS).astype(np.int64), _NUM_STEPS - 1)
-    num = np.bincount(step, minlength=_NUM_STEPS)
-    expected = np.bincount(step, outlier_probability(confidence), _NUM_STEPS)
-    num_outliers = np.bincount(step, bad, _NUM_STEPS)
+    compared = (truth_m > 0) & (depth_map.filled_m > 0)
+    confidence = depth_map.confidence[compared]
+    is_outlier = is_outlier_depth(depth_map.filled_m[compared], truth_m[compared], camera.focal_px)
+    # A confidence of 1 belongs to the last interval.
+    interval = np.minimum((confidence * _NUM_STEPS).astype(np.int64), _NUM_STEPS - 1)
+    num = np.bincount(interval, minlength=_NUM_STEPS)
+    expected = np.bincount(interval, outlier_probability(confidence), _NUM_STEPS)
+    num_outliers = np.bincount(interval, is_outlier, _NUM_STEPS)
     return [
         {
             "confidence": i / _NUM_STEPS,

@@ -31,7 +31,7 @@ from densify.geometry.types import (
 _log = logging.getLogger("densify")
 _USUAL = ProjectSettings()
 _JITTER = 1.5  # greatest ratio of a used half period to half the shorter neighbouring period
-_NUM_ROW_STEPS = 4  # of the search for the row that observes a point
+_NUM_ROW_STEPS = 4  # number of steps of the search for the row that observes a point
 _SAME_AGE_NS = 10_000_000  # ages of two sweeps that differ by less are equal, for clock jitter
 AT_ONCE = 1 << 16
 """Number of points that are projected together: their columns fit into the cache of a core."""
@@ -58,6 +58,12 @@ def key_shots(
     sweep, the earlier of two. With ``project.per=image`` there is a map CAMERA/NUMBER for each
     image nearer to the key sweep than to any other. Without an image within about half a period the
     default map shows the time of the sweep.
+
+    Args:
+        sequence: The recording.
+        cameras: Cameras that get maps.
+        key: Frame number of the key sweep.
+        settings: ``per`` and ``at`` choose the maps and their times.
     """
     stamp_ns = sequence.stamp_ns(key)
     begin_ns, end_ns = _own_time_ns(sequence, key)
@@ -71,48 +77,62 @@ def key_shots(
         if settings.per == "image":
             for number, exposed_ns in images_ns.items():
                 shots[f"{camera.name}/{number:06d}"] = Shot(camera, number, exposed_ns)
+            if not images_ns:
+                _log.warning(
+                    "key %d: %s has no image of %s within %.0f ms of the sweep: no depth map",
+                    key,
+                    sequence.name,
+                    camera.name,
+                    (end_ns - begin_ns) / 2e6,  # half of the interval, in ms
+                )
         elif images_ns:
-            number = min(images_ns, key=lambda n: (abs(images_ns[n] - stamp_ns), images_ns[n]))
+            number = min(
+                images_ns,
+                key=lambda number: (abs(images_ns[number] - stamp_ns), images_ns[number]),
+            )
             shown_ns = images_ns[number] if settings.at == "camera" else stamp_ns
             shots[camera.name] = Shot(camera, number, shown_ns)
         else:
             shots[camera.name] = Shot(camera, None, stamp_ns)
-        if settings.per == "image" and not images_ns:
-            _log.warning(
-                "key %d: %s has no image of %s within %.0f ms of the sweep: no depth map",
-                key,
-                sequence.name,
-                camera.name,
-                (end_ns - begin_ns) / 2e6,
-            )
     return shots
 
 
 def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str, NDArray[np.uint8]]:
     """Return the (H,W,3) RGB images of the shots that show an image, by the name of the map."""
-    images = {n: (s.camera.name, s.number) for n, s in shots.items() if s.number is not None}
+    images = {
+        name: (shot.camera.name, shot.number)
+        for name, shot in shots.items()
+        if shot.number is not None
+    }
     if hasattr(sequence, "prepare"):
         sequence.prepare((), list(images.values()))
     return {name: sequence.image(*image) for name, image in images.items()}
 
 
 def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
-    """Return start and end, in ns, of the time nearer to the key sweep than to another sweep."""
+    """Return start and end, in ns, of the time nearer to the key sweep than to another sweep.
+
+    Without a neighbouring sweep the time is unlimited.
+    """
     frames = list(sequence.frames)
-    row = frames.index(key)
+    index = frames.index(key)
     stamps_ns = {}
-    for frame in frames[max(0, row - 1) : row + 2]:
+    for frame in frames[max(0, index - 1) : index + 2]:
         try:
             stamps_ns[frame] = sequence.stamp_ns(frame)
-        except InputError:  # the image of another key
+        except InputError:
+            # A neighbouring sweep may have no readable stamp. Only the key sweep must have one.
             if frame == key:
                 raise
     if len(stamps_ns) < 2:
         return np.iinfo(np.int64).min, np.iinfo(np.int64).max
-    every_ns, key_ns = [*stamps_ns.values()], stamps_ns[key]
-    most_period_ns = int(_JITTER * np.diff(every_ns).min())
-    before_ns = max([key_ns - most_period_ns, *(s for s in every_ns if s < key_ns)])
-    after_ns = min([key_ns + most_period_ns, *(s for s in every_ns if s > key_ns)])
+
+    key_ns = stamps_ns[key]
+    stamps = list(stamps_ns.values())
+    # A gap in the recording, or the end of it, must not widen the time.
+    max_period_ns = int(_JITTER * np.diff(stamps).min())
+    before_ns = max([key_ns - max_period_ns, *(stamp for stamp in stamps if stamp < key_ns)])
+    after_ns = min([key_ns + max_period_ns, *(stamp for stamp in stamps if stamp > key_ns)])
     return (before_ns + key_ns) // 2, (key_ns + after_ns) // 2
 
 
@@ -131,7 +151,7 @@ class InView(NamedTuple):
     uv: Float  # (K,2) pixel coordinates as in `Sight`
 
     def joined(self, appended: InView, num: int) -> InView:
-        """Return the points of this cloud (``num`` points) with those of another one appended."""
+        """Return the points with those of another cloud; this cloud has ``num`` points in all."""
         return InView(
             self.exposure,
             np.concatenate([self.rows, num + appended.rows]),
@@ -171,44 +191,47 @@ class Exposure:
 
         The camera pose is the recorded pose of the image. Without one it is extrapolated from the
         key sweep with the vehicle's twist. ``output.optical_flow`` adds the ``neighbours``.
+
+        Args:
+            sequence: The recording.
+            stretch: Registered sweeps of the window.
+            key: Frame number of the key sweep.
+            shot: What the map shows.
+            settings: Configuration of the run.
         """
         exposure = _exposure(sequence, stretch, key, key, shot, settings)
         if not settings.output.optical_flow or shot.number is None:
             return exposure
-        neighbours: dict[str, Exposure] = {}
-        stamps_ns = sequence.image_stamps_ns(shot.camera.name)
-        numbers = list(stamps_ns)
-        index = numbers.index(shot.number)
-        sweeps_ns = np.array([s.sweep.stamp_ns for s in stretch.sweeps])
-        for name, row in (("previous", index - 1), ("next", index + 1)):
-            if not 0 <= row < len(numbers):
-                continue
-            exposed_ns = stamps_ns[numbers[row]]
-            frame = stretch.frames[int(np.argmin(np.abs(sweeps_ns - exposed_ns)))]
-            begin_ns, end_ns = _own_time_ns(sequence, frame)
-            if begin_ns < exposed_ns <= end_ns:
-                if settings.project.at == "sweep":
-                    exposed_ns = stretch[frame].sweep.stamp_ns
-                neighbour = Shot(shot.camera, numbers[row], exposed_ns)
-                neighbours[name] = _exposure(sequence, stretch, key, frame, neighbour, settings)
+        neighbours = _neighbour_exposures(
+            sequence, stretch, key, shot.camera, shot.number, settings
+        )
         return replace(exposure, neighbours=neighbours)
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
-        """Project points (N,3) to the image; metres, key sweep's lidar frame at its reference time.
+        """Project points to the image.
 
-        Moving points advance by their velocity, (N,3) or (3,) for all, ego-motion removed, to the
-        exposure. With a rolling shutter each row or column has its own exposure time. Points beside
-        or behind a wide lens have no z and are not inside.
+        Moving points advance by their velocity to the exposure. With a rolling shutter each row or
+        column has its own exposure time. Points beside or behind a wide lens have no z and are not
+        inside.
+
+        Args:
+            points: (N,3) positions in metres, key sweep's lidar frame, at its reference time.
+            velocity_m_s: Velocities without ego-motion, same frame; (N,3), or (3,) for all points.
         """
-        late = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
-        points_cam = poses.transform(self.T_cam_key, late)
+        at_shown_time = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
+        points_cam = poses.transform(self.T_cam_key, at_shown_time)
         uv, inside = image_points(self.camera, points_cam)
+        if not self.camera.is_rolling:
+            return Sight(points_cam, uv, inside & (self.depth_m(points_cam) > NEAREST_M))
+
+        # The row that observes a point depends on the row's time, and so it is found step by step.
         exposed_cam = points_cam
-        last = np.array([self.camera.width_px - 1, self.camera.height_px - 1])
-        time_s = np.array([self.camera.column_time_s, self.camera.row_time_s])
-        for _ in range(_NUM_ROW_STEPS if self.camera.is_rolling else 0):
-            pixel = np.where(np.isnan(uv), last / 2, np.clip(uv, 0, last))
-            row_s = ((pixel - last / 2) * time_s).sum(axis=1, keepdims=True)
+        last_pixel = np.array([self.camera.width_px - 1, self.camera.height_px - 1])
+        pixel_time_s = np.array([self.camera.column_time_s, self.camera.row_time_s])
+        for _ in range(_NUM_ROW_STEPS):
+            pixel = np.where(np.isnan(uv), last_pixel / 2, np.clip(uv, 0, last_pixel))
+            # The middle row is exposed at the time that the map shows.
+            row_s = ((pixel - last_pixel / 2) * pixel_time_s).sum(axis=1, keepdims=True)
             velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
             turn = np.hstack([-row_s * self.twist[:3], np.zeros((len(points), 3))])
             ahead = points_cam + row_s * (velocity_cam - self.twist[3:])
@@ -216,20 +239,51 @@ class Exposure:
             uv, inside = image_points(self.camera, exposed_cam)
         return Sight(exposed_cam, uv, inside & (self.depth_m(exposed_cam) > NEAREST_M))
 
-    def sees(self, cloud: Cloud) -> InView:
+    def view_of(self, cloud: Cloud) -> InView:
         """Return the points in the image of a cloud at the key sweep's reference time."""
-        chunks = []
+        rows, points_cam, uv = [], [], []
         for first in range(0, max(1, len(cloud)), AT_ONCE):
             chunk = slice(first, first + AT_ONCE)
             sight = self.see(cloud.points[chunk], cloud.velocity_m_s[chunk])
             inside = np.flatnonzero(sight.inside)
-            columns = (column.take(inside, axis=0) for column in (sight.points_cam, sight.uv))
-            chunks.append((first + inside, *columns))
-        return InView(self, *(np.concatenate(column) for column in zip(*chunks, strict=True)))
+            rows.append(first + inside)
+            points_cam.append(sight.points_cam.take(inside, axis=0))
+            uv.append(sight.uv.take(inside, axis=0))
+        return InView(self, np.concatenate(rows), np.concatenate(points_cam), np.concatenate(uv))
 
     def depth_m(self, points_cam: Float) -> Float:
         """Return the (N,) depth of points (N,3), camera frame: z or range, by ``measure``."""
         return depth_along(points_cam, self.measure)
+
+
+def _neighbour_exposures(
+    sequence: LidarSequence,
+    stretch: Stretch,
+    key: int,
+    camera: Camera,
+    number: int,
+    settings: Config,
+) -> dict[str, Exposure]:
+    """Return the exposures of an image's "previous" and "next" image, if the window has them."""
+    neighbours: dict[str, Exposure] = {}
+    stamps_ns = sequence.image_stamps_ns(camera.name)
+    numbers = list(stamps_ns)
+    index = numbers.index(number)
+    sweeps_ns = np.array([registered.sweep.stamp_ns for registered in stretch.sweeps])
+    for name, neighbour_index in (("previous", index - 1), ("next", index + 1)):
+        if not 0 <= neighbour_index < len(numbers):
+            continue
+        neighbour_number = numbers[neighbour_index]
+        exposed_ns = stamps_ns[neighbour_number]
+        frame = stretch.frames[int(np.argmin(np.abs(sweeps_ns - exposed_ns)))]
+        begin_ns, end_ns = _own_time_ns(sequence, frame)
+        # An image nearer to a sweep outside the window is too far for the pose of one inside.
+        if begin_ns < exposed_ns <= end_ns:
+            at_sweep = settings.project.at == "sweep"
+            shown_ns = stretch[frame].sweep.stamp_ns if at_sweep else exposed_ns
+            shot = Shot(camera, neighbour_number, shown_ns)
+            neighbours[name] = _exposure(sequence, stretch, key, frame, shot, settings)
+    return neighbours
 
 
 def _exposure(
@@ -241,10 +295,11 @@ def _exposure(
     settings: Config,
 ) -> Exposure:
     """Return the exposure of a shot (as `Exposure.of`), extrapolated from sweep ``frame``."""
-    camera, registered = shot.camera, stretch[frame]
-    late_s = float(shot.stamp_ns - registered.sweep.stamp_ns) * 1e-9
-    twist = registered.twist_before if late_s < 0 else registered.twist_after
-    T_cam_lidar = camera.T_cam_lidar @ poses.inverse(poses.exp(late_s * twist))
+    camera = shot.camera
+    registered = stretch[frame]
+    since_sweep_s = float(shot.stamp_ns - registered.sweep.stamp_ns) * 1e-9
+    twist = registered.twist_before if since_sweep_s < 0 else registered.twist_after
+    T_cam_lidar = camera.T_cam_lidar @ poses.inverse(poses.exp(since_sweep_s * twist))
     at_image = settings.project.at == "camera" and shot.number is not None
     if at_image and hasattr(sequence, "T_world_cam"):
         T_cam_world = poses.inverse(sequence.T_world_cam(camera.name, shot.number or 0))
@@ -258,6 +313,14 @@ def _exposure(
         number=shot.number,
         measure=camera.measure if measure == "auto" else measure,
     )
+
+
+class _Scale(NamedTuple):
+    """Columns of `PointsInImage` that depend on the lens."""
+
+    focal_px: Float  # (K,2) local scale, px per metre at a depth of 1 m
+    slope: Float  # (K,2) slope of inverse depth, not finite where the surface is seen edge-on
+    spacing_px: Float  # (K,2) spacing of neighbouring rays, across and down
 
 
 class PointsInImage(NamedTuple):
@@ -283,80 +346,97 @@ class PointsInImage(NamedTuple):
 
 def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInImage:
     """Return the points of the cloud in the view, with the patches' size and slope in pixels."""
-    by_row = np.argsort(np.rint(view.uv[:, 1]).astype(np.uint16), kind="stable")
-    exposure, rows = view.exposure, view.rows[by_row]
-    points_cam = view.points_cam.take(by_row, axis=0)
+    # In the order of the image's rows, points that are used together lie together in memory.
+    by_image_row = np.argsort(np.rint(view.uv[:, 1]).astype(np.uint16), kind="stable")
+    exposure = view.exposure
+    rows = view.rows[by_image_row]
+    points_cam = view.points_cam.take(by_image_row, axis=0)
     depth = exposure.depth_m(points_cam).astype(np.float32)
     normal = poses.rotate(exposure.T_cam_key, patches.normal.take(rows, axis=0).astype(np.float64))
-    plain = exposure.camera.is_rectified and exposure.measure == "z"
-    focal_px, slope, spacing_px = (_pinhole if plain else _any_lens)(
+    is_pinhole = exposure.camera.is_rectified and exposure.measure == "z"
+    scale = (_pinhole_scale if is_pinhole else _lens_scale)(
         exposure, points_cam, depth, normal, patches.spacing_m.take(rows, axis=0)
     )
     frame, far = cloud.frame[rows], cloud.far[rows]
     return PointsInImage(
         rows=rows,
-        uv=view.uv.take(by_row, axis=0),
+        uv=view.uv.take(by_image_row, axis=0),
         depth=depth,
         inverse=1 / depth.astype(np.float64),
-        focal_px=focal_px,
-        slope=np.nan_to_num(slope, posinf=0.0, neginf=0.0),
-        spacing_px=spacing_px,
+        focal_px=scale.focal_px,
+        slope=np.nan_to_num(scale.slope, posinf=0.0, neginf=0.0),
+        spacing_px=scale.spacing_px,
         frame=frame,
         age_ns=_ages_ns(cloud.since_key_ns[rows], frame, far),
         far=far,
     )
 
 
-def _pinhole(
+def _pinhole_scale(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
-) -> tuple[Float, Float, Float]:
-    """Return focal_px, slope and spacing_px of `PointsInImage` for z depth in a rectified image."""
+) -> _Scale:
+    """Return the scale of points for z depth in a rectified image."""
     focal_px = exposure.camera.K[[0, 1], [0, 1]]
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
-    d = np.einsum("ij,ij->i", normal, points_cam)
+    distance = np.einsum("ij,ij->i", normal, points_cam)  # d
     with np.errstate(divide="ignore", invalid="ignore"):
-        slope = normal[:, :2] / (d[:, None] * focal_px)
-    everywhere = np.broadcast_to(focal_px, points_cam[:, :2].shape)
+        slope = normal[:, :2] / (distance[:, None] * focal_px)
+    all_focal_px = np.broadcast_to(focal_px, points_cam[:, :2].shape)
     # Patches count as facing the camera.
-    return everywhere, slope, spacing_m * focal_px / depth[:, None]
+    return _Scale(all_focal_px, slope, spacing_m * focal_px / depth[:, None])
 
 
-def _any_lens(
+def _lens_scale(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
-) -> tuple[Float, Float, Float]:
-    """Return focal_px, slope and spacing_px of `PointsInImage` for any lens and measure."""
+) -> _Scale:
+    """Return the scale of points for any lens and measure."""
     # If a point moves on the plane n · p = d until the image moves by one pixel, p moves by
     # δ = J⁺ - p (n · J⁺) / d, the inverse depth by -δ_z / z², and the inverse range by -p · δ / r³.
     J = pixels_per_metre(exposure.camera, points_cam)
     focal_px = np.linalg.norm(J, axis=2) * depth[:, None]
-    d = np.einsum("ij,ij->i", normal, points_cam)
+    distance = np.einsum("ij,ij->i", normal, points_cam)  # d
     with np.errstate(divide="ignore", invalid="ignore"):
-        across = J.transpose(0, 2, 1) @ np.linalg.inv(J @ J.transpose(0, 2, 1))
-        along = -np.einsum("ij,ijk->ik", normal, across) / d[:, None]
+        metres_per_px = J.transpose(0, 2, 1) @ np.linalg.inv(J @ J.transpose(0, 2, 1))  # J⁺
+        # - (n · J⁺) / d: the share of its own range by which the point moves along its ray
+        range_share = -np.einsum("ij,ijk->ik", normal, metres_per_px) / distance[:, None]
         if exposure.measure == "z":
             z = points_cam[:, 2:]
-            slope = -(across[:, 2] + along * z) / z**2
+            slope = -(metres_per_px[:, 2] + range_share * z) / z**2
         else:
-            slope = -along / np.linalg.norm(points_cam, axis=1, keepdims=True)
+            slope = -range_share / np.linalg.norm(points_cam, axis=1, keepdims=True)
+
     # Rays of a scanner are spaced in azimuth and in elevation, about the key's upward axis.
     azimuth_axis = np.cross(exposure.T_cam_key[:3, 2], points_cam)
     azimuth_axis /= np.maximum(np.linalg.norm(azimuth_axis, axis=1, keepdims=True), 1e-9)
     elevation_axis = np.cross(points_cam, azimuth_axis)
     elevation_axis /= np.linalg.norm(elevation_axis, axis=1, keepdims=True)
-    px_per_m = [np.einsum("ijk,ik->ij", J, axis) for axis in (azimuth_axis, elevation_axis)]
-    spacing_px = np.hypot(px_per_m[0] * spacing_m[:, :1], px_per_m[1] * spacing_m[:, 1:])
-    return focal_px, slope, spacing_px
+    azimuth_px_per_m, elevation_px_per_m = (
+        np.einsum("ijk,ik->ij", J, axis) for axis in (azimuth_axis, elevation_axis)
+    )
+    spacing_px = np.hypot(
+        azimuth_px_per_m * spacing_m[:, :1], elevation_px_per_m * spacing_m[:, 1:]
+    )
+    return _Scale(focal_px, slope, spacing_px)
 
 
 def _ages_ns(since_key_ns: Int, frame: np.ndarray, far: Bool) -> Int:
-    """Return the (K,) times between the points' sweeps and the key sweep."""
-    ages_ns, in_window = np.abs(since_key_ns), np.flatnonzero(~far)
-    first = int(frame[in_window].min(initial=np.iinfo(np.int32).max))
-    sweep_ages_ns = np.zeros(max(0, int(frame[in_window].max(initial=-1)) + 1 - first), np.int64)
-    sweep_ages_ns[frame[in_window] - first] = ages_ns[in_window]
+    """Return the (K,) times between the points' sweeps and the key sweep.
+
+    Sweeps of the window whose ages differ by less than 10 ms get the same age.
+    """
+    ages_ns = np.abs(since_key_ns)
+    in_window = np.flatnonzero(~far)
+    window_frame = frame[in_window]
+
+    # A table of ages by frame number, from the first frame of the window
+    first = int(window_frame.min(initial=np.iinfo(np.int32).max))
+    num_frames = max(0, int(window_frame.max(initial=-1)) + 1 - first)
+    sweep_ages_ns = np.zeros(num_frames, np.int64)
+    sweep_ages_ns[window_frame - first] = ages_ns[in_window]
+
     for younger, older in pairwise(np.argsort(sweep_ages_ns, kind="stable")):
         # Else clock jitter would decide between the sweeps before and after the key sweep.
         if sweep_ages_ns[older] - sweep_ages_ns[younger] < _SAME_AGE_NS:
             sweep_ages_ns[older] = sweep_ages_ns[younger]
-    ages_ns[in_window] = sweep_ages_ns[frame[in_window] - first]
+    ages_ns[in_window] = sweep_ages_ns[window_frame - first]
     return ages_ns

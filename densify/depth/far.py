@@ -12,7 +12,7 @@ import numpy as np
 
 from densify.depth.confidence import confidence_by_age
 from densify.depth.exposure import AT_ONCE, Exposure
-from densify.depth.patches import AGREE_M, HIDDEN_FRACTION, tangents
+from densify.depth.patches import AGREE_M, HIDDEN_FRACTION, fit_tangents
 from densify.free_space.range_image import RangeImage
 from densify.free_space.seen_through import FREE_MARGIN
 from densify.free_space.sensor import Sensors
@@ -33,14 +33,16 @@ from densify.geometry.types import (
     Sweep,
 )
 
-_MOST_RANGE_M = 60.0
-# Enough, as many sweeps measure a surface; larger patches hide edges.
+_MOST_RANGE_M = 60.0  # greatest range of returns that are registered well
+# Larger patches hide edges. These are large enough, because many sweeps measure each surface.
 _MOST_SPACING_M = 0.5 * AGREE_M
-_SLACK_M = 0.5
+_SLACK_M = 0.5  # distance from its pose at which a camera may be, in the fast test of the view
 _PRIME = 2_654_435_761  # its multiples visit any smaller number of points in mixed order
 _FEW_FILLED = 3  # least number of filled cells of nine, for a sweep beyond the window
-# Travel between testing sweeps, and from the tested sweep: most of a car, or its rear half.
-_WITNESSES_M, _WITNESS_M, _LEAST_WITNESS_M = 5.0, 3.5, 2.0
+_WITNESSES_M = 5.0  # travel between testing sweeps
+# Travel from the tested sweep to its testing sweep: most of a car, at the ends of the road its rear
+# half
+_WITNESS_M, _LEAST_WITNESS_M = 3.5, 2.0
 
 
 def in_reach(sweep: Sweep) -> Bool:
@@ -49,35 +51,39 @@ def in_reach(sweep: Sweep) -> Bool:
     return x * x + y * y + z * z < _MOST_RANGE_M**2
 
 
-def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
+def find_seen_through(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
     """Return for each sweep (N,) True where another sweep along the road saw through the point.
 
     Some sweeps, 5 m of travel apart, test the points of the others. Points ahead of a sweep are
     tested by the next testing sweep at least 3.5 m farther, points behind it by the previous one.
     By then even a vehicle that drives along has left most of its place. At the ends of the road the
-    last testing sweep is taken, if 2 m away or more, or the testing sweep on the other side. The
-    sweeps are deskewed, and ``travel_m`` (S,) is the ascending position of each along the road.
-    """
-    testers = [0] if sweeps else list[int]()
-    for i, at_m in enumerate(travel_m.tolist()):
-        if at_m - travel_m[testers[-1]] >= _WITNESSES_M or i == len(sweeps) - 1 > 0:
-            testers.append(i)
-    with ThreadPoolExecutor(num_threads()) as pool:
-        images = dict(
-            zip(testers, pool.map(lambda i: RangeImage.of(sweeps[i]), testers), strict=True)
-        )
+    last testing sweep is taken, if 2 m away or more, or the testing sweep on the other side.
 
-    def gone(i: int) -> Bool:
-        """Return (N,) True for the points of sweep i that were seen through."""
-        tested, witnesses = sweeps[i], _witnesses(i, testers, travel_m)
-        points, free = tested.sweep.points, np.zeros(len(tested.sweep), bool)
-        witness_of = np.zeros(len(points), np.int64)
+    Args:
+        sweeps: S deskewed sweeps.
+        travel_m: (S,) ascending positions of the sweeps along the road.
+    """
+    testers = _choose_testers(travel_m)
+    with ThreadPoolExecutor(num_threads()) as pool:
+        range_images = pool.map(RangeImage.of, [sweeps[tester] for tester in testers])
+        images = dict(zip(testers, range_images, strict=True))
+
+    def seen_through(index: int) -> Bool:
+        """Return (N,) True for the points of a sweep that were seen through."""
+        tested = sweeps[index]
+        points = tested.sweep.points
+        witnesses = _choose_witnesses(index, testers, travel_m)
         # From the tested sweep's lidar frame to the frames of the witnesses
         T_witness = [
-            poses.inverse(sweeps[w].T_world_lidar) @ tested.T_world_lidar for w in witnesses
+            poses.inverse(sweeps[witness].T_world_lidar) @ tested.T_world_lidar
+            for witness in witnesses
         ]
+        witness_of = np.zeros(len(points), np.int64)
         if len(witnesses) == 2:  # points ahead belong to the later witness
-            witness_of[points @ poses.inverse(T_witness[1])[:3, 3] > 0] = 1
+            to_later_witness = poses.inverse(T_witness[1])[:3, 3]
+            witness_of[points @ to_later_witness > 0] = 1
+
+        free = np.zeros(len(points), bool)
         for number, witness in enumerate(witnesses):
             rows = np.flatnonzero(witness_of == number)
             points_witness = poses.transform(T_witness[number], points.take(rows, axis=0))
@@ -85,52 +91,76 @@ def departed(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
         return free
 
     with ThreadPoolExecutor(num_threads()) as pool:
-        return list(pool.map(gone, range(len(sweeps))))
+        return list(pool.map(seen_through, range(len(sweeps))))
 
 
-def _witnesses(i: int, testers: Sequence[int], travel_m: Float) -> list[int]:
-    """Return the indices, of ``testers``, of the sweeps before and after sweep i that test it."""
-    apart_m = np.array([travel_m[j] - travel_m[i] for j in testers])
-    sides = []
-    for off_m in (-apart_m, apart_m):
-        far_enough = np.flatnonzero(off_m >= _WITNESS_M)
+def _choose_testers(travel_m: Float) -> list[int]:
+    """Return the indices of the testing sweeps: the first, the last, and some between."""
+    if not len(travel_m):
+        return []
+    testers = [0]
+    last = len(travel_m) - 1
+    for index, at_m in enumerate(travel_m.tolist()):
+        if at_m - travel_m[testers[-1]] >= _WITNESSES_M or index == last > 0:
+            testers.append(index)
+    return testers
+
+
+def _choose_witnesses(index: int, testers: Sequence[int], travel_m: Float) -> list[int]:
+    """Return the testing sweeps before and after a sweep that test it, as indices of sweeps.
+
+    There may be one, or none.
+    """
+    ahead_m = np.array([travel_m[tester] - travel_m[index] for tester in testers])
+    witnesses = []
+    for distance_m in (-ahead_m, ahead_m):
+        far_enough = np.flatnonzero(distance_m >= _WITNESS_M)
         if len(far_enough):
-            sides.append(testers[far_enough[np.argmin(off_m[far_enough])]])
-        elif off_m.max() >= _LEAST_WITNESS_M:
-            sides.append(testers[int(np.argmax(off_m))])
-    return sides
+            witnesses.append(testers[far_enough[np.argmin(distance_m[far_enough])]])
+        elif distance_m.max() >= _LEAST_WITNESS_M:
+            witnesses.append(testers[int(np.argmax(distance_m))])
+    return witnesses
 
 
-def standing(sensors: Sensors, registered: RegisteredSweep, gone: Bool) -> StandingWorld:
-    """Return a sweep's points that are not ``gone`` (N,), world frame, with their patches."""
+def static_points(
+    sensors: Sensors, registered: RegisteredSweep, seen_through: Bool
+) -> StandingWorld:
+    """Return the static points of a sweep, world frame, with their patches.
+
+    ``seen_through`` (N,) marks the points to leave out.
+    """
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     source = np.zeros(len(sweep), np.int32)
-    normal, spacing_m = tangents(sweep.points, sweep.lidar, source, sensors, [sensors.origins_m])
+    surface = fit_tangents(sweep.points, sweep.lidar, source, sensors, [sensors.origins_m])
     return StandingWorld(
         points=poses.transform(T_world_lidar, sweep.points).astype(np.float32),
-        normal=poses.rotate(T_world_lidar, normal.astype(np.float64)).astype(np.float32),
-        spacing_m=np.minimum(spacing_m, np.float32(_MOST_SPACING_M)),
+        normal=poses.rotate(T_world_lidar, surface.normal.astype(np.float64)).astype(np.float32),
+        spacing_m=np.minimum(surface.spacing_m, np.float32(_MOST_SPACING_M)),
         source=source,
         row=sweep.row,
         lidar=sweep.lidar,
         intensity=sweep.intensity,
         frames=(sweep.frame,),
         stamp_ns=np.array([sweep.stamp_ns], np.int64),
-    ).select(~gone)
+    ).select(~seen_through)
 
 
-def joined(worlds: Sequence[StandingWorld]) -> StandingWorld:
-    """Join the parts of one static world, ordered by frame number."""
-    worlds = [_NOTHING, *sorted(worlds, key=lambda world: world.frames)]
+def join_worlds(worlds: Sequence[StandingWorld]) -> StandingWorld:
+    """Return the parts of one static world as a whole, ordered by frame number."""
+    # With the empty world there is something to concatenate.
+    worlds = [_EMPTY_WORLD, *sorted(worlds, key=lambda world: world.frames)]
+    # The sources of each world follow those of the worlds before it.
     firsts = np.cumsum([0, *(len(world.frames) for world in worlds)])
     sources = [world.source + np.int32(first) for world, first in zip(worlds, firsts, strict=False)]
     names = {field.name for field in fields(StandingWorld)} - {"source", "frames", "left_out"}
-    columns: dict[str, Any] = {n: np.concatenate([getattr(w, n) for w in worlds]) for n in names}
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(world, name) for world in worlds]) for name in names
+    }
     frames = tuple(frame for world in worlds for frame in world.frames)
     return StandingWorld(**columns, source=np.concatenate(sources), frames=frames)
 
 
-_NOTHING = StandingWorld(
+_EMPTY_WORLD = StandingWorld(
     points=np.zeros((0, 3), np.float32),
     normal=np.zeros((0, 3), np.float32),
     spacing_m=np.zeros((0, 2), np.float32),
@@ -144,21 +174,31 @@ _NOTHING = StandingWorld(
 
 
 def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
-    """Return (N,) True for the points (N,3), world frame, that a camera may observe.
+    """Return (N,) True for the points that a camera may observe.
 
-    It is False only if the point is out of view from every position within ``slack_m`` metres of
-    ``T_cam_world`` (4,4). For a lens that is no pinhole all are True.
+    It is False only if the point is out of view from every position near the camera's pose. For a
+    lens that is no pinhole all are True.
+
+    Args:
+        camera: The camera.
+        T_cam_world: (4,4) pose of the camera.
+        points: (N,3) points in the world frame.
+        slack_m: Greatest distance in metres of a position from the pose.
     """
     if camera.model != "pinhole":
         return np.ones(len(points), bool)
     T = T_cam_world.astype(np.float32)
     x, y, z = T[:3, :3] @ points.T + T[:3, 3:]
     K, slack_m = camera.K.astype(np.float32), np.float32(slack_m)
-    bent = np.float32(1.2 if camera.distortion else 1.0)
-    right, left = bent * (camera.width_px - K[0, 2]) / K[0, 0], -bent * K[0, 2] / K[0, 0]
-    low, high = bent * (camera.height_px - K[1, 2]) / K[1, 1], -bent * K[1, 2] / K[1, 1]
+    # A distorted image may show more than a pinhole of its matrix.
+    widening = np.float32(1.2 if camera.distortion else 1.0)
+    # Slopes x / z and y / z of the rays at the edges of the image
+    right = widening * (camera.width_px - K[0, 2]) / K[0, 0]
+    left = -widening * K[0, 2] / K[0, 0]
+    bottom = widening * (camera.height_px - K[1, 2]) / K[1, 1]
+    top = -widening * K[1, 2] / K[1, 1]
     inside: Bool = (x < right * z + slack_m) & (x > left * z - slack_m) & (z > -slack_m)
-    inside &= (y < low * z + slack_m) & (y > high * z - slack_m)
+    inside &= (y < bottom * z + slack_m) & (y > top * z - slack_m)
     return inside
 
 
@@ -173,20 +213,27 @@ def far_cloud(
     """Return the points beyond the window that a camera observes, and their patches.
 
     Both are in the key sweep's lidar frame. One point per pixel and step of depth is kept.
-    ``T_key_world`` (4,4) maps the world frame of ``world`` to that frame. ``standing_only`` leaves
-    out points that the first or the last sweep of the window saw through.
+
+    Args:
+        world: Static points of the sweeps along the road.
+        T_key_world: (4,4) from the frame of ``world`` to the key sweep's lidar frame.
+        stretch: Registered sweeps of the window.
+        key: Frame number of the key sweep.
+        exposures: Cameras and times of the maps, by name of the map.
+        standing_only: Leave out points that the first or the last sweep of the window saw through.
     """
-    beyond = ~np.isin(world.frames, stretch.frames)
-    rows = np.flatnonzero(beyond[world.source])
+    is_beyond = ~np.isin(world.frames, stretch.frames)
+    rows = np.flatnonzero(is_beyond[world.source])
     needed = np.zeros(len(world), bool)
     for exposure in exposures.values():
-        needed[_seen(world.points, rows, T_key_world, exposure)] = True
+        needed[_select_needed(world.points, rows, T_key_world, exposure)] = True
     world = world.select(needed)
     points = poses.transform(T_key_world, world.points.astype(np.float64))
     if standing_only:
-        is_static = ~_gone(points, stretch, key)
+        is_static = ~_seen_through_by_ends(points, stretch, key)
         world, points = world.select(is_static), points[is_static]
-    num, since_key_ns = len(world), world.stamp_ns - stretch[key].sweep.stamp_ns
+    num = len(world)
+    since_key_ns = world.stamp_ns - stretch[key].sweep.stamp_ns  # of the sweeps
     cloud = Cloud(
         points=points,
         rigid_points=points,
@@ -206,31 +253,31 @@ def far_cloud(
     return cloud, Patches(normal, world.spacing_m)
 
 
-def _seen(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) -> Int:
+def _select_needed(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) -> Int:
     """Return those of the ``rows`` (K,) of points (N,3), world frame, that a camera needs."""
     T_cam_world = exposure.T_cam_key @ T_key_world
-    kept, cells = [rows[:0]], [np.zeros((0, 3), np.float32)]
+    rows_in_view, cells = [rows[:0]], [np.zeros((0, 3), np.float32)]
     for first in range(0, len(rows), AT_ONCE):
+        # A fast test first: the projection takes far longer.
         chunk = rows[first : first + AT_ONCE]
-        viewable = chunk[
-            may_see(exposure.camera, T_cam_world, points.take(chunk, axis=0), _SLACK_M)
-        ]
+        may_be_seen = may_see(exposure.camera, T_cam_world, points.take(chunk, axis=0), _SLACK_M)
+        viewable = chunk[may_be_seen]
         points_key = poses.transform(T_key_world, points.take(viewable, axis=0).astype(np.float64))
         sight = exposure.see(points_key, np.zeros(points_key.shape, np.float32))
         inside = np.flatnonzero(sight.inside)
         depth_m = exposure.depth_m(sight.points_cam.take(inside, axis=0))
         # A camera needs one point in every pixel and step of depth.
         cell = np.column_stack([sight.uv.take(inside, axis=0), np.log(depth_m) / HIDDEN_FRACTION])
-        kept.append(viewable[inside])
+        rows_in_view.append(viewable[inside])
         cells.append(np.rint(cell.astype(np.float32)))
-    rows = np.concatenate(kept)
+    rows = np.concatenate(rows_in_view)
     # A pixel is supported only by several sweeps, so neighbouring pixels take different sweeps.
-    mixed = np.arange(len(rows)) * _PRIME % max(1, len(rows))
-    return rows[thinned(np.concatenate(cells), mixed, 1.0, 1)]
+    mixed_order = np.arange(len(rows)) * _PRIME % max(1, len(rows))
+    return rows[thinned(np.concatenate(cells), mixed_order, 1.0, 1)]
 
 
-def _gone(points: Float, stretch: Stretch, key: int) -> Bool:
-    """Return (M,) True for points, key frame, that an end of the window saw through."""
+def _seen_through_by_ends(points: Float, stretch: Stretch, key: int) -> Bool:
+    """Return (M,) True for points, key frame, that the window's first or last sweep saw through."""
     free = np.zeros(len(points), bool)
     for frame in {stretch.frames[0], stretch.frames[-1]} - {key}:
         points_sweep = poses.transform(stretch.T_target_source(frame, key), points)

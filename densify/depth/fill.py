@@ -27,10 +27,10 @@ from densify.depth.votes import (
     NONE,
     ROUNDED,
     Voters,
-    extended,
-    first_known,
+    extend,
     inverse_of,
     offset,
+    steps_to_known,
     votes_for,
 )
 from densify.geometry.arrays import Bool, Float, Float32
@@ -40,10 +40,11 @@ LEAST_SHARE = 0.97
 """Share of the votes for a boundary pixel that is kept."""
 _FILL_SHARE, _STAR_SHARE = 0.9, 0.8  # share of the votes for a filled pixel
 _NUM_SIZES = 3  # of the windows, up to a half size of a spacing of rays
-_RIDGE_PX2 = 1e-7
+_RIDGE_PX2 = 1e-7  # see `densify.depth.patches.plane`
 _MIN_PLANE_PX = 6  # fewer do not distinguish a plane from a step
 _MOST_PX = 120  # greatest half size of a window
-_STAR_MET = len(DIRECTIONS) // 2  # least number of directions with a known pixel
+_MIN_MET = len(DIRECTIONS) // 2  # least number of directions with a known pixel
+_GAP_TOO_WIDE = len(DIRECTIONS) // 2  # number of neighbouring directions without a known pixel
 _STAR_SPREAD = 0.1  # greatest difference between the predictions, as a share of inverse depth
 _SPOT_PX = 4  # greatest half width of a spot
 
@@ -55,10 +56,11 @@ def accept_boundary_pixels(record: MapRecord, rims: str) -> None:
     all pixels, ``strict`` none.
     """
     pixel = np.flatnonzero(record.boundary_m)
-    share = np.full(len(pixel), np.float32(0.5))
     depth_m = record.boundary_m.flat[pixel]
     if record.lab.size:
-        share = votes_for(record, [record.depth_m], pixel, depth_m, surely=True)
+        share = votes_for(record, [record.depth_m], pixel, depth_m, with_shifts=True)
+    else:
+        share = np.full(len(pixel), np.float32(0.5))  # without an image neither for nor against
     accepted = share >= LEAST_SHARE if rims == "image" else np.full(len(pixel), rims == "keep")
     record.votes.flat[pixel] = share
     record.depth_m.flat[pixel[accepted]] = depth_m[accepted]
@@ -85,19 +87,21 @@ def _reject_unconfirmed(record: MapRecord, empty: Bool, least_share: float) -> N
     # that were not accepted may only vote against. This protects the pillar of a car, which has few
     # measured pixels.
     maps_m = np.maximum(record.depth_m, record.boundary_m), record.depth_m
-    votes = votes_for(record, maps_m, pixel, record.filled_m.flat[pixel], surely=False)
-    record.votes.flat[pixel] = votes
-    filled.flat[pixel] = votes < ROUNDED * least_share
-    record.reject(filled)
+    share = votes_for(record, maps_m, pixel, record.filled_m.flat[pixel], with_shifts=False)
+    record.votes.flat[pixel] = share
+    rejected = np.zeros_like(filled)
+    rejected.flat[pixel] = share < ROUNDED * least_share
+    record.reject(rejected)
 
 
 class _Known(NamedTuple):
     """The K measured pixels of a map, row by row."""
 
-    # (H,W+1) int32 number of measured pixels above row r or left of column c in row r
+    # (H,W+1) number of measured pixels above row r or left of column c in row r: the index of the
+    # first measured pixel from there on
     before: NDArray[np.int32]
-    num: NDArray[np.int32]  # (H+1,W+1) int32 integral image of the measured pixels
-    column: NDArray[np.int32]  # (K,) int32 column of each pixel
+    num: NDArray[np.int32]  # (H+1,W+1) integral image of the measured pixels
+    column: NDArray[np.int32]  # (K,) column of each pixel
     inverse: Float  # (K,) float64 inverse depth of each pixel, 1/m
 
 
@@ -111,24 +115,36 @@ def fill_between(filled_m: Float32, tilt: Float32, spacing_px: Float32, reach: f
 
     The pixel gets the depth of the plane. Weights fall to zero just outside the window. The window
     grows in thirds of the ray spacing, then to ``reach`` spacings. The smallest sufficient window
-    is taken. The maps are those of `MapRecord`, ``filled_m`` with measured pixels only.
+    is taken.
+
+    Args:
+        filled_m: (H,W) depths of the measured pixels, 0 elsewhere; the filled depths are added.
+        tilt: (H,W,2) slopes as in `MapRecord`; those of filled pixels are added.
+        spacing_px: (H,W,2) spacing of rays across and down.
+        reach: Half size of the largest window in spacings of rays.
     """
     sizes = min(reach, 1.0) * np.arange(1, _NUM_SIZES + 1) / _NUM_SIZES
     reaches = np.append(sizes, reach) if reach > 1 else sizes
+    known = _known_pixels(filled_m)
+    _fill.over_rows(filled_m.size, known, spacing_px, reaches, filled_m, tilt)
+
+
+def _known_pixels(filled_m: Float32) -> _Known:
+    """Return the pixels with a depth of a map (H,W)."""
     measured = filled_m > 0
     height, width = measured.shape
     before = np.zeros((height, width + 1), np.int32)
     np.cumsum(measured, axis=1, dtype=np.int32, out=before[:, 1:])
     num = np.zeros((height + 1, width + 1), np.int32)
     np.cumsum(before, axis=0, out=num[1:])
-    before += num[:-1, -1:]
+    before += num[:-1, -1:]  # the pixels of the rows above
     column = np.nonzero(measured)[1].astype(np.int32)
-    known = _Known(before, num, column, inverse=1 / filled_m[measured].astype(np.float64))
-    _fill.over_rows(measured.size, known, spacing_px, reaches, filled_m, tilt)
+    return _Known(before, num, column, inverse=1 / filled_m[measured].astype(np.float64))
 
 
 @inlined
 def _any(num, top, bottom, left, right):  # type: ignore[no-untyped-def]
+    """Return True if a rectangle has measured pixels, by the integral image ``num``."""
     return num[bottom, right] - num[top, right] - num[bottom, left] + num[top, left] > 0
 
 
@@ -145,21 +161,23 @@ def _surrounded(num, window, row, column):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _sum_up(known, window, row, column, m):  # type: ignore[no-untyped-def]
-    """Fill in the sums of a window's pixels for `plane`; return number, nearest, farthest."""
-    # window: its rows, its columns; nearest and farthest are inverse depths
+def _sum_up(known, window, row, column, moments):  # type: ignore[no-untyped-def]
+    """Fill in the ``moments`` (9,) of a window's pixels for `plane`, relative to the pixel.
+
+    Returns the number of pixels, and their nearest and farthest inverse depth.
+    """
     top, bottom, left, right = window
     reach_v, reach_u = max(row - top, bottom - 1 - row), max(column - left, right - 1 - column)
-    num, w_near, w_far = 0, 0.0, np.inf
-    m[:] = 0.0
+    num, nearest, farthest = 0, 0.0, np.inf
+    moments[:] = 0.0
     for r in range(top, bottom):
         for k in range(known.before[r, left], known.before[r, right]):
-            w, du, dv = known.inverse[k], known.column[k] - column, r - row
-            # It falls to 0 just beyond the reach (px).
+            inverse, du, dv = known.inverse[k], known.column[k] - column, r - row
+            # The weight falls to 0 just beyond the reach (px).
             weight = (1 - abs(dv) / (reach_v + 1)) * (1 - abs(du) / (reach_u + 1))
-            add_moments(m, weight, du, dv, w)
-            num, w_near, w_far = num + 1, max(w_near, w), min(w_far, w)
-    return num, w_near, w_far
+            add_moments(moments, weight, du, dv, inverse)
+            num, nearest, farthest = num + 1, max(nearest, inverse), min(farthest, inverse)
+    return num, nearest, farthest
 
 
 @inlined
@@ -168,31 +186,35 @@ def _spread(known, window, row, column, centre, slope_u, slope_v):  # type: igno
     top, bottom, left, right = window
     low, high = np.inf, -np.inf
     for r in range(top, bottom):
-        inverse = centre + (r - row) * slope_v
+        on_plane = centre + (r - row) * slope_v
         for k in range(known.before[r, left], known.before[r, right]):
-            off = known.inverse[k] - inverse - (known.column[k] - column) * slope_u
-            low, high = min(low, off), max(high, off)
+            deviation = known.inverse[k] - on_plane - (known.column[k] - column) * slope_u
+            low, high = min(low, deviation), max(high, deviation)
     return high - low
 
 
 @Kernel
 def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ignore[no-untyped-def]
-    """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`."""
+    """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`.
+
+    ``reaches`` are half sizes of windows in spacings of rays, ascending.
+    """
     height, width = filled_m.shape
-    m = np.empty(9)
+    moments = np.empty(9)
     for p in range(first, last):
         row, column = p // width, p % width
         if filled_m[row, column] > 0:
             continue
-        before_u, before_v = 0, 0
-        for step in range(len(reaches)):  # half sizes in spacings of rays, ascending
+        tried_u, tried_v = 0, 0
+        for step in range(len(reaches)):
+            # The window, unless it is that of the step before
             across_px = reaches[step] * spacing_px[row, column, 0]
             down_px = reaches[step] * spacing_px[row, column, 1]
             reach_u = min(max(int(np.rint(across_px)), 1), _MOST_PX)
             reach_v = min(max(int(np.rint(down_px)), 1), _MOST_PX)
-            if reach_u == before_u and reach_v == before_v:
+            if reach_u == tried_u and reach_v == tried_v:
                 continue
-            before_u, before_v = reach_u, reach_v
+            tried_u, tried_v = reach_u, reach_v
             window = (
                 max(row - reach_v, 0),
                 min(row + reach_v + 1, height),
@@ -201,13 +223,16 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ign
             )
             if not _surrounded(known.num, window, row, column):
                 continue
-            num, w_near, w_far = _sum_up(known, window, row, column, m)
-            allowed = max(HIDDEN_M, HIDDEN_FRACTION / w_near)
-            if num < _MIN_PLANE_PX and 1 / w_far - 1 / w_near > allowed:
+
+            # A depth discontinuity: few pixels are compared by their depths, more by a plane.
+            num, nearest, farthest = _sum_up(known, window, row, column, moments)
+            allowed_m = max(HIDDEN_M, HIDDEN_FRACTION / nearest)
+            if num < _MIN_PLANE_PX and 1 / farthest - 1 / nearest > allowed_m:
                 continue
-            centre, slope_u, slope_v = plane(m, _RIDGE_PX2)
+            centre, slope_u, slope_v = plane(moments, _RIDGE_PX2)
             spread = _spread(known, window, row, column, centre, slope_u, slope_v)
-            if num >= _MIN_PLANE_PX and spread / (centre * centre) > allowed:
+            # A difference of inverse depth (1/m), divided by its square, is one of depth (m).
+            if num >= _MIN_PLANE_PX and spread / (centre * centre) > allowed_m:
                 continue
             if centre > 0:
                 filled_m[row, column] = 1 / centre
@@ -226,7 +251,7 @@ def fill_stars(record: MapRecord) -> None:
     empty = record.filled_m == 0
     pixel = np.flatnonzero(empty)
     predicted_m = np.zeros(len(pixel), np.float32)
-    known = Voters(first_known(~empty), inverse_of(record.filled_m), record.tilt)
+    known = Voters(steps_to_known(~empty), inverse_of(record.filled_m), record.tilt)
     _star.over_rows(len(pixel), pixel, known, record.spacing_px, predicted_m)
     record.filled_m.flat[pixel] = predicted_m
     _reject_unconfirmed(record, empty, _STAR_SHARE)
@@ -236,7 +261,7 @@ def fill_stars(record: MapRecord) -> None:
 def _widest_gap(met):  # type: ignore[no-untyped-def]
     """Return the largest number of neighbouring directions where ``met`` (16,) is False."""
     widest = run = 0
-    for d in range(2 * len(met)):
+    for d in range(2 * len(met)):  # twice around, for gaps across the first direction
         run = 0 if met[d % len(met)] else run + 1
         widest = max(widest, run)
     return min(widest, len(met))
@@ -250,23 +275,23 @@ def _star(first, last, pixel, known, spacing_px, predicted_m):  # type: ignore[n
     for p in range(first, last):
         row, column = pixel[p] // width, pixel[p] % width
         reach_px = max(spacing_px[row, column, 0], spacing_px[row, column, 1])
-        num, w_near, w_far = 0, 0.0, np.inf
-        sum_w, weight = 0.0, 0.0
+        num, nearest, farthest = 0, 0.0, np.inf
+        weighted_sum, sum_weights = 0.0, 0.0
         for d in range(len(DIRECTIONS)):
-            k = np.int64(known.steps[d, row, column])
+            k = np.int64(known.steps[d, row, column])  # at least 1, as the pixel is empty
             du, dv = offset(d, k)
             met[d] = k != NONE and du * du + dv * dv <= reach_px * reach_px
             if met[d]:
-                w = extended(known.inverse, known.tilt, row + dv, column + du, du, dv)
-                w_near, w_far = max(w_near, w), min(w_far, w)
-                sum_w += w / k
-                weight += 1 / k
+                inverse = extend(known.inverse, known.tilt, row + dv, column + du, du, dv)
+                nearest, farthest = max(nearest, inverse), min(farthest, inverse)
+                weighted_sum += inverse / k
+                sum_weights += 1 / k
                 num += 1
-        if num < _STAR_MET or _widest_gap(met) >= _STAR_MET:
+        if num < _MIN_MET or _widest_gap(met) >= _GAP_TOO_WIDE:
             continue
-        w = sum_w / weight
-        if w_near - w_far <= _STAR_SPREAD * w:
-            predicted_m[p] = 1 / w
+        mean = weighted_sum / sum_weights
+        if nearest - farthest <= _STAR_SPREAD * mean:
+            predicted_m[p] = 1 / mean
 
 
 def measure_spots(record: MapRecord) -> None:
@@ -275,39 +300,48 @@ def measure_spots(record: MapRecord) -> None:
     The fill must lie on the surface of the return. A covered pixel takes the ``point`` of the
     nearest return, and keeps its filled depth and confidence. Pixels without fill stay empty.
     """
-    points, measured = record.points, np.flatnonzero(record.depth_m > 0)
-    index_of = np.zeros(len(record.reason), np.int64)  # in the image, by index in the cloud
-    index_of[points.rows] = np.arange(len(points.rows))
-    point = index_of[record.point.flat[measured]]
+    points = record.points
+    measured = np.flatnonzero(record.depth_m > 0)
+    index_in_image = np.zeros(len(record.reason), np.int64)  # by index in the cloud
+    index_in_image[points.rows] = np.arange(len(points.rows))
+    point = index_in_image[record.point.flat[measured]]
     radius_px = np.minimum(FOOTPRINT * points.spacing_px[point, 0], _SPOT_PX)
+    uv = points.uv[point]
+
     filled_m = np.where(record.depth_m == 0, record.filled_m, np.float32(0))
     source = np.full(filled_m.shape, -1)
-    nearest, uv = np.full(filled_m.shape, np.inf), points.uv[point]
-    _cover(measured, uv, radius_px, record.depth_m, record.tilt, filled_m, source, nearest)
+    nearest_px2 = np.full(filled_m.shape, np.inf)
+    _cover(measured, uv, radius_px, record.depth_m, record.tilt, filled_m, source, nearest_px2)
     covered = np.flatnonzero(source >= 0)
     record.depth_m.flat[covered] = record.filled_m.flat[covered]
     record.point.flat[covered] = record.point.flat[source.flat[covered]]
 
 
 @Kernel
-def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, source_pixel, nearest):  # type: ignore[no-untyped-def]
-    """Find for each filled pixel the measured pixel, nearest in the image, whose spot covers it."""
-    # filled_m: 0 where no pixel may be covered; source_pixel (H,W): index of the measured pixel, -1
-    # at first; nearest (H,W): squared distance to its spot, inf at first
+def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, source_pixel, nearest_px2):  # type: ignore[no-untyped-def]
+    """Find for each filled pixel the measured pixel, nearest in the image, whose spot covers it.
+
+    ``filled_m`` is 0 where no pixel may be covered. ``source_pixel`` (H,W) is the index of the
+    measured pixel, -1 at first. ``nearest_px2`` (H,W) is the squared distance to the centre of its
+    spot, inf at first.
+    """
     height, width = filled_m.shape
     for i in range(len(pixel)):
         v, u = pixel[i] // width, pixel[i] % width
         return_m = depth_m[v, u]
-        reach = int(radius_px[i] + 0.5)  # the centre of a spot is in its pixel
+        reach = int(radius_px[i] + 0.5)  # the spot's centre is up to half a pixel from the pixel's
         for row in range(max(v - reach, 0), min(v + reach + 1, height)):
             for column in range(max(u - reach, 0), min(u + reach + 1, width)):
-                z = filled_m[row, column]
-                if z == 0:
+                fill_m = filled_m[row, column]
+                if fill_m == 0:
                     continue
-                away = (column - uv[i, 0]) ** 2 + (row - uv[i, 1]) ** 2
-                if away > radius_px[i] * radius_px[i] or away >= nearest[row, column]:
+                px2 = (column - uv[i, 0]) ** 2 + (row - uv[i, 1]) ** 2
+                if px2 > radius_px[i] * radius_px[i] or px2 >= nearest_px2[row, column]:
                     continue
+                # The surface of the return, extended to the pixel, must have the depth of the fill.
+                # Compared are fill / surface - 1, and the tolerance as a share of the surface.
                 inverse = 1 / return_m + (column - u) * tilt[v, u, 0] + (row - v) * tilt[v, u, 1]
-                if abs(z * inverse - 1) <= (AGREE_M + AGREE_FRACTION * return_m) * abs(inverse):
-                    nearest[row, column] = away
+                tolerance_m = AGREE_M + AGREE_FRACTION * return_m
+                if abs(fill_m * inverse - 1) <= tolerance_m * abs(inverse):
+                    nearest_px2[row, column] = px2
                     source_pixel[row, column] = pixel[i]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from densify.depth.patches import (
     HIDDEN_M,
     add_moments,
     is_occluded,
-    limited,
+    limit_inverse,
     plane,
     sorted_by_pixel,
 )
@@ -40,12 +40,14 @@ _SLACK_M = 0.15 * AGREE_M  # added to the radius of a discontinuity, for errors 
 _EDGE_WINDOW_PX = 1.5  # width beyond the edge in which points must continue the surface
 # Sweeps beyond the window share errors, and continue a surface behind a nearer one.
 _FAR_SWEEPS, _FAR_EDGE = 6, 1.5
-_RIDGE_PX2 = 0.02
-_LEAST_PX, _MOST_PX = 3, 24  # limits of the radius
+_RIDGE_PX2 = 0.02  # see `densify.depth.patches.plane`
+_LEAST_PX, _MOST_PX = 3, 24  # limits of the plane's radius
 ALL_ROUND = 3.0
 """Extent of a surface without a depth discontinuity nearby, in radii of a discontinuity."""
 _BLOCK_PX = 16  # blocks within which the density of rays is about constant
 _JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
+# Rows of the array that `_settle` fills
+_DEPTH, _SWEEPS, _NEAREST, _EDGE, _NUM_SETTLED = range(5)
 
 
 class MapInputs(NamedTuple):
@@ -102,7 +104,8 @@ class MapRecord:
 
     def box(self, box: tuple[slice, slice]) -> MapRecord:
         """Return a box of rows and columns as views: writing to the box changes this record."""
-        names = {f.name for f in fields(self)} - {"points", "reason", "evidence"}
+        # The other fields are images.
+        names = {field.name for field in fields(self)} - {"points", "reason", "evidence"}
         return replace(self, **{name: getattr(self, name)[box] for name in names})
 
     def reject(self, dropped: Bool) -> None:
@@ -113,7 +116,8 @@ class MapRecord:
         dropped = dropped & (self.filled_m > 0)
         np.copyto(self.boundary_m, self.depth_m, where=dropped & (self.depth_m > 0))
         np.copyto(self.rejected_m, self.filled_m, where=dropped)
-        self.depth_m[dropped] = self.filled_m[dropped] = 0
+        self.depth_m[dropped] = 0
+        self.filled_m[dropped] = 0
 
 
 def measure(inputs: MapInputs) -> MapRecord:
@@ -122,12 +126,25 @@ def measure(inputs: MapInputs) -> MapRecord:
     Points beyond the window come second. They measure pixels that the window leaves empty, away
     from depth discontinuities.
     """
-    camera, points = inputs.camera, points_in_image(inputs.cloud, inputs.view, inputs.patches)
-    shape = (camera.height_px, camera.width_px)
+    camera = inputs.camera
+    points = points_in_image(inputs.cloud, inputs.view, inputs.patches)
     in_window = points.take(np.flatnonzero(~points.far)) if points.far.any() else points
-    zero, no_image = np.zeros(shape, np.float32), np.zeros((0, 0, 3), np.float32)
-    lab = no_image if inputs.lab is None else inputs.lab
-    record = MapRecord(
+    record = _empty_record(inputs, points, spaced=points if points.far.all() else in_window)
+    if not inputs.settings.visibility:
+        _measure_nearest(record, points, camera)
+        return record
+    _measure_visible(record, in_window, camera)
+    if points.far.any():
+        _measure_visible(record, points, camera, beyond_window=True)
+    return record
+
+
+def _empty_record(inputs: MapInputs, points: PointsInImage, spaced: PointsInImage) -> MapRecord:
+    """Return a record without depths; the spacing of rays is that of the points ``spaced``."""
+    shape = (inputs.camera.height_px, inputs.camera.width_px)
+    zero = np.zeros(shape, np.float32)
+    no_image = np.zeros((0, 0, 3), np.float32)
+    return MapRecord(
         depth_m=zero.copy(),
         boundary_m=zero.copy(),
         filled_m=zero.copy(),
@@ -135,49 +152,47 @@ def measure(inputs: MapInputs) -> MapRecord:
         confidence=zero.copy(),
         point=np.full(shape, -1, np.int32),
         tilt=np.zeros((*shape, 2), np.float32),
-        spacing_px=_spacing_px(points if points.far.all() else in_window, shape),
+        spacing_px=_spacing_px(spaced, shape),
         votes=np.ones(shape, np.float32),
         edge=zero,
         on_body=np.zeros(shape, bool),
-        lab=np.ascontiguousarray(lab),
+        lab=np.ascontiguousarray(no_image if inputs.lab is None else inputs.lab),
         points=points,
         reason=np.full(len(inputs.cloud), Reason.OUTSIDE, np.uint8),
     )
-    if not inputs.settings.visibility:
-        _measure_nearest(record, points, camera)
-        return record
-    _measure_visible(record, in_window, camera)
-    if points.far.any():
-        _measure_visible(record, points, camera, beyond=True)
-    return record
 
 
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     """Return the (H,W,2) spacing of rays across and down, the mean over blocks of pixels."""
-    height, width = (-(-size // _BLOCK_PX) for size in shape)
+    height, width = (-(-size // _BLOCK_PX) for size in shape)  # in blocks, rounded up
     row, column = pixel_of(points.uv)
     block = row // _BLOCK_PX * width + column // _BLOCK_PX
-    num = np.bincount(block, minlength=height * width)
-    if not num.any():
+    num_points = np.bincount(block, minlength=height * width)
+    if not num_points.any():
         return np.ones((*shape, 2), np.float32)
-    sums = [np.bincount(block, s, height * width) for s in points.spacing_px.T]
-    mean = (np.stack(sums, axis=1) / np.maximum(num, 1)[:, None]).astype(np.float32)
-    empty = (num == 0).reshape(height, width)
+    sums = [np.bincount(block, spacing, height * width) for spacing in points.spacing_px.T]
+    mean = (np.stack(sums, axis=1) / np.maximum(num_points, 1)[:, None]).astype(np.float32)
+
+    # A block without points takes the spacing of the nearest block with points.
+    empty = (num_points == 0).reshape(height, width)
     nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     blocks = mean.reshape(height, width, 2)[tuple(nearest)]
+
     # A block takes the downward spacing of the block above or below if that is far larger: the hole
     # below the last of a scanner's denser rings is as wide.
     down_px = blocks[..., 1]
     widest_px = ndimage.maximum_filter1d(down_px, 3, axis=0)
     blocks[..., 1] = np.where(widest_px > _JUMP * down_px, widest_px, down_px)
-    every = blocks.repeat(_BLOCK_PX, axis=0).repeat(_BLOCK_PX, axis=1)
-    return np.ascontiguousarray(every[: shape[0], : shape[1]])
+
+    # The last blocks reach beyond the image.
+    pixels = blocks.repeat(_BLOCK_PX, axis=0).repeat(_BLOCK_PX, axis=1)
+    return np.ascontiguousarray(pixels[: shape[0], : shape[1]])
 
 
 def _measure_nearest(record: MapRecord, points: PointsInImage, camera: Camera) -> None:
     """Measure each pixel by its nearest point, without occlusion or support tests."""
     start, order = sorted_by_pixel(points, np.zeros(len(points.rows), np.int64), camera)
-    pixel = np.flatnonzero(np.diff(start))
+    pixel = np.flatnonzero(np.diff(start))  # pixels with a point
     nearest = order[start[pixel]]
     record.reason[points.rows] = Reason.NOT_CHOSEN
     record.depth_m.flat[pixel] = points.depth[nearest]
@@ -191,40 +206,82 @@ def _set_source(record: MapRecord, points: PointsInImage, pixel: Int, chosen: In
     record.tilt.reshape(-1, 2)[pixel] = points.slope[chosen]
 
 
+class _Winners(NamedTuple):
+    """P pixels, the visible point that wins each, and the plane through the points around it."""
+
+    pixel: Int  # (P,) flat indices of the pixels
+    point: Int  # (P,) indices of the winners among the points in the image
+    depth_m: Float32  # (P,) depth of the plane at the pixel's centre
+    num_sweeps: Float32  # (P,) number of sweeps that agree with the plane
+    is_nearest: Float32  # (P,) 1 if the sweep nearest to the key is among them, else 0
+    edge: Float32  # (P,) distance from a discontinuity, in radii of a discontinuity
+
+    def select(self, keep: Bool) -> _Winners:
+        """Return the pixels where ``keep`` (P,) is True."""
+        columns: Any = (column[keep] for column in self)
+        return _Winners(*columns)
+
+
 def _measure_visible(
-    record: MapRecord, points: PointsInImage, camera: Camera, beyond: bool = False
+    record: MapRecord, points: PointsInImage, camera: Camera, beyond_window: bool = False
 ) -> None:
-    """Measure pixels by visible points, and set the reason of each point in the image."""
-    # beyond: with points of sweeps beyond the window; pixels measured before stay
+    """Measure pixels without a depth by visible points, and set the reason of each point.
+
+    With ``beyond_window`` the points include those of sweeps beyond the window. Only the reasons of
+    these are set then.
+    """
     hidden = is_occluded(points, camera)
+    winners = _find_winners(record, points, hidden, camera)
     reasons = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
-    last = int(points.age_ns.max(initial=0)) + 1
-    start, order = sorted_by_pixel(points, np.where(hidden, last, points.age_ns), camera)
-    done = record.depth_m > 0
-    settled = np.zeros((4, done.size), np.float32)
-    by_pixel = _ByPixel(points.take(order), hidden[order], start, done.shape)
-    _settle.over_rows(done.size, by_pixel, done.ravel(), settled)
-    pixel = np.flatnonzero(settled[0])
-    winner = order[start[pixel]]
-    depth_m, num_sweeps, supported, edge = settled[:, pixel]
-    if beyond:
+    if beyond_window:
         # Beyond the window the sweep nearest to the key need not agree, but six sweeps must.
-        is_supported, inside = num_sweeps >= _FAR_SWEEPS, edge >= _FAR_EDGE
-        reasons[winner[~inside]] = Reason.EDGE
-        used = is_supported & inside
+        is_supported = winners.num_sweeps >= _FAR_SWEEPS
+        is_inside = winners.edge >= _FAR_EDGE
+        is_used = is_supported & is_inside
+        reasons[winners.point[~is_inside]] = Reason.EDGE
+        judged = points.far
     else:
-        is_supported, inside = supported > 0, edge >= 1
-        used = is_supported
-    reasons[winner[~is_supported]] = Reason.UNSUPPORTED
-    set_by = points.far if beyond else ~points.far
-    record.reason[points.rows[set_by]] = reasons[set_by]
-    pixel, winner, depth_m, edge, inside = (
-        column[used] for column in (pixel, winner, depth_m, edge, inside)
+        is_supported = winners.is_nearest > 0
+        is_inside = winners.edge >= 1  # else it is a boundary pixel
+        is_used = is_supported
+        judged = ~points.far
+    reasons[winners.point[~is_supported]] = Reason.UNSUPPORTED
+    record.reason[points.rows[judged]] = reasons[judged]
+    _set_pixels(record, points, winners.select(is_used), is_inside[is_used])
+
+
+def _find_winners(
+    record: MapRecord, points: PointsInImage, hidden: Bool, camera: Camera
+) -> _Winners:
+    """Return the winners of the pixels without a depth; ``hidden`` (K,) marks occluded points."""
+    # Hidden points rank behind the oldest visible one, so a pixel's first point is its winner.
+    hidden_rank = int(points.age_ns.max(initial=0)) + 1
+    rank = np.where(hidden, hidden_rank, points.age_ns)
+    start, order = sorted_by_pixel(points, rank, camera)
+    has_depth = record.depth_m > 0
+    settled = np.zeros((_NUM_SETTLED, has_depth.size), np.float32)
+    by_pixel = _ByPixel(points.take(order), hidden[order], start, has_depth.shape)
+    _settle.over_rows(has_depth.size, by_pixel, has_depth.ravel(), settled)
+    pixel = np.flatnonzero(settled[_DEPTH])
+    return _Winners(
+        pixel=pixel,
+        point=order[start[pixel]],
+        depth_m=settled[_DEPTH, pixel],
+        num_sweeps=settled[_SWEEPS, pixel],
+        is_nearest=settled[_NEAREST, pixel],
+        edge=settled[_EDGE, pixel],
     )
-    record.depth_m.flat[pixel] = np.where(inside, depth_m, 0)
-    record.boundary_m.flat[pixel] = np.where(inside, 0, depth_m)
-    record.edge.flat[pixel] = edge
-    _set_source(record, points, pixel, winner)
+
+
+def _set_pixels(
+    record: MapRecord, points: PointsInImage, winners: _Winners, is_inside: Bool
+) -> None:
+    """Measure the pixels of the winners; those that are not inside (P,) become boundary pixels."""
+    pixel = winners.pixel
+    record.depth_m.flat[pixel] = np.where(is_inside, winners.depth_m, 0)
+    record.boundary_m.flat[pixel] = np.where(is_inside, 0, winners.depth_m)
+    record.edge.flat[pixel] = winners.edge
+    _set_source(record, points, pixel, winners.point)
 
 
 class _ByPixel(NamedTuple):
@@ -238,6 +295,7 @@ class _ByPixel(NamedTuple):
 
 @inlined
 def _window(reach_px):  # type: ignore[no-untyped-def]
+    """Return the half size of a window in whole pixels, within its limits."""
     return int(min(max(np.rint(reach_px), _LEAST_PX), _MOST_PX))
 
 
@@ -246,85 +304,98 @@ def _extend(reach, u, v):  # type: ignore[no-untyped-def]
     """Raise ``reach`` (8,), the extent of the surface in eight directions, by a point at (u, v)."""
     reach[0], reach[1] = max(reach[0], u), max(reach[1], -u)
     reach[2], reach[3] = max(reach[2], v), max(reach[3], -v)
-    a, b = np.sqrt(0.5) * (u + v), np.sqrt(0.5) * (u - v)
-    reach[4], reach[5] = max(reach[4], a), max(reach[5], -a)
-    reach[6], reach[7] = max(reach[6], b), max(reach[7], -b)
+    falling, rising = np.sqrt(0.5) * (u + v), np.sqrt(0.5) * (u - v)  # along the diagonals
+    reach[4], reach[5] = max(reach[4], falling), max(reach[5], -falling)
+    reach[6], reach[7] = max(reach[6], rising), max(reach[7], -rising)
 
 
 @inlined
-def _count(seen):  # type: ignore[no-untyped-def]
-    """Return the number of sweeps, the bits set in ``seen``."""
+def _count(bits):  # type: ignore[no-untyped-def]
+    """Return the number of bits that are set, each for a sweep."""
     num_sweeps = 0
-    while seen:
-        num_sweeps += seen & 1
-        seen >>= 1
+    while bits:
+        num_sweeps += bits & 1
+        bits >>= 1
     return num_sweeps
 
 
 @inlined
-def _look_round(by_pixel, i, u0, v0, centre, agree, outer, m, reach):  # type: ignore[no-untyped-def]
-    """Compare the points around pixel (v0, u0) with the tangent plane of point i."""
-    # The plane has inverse depth centre (1/m) in the pixel, and visible points within agree (1/m)
-    # of it agree. Points farther behind it within outer (px) show a discontinuity. Filled in are
-    # the sums m (9,) of `plane`, of deviations from the tangent plane, and the extent of the
-    # surface, reach (8,).
+def _compare(by_pixel, i, u0, v0, centre, tolerance, outer, moments, reach):  # type: ignore[no-untyped-def]
+    """Compare the points around pixel (v0, u0) with the tangent plane of point i.
+
+    The plane has inverse depth ``centre`` (1/m) in the pixel. Visible points within ``tolerance``
+    (1/m) of it agree. Points farther behind it, within ``outer`` (px), show a discontinuity. Filled
+    in are ``moments`` (9,) of `plane`, of deviations from the tangent plane, and the extent of the
+    surface, ``reach`` (8,). Returned are a bit for each sweep that agrees, True if no other sweep
+    there is nearer to the key, and True if a point is close behind.
+    """
     points, hidden, start, shape = by_pixel
     uv, inverse, age_ns = points.uv, points.inverse, points.age_ns
-    su, sv, w0 = points.slope[i, 0], points.slope[i, 1], inverse[i]
-    far = (HIDDEN_M + HIDDEN_FRACTION / w0) * w0 * w0
+    slope_u, slope_v, inverse_i = points.slope[i, 0], points.slope[i, 1], inverse[i]
+    behind_step = (HIDDEN_M + HIDDEN_FRACTION / inverse_i) * inverse_i * inverse_i  # 1/m
     reach_u = _window(_REACH * points.spacing_px[i, 0])
     reach_v = _window(_REACH * points.spacing_px[i, 1])
     wide_u, wide_v = max(reach_u, _window(outer)), max(reach_v, _window(outer))
-    seen, behind = np.int64(0), False
+    sweeps, behind = np.int64(0), False
     agree_ns = other_ns = age_ns[i]
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
         for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
             k = np.uint64(j)  # unsigned, so that no access checks for a negative index
             du, dv = uv[k, 0] - u0, uv[k, 1] - v0
-            off = inverse[k] - (centre + su * du + sv * dv)
-            close = abs(du) <= outer and abs(dv) <= outer
-            vouches = abs(du) <= reach_u + 0.5 and abs(v - v0) <= reach_v
-            if hidden[k] or abs(off) > agree:
-                behind |= close and off < -far
-                other_ns = min(other_ns, age_ns[k]) if vouches else other_ns
+            deviation = inverse[k] - (centre + slope_u * du + slope_v * dv)
+            is_close = abs(du) <= outer and abs(dv) <= outer
+            # Points anywhere in the window's last pixel column count, hence half a pixel more.
+            in_window = abs(du) <= reach_u + 0.5 and abs(v - v0) <= reach_v
+            if hidden[k] or abs(deviation) > tolerance:
+                behind |= is_close and deviation < -behind_step
+                other_ns = min(other_ns, age_ns[k]) if in_window else other_ns
                 continue
             # No branches: half of them would be predicted wrongly. A bit of 63 for each sweep.
-            seen |= np.int64(vouches) << np.int64(points.frame[k] % 63)
-            agree_ns = min(agree_ns, age_ns[k]) if vouches else agree_ns
-            _extend(reach, du if close else 0.0, dv if close else 0.0)
+            sweeps |= np.int64(in_window) << np.int64(points.frame[k] % 63)
+            agree_ns = min(agree_ns, age_ns[k]) if in_window else agree_ns
+            _extend(reach, du if is_close else 0.0, dv if is_close else 0.0)
+            # The weight falls to 0 just outside the window.
             weight = max(1 - abs(du) / (reach_u + 1), 0.0) * max(1 - abs(dv) / (reach_v + 1), 0.0)
-            add_moments(m, weight, du, dv, off)
-    # A bit for each sweep that agrees; True if no other sweep there is nearer to the key; True if a
-    # point is close behind.
-    return seen, agree_ns <= other_ns, behind
+            add_moments(moments, weight, du, dv, deviation)
+    return sweeps, agree_ns <= other_ns, behind
 
 
 @Kernel
 def _settle(first, last, by_pixel, done, settled):  # type: ignore[no-untyped-def]
-    """Find the depth of each pixel from the surrounding points that agree with its first point."""
-    # settled (4,P): depth (m), sweeps that agree, 1 if no sweep nearer to the key disagrees, extent
-    # of the surface in radii of discontinuities
-    m, reach = np.empty(9), np.empty(8)
+    """Find the depth of each pixel from the surrounding points that agree with its first point.
+
+    Pixels that are ``done`` (P,) are left out. The rows of ``settled`` (4,P) are the depth in
+    metres, the number of sweeps that agree, 1 if no sweep nearer to the key disagrees, and the
+    extent of the surface in radii of discontinuities.
+    """
+    moments, reach = np.empty(9), np.empty(8)
     points, start, width = by_pixel.points, by_pixel.start, by_pixel.shape[1]
     for p in range(first, last):
         i = start[p]
         if done[p] or i == start[p + 1] or by_pixel.hidden[i]:
             continue
+
+        # The tangent plane of the pixel's first point, in the pixel's centre
         v0, u0 = p // width, p % width
-        w0, uv, slope = points.inverse[i], points.uv[i], points.slope[i]
-        centre = w0 + slope[0] * (u0 - uv[0]) + slope[1] * (v0 - uv[1])
-        agree = (AGREE_M + AGREE_FRACTION / w0) * w0 * w0
-        inner = FOOTPRINT * points.spacing_px[i, 0] + _SLACK_M * points.focal_px[i, 0] * w0
+        inverse, uv, slope = points.inverse[i], points.uv[i], points.slope[i]
+        centre = inverse + slope[0] * (u0 - uv[0]) + slope[1] * (v0 - uv[1])
+        tolerance = (AGREE_M + AGREE_FRACTION / inverse) * inverse * inverse
+        inner = FOOTPRINT * points.spacing_px[i, 0] + _SLACK_M * points.focal_px[i, 0] * inverse
         outer = inner + _EDGE_WINDOW_PX
-        m[:], reach[:] = 0.0, 0.0
-        seen, supported, behind = _look_round(by_pixel, i, u0, v0, centre, agree, outer, m, reach)
-        off, _, _ = plane(m, _RIDGE_PX2)
-        settled[0, p] = 1 / limited(centre + min(max(off, -agree), agree), w0)
-        settled[1, p], settled[2, p] = _count(seen), supported
-        settled[3, p] = ALL_ROUND
+
+        moments[:], reach[:] = 0.0, 0.0
+        sweeps, is_nearest, behind = _compare(
+            by_pixel, i, u0, v0, centre, tolerance, outer, moments, reach
+        )
+        deviation, _, _ = plane(moments, _RIDGE_PX2)
+        deviation = min(max(deviation, -tolerance), tolerance)
+        settled[_DEPTH, p] = 1 / limit_inverse(centre + deviation, inverse)
+        settled[_SWEEPS, p] = _count(sweeps)
+        settled[_NEAREST, p] = is_nearest
+        settled[_EDGE, p] = ALL_ROUND
         if behind and inner > 0:
             least_extent = reach[0]
             for extent in reach[1:]:
                 least_extent = min(least_extent, extent)
-            settled[3, p] = least_extent / inner
+            settled[_EDGE, p] = least_extent / inner

@@ -17,11 +17,11 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from densify.depth.exposure import Exposure, pixel_of
+from densify.depth.exposure import Exposure, Sight, pixel_of
 from densify.depth.fill import LEAST_SHARE
 from densify.depth.measured_pixels import MapRecord
 from densify.depth.patches import FOOTPRINT, HIDDEN_M, agree_m, hidden_m
-from densify.depth.rays import MovingBody, crossing, half_spaces
+from densify.depth.rays import MovingBody, find_crossing, half_spaces
 from densify.depth.votes import ROUNDED, VOTERS_REACH, votes_for
 from densify.geometry import cameras
 from densify.geometry.arrays import Bool, Float, Float32, Int
@@ -29,12 +29,14 @@ from densify.geometry.types import Cloud
 
 _PRIOR = 0.05  # number of rays that end on the body, assumed everywhere
 _WHOLE = 0.8  # closed share of the front from which a body is closed as a whole, as a car is
-_LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5  # share of rays that end on the body; a third at glass
-_VOTES_OF_WHOLE = 0.75  # share of the votes along the silhouette
+# Least share of rays that end on a closed body, and on the closed part of an open one. At glass it
+# is a third.
+_LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5
+_VOTES_OF_WHOLE = 0.75  # least share of the votes along the silhouette of a closed body
 _DEEP_M = 3 * HIDDEN_M  # farther behind the front of the hull are seats, axles and the far side
 _STIFF, _HELD = 3.0, 0.01  # weights of a smooth and of a small offset, against one return
 _ROUNDING = float(np.finfo(np.float32).eps)  # of the stored depth
-_AGREES = 2.0  # tolerance, as a multiple of the tolerance between two static points of a surface
+_AGREES = 2.0  # tolerance, as a multiple of that between two static points of a surface
 
 
 def close_bodies(
@@ -53,11 +55,12 @@ def close_bodies(
             _close(record.box(front.box), cloud, exposure, rows, body, front)
 
 
-def far_inside(bodies: Iterable[MovingBody], exposure: Exposure, depth_m: Float32) -> Bool:
+def find_far_inside(bodies: Iterable[MovingBody], exposure: Exposure, depth_m: Float32) -> Bool:
     """Return (H,W) True where ``depth_m`` (H,W) is far behind a body's front, as behind glass."""
     inverse = fronts(bodies, exposure)
-    far: Bool = (inverse > 0) & (depth_m * inverse > 1 + _DEEP_M * inverse)
-    return far
+    # depth > front + _DEEP_M, times the inverse depth of the front
+    is_far: Bool = (inverse > 0) & (depth_m * inverse > 1 + _DEEP_M * inverse)
+    return is_far
 
 
 def fronts(bodies: Iterable[MovingBody], exposure: Exposure) -> Float:
@@ -83,55 +86,77 @@ class _Front(NamedTuple):
         sight = exposure.see(body.corners, body.velocity_m_s)
         if not sight.inside.any():
             return None
-        low, high = np.zeros(2, int), np.array([camera.width_px, camera.height_px])
-        if (exposure.depth_m(sight.points_cam) > cameras.NEAREST_M).all():
-            low = np.maximum(low, np.floor(np.nanmin(sight.uv, axis=0)).astype(int) - margin_px)
-            high = np.minimum(
-                high, np.ceil(np.nanmax(sight.uv, axis=0)).astype(int) + 1 + margin_px
-            )
-        row, column = np.mgrid[low[1] : high[1], low[0] : high[0]]
+        box = _image_box(sight, exposure, margin_px)
+        row, column = np.mgrid[box]
+
+        # The ray of each pixel enters the hull at its front.
         uv = np.column_stack([column.ravel(), row.ravel()]).astype(np.float64)
         ray = cameras.rays(camera, uv)
-        enter, leave = crossing(half_spaces(sight.points_cam), np.zeros(3), ray)
+        enter, leave = find_crossing(half_spaces(sight.points_cam), np.zeros(3), ray)
         inside = (enter > 0) & (enter < leave)
         depth_m = exposure.depth_m(np.where(inside, enter, 1)[:, None] * ray)
         inside &= depth_m > cameras.NEAREST_M
+        if not inside.any():
+            return None
         inverse = np.divide(1, depth_m, out=np.zeros(len(ray)), where=inside)
-        box = (slice(low[1], high[1]), slice(low[0], high[0]))
-        return _Front(box, inverse.reshape(row.shape)) if inside.any() else None
+        return _Front(box, inverse.reshape(row.shape))
 
     def pixels(self, exposure: Exposure, points: Float, velocity_m_s: Float32) -> _Pixels:
-        """Project points (N,3), key sweep's lidar frame, to pixels within the box."""
+        """Return those of the points (N,3), key sweep's lidar frame, that lie within the box."""
         sight = exposure.see(points, velocity_m_s)
         row, column = pixel_of(np.where(sight.inside[:, None], sight.uv, -1))
-        row, column = row - self.box[0].start, column - self.box[1].start
+        box_row = row - self.box[0].start
+        box_column = column - self.box[1].start
         height, width = self.inverse.shape
-        shown = sight.inside & (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        point = np.flatnonzero(shown)
+        in_box = (
+            sight.inside
+            & (box_row >= 0)
+            & (box_row < height)
+            & (box_column >= 0)
+            & (box_column < width)
+        )
+        point = np.flatnonzero(in_box)
         depth_m = exposure.depth_m(sight.points_cam[point])
-        return _Pixels(point, (row[point], column[point]), depth_m)
+        return _Pixels(point, (box_row[point], box_column[point]), depth_m)
 
-    def closed(self, body: MovingBody, exposure: Exposure, spacing_px: Float32) -> Float:
+    def closed_share(self, body: MovingBody, exposure: Exposure, spacing_px: Float32) -> Float:
         """Return the (h,w) share, 0 to 1, of the rays entering at a pixel that end on the body."""
         blur_px = np.maximum(FOOTPRINT * np.median(spacing_px, axis=(0, 1)), 1.0)
         entered = self.pixels(exposure, body.entries, body.velocity_m_s)
+        # Rays that enter behind the front, on the far side of the hull, do not count.
         front_m = 1 / np.maximum(self.inverse[entered.pixel], 1e-6)
-        faces = entered.depth_m < front_m + hidden_m(front_m)
-        counts = np.zeros((2, *self.inverse.shape))
+        at_front = entered.depth_m < front_m + hidden_m(front_m)
+        counts = np.zeros((2, *self.inverse.shape))  # of rays that pass, and that end
         ends = body.ends[entered.point].astype(np.int64)
-        np.add.at(counts, (ends, *entered.pixel), faces)
-        passed, ended = (cv2.GaussianBlur(n, (0, 0), blur_px[0], sigmaY=blur_px[1]) for n in counts)
-        ended = ended + _PRIOR / (2 * np.pi * blur_px.prod())
-        share: Float = np.where(self.inverse > 0, ended / (ended + passed), 0)
+        np.add.at(counts, (ends, *entered.pixel), at_front)
+        num_passed, num_ended = (
+            cv2.GaussianBlur(count, (0, 0), blur_px[0], sigmaY=blur_px[1]) for count in counts
+        )
+        # After the blur, _PRIOR rays that end in a pixel have this density in it.
+        num_ended = num_ended + _PRIOR / (2 * np.pi * blur_px.prod())
+        share: Float = np.where(self.inverse > 0, num_ended / (num_ended + num_passed), 0)
         return share
 
 
-class _Pixels(NamedTuple):
-    """Points in a box of the image: index, row and column in the box, and depth of each point."""
+def _image_box(sight: Sight, exposure: Exposure, margin_px: int) -> tuple[slice, slice]:
+    """Return the rows and columns of the image around a hull's corners, with a margin."""
+    low = np.zeros(2, int)  # column and row
+    high = np.array([exposure.camera.width_px, exposure.camera.height_px])
+    # A hull that reaches behind the camera may cover the whole image.
+    if (exposure.depth_m(sight.points_cam) > cameras.NEAREST_M).all():
+        first = np.floor(np.nanmin(sight.uv, axis=0)).astype(int)
+        end = np.ceil(np.nanmax(sight.uv, axis=0)).astype(int) + 1  # exclusive
+        low = np.maximum(low, first - margin_px)
+        high = np.minimum(high, end + margin_px)
+    return slice(low[1], high[1]), slice(low[0], high[0])
 
-    point: Int
-    pixel: tuple[Int, Int]
-    depth_m: Float
+
+class _Pixels(NamedTuple):
+    """Points in a box of the image."""
+
+    point: Int  # (K,) indices of the points
+    pixel: tuple[Int, Int]  # (K,) rows and (K,) columns in the box
+    depth_m: Float  # (K,) depths of the points
 
 
 def _close(
@@ -141,19 +166,23 @@ def _close(
     surface = _surface(record, rows, front)
     surface_m = (1 / surface).astype(np.float32)
     allowed_m = _AGREES * agree_m(surface_m)
-    share = front.closed(body, exposure, record.spacing_px)
-    shows, measurable = _show(record, cloud, surface, allowed_m, share)
+    share = front.closed_share(body, exposure, record.spacing_px)
+    shown = _show(record, cloud, surface, allowed_m, share)
 
+    # Returns of the body on its surface
     returns = front.pixels(exposure, cloud.points[rows], cloud.velocity_m_s[rows])
-    off_m = abs(returns.depth_m - surface_m[returns.pixel])
-    agrees = measurable[returns.pixel] & (off_m <= allowed_m[returns.pixel])
-    pixel, rows = tuple(axis[agrees] for axis in returns.pixel), rows[returns.point[agrees]]
-    oldest_first = np.argsort(-abs(cloud.since_key_ns[rows]), kind="stable")
-    measured = np.full(surface.shape, -1)
-    measured[tuple(axis[oldest_first] for axis in pixel)] = rows[oldest_first]
-    hit = measured >= 0
-    record.depth_m[shows] = np.where(hit, surface_m, 0)[shows]
-    record.point[hit] = measured[hit]
+    error_m = abs(returns.depth_m - surface_m[returns.pixel])
+    agrees = shown.measurable[returns.pixel] & (error_m <= allowed_m[returns.pixel])
+    row, column = (index[agrees] for index in returns.pixel)
+    agreeing_rows = rows[returns.point[agrees]]
+
+    # The oldest return is written first, so the one nearest to the key in time stays.
+    oldest_first = np.argsort(-abs(cloud.since_key_ns[agreeing_rows]), kind="stable")
+    source = np.full(surface.shape, -1)
+    source[row[oldest_first], column[oldest_first]] = agreeing_rows[oldest_first]
+    measured = source >= 0
+    record.depth_m[shown.pixels] = np.where(measured, surface_m, 0)[shown.pixels]
+    record.point[measured] = source[measured]
 
 
 def _surface(record: MapRecord, rows: Int, front: _Front) -> Float:
@@ -161,40 +190,72 @@ def _surface(record: MapRecord, rows: Int, front: _Front) -> Float:
     inside = front.inverse > 0
     known_m = np.maximum(record.depth_m, record.boundary_m)
     on_body = inside & (known_m > 0) & np.isin(record.point, rows)
+    # Returns from deep inside, such as those from seats, are not on the surface.
     on_body &= known_m * front.inverse < 1 + _DEEP_M * front.inverse
     offset = 1 / np.where(on_body, known_m, 1) - front.inverse
     surface: Float = np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)
     return surface
 
 
+class _Shown(NamedTuple):
+    """Pixels of a body in the box of its front."""
+
+    pixels: Bool  # (h,w) True where the body is shown
+    measurable: Bool  # (h,w) True where its returns count as measured
+
+
 def _show(
     record: MapRecord, cloud: Cloud, surface: Float, allowed_m: Float | Float32, share: Float
-) -> tuple[Bool, Bool]:
-    """Show a body; return (h,w) its pixels, and (h,w) the pixels where its returns count."""
-    inside, now_m, surface_m = share > 0, record.filled_m, (1 / surface).astype(np.float32)
-    whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
-    in_front = (now_m > 0) & (now_m < surface_m - hidden_m(surface_m))
-    closed = share >= (_LEAST_OF_WHOLE if whole else _LEAST_OF_OPEN)
+) -> _Shown:
+    """Show a body in the record.
+
+    Args:
+        record: The record, cut to the box of the front.
+        cloud: The cloud of the record.
+        surface: (h,w) inverse depth of the body's surface, 1/m.
+        allowed_m: (h,w) greatest deviation of a return from the surface.
+        share: (h,w) share of the rays that end on the body, 0 outside its outline.
+    """
+    inside = share > 0
+    surface_m = (1 / surface).astype(np.float32)
+    is_whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
+
+    # The core is well inside the closed part. It shows the body, unless something is in front.
+    in_front = (record.filled_m > 0) & (record.filled_m < surface_m - hidden_m(surface_m))
+    closed = share >= (_LEAST_OF_WHOLE if is_whole else _LEAST_OF_OPEN)
     core = _well_inside(closed, float(np.median(record.gap_px[inside]))) & ~in_front
-    moves = (record.depth_m > 0) & cloud.moving[record.point]
-    outline = inside & ~in_front & ~core & ~(moves & (record.depth_m <= surface_m + allowed_m))
-    if not whole:
+
+    # In the outline only depths of moving objects in front of the surface, or on it, stay.
+    is_moving = (record.depth_m > 0) & cloud.moving[record.point]
+    stays = is_moving & (record.depth_m <= surface_m + allowed_m)
+    outline = inside & ~in_front & ~core & ~stays
+    if not is_whole:
         outline &= share >= _LEAST_OF_WHOLE
     for layer_m in (record.depth_m, record.filled_m, record.rejected_m):
-        layer_m[outline] = 0  # what is seen past a moving object is not given back
-    record.filled_m[core], record.votes[core] = surface_m[core], 1
-    record.tilt[core] = np.stack(list(np.gradient(surface))[::-1], axis=-1)[core]
-    shows, least_share = core.copy(), _VOTES_OF_WHOLE if whole else LEAST_SHARE
+        layer_m[outline] = 0  # a background seen past a moving object is not given back
+
+    record.filled_m[core] = surface_m[core]
+    record.votes[core] = 1
+    slope_down, slope_right = np.gradient(surface)
+    record.tilt[core] = np.stack([slope_right, slope_down], axis=-1)[core]
+
+    # The votes decide the silhouette.
     pixel = np.flatnonzero(outline)
-    votes = votes_for(record, [record.filled_m], pixel, surface_m[outline], surely=not whole)
-    record.votes[outline], shows[outline] = votes, votes >= ROUNDED * least_share
-    record.filled_m[shows] = surface_m[shows]
-    record.on_body |= shows
-    return shows, shows if whole else core
+    share_for = votes_for(
+        record, [record.filled_m], pixel, surface_m[outline], with_shifts=not is_whole
+    )
+    least_share = _VOTES_OF_WHOLE if is_whole else LEAST_SHARE
+    shown = core.copy()
+    shown[outline] = share_for >= ROUNDED * least_share
+    record.votes[outline] = share_for
+    record.filled_m[shown] = surface_m[shown]
+    record.on_body |= shown
+    return _Shown(shown, measurable=shown if is_whole else core)
 
 
 def _well_inside(closed: Bool, away_px: float) -> Bool:
     """Return the closed pixels farther than ``away_px`` from any open pixel of the box."""
+    # With a border, a box without an open pixel has distances too.
     padded = np.pad(closed, 1, mode="edge").astype(np.uint8)
     distance_px = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     inside: Bool = distance_px > away_px
@@ -203,17 +264,21 @@ def _well_inside(closed: Bool, away_px: float) -> Bool:
 
 def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
     """Return the (h,w) smooth offset (1/m) inside a body's outline, near the known offset."""
+    # Pairs of neighbouring pixels inside, by their numbers
     number = np.cumsum(inside).reshape(inside.shape) - 1
-    across, down = inside[:, :-1] & inside[:, 1:], inside[:-1] & inside[1:]
-    first = np.concatenate([number[:, :-1][across], number[:-1][down]])
-    second = np.concatenate([number[:, 1:][across], number[1:][down]])
-    num = int(inside.sum())
-    joins = sparse.coo_matrix((np.full(len(first), _STIFF), (first, second)), (num, num)).tocsr()
-    joins = joins + joins.T
+    pair_right = inside[:, :-1] & inside[:, 1:]
+    pair_down = inside[:-1] & inside[1:]
+    first = np.concatenate([number[:, :-1][pair_right], number[:-1][pair_down]])
+    second = np.concatenate([number[:, 1:][pair_right], number[1:][pair_down]])
+    num_pixels = int(inside.sum())
+    shape = (num_pixels, num_pixels)
+    half = sparse.coo_matrix((np.full(len(first), _STIFF), (first, second)), shape).tocsr()
+    ties = half + half.T
+
     # The offset o minimises Σ known (o - offset)² + _STIFF Σ |∇o|² + _HELD Σ o².
     weight = known[inside].astype(np.float64)
-    diagonal = np.asarray(joins.sum(axis=1)).ravel() + weight + _HELD
+    diagonal = np.asarray(ties.sum(axis=1)).ravel() + weight + _HELD
+    system = (sparse.diags(diagonal) - ties).tocsr()
     smooth_offset = np.zeros(inside.shape)
-    system = (sparse.diags(diagonal) - joins).tocsr()
     smooth_offset[inside] = cg(system, weight * offset[inside], rtol=_ROUNDING)[0]
     return smooth_offset

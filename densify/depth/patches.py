@@ -28,9 +28,9 @@ FOOTPRINT = 0.35
 _SLACK_M = 0.5 * AGREE_M  # added to the footprint, for errors of registration and flow
 _STEEP = 5.7  # greatest slope, 10 degrees of incidence; a steeper surface on one side is a step
 _BEND = 0.25  # greatest change of the slope on one surface, as a share
-_AROUND, _MOST_CELLS = 5.0, 20  # radius of neighbours of unordered rays: spacings, most cells
-_RIDGE = 0.005  # share of the mean square distance of the neighbours
-_MOST = 1.4  # greatest ratio of the extended inverse depth and that at the start
+_RADIUS, _MOST_CELLS = 5.0, 20  # radius of neighbours of unordered rays: spacings, most cells
+_RIDGE = 0.005  # ridge of planes, as a share of the mean square distance of the neighbours
+_MOST_RATIO = 1.4  # greatest ratio of the extended inverse depth and that at the start
 
 
 def agree_m(depth_m: Float | Float32) -> Float | Float32:
@@ -43,7 +43,7 @@ def hidden_m(surface_m: Float | Float32) -> Float | Float32:
     return HIDDEN_M + HIDDEN_FRACTION * surface_m
 
 
-def patches(
+def find_patches(
     cloud: Cloud, sensors: Sensors, origins: Mapping[int, Float], wanted: Bool | None = None
 ) -> Patches:
     """Return the surface patches of a cloud.
@@ -52,16 +52,19 @@ def patches(
     are on no single surface, the patch faces the scanner.
 
     Args:
+        cloud: The cloud of M points.
+        sensors: Scanners of the recording.
         origins: (S,3) origins of the scanners, key sweep's lidar frame, by frame number.
         wanted: (M,) True for points in view of a camera, None for all. Other points get zeros.
     """
     frames, index = np.unique(cloud.frame, return_inverse=True)
-    by_sweep = [origins[int(frame)] for frame in frames]
     sweep: NDArray[np.int32] = index.ravel().astype(np.int32)
-    return tangents(cloud.rigid_points, cloud.lidar, sweep, sensors, by_sweep, wanted)
+    sweep_origins = [origins[int(frame)] for frame in frames]
+    # In the rigid points the objects have the shape that each sweep measured.
+    return fit_tangents(cloud.rigid_points, cloud.lidar, sweep, sensors, sweep_origins, wanted)
 
 
-def tangents(
+def fit_tangents(
     points: Float,
     lidar: NDArray[np.uint8],
     sweep: NDArray[np.int32],
@@ -69,39 +72,44 @@ def tangents(
     origins: Sequence[Float],
     wanted: Bool | None = None,
 ) -> Patches:
-    """Return the patches of M points, see `patches`.
+    """Return the patches of M points, see `find_patches`.
 
     A point p is on the tangent plane if normal · (p - origin) = 1. Spacings are metres between
     neighbouring rays, along the azimuth and along the elevation.
 
     Args:
+        points: (M,3) points, in any one frame.
         lidar: (M,) number of the scanner of each point.
         sweep: (M,) index of each point's sweep in ``origins``.
+        sensors: Scanners of the recording.
         origins: (S,3) origins of the scanners for each sweep, in the frame of the points.
+        wanted: As in `find_patches`.
     """
     normal = np.zeros((len(points), 3), np.float32)
     spacing_m = np.zeros((len(points), 2), np.float32)
     if not len(points):
         return Patches(normal, spacing_m)
+    # Scanners are counted over all sweeps: those of the first sweep, of the second, and so on.
     num_scanners = len(origins[0])
     scanner = (sweep * num_scanners + lidar).astype(np.int32)
     spherical = np.empty((3, len(points)), np.float32)
-    _look.over_rows(len(points), points, np.concatenate(origins), scanner, spherical)
+    _to_spherical.over_rows(len(points), points, np.concatenate(origins), scanner, spherical)
     size = np.bincount(scanner, minlength=num_scanners * len(origins))
     members = np.split(np.argsort(scanner, kind="stable"), np.cumsum(size)[:-1])
     for number, model in sensors.models.items():
         grid = model.grid
         cells = np.empty((grid.num_rows, grid.num_columns), np.int32)
-        find = _tangents_anywhere if model.unordered else _tangents_on_rings
-        for rows in members[number::num_scanners]:
+        fit = _fit_anywhere if model.unordered else _fit_on_rings
+        for rows in members[number::num_scanners]:  # of one scanner, sweep by sweep
             _nearest_in_cells(spherical, rows, grid, cells)
-            rows = rows if wanted is None else rows[wanted[rows]]
-            find.over_rows(len(rows), rows, spherical, model.table, grid, cells, normal, spacing_m)
+            if wanted is not None:
+                rows = rows[wanted[rows]]
+            fit.over_rows(len(rows), rows, spherical, model.table, grid, cells, normal, spacing_m)
     return Patches(normal, spacing_m)
 
 
 @Kernel
-def _look(first, last, points, origins, scanner, spherical):  # type: ignore[no-untyped-def]
+def _to_spherical(first, last, points, origins, scanner, spherical):  # type: ignore[no-untyped-def]
     """Fill ``spherical`` (3,N) with azimuth, elevation (rad) and range (m) of points (N,3)."""
     for i in range(first, last):
         x = points[i, 0] - origins[scanner[i], 0]
@@ -116,10 +124,11 @@ def _look(first, last, points, origins, scanner, spherical):  # type: ignore[no-
 @inlined
 def _cell(azimuth, elevation, grid):  # type: ignore[no-untyped-def]
     """Return row and column of a direction in a `densify.free_space.sensor.RayGrid`."""
-    at_bin = (elevation - grid.low_rad) / grid.bin_rad
-    k = min(max(int(at_bin), 0), len(grid.row_of) - 2)
-    at_row = grid.row_of[k] + (at_bin - k) * (grid.row_of[k + 1] - grid.row_of[k])
-    row = min(max(int(at_row), 0), grid.num_rows - 1)
+    # The row is interpolated between the edges of the elevation's bin.
+    bin_position = (elevation - grid.low_rad) / grid.bin_rad
+    k = min(max(int(bin_position), 0), len(grid.row_of) - 2)
+    row_position = grid.row_of[k] + (bin_position - k) * (grid.row_of[k + 1] - grid.row_of[k])
+    row = min(max(int(row_position), 0), grid.num_rows - 1)
     column = int((azimuth + np.pi) * (grid.num_columns / (2 * np.pi)))
     return row, min(max(column, 0), grid.num_columns - 1)
 
@@ -127,10 +136,10 @@ def _cell(azimuth, elevation, grid):  # type: ignore[no-untyped-def]
 @inlined
 def _spacing(azimuth, elevation, table):  # type: ignore[no-untyped-def]
     """Return the angles (rad) to the next ray along azimuth and elevation, from a `RayTable`."""
-    row = min(max(int((elevation - table.low_rad) / table.bin_rad), 0), table.along.shape[0] - 1)
-    columns = table.along.shape[1]
+    rows, columns = table.elevation_gap_rad.shape
+    row = min(max(int((elevation - table.low_rad) / table.bin_rad), 0), rows - 1)
     column = int((azimuth + np.pi) * (columns / (2 * np.pi))) % columns
-    return table.across[row, column], table.along[row, column]
+    return table.azimuth_gap_rad[row, column], table.elevation_gap_rad[row, column]
 
 
 @inlined
@@ -169,18 +178,23 @@ def _first(cells, row, column, rows, columns):  # type: ignore[no-untyped-def]
 @inlined
 def _slope(slope_a, slope_b, step, range_m):  # type: ignore[no-untyped-def]
     """Return the slope of inverse range per radian from its slopes on both sides (NaN: unknown)."""
-    metres = step * range_m * range_m  # of range per step, by a unit of slope
-    # On one surface the mean, else the lesser slope, or 0 if that is a step in depth; step in rad
+    # Metres of range per step (rad), for a slope of 1: the range changes by range² · slope.
+    metres = step * range_m * range_m
+    # The mean on one surface, else the lesser slope, or 0 if that is a step in depth
     if abs(slope_a - slope_b) * metres <= AGREE_M + _BEND * abs(slope_a + slope_b) * metres:
         return 0.5 * (slope_a + slope_b)
-    if not abs(slope_a) <= abs(slope_b):  # NaN too
+    if not abs(slope_a) <= abs(slope_b):  # True if a slope is NaN
         slope_a = slope_b
     return slope_a if abs(slope_a) * range_m <= _STEEP else 0.0
 
 
 @inlined
 def _change(spherical, i, j, axis, across, slope_across):  # type: ignore[no-untyped-def]
-    """Return the change of inverse range per radian along axis 0 (azimuth) or 1, NaN unknown."""
+    """Return the change of inverse range per radian from point i to j, NaN if unknown.
+
+    It is along ``axis``, 0 for the azimuth or 1 for the elevation. ``across`` is the other axis,
+    and the change along it, at ``slope_across``, is removed.
+    """
     if j < 0:
         return np.nan
     apart = spherical[axis, j] - spherical[axis, i]
@@ -188,62 +202,64 @@ def _change(spherical, i, j, axis, across, slope_across):  # type: ignore[no-unt
         apart -= 2 * np.pi * np.rint(apart / (2 * np.pi))
     if abs(apart) < 1e-5:
         return np.nan
-    # The change by the other angle is removed.
     beside = spherical[across, j] - spherical[across, i]
     return (1 / spherical[2, j] - 1 / spherical[2, i] - slope_across * beside) / apart
 
 
 @inlined
 def _put(i, spherical, table, slope_u, slope_v, normal, spacing):  # type: ignore[no-untyped-def]
-    """Fill in normal and spacing of point i from its slopes of inverse range per radian."""
+    """Fill in normal and spacing of point i from its slopes of inverse range per radian.
+
+    ``slope_u`` is the slope along the azimuth, ``slope_v`` along the elevation.
+    """
     azimuth, elevation, range_m = spherical[0, i], spherical[1, i], spherical[2, i]
-    across, along = _spacing(azimuth, elevation, table)
+    azimuth_gap, elevation_gap = _spacing(azimuth, elevation, table)
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
-    # slope_u: along the azimuth, slope_v: along the elevation
     aside = slope_u / max(ce, 1e-3)
     normal[i, 0] = ce * ca / range_m - aside * sa - slope_v * se * ca
     normal[i, 1] = ce * sa / range_m + aside * ca - slope_v * se * sa
     normal[i, 2] = se / range_m + slope_v * ce
-    spacing[i, 0] = range_m * across
-    spacing[i, 1] = range_m * along
+    spacing[i, 0] = range_m * azimuth_gap
+    spacing[i, 1] = range_m * elevation_gap
 
 
 @Kernel
-def _tangents_on_rings(first, last, members, spherical, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
+def _fit_on_rings(first, last, members, spherical, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
     """Fill normal (N,3) and spacing (N,2) of members from neighbours on the ring, above, below."""
+    # Offsets of the cells in which a neighbour is looked for, in this order
     right, left = np.array([-2, -1, -3]), np.array([2, 1, 3])
     same = np.array([0, 0, 0])
     up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
     straight = np.array([0, 1, -1, 0])
     for k in range(first, last):
         i = members[k]
-        across, along = _spacing(spherical[0, i], spherical[1, i], table)
-        step = across / max(np.cos(spherical[1, i]), 1e-3)
+        azimuth_gap, elevation_gap = _spacing(spherical[0, i], spherical[1, i], table)
+        step = azimuth_gap / max(np.cos(spherical[1, i]), 1e-3)
         row, column = _cell(spherical[0, i], spherical[1, i], grid)
         slope_a = _change(spherical, i, _first(cells, row, column, same, right), 0, 1, 0.0)
         slope_b = _change(spherical, i, _first(cells, row, column, same, left), 0, 1, 0.0)
-        slope_u = _slope(slope_a, slope_b, 2 * step, spherical[2, i])
+        slope_u = _slope(slope_a, slope_b, 2 * step, spherical[2, i])  # neighbours two steps away
         slope_u = 0.0 if np.isnan(slope_u) else slope_u
         above = _first(cells, row, column, up, straight)
         below = _first(cells, row, column, down, straight)
         slope_a = _change(spherical, i, above, 1, 0, slope_u)
         slope_b = _change(spherical, i, below, 1, 0, slope_u)
-        slope_v = _slope(slope_a, slope_b, along, spherical[2, i])
+        slope_v = _slope(slope_a, slope_b, elevation_gap, spherical[2, i])
         _put(i, spherical, table, slope_u, 0.0 if np.isnan(slope_v) else slope_v, normal, spacing)
 
 
 @Kernel
-def _tangents_anywhere(first, last, members, spherical, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
-    """Fill normal and spacing as `_tangents_on_rings`, for a scanner without rings."""
+def _fit_anywhere(first, last, members, spherical, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
+    """Fill normal and spacing as `_fit_on_rings`, for a scanner without rings."""
     num_rows, num_columns = cells.shape
     for k in range(first, last):
         i = members[k]
         range_m, flatten = spherical[2, i], np.cos(spherical[1, i])
         row, column = _cell(spherical[0, i], spherical[1, i], grid)
         spacing_rad = _spacing(spherical[0, i], spherical[1, i], table)[1]
-        reach = min(1 + int(_AROUND * spacing_rad / grid.bin_rad), _MOST_CELLS)
+        reach = min(1 + int(_RADIUS * spacing_rad / grid.bin_rad), _MOST_CELLS)
         slope_u, slope_v = 0.0, 0.0
-        for turn in range(2):  # a plane to the points around, then to those close to it
+        for turn in range(2):  # fit a plane to the points around, then to those close to it
             uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0
             num, num_kept = 0, 0
             for r in range(max(row - reach, 0), min(row + reach, num_rows - 1) + 1):
@@ -255,10 +271,10 @@ def _tangents_anywhere(first, last, members, spherical, table, grid, cells, norm
                     u = (u - 2 * np.pi * np.rint(u / (2 * np.pi))) * flatten
                     v, w = spherical[1, j] - spherical[1, i], 1 / spherical[2, j] - 1 / range_m
                     if u == 0 and v == 0 and w == 0:
-                        continue  # the point itself, or its equal
+                        continue  # the point itself, or one at the same position
                     num += 1
-                    off_m = abs(w - slope_u * u - slope_v * v) * range_m * range_m
-                    if turn and off_m > AGREE_M + _BEND * abs(w) * range_m * range_m:
+                    deviation_m = abs(w - slope_u * u - slope_v * v) * range_m * range_m
+                    if turn and deviation_m > AGREE_M + _BEND * abs(w) * range_m * range_m:
                         continue
                     num_kept += 1
                     uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
@@ -272,6 +288,7 @@ def _tangents_anywhere(first, last, members, spherical, table, grid, cells, norm
 def is_occluded(points: PointsInImage, camera: Camera) -> Bool:
     """Return (K,) True for points clearly behind the nearest patch over their pixel."""
     slack_px = _SLACK_M * points.focal_px / points.depth[:, None]
+    # At least half a pixel, so that each patch covers a pixel
     half_px = np.maximum(FOOTPRINT * points.spacing_px + slack_px, 0.5)
     nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
     paint(points.uv, points.inverse, points.slope, half_px, nearest)
@@ -291,7 +308,7 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
     """
     height, width = canvas.shape
     for i in range(len(inverse)):
-        w = inverse[i]
+        own = inverse[i]
         left = max(int(np.ceil(uv[i, 0] - half_px[i, 0])), 0)
         right = min(int(np.floor(uv[i, 0] + half_px[i, 0])), width - 1)
         top = max(int(np.ceil(uv[i, 1] - half_px[i, 1])), 0)
@@ -301,7 +318,7 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
             covered = canvas[v, left : right + 1]
             for k in range(len(covered)):
                 tilt = tilt_v + slope[i, 0] * (left + k - uv[i, 0])
-                on_patch = w + min(max(tilt, -0.5 * w), 0.0)
+                on_patch = own + min(max(tilt, -0.5 * own), 0.0)
                 covered[k] = max(covered[k], np.float32(on_patch))
 
 
@@ -336,6 +353,7 @@ def _wins(a, b, rank, depth, frame, uv):  # type: ignore[no-untyped-def]
 @Kernel
 def _by_pixel(pixel, rank, depth, frame, uv, start, order):  # type: ignore[no-untyped-def]
     """Fill start (num_pixels + 1,) and order (K,) of `sorted_by_pixel`."""
+    # The number of points of each pixel, one place later, so that sums give the first places
     start[:] = 0
     for p in pixel:
         start[p + 1] += 1
@@ -345,18 +363,19 @@ def _by_pixel(pixel, rank, depth, frame, uv, start, order):  # type: ignore[no-u
     filled[:] = 0
     for i in range(len(pixel)):
         p = pixel[i]
-        at = start[p] + filled[p]
-        while at > start[p] and _wins(i, order[at - 1], rank, depth, frame, uv):
-            order[at] = order[at - 1]
-            at -= 1
-        order[at] = i
+        # Insertion sort: a pixel has few points.
+        place = start[p] + filled[p]
+        while place > start[p] and _wins(i, order[place - 1], rank, depth, frame, uv):
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = i
         filled[p] += 1
 
 
 @inlined
-def limited(inverse, start):  # type: ignore[no-untyped-def]
+def limit_inverse(inverse, start):  # type: ignore[no-untyped-def]
     """Return inverse depth ``inverse``, kept between 1 / 1.4 and 1.4 times ``start``."""
-    return min(max(inverse, start / _MOST), _MOST * start)
+    return min(max(inverse, start / _MOST_RATIO), _MOST_RATIO * start)
 
 
 @inlined
@@ -367,26 +386,31 @@ def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def add_moments(m, weight, u, v, w):  # type: ignore[no-untyped-def]
-    """Add a pixel, at offset (u, v) with inverse depth w, to the sums m (9,) of `plane`."""
-    m[0] += weight
-    m[1] += weight * u
-    m[2] += weight * v
-    m[3] += weight * u * u
-    m[4] += weight * u * v
-    m[5] += weight * v * v
-    m[6] += weight * w
-    m[7] += weight * u * w
-    m[8] += weight * v * w
+def add_moments(moments, weight, u, v, w):  # type: ignore[no-untyped-def]
+    """Add a pixel, at offset (u, v) with inverse depth w, to the ``moments`` (9,) of `plane`."""
+    moments[0] += weight
+    moments[1] += weight * u
+    moments[2] += weight * v
+    moments[3] += weight * u * u
+    moments[4] += weight * u * v
+    moments[5] += weight * v * v
+    moments[6] += weight * w
+    moments[7] += weight * u * w
+    moments[8] += weight * v * w
 
 
 @inlined
-def plane(m, ridge):  # type: ignore[no-untyped-def]
-    """Return inverse depth at the origin and both slopes of the least-squares plane of m (9,)."""
-    # ridge: variance (px²) added in both directions: pixels on one line do not tilt the plane
-    # across the line
-    n = m[0]
-    u, v, w = m[1] / n, m[2] / n, m[6] / n
-    uu, vv, uv = m[3] / n - u * u + ridge, m[5] / n - v * v + ridge, m[4] / n - u * v
-    slope_u, slope_v = slopes(uu, uv, vv, m[7] / n - u * w, m[8] / n - v * w)
+def plane(moments, ridge):  # type: ignore[no-untyped-def]
+    """Return inverse depth at the origin and both slopes of the least-squares plane.
+
+    ``moments`` (9,) are the sums of `add_moments`. ``ridge`` is a variance (px²) added in both
+    directions: pixels on one line do not tilt the plane across the line.
+    """
+    n = moments[0]
+    u, v, w = moments[1] / n, moments[2] / n, moments[6] / n
+    uu = moments[3] / n - u * u + ridge
+    uv = moments[4] / n - u * v
+    vv = moments[5] / n - v * v + ridge
+    uw, vw = moments[7] / n - u * w, moments[8] / n - v * w
+    slope_u, slope_v = slopes(uu, uv, vv, uw, vw)
     return w - slope_u * u - slope_v * v, slope_u, slope_v

@@ -25,48 +25,61 @@ MAX_WRONG = 0.2
 used prior is off by more than 25 %. Good priors had up to 0.11, priors of other images 0.25 to
 0.6."""
 _FORMS = {"auto": ("depth", "log", "inverse"), "depth": ("depth", "log"), "inverse": ("inverse",)}
-_MIN_FITTED = 100
-_WRONG = np.log(1.25)
-_MOST_CONFIDENCE = 0.2  # of a pixel of the prior
+_MIN_FITTED = 100  # least number of measured pixels for a fit
+_WRONG = np.log(1.25)  # least error of a wrong pixel, in the logarithm of depth
+_MOST_CONFIDENCE = 0.2  # greatest confidence of a pixel of the prior
 _USUAL = 0.05  # error of a prior in the logarithm of depth; a step of more than twice is an edge
-_MAX_CELLS = 40_000
-_SMOOTHNESS = 10.0  # relative to 1 for a cell with all pixels known
+_MAX_CELLS = 40_000  # greatest number of cells, about
+_SMOOTHNESS = 10.0  # weight of equal corrections, relative to 1 for a cell with all pixels known
 _TOWARDS_NONE = 0.002  # pull to no correction and the mean error, far from known pixels
-_AROUND = np.ones((5, 5), np.uint8)
+_NEIGHBOURHOOD = np.ones((5, 5), np.uint8)
 _EMPTY = 2 * np.log(FAR_M)  # logarithm of a depth beyond all others
 
 
-def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
+def complete(depth_map: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
     """Return the depth map with pixels of the prior where it has no measured or filled depth.
 
     A pixel stays empty if the prior has no value, shows sky by the mask, or is beyond ``FAR_M`` or
     at its far limit. Pixels on the blurred transition between two surfaces stay empty too. A prior
     that does not fit is not used. Confidences are a ranking. A pixel of the prior has at most 0.2,
     less where the prior is steep or deviates from known pixels nearby. All known pixels have more.
-    The prior has the map's shape and measure of depth. The ``kind`` of its values is ``depth``,
-    ``inverse`` or ``auto``.
+
+    Args:
+        depth_map: The map to complete.
+        prior: Depth image of the user, of the map's shape and measure of depth.
+        kind: What the prior's values are: ``depth``, ``inverse`` (depth) or ``auto``.
     """
-    known = (prior.value > 0) & ~prior.sky
-    above = _MOST_CONFIDENCE + (1 - _MOST_CONFIDENCE) * maps.confidence
-    confidence = np.where(maps.filled_m > 0, above, 0).astype(np.float32)
-    measured = known & (maps.depth_m > 0)
-    fit = fit_prior(prior.value[measured], maps.depth_m[measured], kind)
+    has_value = (prior.value > 0) & ~prior.sky
+    has_depth = depth_map.filled_m > 0
+    known_confidence = _MOST_CONFIDENCE + (1 - _MOST_CONFIDENCE) * depth_map.confidence
+    confidence = np.where(has_depth, known_confidence, 0).astype(np.float32)
+    measured = has_value & (depth_map.depth_m > 0)
+    fit = fit_prior(prior.value[measured], depth_map.depth_m[measured], kind)
     if not fit.used:
-        nothing = np.zeros(known.shape, bool)
-        return FullDepth(maps.filled_m, confidence, nothing, fit, prior.source)
+        no_pixels = np.zeros(has_value.shape, bool)
+        return FullDepth(depth_map.filled_m, confidence, no_pixels, fit, prior.source)
+
+    # The farthest value is often that of the sky.
     log_depth = _log_depth(prior.value, fit)
-    farthest = prior.value[known].min() if fit.kind == "inverse" else prior.value[known].max()
-    usable = known & (log_depth < np.log(FAR_M)) & (prior.value != farthest)  # often the sky
+    values = prior.value[has_value]
+    farthest = values.min() if fit.kind == "inverse" else values.max()
+    usable = has_value & (log_depth < np.log(FAR_M)) & (prior.value != farthest)
+
+    # Steps of the prior's smoothed logarithm of depth to the farthest and nearest pixel around
     guide = np.where(usable, log_depth, _EMPTY).astype(np.float32)
     guide = cv2.medianBlur(guide, 5).astype(np.float32)
-    farther, nearer = cv2.dilate(guide, _AROUND) - guide, guide - cv2.erode(guide, _AROUND)
-    correction, spread = _correction(maps.filled_m, log_depth, guide, farther + nearer, usable)
+    farther = cv2.dilate(guide, _NEIGHBOURHOOD) - guide
+    nearer = guide - cv2.erode(guide, _NEIGHBOURHOOD)
+    steepness = farther + nearer
+
+    correction, spread = _correction(depth_map.filled_m, log_depth, guide, steepness, usable)
     full_m = np.exp(np.minimum(log_depth + correction, _EMPTY)).astype(np.float32)
+    # A pixel far from both surfaces is on the blurred transition between them.
     usable &= (np.minimum(farther, nearer) < 2 * _USUAL) & (full_m < FAR_M)
-    from_prior = usable & (maps.filled_m == 0)
-    error = np.hypot(spread, farther + nearer) / _USUAL
+    from_prior = usable & (depth_map.filled_m == 0)
+    error = np.hypot(spread, steepness) / _USUAL
     return FullDepth(
-        np.where(from_prior, full_m, maps.filled_m),
+        np.where(from_prior, full_m, depth_map.filled_m),
         np.where(from_prior, _MOST_CONFIDENCE / (1 + error), confidence).astype(np.float32),
         from_prior,
         fit,
@@ -77,50 +90,70 @@ def complete(maps: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
 def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
     """Return the curve from the values of a prior to depth with the least ``residual``.
 
-    A curve that turns near into far is rejected. ``value`` and ``depth_m``, both (N,) and above 0,
-    are of the same pixels. ``kind`` is as in `complete`.
+    A curve that turns near into far is rejected.
+
+    Args:
+        value: (N,) values of the prior, above 0.
+        depth_m: (N,) depths of the same pixels in metres, above 0.
+        kind: As in `complete`.
     """
     p, z = value.astype(np.float64), depth_m.astype(np.float64)
-    fits = [_fitted(form, p, z) for form in _FORMS[kind]]
+    fits = [_fit_form(form, p, z) for form in _FORMS[kind]]
     return min(fits, key=lambda fit: (not fit.scale > 0, fit.residual))
 
 
-def _fitted(form: str, p: Float, z: Float) -> PriorFit:
+def _fit_form(form: str, p: Float, z: Float) -> PriorFit:
     """Fit one form of curve to values p (N,) and depths z (N,) by medians in steps of depth."""
     if len(z) < _MIN_FITTED:
         return PriorFit(form, 0.0, 0.0, np.inf, 1.0, False)
     step = np.floor(np.log(z / z.min()) / _USUAL).astype(np.int64)
-    num = np.bincount(step)
-    steps = np.flatnonzero(num)
+    num_pixels = np.bincount(step)
+    steps = np.flatnonzero(num_pixels)
     # Measured depth counts as exact, the prior's values do not. Medians tolerate a tenth of
     # outliers.
-    middle_p = ndimage.median(p, step, steps)
-    scale, shift = _line(form, middle_p, ndimage.median(z, step, steps))
-    off = np.abs(_log_depth(p, PriorFit(form, scale, shift, np.inf, 1.0, False)) - np.log(z))
-    weight = 1 / np.sqrt(num)[step]
-    residual = float(np.average(np.minimum(off, _WRONG), weights=weight))
-    wrong = float(np.average(off > _WRONG, weights=weight))
-    return PriorFit(form, scale, shift, residual, wrong, scale > 0 and wrong <= MAX_WRONG)
+    median_p = ndimage.median(p, step, steps)
+    median_z = ndimage.median(z, step, steps)
+    scale, shift = _fit_curve(form, median_p, median_z)
+
+    curve = PriorFit(form, scale, shift, np.inf, 1.0, False)
+    deviation = np.abs(_log_depth(p, curve) - np.log(z))
+    # Together the pixels of a step weigh the root of their number.
+    weight = 1 / np.sqrt(num_pixels)[step]
+    residual = float(np.average(np.minimum(deviation, _WRONG), weights=weight))
+    wrong_share = float(np.average(deviation > _WRONG, weights=weight))
+    used = scale > 0 and wrong_share <= MAX_WRONG
+    return PriorFit(form, scale, shift, residual, wrong_share, used)
 
 
-def _line(form: str, p: Float, z: Float) -> tuple[float, float]:
-    """Return scale and shift of the curve of one form, linear in both, through p and z."""
-    unit, one = float(np.median(p)), np.ones(len(z))
+def _fit_curve(form: str, p: Float, z: Float) -> tuple[float, float]:
+    """Return scale and shift of the curve of one form through values p and depths z, both (N,).
+
+    The curve is log(z) = scale · log(p) + shift for the form ``log``, z = scale · p + shift for
+    ``depth``, and 1 / z = scale · p + shift for ``inverse``.
+    """
+    # Values are divided by their median, so that both unknowns are of similar size.
+    unit = float(np.median(p))
+    ones = np.ones(len(z))
     if form == "log":
-        columns, target = [np.log(p / unit), one], np.log(z)
+        columns = [np.log(p / unit), ones]
+        target = np.log(z)
     else:
         # The weights make residuals close to residuals of the logarithm of depth.
         weight = z if form == "inverse" else 1 / z
-        columns, target = [p / unit * weight, weight], one
+        columns = [p / unit * weight, weight]
+        target = ones
     A = np.stack(columns, axis=1)
 
-    def residual(x: Float) -> Float:
-        return A @ x - target
+    def residual(scale_shift: Float) -> Float:
+        return A @ scale_shift - target
 
     start = np.linalg.lstsq(A, target, rcond=None)[0]
     solution = optimize.least_squares(residual, start, loss="soft_l1", f_scale=_USUAL)
-    scale, shift = (float(x) for x in solution.x)
-    return (scale, shift - scale * np.log(unit)) if form == "log" else (scale / unit, shift)
+    scale, shift = (float(number) for number in solution.x)
+    # Back to values that are not divided by the unit
+    if form == "log":
+        return scale, shift - scale * np.log(unit)
+    return scale / unit, shift
 
 
 def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
@@ -157,66 +190,85 @@ class _Cells(NamedTuple):
         first = np.concatenate([cell[:, :-1].ravel(), cell[:-1].ravel()])
         second = np.concatenate([cell[:, 1:].ravel(), cell[1:].ravel()])
         step = (self.guide.ravel()[first] - self.guide.ravel()[second]) / _USUAL
-        tied = _SMOOTHNESS * np.exp(-(step**2))  # less, the more the guides of both cells differ
-        half = sparse.coo_array((tied, (first, second)), shape=(cell.size, cell.size))
+        tie = _SMOOTHNESS * np.exp(-(step**2))  # less, the more the guides of both cells differ
+        half = sparse.coo_array((tie, (first, second)), shape=(cell.size, cell.size))
         weights = (half + half.T).tocsr()
         return sparse.diags_array(weights.sum(axis=1)) - weights
 
     def at_pixels(self, values: Float, guide: Float32) -> Float:
-        """Return (K,H,W) values (K,RC) of cells, interpolated between four cells."""
+        """Return (K,H,W) the values (K,RC) of cells, interpolated between four cells.
+
+        ``guide`` (H,W) is the logarithm of depth of the pixels.
+        """
         grid = values.reshape(-1, *self.guide.shape)
+        # Positions of the image's rows and columns, in cells from the centre of the first
         down, right = ((np.arange(length) - self.size // 2) / self.size for length in guide.shape)
-        weight_sum, value_sum = np.zeros(guide.shape), np.zeros((len(grid), *guide.shape))
-        for row, row_weight in _both_ways(down, self.guide.shape[0]):
-            for column, column_weight in _both_ways(right, self.guide.shape[1]):
-                corner = np.ix_(row, column)
+        weight_sum = np.zeros(guide.shape)
+        value_sum = np.zeros((len(grid), *guide.shape))
+        for row, row_weight in _cells_beside(down, self.guide.shape[0]):
+            for column, column_weight in _cells_beside(right, self.guide.shape[1]):
                 # Cells on another surface, by their guide, hardly count.
-                off = (guide - self.guide[corner]) / _USUAL
-                alike = np.exp(-(off**2)) + np.finfo(float).eps
-                weight = alike * np.outer(row_weight, column_weight)
+                difference = (guide - self.guide[np.ix_(row, column)]) / _USUAL
+                similarity = np.exp(-(difference**2)) + np.finfo(float).eps
+                weight = similarity * np.outer(row_weight, column_weight)
                 weight_sum += weight
                 value_sum += weight * grid[:, row[:, None], column]
         return value_sum / weight_sum
 
 
-def _both_ways(position: Float, num: int) -> list[tuple[Int, Float]]:
+def _cells_beside(position: Float, num_cells: int) -> list[tuple[Int, Float]]:
     """Return the cells before and after fractional positions, each with its weights."""
-    before = np.clip(np.floor(position), 0, num - 1).astype(np.int64)
+    before = np.clip(np.floor(position), 0, num_cells - 1).astype(np.int64)
+    after = np.minimum(before + 1, num_cells - 1)
     share = np.clip(position - before, 0, 1)
-    return [(before, 1 - share), (np.minimum(before + 1, num - 1), share)]
+    return [(before, 1 - share), (after, share)]
 
 
 def _correction(
     filled_m: Float32, log_depth: Float, guide: Float32, steepness: Float32, usable: Bool
 ) -> tuple[Float, Float]:
-    """Return (H,W) the correction of the logarithm of depth, and (H,W) its remaining error."""
-    # guide: the prior's log_depth smoothed, steepness: its range around a pixel
+    """Return (H,W) the correction of the logarithm of depth, and (H,W) its remaining error.
+
+    Args:
+        filled_m: (H,W) known depth, 0 for none.
+        log_depth: (H,W) logarithm of depth by the prior's curve.
+        guide: The same, smoothed.
+        steepness: Range of the guide around each pixel.
+        usable: True where the prior has a depth.
+    """
     cells = _Cells.over(guide)
-    area, num = cells.size**2, cells.guide.size
-    known = usable & (filled_m > 0) & (np.abs(guide - cells.guide.ravel()[cells.number]) < _USUAL)
-    cell = cells.number[known]
-    deviation = np.log(filled_m[known].astype(np.float64)) - log_depth[known]
+    area, num_cells = cells.size**2, cells.guide.size
+    # Pixels on another surface than the centre of their cell do not tie the cell.
+    centre_guide = cells.guide.ravel()[cells.number]
+    ties = usable & (filled_m > 0) & (np.abs(guide - centre_guide) < _USUAL)
+    cell = cells.number[ties]
+    deviation = np.log(filled_m[ties].astype(np.float64)) - log_depth[ties]
     membrane = cells.membrane()
 
-    def at_rest(trust: Float, values: Float, elsewhere: float) -> Float:
-        """Return the (RC,) membrane at rest, pulled by known pixels to their values."""
-        tied = np.bincount(cell, trust, num) / area + _TOWARDS_NONE
-        pulled = np.bincount(cell, trust * values, num) / area + _TOWARDS_NONE * elsewhere
-        system = (membrane + sparse.diags_array(tied)).tocsc()
-        settled: Float = linalg.spsolve(system, pulled, permc_spec="MMD_AT_PLUS_A")
-        return settled
-
-    def trusted(off: Float | Float32) -> Float:
-        """Return the (N,) weight of known pixels at these deviations."""
-        weight: Float = 1 / (1 + (off.astype(np.float64) / (2 * _USUAL)) ** 2)
-        return weight
+    def solve_membrane(weight: Float, values: Float, elsewhere: float) -> Float:
+        """Return the (RC,) membrane pulled to values (N,), and to ``elsewhere`` without any."""
+        diagonal = np.bincount(cell, weight, num_cells) / area + _TOWARDS_NONE
+        pull = np.bincount(cell, weight * values, num_cells) / area + _TOWARDS_NONE * elsewhere
+        system = (membrane + sparse.diags_array(diagonal)).tocsc()
+        solution: Float = linalg.spsolve(system, pull, permc_spec="MMD_AT_PLUS_A")
+        return solution
 
     # A steep prior may be blurred. Differences there have little weight.
-    flat = trusted(steepness[known])
-    mean = float(np.average(np.abs(deviation), weights=flat)) if len(flat) else 0.0
-    trust = flat * trusted(deviation - at_rest(flat, deviation, 0.0)[cell])
-    correction = at_rest(trust, deviation, 0.0)
+    flatness_weight = _robust_weight(steepness[ties])
+    mean_error = 0.0
+    if len(deviation):
+        mean_error = float(np.average(np.abs(deviation), weights=flatness_weight))
+    # Pixels that deviate from a first solution are outliers.
+    first = solve_membrane(flatness_weight, deviation, 0.0)
+    weight = flatness_weight * _robust_weight(deviation - first[cell])
+    correction = solve_membrane(weight, deviation, 0.0)
     # The mean error of known pixels nearby on the same surface; far from them, of the image.
-    spread = at_rest(trust, np.abs(deviation - correction[cell]), mean)
+    spread = solve_membrane(weight, np.abs(deviation - correction[cell]), mean_error)
     at_pixels = cells.at_pixels(np.stack([correction, spread]), guide)
     return at_pixels[0], at_pixels[1]
+
+
+def _robust_weight(deviation: Float | Float32) -> Float:
+    """Return the (N,) weights of pixels with these deviations in the logarithm of depth."""
+    weight: Float = 1 / (1 + (deviation.astype(np.float64) / (2 * _USUAL)) ** 2)
+    return weight

@@ -12,7 +12,7 @@ Robotics", 2005, ch. 9).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -30,9 +30,15 @@ from densify.geometry.types import Bool, Camera, Cloud, DepthMap, Float, Float32
 
 _LEAST_CONFIDENCE = np.float32(1) / np.iinfo(np.uint8).max  # stored as 1; 0 is no depth
 _SHARE = 0.25  # share of passing rays above which a pixel is rejected
-_NUM_STEPS = 6
+_NUM_STEPS = 6  # number of steps of the search for a crossing
 
-_Stage = tuple[bool, Callable[..., None], tuple[Any, ...]]
+
+class _Stage(NamedTuple):
+    """A stage of a record's way to a depth map."""
+
+    applies: bool
+    stage: Callable[..., None]  # changes the record, its first argument, in place
+    arguments: tuple[Any, ...] = ()  # the others
 
 
 def project(inputs: MapInputs) -> DepthMap:
@@ -41,26 +47,26 @@ def project(inputs: MapInputs) -> DepthMap:
     Moving objects are shown at their position at the view's time.
     """
     record = measure(inputs)
-    for applies, stage, arguments in _stages(inputs):
-        if applies:
-            stage(record, *arguments)
+    for step in _stages(inputs):
+        if step.applies:
+            step.stage(record, *step.arguments)
     return _finished(record, inputs)
 
 
 def _stages(inputs: MapInputs) -> tuple[_Stage, ...]:
-    """Return the stages in their order: if each applies, its function, and its arguments."""
-    cloud, view, settings = inputs.cloud, inputs.view, inputs.settings
-    filled, visible, rays = inputs.filled, settings.visibility, inputs.rays
+    """Return the stages in their order."""
+    cloud, view, settings, rays = inputs.cloud, inputs.view, inputs.settings, inputs.rays
+    filled, visible = inputs.filled, settings.visibility
     return (
-        (True, accept_boundary_pixels, (settings.rims,)),
-        (filled, fill, (settings.fill_reach,)),
-        (filled, fill_stars, ()),
-        (filled and visible, close_bodies, (cloud, view.exposure, inputs.bodies)),
-        (visible and rays is not None, reject_seen_through, (cloud, view, rays)),
-        (visible, _rate, (cloud, inputs.camera)),
-        (not visible, _rate_by_age, (cloud,)),
-        (True, _set_reasons, ()),
-        (filled and visible, measure_spots, ()),
+        _Stage(True, accept_boundary_pixels, (settings.rims,)),
+        _Stage(filled, fill, (settings.fill_reach,)),
+        _Stage(filled, fill_stars),
+        _Stage(filled and visible, close_bodies, (cloud, view.exposure, inputs.bodies)),
+        _Stage(visible and rays is not None, reject_seen_through, (cloud, view, rays)),
+        _Stage(visible, _rate, (cloud, inputs.camera)),
+        _Stage(not visible, _rate_by_age, (cloud,)),
+        _Stage(True, _set_reasons),
+        _Stage(filled and visible, measure_spots),
     )
 
 
@@ -77,8 +83,9 @@ def _rate_by_age(record: MapRecord, cloud: Cloud) -> None:
     """Set the confidence of each pixel to that of the point that measured the nearest pixel."""
     shown = record.filled_m > 0
     if shown.any():
-        of_point = cloud.confidence[record.point[nearest_pixel(record.depth_m > 0)]][shown]
-        record.confidence[shown] = np.maximum(of_point, _LEAST_CONFIDENCE)
+        source = record.point[nearest_pixel(record.depth_m > 0)]
+        source_confidence = cloud.confidence[source][shown]
+        record.confidence[shown] = np.maximum(source_confidence, _LEAST_CONFIDENCE)
 
 
 def _set_reasons(record: MapRecord) -> None:
@@ -89,24 +96,26 @@ def _set_reasons(record: MapRecord) -> None:
 
 def _finished(record: MapRecord, inputs: MapInputs) -> DepthMap:
     """Return the record as a depth map, with the sweep that measured each pixel."""
-    shown, rejected, none = record.filled_m > 0, record.rejected_m > 0, np.float32(0)
+    shown, rejected = record.filled_m > 0, record.rejected_m > 0
+    no_confidence = np.float32(0)
 
-    def frames(mask: Bool) -> NDArray[np.int32]:
+    def source_frames(mask: Bool) -> NDArray[np.int32]:
+        """Return the (H,W) frame numbers of the sweeps that measured the pixels, else -1."""
         frame = np.full(mask.shape, -1, np.int32)
         frame[mask] = inputs.cloud.frame[record.point[mask]]
         return frame
 
     rejected_pixels = Rejected(
         record.rejected_m,
-        np.where(shown, none, record.confidence),
-        frames(rejected & (record.boundary_m > 0)),
+        np.where(shown, no_confidence, record.confidence),
+        source_frames(rejected & (record.boundary_m > 0)),
     )
     return DepthMap(
         camera=inputs.camera.name,
         depth_m=record.depth_m,
         filled_m=record.filled_m,
-        confidence=np.where(shown, record.confidence, none),
-        frame=frames(record.depth_m > 0),
+        confidence=np.where(shown, record.confidence, no_confidence),
+        frame=source_frames(record.depth_m > 0),
         reason=record.reason,
         measure=inputs.view.exposure.measure,
         evidence=record.evidence,
@@ -115,58 +124,82 @@ def _finished(record: MapRecord, inputs: MapInputs) -> DepthMap:
 
 
 def reject_seen_through(record: MapRecord, cloud: Cloud, view: InView, rays: Rays) -> None:
-    """Reject the pixels that rays passed through.
+    """Reject the pixels of a record, in place, that rays passed through.
 
-    The ray of an occluded static point (by its reason) passed through where it crosses the surface
-    of the map, clearly before its end. The ray of any other point ended in its pixel. Both are
-    blurred by a third of the ray spacing. A pixel is rejected if more than a quarter of the rays
-    passed through. Moving bodies stay.
+    A ray passed through if its point is static and occluded (`Reason.HIDDEN`). It counts in the
+    pixel where it crosses the surface of the map, clearly before its end. A ray stopped if its
+    point has any other reason. It counts in the pixel of its point. Both counts are blurred by a
+    third of the ray spacing. A pixel is rejected if more than a quarter of its rays passed through.
+    Moving bodies stay.
+
+    Args:
+        record: The map, with the reasons of all points.
+        cloud: The cloud of the record.
+        view: Points of the cloud in the image.
+        rays: Rays of the window; points of other sweeps do not count.
     """
-    counts = np.isin(cloud.frame, rays.stretch.frames) & (record.reason != Reason.OUTSIDE)
-    stopped = counts & (record.reason != Reason.HIDDEN)
-    passed = cloud.select(counts & ~stopped & ~cloud.moving)
-    blur_px, shape = FOOTPRINT * float(np.median(record.gap_px)), record.filled_m.shape
-    through = crossings(record.filled_m, rays.starts(passed), passed.points, view.exposure)
-    num = _counts(through, shape, blur_px)
-    num_stopped = _counts(view.uv[stopped[view.rows]], shape, blur_px)
-    record.reject((num > _SHARE * (num + num_stopped)) & ~record.on_body)
+    in_window = np.isin(cloud.frame, rays.stretch.frames)
+    counted = in_window & (record.reason != Reason.OUTSIDE)
+    stopped = counted & (record.reason != Reason.HIDDEN)
+    passed_cloud = cloud.select(counted & ~stopped & ~cloud.moving)
+
+    origins = rays.origins_of(passed_cloud)
+    crossings_uv = find_crossings(record.filled_m, origins, passed_cloud.points, view.exposure)
+    stopped_uv = view.uv[stopped[view.rows]]
+    blur_px = FOOTPRINT * float(np.median(record.gap_px))
+    shape = record.filled_m.shape
+    num_passed = _counts(crossings_uv, shape, blur_px)
+    num_stopped = _counts(stopped_uv, shape, blur_px)
+    seen_through = num_passed > _SHARE * (num_passed + num_stopped)
+    record.reject(seen_through & ~record.on_body)
 
 
 def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
     """Return (H,W) the number of positions uv (K,2) in each pixel, blurred by ``blur_px``."""
     row, column = pixel_of(uv)
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
-    size = 2 * round(2.5 * blur_px) + 1
     pixels = counts.reshape(shape).astype(np.float32)
-    blurred = cv2.GaussianBlur(pixels, (size, size), blur_px, borderType=cv2.BORDER_REFLECT)
+    kernel_px = 2 * round(2.5 * blur_px) + 1  # 2.5 standard deviations to each side
+    size = (kernel_px, kernel_px)
+    blurred = cv2.GaussianBlur(pixels, size, blur_px, borderType=cv2.BORDER_REFLECT)
     return blurred.astype(np.float32, copy=False)
 
 
-def crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Exposure) -> Float:
+def find_crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Exposure) -> Float:
     """Return the (P,2) px where rays cross the surface of a map clearly before they end.
 
     The search starts at the end of the ray. It goes to the point of the ray at the surface's depth
-    in the present pixel, and repeats this until the depth stays the same. The rays go ``from_key``
-    (K,3) ``to_key`` (K,3), key sweep's lidar frame. ``surface_m`` (H,W) is in metres, 0 none.
+    in the present pixel, and repeats this until the depth stays the same.
+
+    Args:
+        surface_m: (H,W) depth of the surface in metres, 0 for none.
+        from_key: (K,3) origins of the rays, key sweep's lidar frame.
+        to_key: (K,3) ends of the rays, same frame.
+        exposure: Camera and time of the map.
     """
-    start = poses.transform(exposure.T_cam_key, from_key)
-    end = poses.transform(exposure.T_cam_key, to_key)
-    end_m, still = exposure.depth_m(end), np.zeros(to_key.shape, np.float32)
-    sight = exposure.see(to_key, still)
+    start_cam = poses.transform(exposure.T_cam_key, from_key)
+    end_cam = poses.transform(exposure.T_cam_key, to_key)
+    end_m = exposure.depth_m(end_cam)
+    no_velocity = np.zeros(to_key.shape, np.float32)
+    sight = exposure.see(to_key, no_velocity)
     uv, valid = sight.uv, sight.inside
     depth_m = np.full(len(to_key), np.inf)
     for _ in range(_NUM_STEPS):
-        before_m, pixel = depth_m, pixel_of(np.where(valid[:, None], uv, 0))
+        before_m = depth_m
+        pixel = pixel_of(np.where(valid[:, None], uv, 0))
         depth_m = surface_m[pixel].astype(np.float64)
         with np.errstate(invalid="ignore"):
-            same = abs(depth_m - before_m) <= agree_m(before_m)
-        share = _share(start, end, depth_m, exposure.measure)
+            is_same = abs(depth_m - before_m) <= agree_m(before_m)
+
+        share = _share(start_cam, end_cam, depth_m, exposure.measure)
         valid &= (depth_m > 0) & (share > 0) & (share < 1)
         share = np.where(valid, share, 1.0)[:, None]
-        sight = exposure.see(from_key + share * (to_key - from_key), still)
-        uv, valid = sight.uv, valid & sight.inside
-    crosses: Float = uv[valid & same & (end_m - depth_m > hidden_m(depth_m))]
-    return crosses
+        sight = exposure.see(from_key + share * (to_key - from_key), no_velocity)
+        uv = sight.uv
+        valid = valid & sight.inside
+    crosses = valid & is_same & (end_m - depth_m > hidden_m(depth_m))
+    crossings_uv: Float = uv[crosses]
+    return crossings_uv
 
 
 def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
@@ -176,7 +209,10 @@ def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
         if measure == "z":
             share: Float = (depth_m - start[:, 2]) / path[:, 2]
             return share
-        length_squared, along = (path**2).sum(axis=1), (start * path).sum(axis=1)
-        discriminant = along**2 - length_squared * ((start**2).sum(axis=1) - depth_m**2)
-        share = (np.sqrt(discriminant) - along) / length_squared
+        # The farther solution of |start + share · path|² = depth²
+        length_squared = (path**2).sum(axis=1)
+        start_along_path = (start * path).sum(axis=1)
+        range_difference = (start**2).sum(axis=1) - depth_m**2
+        discriminant = start_along_path**2 - length_squared * range_difference
+        share = (np.sqrt(discriminant) - start_along_path) / length_squared
         return share

@@ -22,20 +22,20 @@ from densify.depth.exposure import Exposure
 from densify.depth.patches import AGREE_M, HIDDEN_M
 from densify.free_space.ground import HeightMap
 from densify.geometry import poses
-from densify.geometry.types import Bool, Cloud, Float, Float32, Int, ObjectTrack, Stretch
+from densify.geometry.types import Bool, Cloud, Float, Float32, Int, ObjectTrack, Stretch, Sweep
 
-_AROUND_M = 2.5 * AGREE_M  # distance within which a point of a body has other points of it
-_LEAST_AROUND = 6  # number of these points
+_NEAR_M = 2.5 * AGREE_M  # distance within which a point of a body has other points of it
+_LEAST_NEAR = 6  # least number of these points
 _SIDES = (("rear", "front"), ("right", "left"), ("bottom", "top"))
 # Distance of rays to a side that is seen; tolerates errors of motion and registration.
 _BESIDE_M = 2 * HIDDEN_M
 _NUM_RAYS = 3  # rays that show free space; single rays may be mixed echoes
 _MIDDLE = 0.6  # share of a side, around its middle, that is flat; corners are round
-_BODY = (0.2, 0.5)  # share of the height: above the road, below the panes
+_BODY = (0.2, 0.5)  # shares of the height: from above the road to below the windows
 _CAR_WIDE_M = 1.4  # the narrowest cars are wider, other road users narrower
 _CAR_LONG_M = 3.0  # shorter objects may be people and bicycles
 _LENGTH_OF_WIDTH = 2.4  # of cars: 1.65 by 4.0 m, 1.85 by 4.4 m
-_WIDEST_M = 2.55  # by law
+_WIDEST_M = 2.55  # greatest width of a vehicle by law
 
 
 @dataclass(frozen=True)
@@ -45,36 +45,51 @@ class Rays:
     stretch: Stretch  # registered sweeps of the window
     key: int  # frame number of the key sweep
 
-    def starts(self, cloud: Cloud) -> Float:
-        """Return the (M,3) origins of the rays of a cloud's M points, at their firing times."""
-        starts = np.empty((len(cloud), 3))
+    def origins_of(self, cloud: Cloud) -> Float:
+        """Return the (M,3) origins of the rays of a cloud's M points, at their firing times.
+
+        They are in the key sweep's lidar frame.
+        """
+        origins = np.empty((len(cloud), 3))
         for frame in np.unique(cloud.frame).tolist():
-            rows, registered = np.flatnonzero(cloud.frame == frame), self.stretch[frame]
-            sweep = registered.sweep
-            origin = np.stack([sweep.origin_m(n) for n in range(int(sweep.lidar.max()) + 1)])
-            start = origin[cloud.lidar[rows]]
-            if sweep.offset_ns is not None:
-                order = np.argsort(sweep.row, kind="stable")
-                sweep_rows = order[np.searchsorted(sweep.row, cloud.row[rows], sorter=order)]
-                offset_s = sweep.offset_ns[sweep_rows, None] * 1e-9
+            rows = np.flatnonzero(cloud.frame == frame)
+            registered = self.stretch[frame]
+            origins_by_scanner = _scanner_origins(registered.sweep)
+            origin = origins_by_scanner[cloud.lidar[rows]]
+            offset_ns = registered.sweep.offset_ns
+            if offset_ns is not None:
+                returns = _find_returns(registered.sweep, cloud.row[rows])
+                offset_s = offset_ns[returns, None] * 1e-9
                 twist: Float = np.where(
                     offset_s < 0, registered.twist_before, registered.twist_after
                 )
-                start = poses.transform_each(offset_s * twist, start)
-            starts[rows] = poses.transform(self.stretch.T_target_source(self.key, frame), start)
-        return starts
+                origin = poses.transform_each(offset_s * twist, origin)
+            origins[rows] = poses.transform(self.stretch.T_target_source(self.key, frame), origin)
+        return origins
 
-    def moved_m(self, frame: int) -> float:
-        """Return a bound of the distances of a sweep's rays, at their start, from its lidar."""
+    def origin_bound_m(self, frame: int) -> float:
+        """Return a bound of the distances of a sweep's ray origins from its lidar in metres."""
         registered = self.stretch[frame]
         sweep = registered.sweep
-        numbers = range(int(sweep.lidar.max(initial=0)) + 1)
-        bound_m = float(np.linalg.norm([sweep.origin_m(n) for n in numbers], axis=1).max())
+        bound_m = float(np.linalg.norm(_scanner_origins(sweep), axis=1).max())
         if sweep.offset_ns is not None:
-            speeds = (registered.twist_before, registered.twist_after)
-            speed_m_s = max(float(np.linalg.norm(twist[3:])) for twist in speeds)
+            twists = (registered.twist_before, registered.twist_after)
+            speed_m_s = max(float(np.linalg.norm(twist[3:])) for twist in twists)
             bound_m += speed_m_s * 1e-9 * float(np.abs(sweep.offset_ns).max(initial=0))
         return bound_m
+
+
+def _scanner_origins(sweep: Sweep) -> Float:
+    """Return the (S,3) origins of a sweep's scanners in its lidar frame."""
+    num_scanners = int(sweep.lidar.max(initial=0)) + 1
+    return np.stack([sweep.origin_m(scanner) for scanner in range(num_scanners)])
+
+
+def _find_returns(sweep: Sweep, numbers: Int) -> Int:
+    """Return the (K,) indices in a sweep of the returns with these numbers in the recording."""
+    order = np.argsort(sweep.row, kind="stable")
+    returns: Int = order[np.searchsorted(sweep.row, numbers, sorter=order)]
+    return returns
 
 
 def half_spaces(corners: Float) -> Float:
@@ -85,16 +100,21 @@ def half_spaces(corners: Float) -> Float:
     return np.unique(ConvexHull(corners).equations, axis=0)
 
 
-def crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float, Float]:
+def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float, Float]:
     """Return the (K,) t at which lines start + t · direction enter a convex body, and leave it.
 
-    A line that misses the body leaves before it enters. ``spaces`` is from `half_spaces`,
-    ``direction`` (K,3), ``start`` (K,3) or (3,) for all lines.
+    A line that misses the body leaves before it enters.
+
+    Args:
+        spaces: (F,4) sides of the body from `half_spaces`.
+        start: (K,3) points on the lines, or (3,) for all lines.
+        direction: (K,3) directions of the lines, of any length.
     """
     enter, leave = np.full(len(direction), -np.inf), np.full(len(direction), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
         for side in spaces:
-            # No -0: a line along a side that is outside never enters.
+            # The sum turns a slope of -0 into 0: with -0, t has the wrong sign, and a line parallel
+            # to a side and outside it would enter.
             slope = direction @ side[:3] + 0.0
             t = (start @ -side[:3] - side[3]) / slope
             inward = slope < 0
@@ -104,11 +124,15 @@ def crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float, Floa
 
 
 def passes_near(corners: Float, start: Float, direction: Float) -> Bool:
-    """Return (K,) True for lines, as in `crossing`, that meet a sphere around the corners (V,3)."""
+    """Return (K,) True for lines that meet a sphere around the corners (V,3).
+
+    The lines are those of `find_crossing`.
+    """
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius_m = np.linalg.norm(corners - middle, axis=1).max()
-    off = np.linalg.norm(np.cross(start - middle, direction), axis=1)
-    passes: Bool = off <= radius_m * np.linalg.norm(direction, axis=1)
+    # The distance of a line from the middle, times the length of its direction
+    scaled_m = np.linalg.norm(np.cross(start - middle, direction), axis=1)
+    passes: Bool = scaled_m <= radius_m * np.linalg.norm(direction, axis=1)
     return passes
 
 
@@ -129,48 +153,84 @@ def rays_toward(
 ) -> dict[int, ObjectRays]:
     """Return the rays of all sweeps that may meet the hull of each object, by instance number.
 
-    ``rows_of`` are the indices of each object's points in the cloud, ``corners`` (V,3) those of its
-    hull at the key's time.
+    Args:
+        cloud: The cloud that the rays measured.
+        rays: The rays of the window's sweeps.
+        rows_of: Indices of each object's points in the cloud.
+        corners: (V,3) corners of each object's hull at the key's time, key sweep's lidar frame.
     """
-    rays_of: dict[int, list[ObjectRays]] = {k: [] for k in rows_of}
+    by_sweep: dict[int, list[ObjectRays]] = {instance: [] for instance in rows_of}
     for frame in rays.stretch.frames if rows_of else ():
-        motions = dict[int, Float]()  # of objects from the sweep to the key, key's lidar frame
-        for k, rows in rows_of.items():
-            seen = rows[cloud.frame[rows] == frame]
-            if len(seen):
-                motions[k] = poses.fit_rigid(cloud.rigid_points[seen], cloud.points[seen])
-        returns = np.flatnonzero(cloud.frame == frame)
-        origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
-        xy = (cloud.rigid_points.take(returns, axis=0) - origin)[:, :2].T.astype(np.float32)
-        moved_m, toward = rays.moved_m(frame), dict[int, Int]()
-        for k, T_key_sweep in motions.items():
-            hull = poses.transform(poses.inverse(T_key_sweep), corners[k]) - origin
-            toward[k] = returns[_may_meet(xy, moved_m, hull)]
-        starts = rays.starts(cloud.select(np.concatenate([returns[:0], *toward.values()])))
-        for k, T_key_sweep in motions.items():
-            rows = toward[k]
-            start, starts = poses.transform(T_key_sweep, starts[: len(rows)]), starts[len(rows) :]
-            end = poses.transform(T_key_sweep, cloud.rigid_points[rows])
-            rays_of[k].append(ObjectRays(rows, start, end - start))
+        for instance, object_rays in _sweep_rays(cloud, rays, frame, rows_of, corners).items():
+            by_sweep[instance].append(object_rays)
     return {
-        k: ObjectRays(*(np.concatenate(column) for column in zip(*by_sweep, strict=True)))
-        for k, by_sweep in rays_of.items()
+        instance: ObjectRays(
+            np.concatenate([part.rows for part in parts]),
+            np.concatenate([part.start for part in parts]),
+            np.concatenate([part.to_return for part in parts]),
+        )
+        for instance, parts in by_sweep.items()
     }
 
 
-def _may_meet(xy: Float32, moved_m: float, corners: Float) -> Bool:
-    """Return (N,) True for returns at xy (2,N) whose rays may meet a hull with corners (V,3)."""
-    # Metres from the lidar at the sweep's reference time; rays start up to moved_m away from it
+def _sweep_rays(
+    cloud: Cloud,
+    rays: Rays,
+    frame: int,
+    rows_of: Mapping[int, Int],
+    corners: Mapping[int, Float],
+) -> dict[int, ObjectRays]:
+    """Return the rays of one sweep as `rays_toward`, for the objects that the sweep observes."""
+    # Motions of the objects from the sweep to the key, in the key's lidar frame
+    motions = dict[int, Float]()
+    for instance, rows in rows_of.items():
+        own = rows[cloud.frame[rows] == frame]
+        if len(own):
+            motions[instance] = poses.fit_rigid(cloud.rigid_points[own], cloud.points[own])
+
+    # Rows of the rays toward each object, by their direction from the lidar
+    returns = np.flatnonzero(cloud.frame == frame)
+    lidar_origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
+    from_lidar = cloud.rigid_points.take(returns, axis=0) - lidar_origin
+    xy = from_lidar[:, :2].T.astype(np.float32)
+    bound_m = rays.origin_bound_m(frame)
+    toward = dict[int, Int]()
+    for instance, T_key_sweep in motions.items():
+        hull = poses.transform(poses.inverse(T_key_sweep), corners[instance]) - lidar_origin
+        toward[instance] = returns[_may_meet(xy, bound_m, hull)]
+
+    # All origins are found together, and cut into those of each object.
+    all_rows = np.concatenate([returns[:0], *toward.values()])
+    origins = rays.origins_of(cloud.select(all_rows))
+    object_rays = {}
+    first = 0
+    for instance, T_key_sweep in motions.items():
+        rows = toward[instance]
+        start = poses.transform(T_key_sweep, origins[first : first + len(rows)])
+        end = poses.transform(T_key_sweep, cloud.rigid_points[rows])
+        object_rays[instance] = ObjectRays(rows, start, end - start)
+        first += len(rows)
+    return object_rays
+
+
+def _may_meet(xy: Float32, bound_m: float, corners: Float) -> Bool:
+    """Return (N,) True for returns at xy (2,N) whose rays may meet a hull with corners (V,3).
+
+    Both are in metres from the lidar at the sweep's reference time. The rays start up to
+    ``bound_m`` metres from the lidar.
+    """
     x, y, _ = corners.T
     middle = np.array([x.mean(), y.mean()])
     range_m = np.hypot(*middle)
-    radius_m = np.hypot(x - middle[0], y - middle[1]).max() + moved_m
+    radius_m = np.hypot(x - middle[0], y - middle[1]).max() + bound_m
     if range_m <= radius_m:
         return np.ones(xy.shape[1], bool)
-    right, ahead = (middle / range_m).astype(np.float32)
-    wide = np.float32(radius_m / np.sqrt(range_m**2 - radius_m**2))
-    along, aside = right * xy[0] + ahead * xy[1], ahead * xy[0] - right * xy[1]
-    meets: Bool = (along > range_m - radius_m) & (abs(aside) <= wide * along)
+    # The cone from the lidar that touches a circle around the hull
+    axis_x, axis_y = (middle / range_m).astype(np.float32)
+    tangent = np.float32(radius_m / np.sqrt(range_m**2 - radius_m**2))
+    along_m = axis_x * xy[0] + axis_y * xy[1]
+    aside_m = axis_y * xy[0] - axis_x * xy[1]
+    meets: Bool = (along_m > range_m - radius_m) & (abs(aside_m) <= tangent * along_m)
     return meets
 
 
@@ -185,7 +245,7 @@ class MovingBody(NamedTuple):
     frame: NDArray[np.integer]  # (K,) frame number of the ray's sweep
 
 
-def moving_bodies(
+def find_moving_bodies(
     cloud: Cloud, rays: Rays, exposures: Collection[Exposure]
 ) -> dict[int, MovingBody]:
     """Return the bodies of moving objects in view of a camera, by instance number.
@@ -193,55 +253,77 @@ def moving_bodies(
     Objects whose points span no volume have no body. The ``rays`` measured the ``cloud``.
     """
     moving = np.flatnonzero(cloud.moving & (cloud.instance >= 0))
-    instance = cloud.instance[moving]
-    rows_of = {k: moving[instance == k] for k in np.unique(instance).tolist()}
-    hulls = {k: _corners(cloud.points[rows]) for k, rows in rows_of.items()}
-    velocity_m_s = {k: np.median(cloud.velocity_m_s[rows], axis=0) for k, rows in rows_of.items()}
+    instance_of = cloud.instance[moving]
+    rows_of = {
+        instance: moving[instance_of == instance] for instance in np.unique(instance_of).tolist()
+    }
+    hulls = {instance: _hull_corners(cloud.points[rows]) for instance, rows in rows_of.items()}
+    velocity_m_s = {
+        instance: np.median(cloud.velocity_m_s[rows], axis=0) for instance, rows in rows_of.items()
+    }
 
-    def is_shown(k: int) -> bool:
+    def is_shown(instance: int) -> bool:
         """Return True if a corner of the object's hull is in an image."""
-        return any(e.see(hulls[k], velocity_m_s[k]).inside.any() for e in exposures)
+        return any(
+            exposure.see(hulls[instance], velocity_m_s[instance]).inside.any()
+            for exposure in exposures
+        )
 
-    rows_of = {k: rows for k, rows in rows_of.items() if is_shown(k)}
+    rows_of = {instance: rows for instance, rows in rows_of.items() if is_shown(instance)}
     return {
-        k: MovingBody(hulls[k], velocity_m_s[k], *_met(cloud, k, hulls[k], toward))
-        for k, toward in rays_toward(cloud, rays, rows_of, hulls).items()
+        instance: _body(cloud, instance, hulls[instance], velocity_m_s[instance], toward)
+        for instance, toward in rays_toward(cloud, rays, rows_of, hulls).items()
     }
 
 
 def without_sweep(
     bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
 ) -> dict[int, MovingBody]:
-    """Return the bodies without sweep ``frame``. cloud: points of all other sweeps."""
+    """Return the bodies without the points and rays of sweep ``frame``.
+
+    ``cloud`` has the points of all other sweeps. Bodies whose points there span no volume are left
+    out.
+    """
     reduced_bodies = {}
-    for k, body in bodies.items():
-        corners = _corners(cloud.points[cloud.moving & (cloud.instance == k)])
+    for instance, body in bodies.items():
+        corners = _hull_corners(cloud.points[cloud.moving & (cloud.instance == instance)])
         if len(corners):
-            rays = (column[body.frame != frame] for column in (body.entries, body.ends, body.frame))
-            reduced_bodies[k] = MovingBody(corners, body.velocity_m_s, *rays)
+            keep = body.frame != frame
+            reduced_bodies[instance] = MovingBody(
+                corners, body.velocity_m_s, body.entries[keep], body.ends[keep], body.frame[keep]
+            )
     return reduced_bodies
 
 
-def _corners(points: Float) -> Float:
-    """Return the (V,3) hull corners of the points (N,3) that have other points around."""
-    away_m, _ = KDTree(points).query(points, [_LEAST_AROUND + 1])  # the first is the point
-    points = points[np.ravel(away_m) <= _AROUND_M]
+def _hull_corners(points: Float) -> Float:
+    """Return the (V,3) hull corners of the points (N,3) that have other points around.
+
+    There are none if the points span no volume.
+    """
+    # One more point than needed: the nearest is the point itself.
+    distance_m, _ = KDTree(points).query(points, [_LEAST_NEAR + 1])
+    points = points[np.ravel(distance_m) <= _NEAR_M]
     try:
         return points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):  # too few, or flat
+    except (QhullError, ValueError):  # too few points, or points on a plane
         return points[:0]
 
 
-def _met(
-    cloud: Cloud, instance: int, corners: Float, rays: ObjectRays
-) -> tuple[Float, Bool, NDArray[np.integer]]:
-    """Return entries, ends and frame of the rays that meet a hull (V,3), as in `MovingBody`."""
+def _body(
+    cloud: Cloud, instance: int, corners: Float, velocity_m_s: Float32, rays: ObjectRays
+) -> MovingBody:
+    """Return the body with this hull (V,3), and those of the ``rays`` that meet the hull."""
     rays = rays.select(passes_near(corners, rays.start, rays.to_return))
-    enter, leave = crossing(half_spaces(corners), rays.start, rays.to_return)
-    meets = (enter > 0) & (enter < np.minimum(leave, 1))
-    (rows, start, to_return), enter = rays.select(meets), enter[meets]
-    ends = cloud.moving[rows] & (cloud.instance[rows] == instance)
-    return start + enter[:, None] * to_return, ends, cloud.frame[rows]
+    enter, leave = find_crossing(half_spaces(corners), rays.start, rays.to_return)
+    meets = (enter > 0) & (enter < np.minimum(leave, 1))  # 0 is the origin, 1 the return
+    rays = rays.select(meets)
+    return MovingBody(
+        corners=corners,
+        velocity_m_s=velocity_m_s,
+        entries=rays.start + enter[meets, None] * rays.to_return,
+        ends=cloud.moving[rays.rows] & (cloud.instance[rays.rows] == instance),
+        frame=cloud.frame[rays.rows],
+    )
 
 
 def complete_boxes(
@@ -249,25 +331,30 @@ def complete_boxes(
 ) -> tuple[ObjectTrack, ...]:
     """Return the tracks with completed boxes, and with the sides that were seen.
 
-    The boxes of ``tracks`` are around the objects' points. The ``rays`` measured the ``cloud``.
-    ``ground`` is in the world of their sweeps.
+    Args:
+        tracks: The tracked objects, with boxes around their points.
+        cloud: The cloud of the window.
+        rays: The rays that measured the cloud.
+        ground: The ground in the world frame of their sweeps.
     """
-    tracks = [_on_ground(track, rays, ground) for track in tracks]
-    reach = {track.instance: _reach(track, rays.key) for track in tracks}
-    rows_of = {k: np.flatnonzero(cloud.moving & (cloud.instance == k)) for k in reach}
+    tracks = [_lower_to_ground(track, rays, ground) for track in tracks]
+    reach = {track.instance: _reach_corners(track, rays.key) for track in tracks}
+    rows_of = {
+        instance: np.flatnonzero(cloud.moving & (cloud.instance == instance)) for instance in reach
+    }
     toward = rays_toward(cloud, rays, rows_of, reach)
     completed = []
     for track in tracks:
-        k = track.instance
         T_object_key = poses.inverse(track.T_key_object[track.frames.index(rays.key)])
-        start = poses.transform(T_object_key, toward[k].start)
-        to_return = poses.rotate(T_object_key, toward[k].to_return)
-        completed.append(_completed(track, start, to_return))
+        object_rays = toward[track.instance]
+        start = poses.transform(T_object_key, object_rays.start)
+        to_return = poses.rotate(T_object_key, object_rays.to_return)
+        completed.append(_complete_box(track, start, to_return))
     return tuple(completed)
 
 
 def _missing_m(size_m: Float) -> Float:
-    """Return (3,) metres by which length, width and height are below the usual ones."""
+    """Return the (3,) metres that length, width and height lack to those of a usual vehicle."""
     length_m, width_m, _ = size_m
     missing_m = np.zeros(3)
     if length_m >= _CAR_LONG_M:
@@ -277,75 +364,106 @@ def _missing_m(size_m: Float) -> Float:
     return missing_m
 
 
-def _on_ground(track: ObjectTrack, rays: Rays, ground: HeightMap) -> ObjectTrack:
-    """Return the track with a box whose bottom is on the ground at the key."""
+def _lower_to_ground(track: ObjectTrack, rays: Rays, ground: HeightMap) -> ObjectTrack:
+    """Return the track with a box that reaches down to the ground at the key."""
     T_key_object = track.T_key_object[track.frames.index(rays.key)]
     corners = poses.transform(T_key_object, corners_of(track.size_m))
     T_world_key = rays.stretch[rays.key].T_world_lidar
-    above_m = float(np.median(ground.above(poses.transform(T_world_key, corners[::2]))))
-    return grown(track, 2, max(above_m, 0.0), 0.0)
+    bottom = corners[::2]
+    above_m = float(np.median(ground.above(poses.transform(T_world_key, bottom))))
+    return grow_box(track, 2, max(above_m, 0.0), 0.0)
 
 
-def _reach(track: ObjectTrack, key: int) -> Float:
+def _reach_corners(track: ObjectTrack, key: int) -> Float:
     """Return the (8,3) corners at the key of all space that decides about a track's box."""
-    wider_m = 2 * (_missing_m(track.size_m) + _BESIDE_M)
+    wider_m = 2 * (_missing_m(track.size_m) + _BESIDE_M)  # at both ends of each axis
     T_key_object = track.T_key_object[track.frames.index(key)]
     return poses.transform(T_key_object, corners_of(track.size_m + wider_m))
 
 
 def corners_of(size_m: Float) -> Float:
-    """Return the (8,3) corners of a box of (3,) metres around the origin, bottom, top in turn."""
+    """Return the (8,3) corners of a box of (3,) metres around the origin.
+
+    Corners at the bottom and at the top take turns.
+    """
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1)
     corners: Float = signs.reshape(-1, 3) * size_m / 2
     return corners
 
 
-def _completed(track: ObjectTrack, start: Float, to_return: Float) -> ObjectTrack:
+def _complete_box(track: ObjectTrack, start: Float, to_return: Float) -> ObjectTrack:
     """Return a track with its completed box, from rays (K,3) in the object's frame at the key."""
-    seen, missing_m = list[str](), _missing_m(track.size_m)
+    sides_seen = list[str]()
+    missing_m = _missing_m(track.size_m)
     reach_m = track.size_m / 2 + missing_m + _BESIDE_M
-    enter, leave = crossing(_box_spaces(-reach_m, reach_m), start, to_return)
+    enter, leave = find_crossing(_box_spaces(-reach_m, reach_m), start, to_return)
     meets = (enter < leave) & (leave > 0) & (enter < 1)
     start, to_return = start[meets], to_return[meets]
     size_m = track.size_m  # the rays are in the frame of this box
-    for axis, names in enumerate(_SIDES):
+    for axis, sides in enumerate(_SIDES):
+        # At the lower and at the upper end of the axis; a seen side stays where it is.
         free_m = [_free_m(size_m, missing_m, axis, sign, start, to_return) for sign in (-1, 1)]
-        seen += [name for name, m in zip(names, free_m, strict=True) if m <= _BESIDE_M]
-        room_m = [0.0 if m <= _BESIDE_M else m for m in free_m]
+        room_m = [0.0 if end_m <= _BESIDE_M else end_m for end_m in free_m]
+        sides_seen += [
+            side for side, end_m in zip(sides, free_m, strict=True) if end_m <= _BESIDE_M
+        ]
         if missing_m[axis] > 0 and sum(room_m):
-            part_m = [min(m, missing_m[axis] / (1 + all(room_m))) for m in room_m]
-            left_m = missing_m[axis] - sum(part_m)
-            part_m = [min(m, p + left_m) for m, p in zip(room_m, part_m, strict=True)]
-            track = grown(track, axis, *part_m)
-    return replace(track, sides_seen=tuple(name for name in seen if name != "bottom"))
+            growth_m = _share_growth(float(missing_m[axis]), room_m)
+            track = grow_box(track, axis, *growth_m)
+    return replace(track, sides_seen=tuple(side for side in sides_seen if side != "bottom"))
+
+
+def _share_growth(missing_m: float, room_m: Sequence[float]) -> list[float]:
+    """Return the growth of the two ends of a box in metres, within the room at each end."""
+    # Equal parts, if there is room at both ends. An end takes what the other has no room for.
+    part_m = [min(end_m, missing_m / (1 + all(room_m))) for end_m in room_m]
+    left_m = missing_m - sum(part_m)
+    return [min(room, part + left_m) for room, part in zip(room_m, part_m, strict=True)]
 
 
 def _free_m(
     size_m: Float, missing_m: Float, axis: int, sign: int, start: Float, to_return: Float
 ) -> float:
-    """Return the metres from a side of a box to the nearest free space outside; inf for none."""
+    """Return the metres from a side of a box to the nearest free space outside; inf for none.
+
+    Args:
+        size_m: (3,) size of the box, around the origin.
+        missing_m: (3,) greatest growth of the box along each axis.
+        axis: Axis across the side.
+        sign: -1 for the side at the lower end of the axis, 1 for the upper.
+        start: (K,3) origins of rays in the frame of the box.
+        to_return: (K,3) vectors from the origins to the returns.
+    """
+    # The space outside the flat part of the side; vertical sides are tested below the windows.
     half = np.stack([-size_m / 2, size_m / 2])
     low, high = _MIDDLE * half
     if axis < 2:
         low[2], high[2] = half[0, 2] + np.array(_BODY) * size_m[2]
     reach_m = missing_m[axis] + _BESIDE_M
-    edge_m = sign * size_m[axis] / 2
-    low[axis], high[axis] = sorted([edge_m, edge_m + sign * reach_m])
-    enter, leave = crossing(_box_spaces(low, high), start, to_return)
+    side_m = sign * size_m[axis] / 2
+    low[axis], high[axis] = sorted([side_m, side_m + sign * reach_m])
+
+    # Each ray crosses the space from its origin or entry to its return or exit.
+    enter, leave = find_crossing(_box_spaces(low, high), start, to_return)
     enter, leave = np.maximum(enter, 0), np.minimum(leave, 1)
     crosses = enter < leave
-    along = [start[crosses, axis] + t[crosses] * to_return[crosses, axis] for t in (enter, leave)]
-    away_m = np.sort(np.min(sign * np.stack(along), axis=0) - abs(edge_m))
-    return float(away_m[_NUM_RAYS - 1]) if len(away_m) >= _NUM_RAYS else np.inf
+    start_m, ray_m = start[crosses, axis], to_return[crosses, axis]
+    ends_m = np.stack([start_m + enter[crosses] * ray_m, start_m + leave[crosses] * ray_m])
+    distance_m = np.sort(np.min(sign * ends_m, axis=0) - abs(side_m))
+    # Fewer rays may be mixed echoes.
+    return float(distance_m[_NUM_RAYS - 1]) if len(distance_m) >= _NUM_RAYS else np.inf
 
 
 def _box_spaces(low: Float, high: Float) -> Float:
-    """Return the (6,4) sides of a box between two corners (3,), as `hulls.half_spaces`."""
+    """Return the (6,4) sides of a box between two corners (3,), as `half_spaces`."""
     return np.block([[np.eye(3), -high[:, None]], [-np.eye(3), low[:, None]]])
 
 
-def grown(track: ObjectTrack, axis: int, before_m: float, after_m: float) -> ObjectTrack:
-    """Return the track with a box that is longer along an axis at its lower and its upper end."""
+def grow_box(track: ObjectTrack, axis: int, before_m: float, after_m: float) -> ObjectTrack:
+    """Return the track with a longer box.
+
+    The box grows along ``axis`` by ``before_m`` at its lower end and by ``after_m`` at its upper.
+    """
     size_m, T_key_object = track.size_m.copy(), track.T_key_object.copy()
     size_m[axis] += before_m + after_m
     shift_m = (after_m - before_m) / 2

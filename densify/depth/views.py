@@ -16,11 +16,11 @@ from densify.depth.confidence import nearest_pixel, reliability, tolerance, with
 from densify.depth.exposure import Exposure, InView, Shot, pixel_of
 from densify.depth.far import far_cloud
 from densify.depth.measured_pixels import MapInputs
-from densify.depth.moving_bodies import far_inside, fronts
-from densify.depth.patches import hidden_m, patches
+from densify.depth.moving_bodies import find_far_inside, fronts
+from densify.depth.patches import find_patches, hidden_m
 from densify.depth.project import project
-from densify.depth.rays import MovingBody, Rays, moving_bodies, without_sweep
-from densify.depth.votes import lab
+from densify.depth.rays import MovingBody, Rays, find_moving_bodies, without_sweep
+from densify.depth.votes import to_lab
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.cameras import converted
@@ -37,12 +37,13 @@ from densify.geometry.types import (
     Reason,
     StandingWorld,
     Stretch,
+    Sweep,
     Truth,
 )
 from densify.scores import depth_metrics
 from densify.scores.edge_fit import is_off, silhouettes_of
 
-_OFF = (
+_MISALIGNED = (
     "image edges do not lie on depth discontinuities (calibration, clock?): the image is not used, "
     "and boundary pixels are left out as with project.rims=strict; densify doctor says more"
 )
@@ -56,13 +57,16 @@ class SeenCloud(NamedTuple):
     in_view: Mapping[str, InView]  # points in each image, by name of the map
     bodies: Mapping[int, MovingBody] = {}  # hulls of moving objects by instance number
 
-    def joined(self, far: SeenCloud | None) -> SeenCloud:
+    def with_far_points(self, far: SeenCloud | None) -> SeenCloud:
         """Return the cloud with the points of sweeps beyond the window appended."""
         if far is None or not len(far.cloud):
             return self
-        num, surface = len(self.cloud), self.patches.joined(far.patches)
-        in_view = {name: v.joined(far.in_view[name], num) for name, v in self.in_view.items()}
-        return SeenCloud(self.cloud.joined(far.cloud), surface, in_view, self.bodies)
+        num_points = len(self.cloud)
+        in_view = {
+            name: view.joined(far.in_view[name], num_points) for name, view in self.in_view.items()
+        }
+        cloud = self.cloud.joined(far.cloud)
+        return SeenCloud(cloud, self.patches.joined(far.patches), in_view, self.bodies)
 
 
 @dataclass(frozen=True)
@@ -70,15 +74,15 @@ class Views:
     """The cameras and times of the depth maps of a key sweep; mappings are by name of the map."""
 
     key: int  # frame number of the key sweep
-    exposures: Mapping[str, Exposure]
+    exposures: Mapping[str, Exposure]  # camera and time of each map
     sensors: Sensors
-    # (S,3) of the scanners, key sweep's lidar frame, by frame number of the sweep
+    # (S,3) origins of the scanners in the key sweep's lidar frame, by frame number of the sweep
     origins: Mapping[int, Float]
     rays: Rays  # rays of the window's sweeps
     settings: ProjectSettings
     lab: Mapping[str, Float32]  # (H,W,3) L*a*b* images of the maps that use an image
-    # Names of the maps whose image does not lie where the depth discontinuities are
-    off: frozenset[str] = frozenset()
+    # Names of the maps whose image edges do not lie on the depth discontinuities
+    misaligned_maps: frozenset[str] = frozenset()
 
     @staticmethod
     def of(
@@ -89,56 +93,73 @@ class Views:
         images: Mapping[str, NDArray[np.uint8]],
         settings: Config,
     ) -> Views:
-        """Return the cameras and times of the maps of key sweep ``key``, shown by ``shots``.
+        """Return the cameras and times of the maps of a key sweep.
 
-        Images are used if ``project.rims`` is not ``strict``, and if they are not off (`is_off`).
+        Images are used unless ``project.rims`` is ``strict`` or they are misaligned (`is_off`).
+
+        Args:
+            sequence: The recording.
+            stretch: Registered sweeps of the window.
+            key: Frame number of the key sweep.
+            shots: What each map shows, by name of the map.
+            images: (H,W,3) RGB images by name of the map.
+            settings: Configuration of the run.
         """
         sensors = Sensors.of(stretch.sweeps)
-        exposures = {n: Exposure.of(sequence, stretch, key, s, settings) for n, s in shots.items()}
-        used, off = {}, frozenset[str]()
+        exposures = {
+            name: Exposure.of(sequence, stretch, key, shot, settings)
+            for name, shot in shots.items()
+        }
+        misaligned_maps = frozenset[str]()
+        lab_images = dict[str, Float32]()
         if settings.project.rims != "strict" and images:
-            silhouettes = silhouettes_of(stretch[key].sweep)
-            cameras = {n: replace(e.camera, T_cam_lidar=e.T_cam_key) for n, e in exposures.items()}
-            off = frozenset(n for n, i in images.items() if is_off(cameras[n], silhouettes, i))
-            used = {name: lab(image) for name, image in images.items() if name not in off}
+            misaligned_maps = _misaligned_maps(stretch[key].sweep, exposures, images)
+            lab_images = {
+                name: to_lab(image) for name, image in images.items() if name not in misaligned_maps
+            }
         return Views(
             key=key,
             exposures=exposures,
             sensors=sensors,
             origins={
-                f: poses.transform(stretch.T_target_source(key, f), sensors.origins_m)
-                for f in stretch.frames
+                frame: poses.transform(stretch.T_target_source(key, frame), sensors.origins_m)
+                for frame in stretch.frames
             },
             rays=Rays(stretch, key),
             settings=settings.project,
-            lab=used,
-            off=off,
+            lab=lab_images,
+            misaligned_maps=misaligned_maps,
         )
 
     def see(self, cloud: Cloud) -> SeenCloud:
         """Return a cloud with its patches, as the cameras see it."""
-        in_view, wanted = self.in_view(cloud), np.zeros(len(cloud), bool)
+        in_view = self.points_in_view(cloud)
+        wanted = np.zeros(len(cloud), bool)
         for view in in_view.values():
             wanted[view.rows] = True
-        return SeenCloud(cloud, patches(cloud, self.sensors, self.origins, wanted), in_view)
+        return SeenCloud(cloud, find_patches(cloud, self.sensors, self.origins, wanted), in_view)
 
-    def in_view(self, cloud: Cloud) -> dict[str, InView]:
+    def points_in_view(self, cloud: Cloud) -> dict[str, InView]:
         """Return the points of a cloud in each image, by name of the map."""
-        return {name: exposure.sees(cloud) for name, exposure in self.exposures.items()}
+        return {name: exposure.view_of(cloud) for name, exposure in self.exposures.items()}
 
-    def bodies(self, cloud: Cloud) -> dict[int, MovingBody]:
+    def find_bodies(self, cloud: Cloud) -> dict[int, MovingBody]:
         """Return the bodies of moving objects by instance number, from all points of the window."""
-        return moving_bodies(cloud, self.rays, self.exposures.values())
+        return find_moving_bodies(cloud, self.rays, self.exposures.values())
 
-    def far(
+    def see_far(
         self, world: StandingWorld, T_key_world: Float, stretch: Stretch, standing_only: bool
     ) -> SeenCloud:
-        """Return the points of sweeps beyond the window, see `densify.depth.far.far_cloud`."""
-        of_key = stretch, self.key, self.exposures
-        cloud, surface = far_cloud(world, T_key_world, *of_key, standing_only)
-        return SeenCloud(cloud, surface, self.in_view(cloud))
+        """Return the points of sweeps beyond the window, as the cameras see them.
 
-    def depth(
+        The arguments are those of `densify.depth.far.far_cloud`.
+        """
+        cloud, surface = far_cloud(
+            world, T_key_world, stretch, self.key, self.exposures, standing_only
+        )
+        return SeenCloud(cloud, surface, self.points_in_view(cloud))
+
+    def depth_maps(
         self, seen: SeenCloud, visible: bool = True, filled: bool = True
     ) -> dict[str, DepthMap]:
         """Return the depth map of each view by name.
@@ -147,36 +168,53 @@ class Views:
         measured pixels.
         """
         settings = replace(self.settings, visibility=visible)
-        maps = {}
+        depth_maps = {}
         for name, view in seen.in_view.items():
-            evidence = self.lab.get(name), self.rays, seen.bodies
-            inputs = MapInputs(seen.cloud, seen.patches, view, settings, filled, *evidence)
+            inputs = MapInputs(
+                cloud=seen.cloud,
+                patches=seen.patches,
+                view=view,
+                settings=settings,
+                filled=filled,
+                lab=self.lab.get(name),
+                rays=self.rays,
+                bodies=seen.bodies,
+            )
             depth_map = project(inputs)
-            maps[name] = replace(depth_map, warnings=(_OFF,)) if name in self.off else depth_map
-        return maps
+            if name in self.misaligned_maps:
+                depth_map = replace(depth_map, warnings=(_MISALIGNED,))
+            depth_maps[name] = depth_map
+        return depth_maps
 
-    def coloured(
+    def with_colours(
         self,
         seen: SeenCloud,
-        depth: Mapping[str, DepthMap],
+        depth_maps: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
-        """Return the cloud with the colours of the (H,W,3) images that observe its points.
+        """Return the cloud with the colours of the images that observe its points.
 
-        A point is observed unless it is clearly behind the depth of its pixel, in the maps
-        ``depth`` of the cloud. Pixels without depth give no colour.
+        A point is observed unless it is clearly behind the depth of its pixel. Pixels without
+        depth give no colour.
+
+        Args:
+            seen: The cloud and its points in the images.
+            depth_maps: Depth maps of the cloud, by name of the map.
+            images: (H,W,3) RGB images, by name of the map.
         """
         rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
             view = seen.in_view[name]
             pixel = pixel_of(view.uv)
-            surface_m = depth[name].filled_m[pixel]
+            surface_m = depth_maps[name].filled_m[pixel]
             reach_m = surface_m + hidden_m(surface_m)
-            shows = (surface_m > 0) & (view.exposure.depth_m(view.points_cam) <= reach_m)
-            rgb[view.rows[shows]] = image[pixel][shows]
+            is_shown = (surface_m > 0) & (view.exposure.depth_m(view.points_cam) <= reach_m)
+            rgb[view.rows[is_shown]] = image[pixel][is_shown]
         return replace(seen.cloud, rgb=rgb)
 
-    def confident(self, seen: SeenCloud, cloud: Cloud, depth: Mapping[str, DepthMap]) -> Cloud:
+    def with_confidence(
+        self, seen: SeenCloud, cloud: Cloud, depth_maps: Mapping[str, DepthMap]
+    ) -> Cloud:
         """Return the cloud with the greatest confidence of the pixels that agree with each point.
 
         A pixel agrees if the point is no outlier there. Points that no map confirms have 0.
@@ -184,63 +222,69 @@ class Views:
         Args:
             seen: The points in the images.
             cloud: The same points.
-            depth: Maps made of them, by name.
+            depth_maps: Maps made of them, by name.
         """
         confidence = np.zeros(len(cloud), np.float32)
         for name, view in seen.in_view.items():
-            maps, pixel = depth[name], pixel_of(view.uv)
-            surface_m = maps.filled_m[pixel]
-            off_m = abs(view.exposure.depth_m(view.points_cam) - surface_m)
-            agrees = off_m <= surface_m * tolerance(surface_m, view.exposure.camera)
-            of_pixel = np.where(agrees & (surface_m > 0), maps.confidence[pixel], 0)
-            confidence[view.rows] = np.maximum(confidence[view.rows], of_pixel)
+            depth_map = depth_maps[name]
+            pixel = pixel_of(view.uv)
+            surface_m = depth_map.filled_m[pixel]
+            error_m = abs(view.exposure.depth_m(view.points_cam) - surface_m)
+            agrees = error_m <= surface_m * tolerance(surface_m, view.exposure.camera)
+            pixel_confidence = np.where(agrees & (surface_m > 0), depth_map.confidence[pixel], 0)
+            confidence[view.rows] = np.maximum(confidence[view.rows], pixel_confidence)
         return replace(cloud, confidence=confidence)
 
-    def truth(self, truth: Truth) -> dict[str, tuple[Float32, Bool]]:
+    def true_maps(self, truth: Truth) -> dict[str, tuple[Float32, Bool]]:
         """Return the true depth (H,W) and moving pixels (H,W) of each map that shows an image."""
-        known = {}
-        for name, e in self.exposures.items():
-            if e.number is not None:
-                depth_m = truth.depth_m(e.camera.name, e.number)
-                depth_m = converted(e.camera, depth_m, e.camera.measure, e.measure)
-                known[name] = (depth_m, truth.moving_mask(e.camera.name, e.number))
-        return known
+        true_maps = {}
+        for name, exposure in self.exposures.items():
+            if exposure.number is not None:
+                camera = exposure.camera
+                depth_m = truth.depth_m(camera.name, exposure.number)
+                depth_m = converted(camera, depth_m, camera.measure, exposure.measure)
+                true_maps[name] = (depth_m, truth.moving_mask(camera.name, exposure.number))
+        return true_maps
 
     def cameras(self) -> dict[str, CameraView]:
         """Return the viewpoint of each map by name."""
         return {
-            name: CameraView(e.camera, e.T_cam_key, e.late_s, e.number)
-            for name, e in self.exposures.items()
+            name: CameraView(exposure.camera, exposure.T_cam_key, exposure.late_s, exposure.number)
+            for name, exposure in self.exposures.items()
         }
 
     def optical_flow(
-        self, cloud: Cloud, depth: Mapping[str, DepthMap]
+        self, cloud: Cloud, depth_maps: Mapping[str, DepthMap]
     ) -> dict[str, dict[str, Float32]]:
         """Return the (H,W,2) `optical_flow` to the "previous" and "next" image, by map name."""
         return {
             name: {
-                image: optical_flow(cloud, depth[name], exposure, neighbour)
+                image: optical_flow(cloud, depth_maps[name], exposure, neighbour)
                 for image, neighbour in exposure.neighbours.items()
             }
             for name, exposure in self.exposures.items()
         }
 
-    def rejected(
-        self, seen: SeenCloud, depth: Mapping[str, DepthMap]
+    def rejection_reasons(
+        self, seen: SeenCloud, depth_maps: Mapping[str, DepthMap]
     ) -> dict[str, NDArray[np.uint8]]:
-        """Return for each map (H,W) the `Reason` of a pixel's nearest rejected point, 0 none.
+        """Return by map name (H,W) the `Reason` of the nearest rejected point in each pixel.
 
-        Points that lost their pixel to another point do not count.
+        Pixels without a rejected point have 0. A point that lost its pixel to another point is not
+        rejected.
         """
-        maps = {}
+        reason_maps = {}
         for name, view in seen.in_view.items():
-            reason, depth_m = depth[name].reason[view.rows], view.exposure.depth_m(view.points_cam)
+            reason = depth_maps[name].reason[view.rows]
+            depth_m = view.exposure.depth_m(view.points_cam)
+            is_rejected = np.isin(reason, [Reason.KEPT, Reason.NOT_CHOSEN], invert=True)
+            # The farthest point is written first, so the nearest one in a pixel stays.
             farthest_first = np.argsort(-depth_m, kind="stable")
-            lost = np.isin(reason[farthest_first], [Reason.KEPT, Reason.NOT_CHOSEN], invert=True)
-            rejected = farthest_first[lost]
-            maps[name] = np.zeros(depth[name].depth_m.shape, np.uint8)
-            maps[name][pixel_of(view.uv[rejected])] = reason[rejected]
-        return maps
+            rejected_points = farthest_first[is_rejected[farthest_first]]
+            reason_map = np.zeros(depth_maps[name].depth_m.shape, np.uint8)
+            reason_map[pixel_of(view.uv[rejected_points])] = reason[rejected_points]
+            reason_maps[name] = reason_map
+        return reason_maps
 
     def movers(
         self,
@@ -249,49 +293,95 @@ class Views:
         bodies: Mapping[int, MovingBody],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> dict[int, Mover]:
-        """Return every moving object alone by instance number, points without an object as -1."""
+        """Return every moving object alone, by instance number.
+
+        Moving points without an object are together, with the number -1.
+
+        Args:
+            cloud: The cloud of the window.
+            visible: Leave out occluded and unsupported points.
+            bodies: Hulls of the moving objects, by instance number.
+            images: (H,W,3) RGB images, by name of the map.
+        """
         movers = {}
         for instance in np.unique(cloud.instance[cloud.moving]).tolist():
             seen = self.see(cloud.select(cloud.moving & (cloud.instance == instance)))
-            seen = seen._replace(bodies={k: b for k, b in bodies.items() if k == instance})
-            depth = self.depth(seen, visible)
-            movers[instance] = Mover(self.coloured(seen, depth, images), depth)
+            own_body = {instance: bodies[instance]} if instance in bodies else {}
+            seen = seen._replace(bodies=own_body)
+            depth_maps = self.depth_maps(seen, visible)
+            movers[instance] = Mover(self.with_colours(seen, depth_maps, images), depth_maps)
         return movers
 
 
-def optical_flow(cloud: Cloud, depth: DepthMap, exposure: Exposure, target: Exposure) -> Float32:
+def _misaligned_maps(
+    key_sweep: Sweep, exposures: Mapping[str, Exposure], images: Mapping[str, NDArray[np.uint8]]
+) -> frozenset[str]:
+    """Return the names of the maps whose image edges miss the key sweep's depth discontinuities."""
+    silhouettes = silhouettes_of(key_sweep)
+    names = list[str]()
+    for name, image in images.items():
+        exposure = exposures[name]
+        # The silhouettes are in the lidar frame of the key sweep's time. This pose includes the
+        # ego-motion between that time and the exposure.
+        camera = replace(exposure.camera, T_cam_lidar=exposure.T_cam_key)
+        if is_off(camera, silhouettes, image):
+            names.append(name)
+    return frozenset(names)
+
+
+def optical_flow(
+    cloud: Cloud, depth_map: DepthMap, exposure: Exposure, target: Exposure
+) -> Float32:
     """Return the (H,W,2) flow in pixels, right and down, between two exposures; NaN if unknown.
 
     The flow includes ego-motion, and moving objects continue at their velocity. Pixels that only a
     laser spot covers take the flow of the nearest measured pixel. Other filled pixels have none.
     """
-    chosen = np.flatnonzero(depth.reason == Reason.KEPT)
+    chosen = np.flatnonzero(depth_map.reason == Reason.KEPT)
     points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
     uv = exposure.see(points, velocity_m_s).uv
-    flow = np.full((*depth.depth_m.shape, 2), np.nan, np.float32)
-    hit = np.zeros(depth.depth_m.shape, bool)
-    flow[pixel_of(uv)] = target.see(points, velocity_m_s).uv - uv
-    hit[pixel_of(uv)] = True
-    covered = (depth.depth_m > 0) & ~hit
+    pixel = pixel_of(uv)
+    flow = np.full((*depth_map.depth_m.shape, 2), np.nan, np.float32)
+    flow[pixel] = target.see(points, velocity_m_s).uv - uv
+    has_return = np.zeros(depth_map.depth_m.shape, bool)
+    has_return[pixel] = True
+    covered = (depth_map.depth_m > 0) & ~has_return
     if covered.any():
-        flow[covered] = flow[nearest_pixel(hit)][covered]
+        flow[covered] = flow[nearest_pixel(has_return)][covered]
     return flow
 
 
-def with_ages(depth: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: float) -> DepthMap:
+def with_ages(
+    depth_map: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: float
+) -> DepthMap:
     """Return the map with ``age_s``, seconds between its time and the source sweep of each pixel.
 
-    A filled pixel has the age of the nearest measured pixel in the image. The map shows a time
-    ``late_s`` seconds after the key sweep. ``stamps_ns`` has the sweeps' times by frame number.
+    A filled pixel has the age of the nearest measured pixel in the image.
+
+    Args:
+        depth_map: The map.
+        stamps_ns: Times of the sweeps by frame number.
+        key: Frame number of the key sweep.
+        late_s: Time that the map shows, in seconds after the key sweep.
     """
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
     age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
-    measured, shown = depth.depth_m > 0, depth.filled_m > 0
+    measured = depth_map.depth_m > 0
+    has_depth = depth_map.filled_m > 0
     ages = np.full(measured.shape, np.nan, np.float32)
     if measured.any():
-        frames, index = np.unique(depth.frame[nearest_pixel(measured)][shown], return_inverse=True)
-        ages[shown] = np.array([age_s[int(f)] for f in frames])[index]
-    return replace(depth, age_s=ages)
+        source_frame = depth_map.frame[nearest_pixel(measured)][has_depth]
+        frames, index = np.unique(source_frame, return_inverse=True)
+        ages[has_depth] = np.array([age_s[int(frame)] for frame in frames])[index]
+    return replace(depth_map, age_s=ages)
+
+
+class JudgedMap(NamedTuple):
+    """A map made without the key sweep, and the key sweep's returns as its ground truth."""
+
+    depth_map: DepthMap
+    truth_m: Float32  # (H,W) depth of the key sweep's returns, 0 none
+    moving: Bool  # (H,W) True at moving returns of the key sweep
 
 
 @dataclass(frozen=True)
@@ -306,41 +396,56 @@ class HeldOut:
 
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
-        """Return the ground truth of a key sweep; ``cloud`` has its moving points' velocities."""
+        """Return the ground truth of a key sweep.
+
+        ``cloud`` has the points of the window's sweeps, and velocities of its moving points.
+        """
         settings = replace(views.settings, rims="strict", visibility=True)
         key_cloud = cloud.select(cloud.frame == views.key)
-        seen, key_alone, moving = views.see(key_cloud), {}, {}
+        seen = views.see(key_cloud)
+        key_alone = {}
+        moving = {}
         for name, view in seen.in_view.items():
-            maps = project(MapInputs(key_cloud, seen.patches, view, settings, filled=False))
-            moves = (maps.reason == Reason.KEPT) & key_cloud.moving
-            key_alone[name], moving[name] = maps, np.zeros(maps.depth_m.shape, bool)
-            moving[name][pixel_of(view.uv[moves[view.rows]])] = True
-        gap_rad = seen.patches.spacing_m[:, 1] / np.linalg.norm(key_cloud.points, axis=1)
-        known = gap_rad[np.isfinite(gap_rad) & (gap_rad > 0)]
-        return HeldOut(views, key_alone, moving, float(np.median(known)) if len(known) else 0.0)
+            depth_map = project(MapInputs(key_cloud, seen.patches, view, settings, filled=False))
+            in_map = (depth_map.reason == Reason.KEPT) & key_cloud.moving
+            is_moving = np.zeros(depth_map.depth_m.shape, bool)
+            is_moving[pixel_of(view.uv[in_map[view.rows]])] = True
+            key_alone[name] = depth_map
+            moving[name] = is_moving
+
+        elevation_spacing_m = seen.patches.spacing_m[:, 1]
+        gap_rad = elevation_spacing_m / np.linalg.norm(key_cloud.points, axis=1)
+        # Points out of view have no patch, and so no spacing.
+        gap_rad = gap_rad[np.isfinite(gap_rad) & (gap_rad > 0)]
+        usual_gap_rad = float(np.median(gap_rad)) if len(gap_rad) else 0.0
+        return HeldOut(views, key_alone, moving, usual_gap_rad)
 
     def without_key(self, seen: SeenCloud) -> SeenCloud:
         """Return the cloud without the key sweep and its evidence on bodies."""
         keep = seen.cloud.frame != self.views.key
-        surface, cloud = seen.patches.select(keep), seen.cloud.select(keep)
+        cloud = seen.cloud.select(keep)
         bodies = without_sweep(seen.bodies, cloud, self.views.key)
-        return SeenCloud(cloud, surface, self.views.in_view(cloud), bodies)
+        in_view = self.views.points_in_view(cloud)
+        return SeenCloud(cloud, seen.patches.select(keep), in_view, bodies)
 
-    def maps(self, seen: SeenCloud, visible: bool) -> dict[str, tuple[DepthMap, Float32, Bool]]:
-        """Return each map made without the key sweep, its (H,W) truth, and (H,W) moving pixels.
+    def judged_maps(self, seen: SeenCloud, visible: bool) -> dict[str, JudgedMap]:
+        """Return each map made without the key sweep with its ground truth, by name of the map.
 
         Returns from far inside a moving body are no ground truth: they passed its windows, but the
         map shows the glass. The result is empty if no points remain.
         """
-        without_key = self.without_key(seen)
-        if not len(without_key.cloud):
+        neighbours_only = self.without_key(seen)
+        if not len(neighbours_only.cloud):
             return {}
-        maps = {}
-        for name, depth in self.views.depth(without_key, visible).items():
-            moving, truth_m = self.moving[name], self.key_alone[name].depth_m
-            inside = moving & far_inside(seen.bodies.values(), self.views.exposures[name], truth_m)
-            maps[name] = depth, np.where(inside, np.float32(0), truth_m), moving & ~inside
-        return maps
+        judged_maps = {}
+        for name, depth_map in self.views.depth_maps(neighbours_only, visible).items():
+            moving = self.moving[name]
+            truth_m = self.key_alone[name].depth_m
+            exposure = self.views.exposures[name]
+            inside = moving & find_far_inside(seen.bodies.values(), exposure, truth_m)
+            truth_m = np.where(inside, np.float32(0), truth_m)
+            judged_maps[name] = JudgedMap(depth_map, truth_m, moving & ~inside)
+        return judged_maps
 
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Return the scores of each map made without the key sweep, None if no points remain.
@@ -350,24 +455,32 @@ class HeldOut:
         sweep within a ray spacing.
         """
         scores: dict[str, Any] = {}
-        for name, (depth, truth_m, moving) in self.maps(seen, visible).items():
+        for name, judged in self.judged_maps(seen, visible).items():
             camera = self.views.exposures[name].camera
-            depth = with_max_outliers(depth, self.views.settings.max_outliers)
+            truth_m = judged.truth_m
+            depth_map = with_max_outliers(judged.depth_map, self.views.settings.max_outliers)
             scores[name] = {
-                **depth_metrics.depth_scores(depth, truth_m, moving, camera),
-                "curve": depth_metrics.precision_density(depth, truth_m, camera),
-                "reliability": reliability(depth, truth_m, camera),
-                "unjudged": self._unjudged(name, depth, seen.bodies),
+                **depth_metrics.depth_scores(depth_map, truth_m, judged.moving, camera),
+                "curve": depth_metrics.precision_density(depth_map, truth_m, camera),
+                "reliability": reliability(depth_map, truth_m, camera),
+                "unjudged": self._unjudged_shares(name, depth_map, seen.bodies),
             }
         return scores or None
 
-    def _unjudged(
-        self, name: str, maps: DepthMap, bodies: Mapping[int, MovingBody]
+    def _unjudged_shares(
+        self, name: str, depth_map: DepthMap, bodies: Mapping[int, MovingBody]
     ) -> dict[str, float | None]:
-        """Return the share of a map's filled pixels without a return of the key sweep nearby."""
-        away_px = ndimage.distance_transform_edt(self.key_alone[name].depth_m == 0)
-        unjudged = away_px > self.gap_rad * self.views.exposures[name].camera.focal_px
-        filled = maps.filled_m > 0
-        moving = fronts(bodies.values(), self.views.exposures[name]) > 0
+        """Return the share of a map's filled pixels without a return of the key sweep nearby.
+
+        The keys are ``all``, ``moving`` and ``static`` pixels; None for no pixels.
+        """
+        exposure = self.views.exposures[name]
+        to_return_px = ndimage.distance_transform_edt(self.key_alone[name].depth_m == 0)
+        unjudged = to_return_px > self.gap_rad * exposure.camera.focal_px
+        filled = depth_map.filled_m > 0
+        moving = fronts(bodies.values(), exposure) > 0
         masks = {"all": filled, "moving": filled & moving, "static": filled & ~moving}
-        return {n: float(unjudged[p].mean()) if p.any() else None for n, p in masks.items()}
+        return {
+            part: float(unjudged[mask].mean()) if mask.any() else None
+            for part, mask in masks.items()
+        }

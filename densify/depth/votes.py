@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.depth.measured_pixels import MapRecord
-from densify.depth.patches import HIDDEN_FRACTION, HIDDEN_M, limited
+from densify.depth.patches import HIDDEN_FRACTION, HIDDEN_M, limit_inverse
 from densify.geometry.arrays import Bool, Float32, Int
 from densify.geometry.compiled import Kernel, inlined
 
@@ -36,21 +36,22 @@ ROUNDED = 1 - 1e-6
 """Tolerance for rounding of a share of votes."""
 
 
-def lab(image: NDArray[np.uint8]) -> Float32:
+def to_lab(image: NDArray[np.uint8]) -> Float32:
     """Convert (H,W,3) RGB to CIE L*a*b*, L from 0 to 100; slightly blurred, lightened if dark."""
     blurred = cv2.GaussianBlur(image.astype(np.float32) / 255, (0, 0), _BLUR_PX)
     colours = cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB).astype(np.float32, copy=False)
-    light = float(np.percentile(colours[..., 0], 99))
-    return colours * np.float32(max(1.0, _LEAST_LIGHT / max(light, 1.0)))
+    lightest = float(np.percentile(colours[..., 0], 99))
+    return colours * np.float32(max(1.0, _LEAST_LIGHT / max(lightest, 1.0)))
 
 
 def _directions() -> NDArray[np.int64]:
     """Return (16,2,2) offsets as in `DIRECTIONS`."""
-    axis, diagonal = (1, 0), (1, 1)
-    quarter = [(axis, (2, 0)), (axis, (2, 1)), (diagonal, (2, 2)), ((0, 1), (1, 2))]
-    turn = np.array([[0, -1], [1, 0]])
-    table = [np.array(quarter) @ np.linalg.matrix_power(turn, k).T for k in range(4)]
-    return np.concatenate(table).astype(np.int64)
+    right, below, diagonal = (1, 0), (0, 1), (1, 1)
+    # Four directions, from the right to almost below. Turned by quarters they give all.
+    quarter = np.array([(right, (2, 0)), (right, (2, 1)), (diagonal, (2, 2)), (below, (1, 2))])
+    quarter_turn = np.array([[0, -1], [1, 0]])
+    quarters = [quarter @ np.linalg.matrix_power(quarter_turn, k).T for k in range(4)]
+    return np.concatenate(quarters).astype(np.int64)
 
 
 DIRECTIONS = _directions()
@@ -58,8 +59,12 @@ DIRECTIONS = _directions()
 from the right. Each step goes to one of the eight neighbours."""
 
 
-def first_known(known: Bool) -> NDArray[np.uint8]:
-    """Return (16,H,W) steps to the first known pixel by `DIRECTIONS`: 0 at one, else `NONE`."""
+def steps_to_known(known: Bool) -> NDArray[np.uint8]:
+    """Return the (16,H,W) number of steps to the first known pixel in each of `DIRECTIONS`.
+
+    It is 0 at a known pixel, and `NONE` if there is no known pixel.
+    """
+    # Two steps go up to two pixels beyond the image: there is a border of two on each side.
     padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
     steps = padded[:, 2:-2, 2:-2]
     steps[:] = np.where(known, np.uint8(0), np.uint8(NONE))
@@ -77,17 +82,19 @@ def _march(steps):  # type: ignore[no-untyped-def]
             row = height - 1 - i if v2 > 0 else i  # rows two steps on are done before
             line = steps[d, row, 2 : width - 2]
             if v2 == 0:
+                # Within the row each pixel is a step from the one done before.
                 for j in range(len(line)):
                     column = len(line) - 1 - j if u2 > 0 else j
                     before = steps[d, row, 2 + column + u1]
                     line[column] = 0 if line[column] == 0 else min(before, 254) + 1
                 continue
-            first = steps[d, row + v1, 2 + u1 : width - 2 + u1]
-            second = steps[d, row + v2, 2 + u2 : width - 2 + u2]
+            after_one = steps[d, row + v1, 2 + u1 : width - 2 + u1]
+            after_two = steps[d, row + v2, 2 + u2 : width - 2 + u2]
             for j in range(len(line)):
-                beyond = min(second[j], np.uint8(253)) + np.uint8(2)
-                beyond = np.uint8(1) if first[j] == 0 else np.uint8(beyond)
-                line[j] = np.uint8(0) if line[j] == 0 else beyond
+                # A sum above 254 would overflow: NONE is 255.
+                farther = min(after_two[j], np.uint8(253)) + np.uint8(2)
+                farther = np.uint8(1) if after_one[j] == 0 else np.uint8(farther)
+                line[j] = np.uint8(0) if line[j] == 0 else farther
 
 
 @inlined
@@ -99,20 +106,20 @@ def offset(d, k):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def extended(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
-    """Return the inverse depth of a pixel if the surface of pixel (v, u) is extended to it.
+def extend(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
+    """Return the inverse depth of a pixel to which the surface of pixel (v, u) is extended.
 
     Pixel (v, u) is du columns and dv rows away. ``inverse`` (H,W) is in 1/m, ``tilt`` (H,W,2) is
     its slope to the right and down in 1/m per px.
     """
     known = inverse[v, u]
-    return limited(known - tilt[v, u, 0] * du - tilt[v, u, 1] * dv, known)
+    return limit_inverse(known - tilt[v, u, 0] * du - tilt[v, u, 1] * dv, known)
 
 
 class Voters(NamedTuple):
     """Pixels with a known depth, which vote on the depths of pixels around them."""
 
-    steps: NDArray[np.uint8]  # (16,H,W) of `first_known`
+    steps: NDArray[np.uint8]  # (16,H,W) of `steps_to_known`
     inverse: Float32  # (H,W) inverse depth in 1/m, 0 where the depth is unknown
     tilt: Float32  # (H,W,2) slope of the inverse depth to the right and down, 1/m per px
 
@@ -123,7 +130,7 @@ def inverse_of(depth_m: Float32) -> Float32:
 
 
 def votes_for(
-    record: MapRecord, maps_m: Sequence[Float32], pixel: Int, depth_m: Float32, surely: bool
+    record: MapRecord, maps_m: Sequence[Float32], pixel: Int, depth_m: Float32, with_shifts: bool
 ) -> Float32:
     """Return the (P,) weighted share of the votes, 0 to 1, that confirm the depth of each pixel.
 
@@ -131,21 +138,22 @@ def votes_for(
     Otherwise it votes against. Edges of the image weaken votes.
 
     Args:
+        record: Record with the image, the slopes and the spacing of rays.
         maps_m: Depths (H,W) of the pixels that vote, 0 for other pixels. The least share of the
             maps counts.
         pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
         depth_m: (P,) depths to confirm.
-        surely: True takes the least share of five positions of the image (unshifted, and shifted by
-            0.6 ray spacings to each side), with a small constant vote. False takes the unshifted
-            image; the share is 0 without voters.
+        with_shifts: True takes the least share of five positions of the image, with a small
+            constant vote. The image is unshifted, and shifted by 0.6 ray spacings to each side.
+            False takes the unshifted image; the share is 0 without voters.
     """
     shares = np.ones((len(maps_m), len(pixel)), np.float32)
-    # Arrays of one layout: the kernel is compiled for each.
+    # The kernel is compiled for each memory layout of its arrays: here they have one.
     tilt, inverse = np.ascontiguousarray(record.tilt), 1 / depth_m
     colours, gap_px = np.ascontiguousarray(record.lab), record.gap_px
     for map_m, share in zip(maps_m, shares, strict=True):
-        voters = Voters(first_known(map_m > 0), inverse_of(map_m), tilt)
-        _vote.over_rows(len(pixel), pixel, inverse, voters, colours, gap_px, surely, share)
+        voters = Voters(steps_to_known(map_m > 0), inverse_of(map_m), tilt)
+        _vote.over_rows(len(pixel), pixel, inverse, voters, colours, gap_px, with_shifts, share)
     least_share: Float32 = shares.min(axis=0)
     return least_share
 
@@ -155,6 +163,7 @@ def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
     """Return the number of steps in direction d from row v, column u to the next known pixel."""
     num_steps = np.int64(steps[d, v, u])
     height, width = steps.shape[1:]
+    # A known pixel has no steps of its own: those of the pixels one and two steps on are taken.
     for k in range(1, 3 if num_steps == 0 else 1):
         du, dv = offset(d, k)
         if not (0 <= u + du < width and 0 <= v + dv < height):
@@ -166,10 +175,13 @@ def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill in the 16 votes on the pixel in row v, column u; return the numbers for and against."""
-    # depth in metres, gap in px; steps: to the voter in each direction, 0 without a vote
-    agree_m = HIDDEN_M + HIDDEN_FRACTION * depth
+def _cast_votes(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
+    """Fill in the 16 votes on the pixel in row v, column u; return the numbers for and against.
+
+    ``depth`` is in metres, ``gap`` in px. ``steps`` (16,) lead to the voter in each direction, 0
+    without a vote.
+    """
+    tolerance_m = HIDDEN_M + HIDDEN_FRACTION * depth
     num_for, num_against = 0, 0
     for d in range(len(steps)):
         k = _steps_to(voters.steps, d, v, u)
@@ -178,58 +190,65 @@ def _agree(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-
         if k == NONE or max(abs(du), abs(dv)) > VOTERS_REACH * gap:
             continue
         steps[d] = k
-        predicted = extended(voters.inverse, voters.tilt, v + dv, u + du, du, dv)
-        agrees[d] = abs(1 / predicted - depth) <= agree_m
+        predicted = extend(voters.inverse, voters.tilt, v + dv, u + du, du, dv)
+        agrees[d] = abs(1 / predicted - depth) <= tolerance_m
         num_for += agrees[d]
         num_against += not agrees[d]
     return num_for, num_against
 
 
 @inlined
-def _alike(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
-    """Return the weight exp(-c² / 2 s²) + ``_THROUGH`` of a vote by the colours of the image."""
+def _colour_weight(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
+    """Return the weight exp(-c² / 2 s²) + ``_THROUGH`` of a vote by the colours of the image.
+
+    The voter is k steps in direction d from row v, column u. c² is the greatest squared colour
+    distance from the start along the path, and s is ``_COLOURS``.
+    """
     if lab.size == 0:
         return 1 + _THROUGH
     stride = max(np.int64(gap / _STRIDE), 1)
     height, width = lab.shape[:2]
     row, column = min(max(v, 0), height - 1), min(max(u, 0), width - 1)
     light, a, b = lab[row, column, 0], lab[row, column, 1], lab[row, column, 2]
-    # c²: greatest squared colour distance from the start along the path; s is _COLOURS
     change = np.float32(0)
+    # The compared steps end with the voter itself.
     for step in range((k - 1) % stride + 1, k + 1, stride):
         du, dv = offset(d, step)
         row, column = min(max(v + dv, 0), height - 1), min(max(u + du, 0), width - 1)
-        off_light, off_a = lab[row, column, 0] - light, lab[row, column, 1] - a
-        off_b = lab[row, column, 2] - b
-        change = max(change, off_light * off_light + off_a * off_a + off_b * off_b)
+        change_light, change_a = lab[row, column, 0] - light, lab[row, column, 1] - a
+        change_b = lab[row, column, 2] - b
+        squared = change_light * change_light + change_a * change_a + change_b * change_b
+        change = max(change, squared)
     return np.exp(-0.5 / (_COLOURS * _COLOURS) * change) + _THROUGH
 
 
 @Kernel
-def _vote(first, last, pixel, inverse, voters, lab, gap_px, surely, share):  # type: ignore[no-untyped-def]
-    """Fill ``share`` (P,), the result of `vote` on the inverse depths ``inverse`` (P,) in 1/m."""
+def _vote(first, last, pixel, inverse, voters, lab, gap_px, with_shifts, share):  # type: ignore[no-untyped-def]
+    """Fill ``share`` (P,), the result of `votes_for` on inverse depths ``inverse`` (P,) in 1/m."""
     width, num = gap_px.shape[1], len(DIRECTIONS)
     steps, agrees = np.empty(num, np.int64), np.empty(num, np.bool_)
-    doubt = _DOUBT if surely else 0.0
+    doubt = _DOUBT if with_shifts else 0.0
     for i in range(first, last):
         v, u = pixel[i] // width, pixel[i] % width
         gap = gap_px[v, u]
-        num_for, num_against = _agree(voters, v, u, 1 / inverse[i], gap, steps, agrees)
-        if not surely and (num_for == 0 or num_against == 0):
-            share[i] = num_for > 0
+        num_for, num_against = _cast_votes(voters, v, u, 1 / inverse[i], gap, steps, agrees)
+        if not with_shifts and (num_for == 0 or num_against == 0):
+            share[i] = num_for > 0  # all votes are equal, whatever they weigh
             continue
-        aside = np.int64(np.rint(_ASIDE * gap)) if surely else 0
+        shift = np.int64(np.rint(_ASIDE * gap)) if with_shifts else 0
         least_share = 1.0
-        for side in range(5 if aside else 1):
-            down = aside * ((side == 3) - (side == 4))
-            right = aside * ((side == 1) - (side == 2))
-            votes_for, votes = 0.5 * doubt, doubt
+        # The image unshifted, then shifted to the right, left, down and up
+        for side in range(5 if shift else 1):
+            down = shift * ((side == 3) - (side == 4))
+            right = shift * ((side == 1) - (side == 2))
+            sum_for, sum_all = 0.5 * doubt, doubt  # half of the constant vote is for the depth
             for d in range(num):
                 k = steps[d]
                 if k == 0:
                     continue
-                weight = _alike(lab, v + down, u + right, d, k, gap) / (1 + k / (_DECAY * gap))
-                votes += weight
-                votes_for += weight * agrees[d]
-            least_share = min(least_share, votes_for / votes)
+                likeness = _colour_weight(lab, v + down, u + right, d, k, gap)
+                weight = likeness / (1 + k / (_DECAY * gap))
+                sum_all += weight
+                sum_for += weight * agrees[d]
+            least_share = min(least_share, sum_for / sum_all)
         share[i] = least_share

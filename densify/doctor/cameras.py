@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
-from densify.doctor.motion import CAM_AXES, changed
+from densify.doctor.motion import CAM_AXES, change_pose
 from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, finding
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float, RegisteredSweep
@@ -26,12 +27,15 @@ from densify.scores.edge_fit import (
     turned,
 )
 
-_MOST_IMAGES, _LEAST_IMAGES = 36, 4  # of all cameras; of one camera for a verdict
-_CLEARLY = 1.25
+_MOST_IMAGES, _LEAST_IMAGES = 36, 4  # most images of all cameras; least of one for a verdict
+_CLEARLY = 1.25  # ratio of two scores from which the larger one is clearly better
 _LEAST_EDGES = 0.5  # share of the edges visible as given; one object may match by chance
-_OFF_DEG, _WRONG_DEG, _UNSURE_DEG = 0.5, 0.75, 0.25  # an offset of 1 degree is 4 standard errors
-_CLOCK_OFF_S, _CLOCK_WRONG_S = 0.02, 0.05
-_LEAST_SPEED_M_S = 3.0
+# Errors of rotation: suspicious, wrong, and the standard error without a verdict. An offset of
+# 1 degree is 4 standard errors.
+_OFF_DEG, _WRONG_DEG, _UNSURE_DEG = 0.5, 0.75, 0.25
+_CLOCK_OFF_S, _CLOCK_WRONG_S = 0.02, 0.05  # errors of the clock: suspicious, wrong
+_LEAST_SPEED_M_S = 3.0  # a slower vehicle does not show an error of the clock
+# Names of a positive and a negative pitch, yaw and roll
 _DIRECTIONS = (
     ("higher", "lower"),
     ("farther right", "farther left"),
@@ -44,13 +48,13 @@ def check_cameras(sample: Sample) -> list[Finding]:
     if not sample.sequence.cameras:
         return [finding("cameras", FINE, "none: the cloud and the scores alone")]
     findings = []
-    silhouettes: dict[int, Silhouettes] = {}
+    silhouettes: dict[int, Silhouettes] = {}  # frame -> silhouettes, shared by the cameras
     for camera in sample.sequence.cameras.values():
         findings.append(_check_images(sample, camera))
-        views, broken = camera_views(sample, camera, silhouettes)
-        if broken:
+        views, read_error = camera_views(sample, camera, silhouettes)
+        if read_error:
             remedy = "fetch the image again, or give size and calibration of images like it"
-            findings.append(finding(f"{camera.name}: images", WRONG, broken, remedy))
+            findings.append(finding(f"{camera.name}: images", WRONG, read_error, remedy))
         findings += check_calibration(camera, views)
         if findings[-1].check != f"{camera.name}: clock":
             text = "not compared, because the calibration is not known to be right"
@@ -59,41 +63,45 @@ def check_cameras(sample: Sample) -> list[Finding]:
 
 
 def _check_images(sample: Sample, camera: Camera) -> Finding:
-    name, timeline = f"{camera.name}: images", sample.timeline
+    """Check that every sweep has an image of the camera within a period."""
+    name = f"{camera.name}: images"
+    timeline = sample.timeline
     exposed_ns = np.array(sorted(sample.sequence.image_stamps_ns(camera.name).values()), np.int64)
     if not len(exposed_ns):
         remedy = f"leave the camera out (--camera with the others), or fetch {camera.name}"
         return finding(name, SUSPICIOUS, "not a single image", remedy)
-    images = cKDTree(exposed_ns[:, None] - exposed_ns[0])
-    nearest = np.asarray(images.query(timeline.stamp_ns[:, None] - exposed_ns[0])[0])
-    without = [f for f, ns in zip(timeline.frames, nearest, strict=True) if ns > timeline.period_ns]
-    apart_ms = float(np.median(nearest)) * 1e-6
+    # Times count from the first image, to keep their digits in floating point.
+    tree = cKDTree(exposed_ns[:, None] - exposed_ns[0])
+    nearest_ns = np.asarray(tree.query(timeline.stamp_ns[:, None] - exposed_ns[0])[0])
+    lacking = [
+        frame
+        for frame, apart_ns in zip(timeline.frames, nearest_ns, strict=True)
+        if apart_ns > timeline.period_ns
+    ]
+    apart_ms = float(np.median(nearest_ns)) * 1e-6
     text = f"{len(exposed_ns)}, usually {apart_ms:.1f} ms from a sweep's reference time"
-    verdict, remedy = FINE, "choose other keys than these"
-    if without:
+    verdict = FINE
+    remedy = "choose other keys than these"
+    if lacking:
         verdict = SUSPICIOUS
-        text += f"; {len(without)} sweeps have none within a period: {format_frames(without)}"
-    if len(without) == len(timeline.frames):
-        verdict, remedy = WRONG, "put sweeps and images on one clock"
-    values = {"num_images": len(exposed_ns), "num_without": len(without), "apart_ms": apart_ms}
+        text += f"; {len(lacking)} sweeps have none within a period: {format_frames(lacking)}"
+    if len(lacking) == len(timeline.frames):
+        verdict = WRONG
+        remedy = "put sweeps and images on one clock"
+    values = {"num_images": len(exposed_ns), "num_without": len(lacking), "apart_ms": apart_ms}
     return finding(name, verdict, text, remedy, **values)
 
 
 def camera_views(
     sample: Sample, camera: Camera, silhouettes: dict[int, Silhouettes]
 ) -> tuple[list[View], str]:
-    """Return views (a sweep and its nearest image) from all registered spots, and an error message.
+    """Return views (a sweep and its nearest image) from all registered spots.
 
-    Missing ``silhouettes`` (by frame number) are added. The message is "" if no image is
-    unreadable.
+    The first image that cannot be read ends the views. The second value is its error, "" if all
+    images can be read. Missing ``silhouettes``, by frame, are added.
     """
     stamps_ns = sample.sequence.image_stamps_ns(camera.name)
-    pairs: list[tuple[RegisteredSweep, int]] = []
-    for registered in (r for spot in sample.registered for r in spot.stretch.sweeps[1:]):
-        sweep_ns = registered.sweep.stamp_ns
-        number = min(stamps_ns, key=lambda n: abs(stamps_ns[n] - sweep_ns), default=None)
-        if number is not None and abs(stamps_ns[number] - sweep_ns) <= sample.timeline.period_ns:
-            pairs.append((registered, number))
+    pairs = _pair_images(sample, stamps_ns)
     num_views = max(_LEAST_IMAGES, _MOST_IMAGES // len(sample.sequence.cameras))
     views: list[View] = []
     for row in np.unique(np.linspace(0, len(pairs) - 1, min(num_views, len(pairs))).astype(int)):
@@ -112,24 +120,43 @@ def camera_views(
     return views, ""
 
 
-def alternatives(T: Float) -> dict[str, Float]:
-    """Return common mistake -> ``T_cam_lidar`` (4,4), the lidar's pose in the camera, corrected."""
-    turned = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+def _pair_images(sample: Sample, stamps_ns: Mapping[int, int]) -> list[tuple[RegisteredSweep, int]]:
+    """Return registered sweeps with the number of the nearest image, if it is within a period."""
+    # The first sweep of a spot has no motion before it.
+    sweeps = [registered for spot in sample.registered for registered in spot.stretch.sweeps[1:]]
+    pairs = []
+    for registered in sweeps:
+        sweep_ns = registered.sweep.stamp_ns
+        nearest = min(stamps_ns, key=lambda number: abs(stamps_ns[number] - sweep_ns), default=None)
+        if nearest is not None and abs(stamps_ns[nearest] - sweep_ns) <= sample.timeline.period_ns:
+            pairs.append((registered, nearest))
+    return pairs
+
+
+def correct_common_mistakes(T_cam_lidar: Float) -> dict[str, Float]:
+    """Return common mistake -> (4,4) pose of the lidar in the camera frame, corrected for it."""
+    right_forward_axes = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    T_lidar_cam = poses.inverse(T_cam_lidar)
     return {
-        "the inverse of the given pose (T_lidar_cam instead of T_cam_lidar)": poses.inverse(T),
-        "a camera whose pose is that of a body (x forward, y left, z up)": CAM_AXES @ T,
-        "the pose for a lidar with x right, y forward": T @ turned,
-        "the transposed rotation": changed(np.transpose)(T),
+        "the inverse of the given pose (T_lidar_cam instead of T_cam_lidar)": T_lidar_cam,
+        "a camera whose pose is that of a body (x forward, y left, z up)": CAM_AXES @ T_cam_lidar,
+        "the pose for a lidar with x right, y forward": T_cam_lidar @ right_forward_axes,
+        "the transposed rotation": change_pose(np.transpose)(T_cam_lidar),
     }
 
 
 def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
-    """Compare the score of the given calibration with nearby offsets and with common mistakes."""
-    name, num = f"{camera.name}: calibration", len(views)
-    if num < _LEAST_IMAGES:
-        text = f"{num} images near registered sweeps, {_LEAST_IMAGES} are needed to tell"
+    """Return findings about the calibration and, if it can be fitted, about the camera's clock.
+
+    The given calibration is compared with nearby offsets and with common mistakes.
+    """
+    name = f"{camera.name}: calibration"
+    num_images = len(views)
+    if num_images < _LEAST_IMAGES:
+        text = f"{num_images} images near registered sweeps, {_LEAST_IMAGES} are needed to tell"
         return [finding(name, UNKNOWN, text)]
-    with_clock = any(np.linalg.norm(v.twist[3:]) > _LEAST_SPEED_M_S for v in views)
+
+    with_clock = any(np.linalg.norm(view.twist[3:]) > _LEAST_SPEED_M_S for view in views)
     fit = best_fit(camera, views, with_clock)
     mistake, mistake_score = _best_mistake(camera, views)
     values = {"score": fit.score, "clearness": fit.clearness, "other": mistake_score}
@@ -137,49 +164,74 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
     if mistake_score > _CLEARLY * max(fit.score, fit.rival, 0.0):
         text = f"depth discontinuities lie on image edges with {mistake}, and not as given"
         return [finding(name, WRONG, text, f"give {mistake}", **values)]
-    error_deg = fit.error[:3]
+
     explanations = [_best_explanation(fit, with_clock), *map(_explanation, fit.others)]
+    # Offsets that fit equally matter unless the best fit changes less than each of them.
     num_changes = num_changed(fit.others[fit.are_equal]).min(initial=2)
     is_one_of_many = fit.are_equal.any() and num_changed(fit.offset) >= min(num_changes, 2)
-    if is_one_of_many or fit.clearness < _CLEARLY or error_deg[:2].max() > _UNSURE_DEG:
-        text = (
-            f"no turn of up to 2.7 deg puts the depth discontinuities of {num} sweeps on image "
-            f"edges better than others do: images and sweeps do not show the same, or too little; "
-            f"the best fit: {explanations[0]}"
-        )
-        if len(explanations) > 1:
-            text = f"{len(explanations)} explanations fit {num} images about equally: "
-            text += "; or ".join(explanations)
-        is_as_given = num_changed(fit.offset) == 0 and fit.score > fit.usual
-        verdict = UNKNOWN if is_as_given or num < 2 * _LEAST_IMAGES else SUSPICIOUS
-        remedy = (
-            "check T_cam_lidar, K and the clocks, and that the images are the camera's; sweeps at "
-            "rest tell a turn from a clock"
-        )
-        return [finding(name, verdict, text, remedy, **values)]
-    verdict, text = FINE, f"{explanations[0]} (best fit of {num} images)"
-    excess_deg = np.abs(fit.offset[:3]) - 2 * error_deg
-    off = (np.abs(fit.offset[:3]) > _OFF_DEG) & (excess_deg > 0)
-    if off.any():
-        verdict = WRONG if (off & (excess_deg > _WRONG_DEG)).any() else SUSPICIOUS
+    is_uncertain = fit.clearness < _CLEARLY or fit.error[:2].max() > _UNSURE_DEG
+    if is_one_of_many or is_uncertain:
+        return [_report_ambiguous(name, fit, explanations, num_images, values)]
+
+    calibration = _report_offset(camera, fit, explanations, num_images, values)
+    if with_clock:
+        return [calibration, _check_clock(camera, fit, num_images)]
+    text = f"the vehicle is slower than {_LEAST_SPEED_M_S:g} m/s where it was looked at"
+    return [calibration, finding(f"{camera.name}: clock", UNKNOWN, text)]
+
+
+def _report_ambiguous(
+    name: str, fit: Fit, explanations: list[str], num_images: int, values: Mapping[str, float]
+) -> Finding:
+    """Report that no offset fits the images clearly better than others."""
+    text = (
+        f"no turn of up to 2.7 deg puts the depth discontinuities of {num_images} sweeps on image "
+        f"edges better than others do: images and sweeps do not show the same, or too little; "
+        f"the best fit: {explanations[0]}"
+    )
+    if len(explanations) > 1:
+        text = f"{len(explanations)} explanations fit {num_images} images about equally: "
+        text += "; or ".join(explanations)
+    is_as_given = num_changed(fit.offset) == 0 and fit.score > fit.usual
+    verdict = UNKNOWN if is_as_given or num_images < 2 * _LEAST_IMAGES else SUSPICIOUS
+    remedy = (
+        "check T_cam_lidar, K and the clocks, and that the images are the camera's; sweeps at "
+        "rest tell a turn from a clock"
+    )
+    return finding(name, verdict, text, remedy, **values)
+
+
+def _report_offset(
+    camera: Camera,
+    fit: Fit,
+    explanations: list[str],
+    num_images: int,
+    values: Mapping[str, float],
+) -> Finding:
+    """Report the rotation between the given and the best calibration."""
+    verdict = FINE
+    text = f"{explanations[0]} (best fit of {num_images} images)"
+    # An error counts if it exceeds two standard errors.
+    offset_deg = np.abs(fit.offset[:3])
+    excess_deg = offset_deg - 2 * fit.error[:3]
+    is_off = (offset_deg > _OFF_DEG) & (excess_deg > 0)
+    if is_off.any():
+        verdict = WRONG if (is_off & (excess_deg > _WRONG_DEG)).any() else SUSPICIOUS
     else:
         text = f"right within {_OFF_DEG} deg: {text}"
     if len(explanations) > 1:
         text += f"; more changes at once fit about equally: {'; or '.join(explanations[1:])}"
-    calibration = finding(name, verdict, text, _corrected_line(camera, fit), **values)
-    if with_clock:
-        return [calibration, _check_clock(camera, fit, num)]
-    text = f"the vehicle is slower than {_LEAST_SPEED_M_S:g} m/s where it was looked at"
-    return [calibration, finding(f"{camera.name}: clock", UNKNOWN, text)]
+    name = f"{camera.name}: calibration"
+    return finding(name, verdict, text, _corrected_line(camera, fit), **values)
 
 
 def _best_mistake(camera: Camera, views: list[View]) -> tuple[str, float]:
     """Return the common mistake whose correction scores best, and its score."""
     num_given = score(camera, views)[1]
     scores = {}
-    for mistake, T_cam_lidar in alternatives(camera.T_cam_lidar).items():
-        value, num_edges = score(replace(camera, T_cam_lidar=T_cam_lidar), views)
-        scores[mistake] = value if num_edges > _LEAST_EDGES * num_given else 0.0
+    for mistake, T_cam_lidar in correct_common_mistakes(camera.T_cam_lidar).items():
+        mistake_score, num_edges = score(replace(camera, T_cam_lidar=T_cam_lidar), views)
+        scores[mistake] = mistake_score if num_edges > _LEAST_EDGES * num_given else 0.0
     best = max(scores, key=lambda mistake: scores[mistake])
     return best, scores[best]
 
@@ -211,12 +263,12 @@ def _corrected_line(camera: Camera, fit: Fit) -> str:
     return f"T_cam_lidar: {rows}  # {where}"
 
 
-def _check_clock(camera: Camera, fit: Fit, num: int) -> Finding:
+def _check_clock(camera: Camera, fit: Fit, num_images: int) -> Finding:
     """Report the difference between the clocks of camera and lidar."""
     late_s, error_s = float(fit.offset[3]), float(fit.error[3])
     text = (
         f"the images were exposed {abs(late_s) * 1e3:.0f} ± {max(error_s * 1e3, 1):.0f} ms "
-        f"{'after' if late_s > 0 else 'before'} their stamps (best fit of {num} images)"
+        f"{'after' if late_s > 0 else 'before'} their stamps (best fit of {num_images} images)"
     )
     verdict = FINE
     if abs(late_s) > max(_CLOCK_OFF_S, 2 * error_s):

@@ -28,7 +28,7 @@ from densify.doctor.sample import (
 )
 from densify.free_space.ground import HeightMap, find_upright
 from densify.free_space.raw_sweeps import MAP_FRAME_REMEDY, is_still, way_in_map
-from densify.free_space.sensor import Sensors
+from densify.free_space.sensor import SensorModel, Sensors
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 from densify.readers.recorded_poses import PoseTrack
@@ -45,35 +45,38 @@ from densify.registration.deskew import (
 )
 from densify.scores.pose_metrics import RecordedError, main_error
 
-_NEAR_M = 25.0
+_NEAR_M = 25.0  # range of the returns that show the ground, and that are compared for deskewing
 # Returns of the own vehicle
-_CELL_M, _CLOSE_M = 0.1, 6.0
+_CELL_M, _CLOSE_M = 0.1, 6.0  # side of a cell in which sweeps agree; reach of the vehicle
 _LEAST_RETURNS, _LEAST_HEIGHT_M, _DRIVING_M_S = 20, 0.4, 1.0
-_WIDEST_M = 2.6  # of a road vehicle; kerbs and rails stay beside it too, but farther out
-_LEAST_WITHOUT = 0.005  # share of the rows
+_WIDEST_M = 2.6  # width of a road vehicle; kerbs and rails stay beside it too, but farther out
+_LEAST_WITHOUT = 0.005  # least reported share of rows without a return
 # Deskewing: distances between the first and the last sweep of a spot
 _LEAST_DESKEWING_M_S = 3.0
-_ABOVE_GROUND_M, _APART_M = 0.5, 1.0
+_ABOVE_GROUND_M, _APART_M = 0.5, 1.0  # least height of compared points; greatest distance
 _LEAST_POINTS = 50
-_CLEARLY_NEARER, _NEARER = 1.2, 1.05
+_CLEARLY_NEARER, _NEARER = 1.2, 1.05  # ratios of distances for a verdict: wrong, fine
 # Rings
 _FAR_M, _LEAST_RING_POINTS = 60.0, 500
-_REACH_M = np.array([3.0, 0.8, 2.4])  # searched ahead and behind, aside, above and below
-_GRID_M = (0.5, 0.4, 0.05)  # fine in height, which changes every ring
+# The search for a scanner's position: first on a grid, with far points and wide bins
+_REACH_M = np.array([3.0, 0.8, 2.4])  # reach ahead and behind, aside, above and below
+_GRID_M = (0.5, 0.4, 0.05)  # steps of the grid; fine in height, which changes every ring
 _COARSE_FROM_M, _COARSE_POINTS, _COARSE_BINS, _NUM_STARTS = 18.0, 3000, 3, 8
-_FINER = ((0.1, 3), (0.05, 2), (0.02, 1))  # step in metres, bins
-_CUBE = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+_FINER = ((0.1, 3), (0.05, 2), (0.02, 1))  # then by steps in metres, with narrower bins
+_CUBE = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)  # neighbours
 _MOST_STEPS = 8
 # The rings of KITTI's HDL-64E, with two separate blocks of lasers, are sharpest from 0.2 m above.
 _OFF_M = 0.3
 # Poses
 _LEAST_WAY_M = 1.5  # an error of 3 % of this distance exceeds the tolerance
-_WRONG_COST = 4.0  # as a multiple of the tolerance
-_MUCH_BETTER = 0.4
-_CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.3, 0.02, 0.04
+_WRONG_COST = 4.0  # error of wrong poses, as a multiple of the tolerance
+_MUCH_BETTER = 0.4  # error after a correction that explains it, as a share of the error before
+_CLOCK_S, _CLOCK_STEP_S, _CLOCK_OFF_S = 0.3, 0.02, 0.04  # reach and step of the search; suspicious
 _WIDEST_CLOCK_S = 0.1  # a period of most scanners; a wider interval gives no verdict
+# Standard errors of odometry, and the excess of cost at two standard errors of the clock
 _NOISE_M, _NOISE_RAD, _EVEN_COST = 0.05, 1.5e-3, 4.0
 CAM_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""(4,4) pose of a body (x forward, y left, z up) in the axes of a camera."""
 
 
 def check_registration(sample: Sample) -> list[Finding]:
@@ -91,10 +94,11 @@ def check_registration(sample: Sample) -> list[Finding]:
 
 def check_frame(sample: Sample) -> list[Finding]:
     """Check that each sweep is in the frame of its own scanner, not in that of a map."""
-    name, tracks = "frame of sweeps", [s.trajectory for s in sample.spots if s.trajectory]
+    name = "frame of sweeps"
+    trajectories = [spot.trajectory for spot in sample.spots if spot.trajectory]
     if sample.unregistered:
         return [finding(name, UNKNOWN, sample.unregistered)]
-    if not all(is_still(track.T_world_lidar) for track in tracks):
+    if not all(is_still(trajectory.T_world_lidar) for trajectory in trajectories):
         return [finding(name, FINE, "the scanner's own: odometry finds motion")]
     way_m = way_in_map(sample.spots[0].sweeps[0], sample.spots[-1].sweeps[-1])
     if not way_m:
@@ -107,55 +111,67 @@ def check_sensors(sample: Sample) -> list[Finding]:
     """Describe each scanner as the pipeline models it: rings, field of view, number of returns."""
     if sample.unregistered:
         return [finding("scanners", UNKNOWN, sample.unregistered)]
-    spot, findings = sample.fastest, []
-    sweeps = [replace(s, sweep=in_range(s.sweep, sample.settings)) for s in spot.stretch.sweeps]
-    without = max(1 - len(s) / (int(s.row.max(initial=0)) + 1) for s in spot.sweeps)
-    for number, model in Sensors.of(sweeps).models.items():
-        kind = "lines" if model.rings_rad is None else f"{len(model.rings_rad)} rings"
-        kind = "no rings" if model.unordered else kind
-        low, high = np.rad2deg(model.elevation_rad)
-        right, left = np.rad2deg(model.azimuth_rad)
-        counts = [int((s.lidar == number).sum()) for s in spot.sweeps]
-        text = (
-            f"{kind}, {low:.1f} to {high:.1f} deg up, {right:.0f} to {left:.0f} deg around, "
-            f"{np.rad2deg(model.azimuth_step_rad):.2f} deg from ray to ray, {min(counts):,} to "
-            f"{max(counts):,} returns a sweep"
-        )
-        if without > _LEAST_WITHOUT:
-            text += f", {100 * without:.0f} % of the rows without a return"
-        every = (s for each in sample.spots for s in each.sweeps)
-        empty = [s.frame for s in every if not (s.lidar == number).any()]
-        if empty:
-            text += f", none in sweeps {format_frames(empty)}"
-        verdict = FINE
-        if empty or min(counts) < 0.5 * max(counts):
-            verdict, text = SUSPICIOUS, f"{text}; some sweeps are broken off"
-        scanner = finding(
-            f"scanner {number}",
-            verdict,
-            text,
-            "leave the sweeps with few returns out",
-            returns_least=min(counts),
-            returns_most=max(counts),
-            without_return=without,
-        )
-        findings.append(scanner)
-    return findings
+    sweeps = [
+        replace(registered, sweep=in_range(registered.sweep, sample.settings))
+        for registered in sample.fastest.stretch.sweeps
+    ]
+    models = Sensors.of(sweeps).models
+    return [_describe_scanner(sample, number, model) for number, model in models.items()]
+
+
+def _describe_scanner(sample: Sample, number: int, model: SensorModel) -> Finding:
+    """Describe the scanner with index ``number``."""
+    spot = sample.fastest
+    # Rows of a file without a return are not read: the last row tells their number.
+    without_return = max(
+        1 - len(sweep) / (int(sweep.row.max(initial=0)) + 1) for sweep in spot.sweeps
+    )
+    kind = "lines" if model.rings_rad is None else f"{len(model.rings_rad)} rings"
+    kind = "no rings" if model.unordered else kind
+    low, high = np.rad2deg(model.elevation_rad)
+    right, left = np.rad2deg(model.azimuth_rad)
+    counts = [int((sweep.lidar == number).sum()) for sweep in spot.sweeps]
+    text = (
+        f"{kind}, {low:.1f} to {high:.1f} deg up, {right:.0f} to {left:.0f} deg around, "
+        f"{np.rad2deg(model.azimuth_step_rad):.2f} deg from ray to ray, {min(counts):,} to "
+        f"{max(counts):,} returns a sweep"
+    )
+    if without_return > _LEAST_WITHOUT:
+        text += f", {100 * without_return:.0f} % of the rows without a return"
+    all_sweeps = [sweep for each in sample.spots for sweep in each.sweeps]
+    silent = [sweep.frame for sweep in all_sweeps if not (sweep.lidar == number).any()]
+    if silent:
+        text += f", none in sweeps {format_frames(silent)}"
+    verdict = FINE
+    if silent or min(counts) < 0.5 * max(counts):
+        verdict = SUSPICIOUS
+        text += "; some sweeps are broken off"
+    return finding(
+        f"scanner {number}",
+        verdict,
+        text,
+        "leave the sweeps with few returns out",
+        returns_least=min(counts),
+        returns_most=max(counts),
+        without_return=without_return,
+    )
 
 
 def check_own_vehicle(sample: Sample) -> list[Finding]:
     """Check for returns of the own vehicle, which keep their lidar-frame position as it drives."""
-    moving = [
+    driving_spots = [
         spot
         for spot in sample.registered
         if spot.speed_m_s > _DRIVING_M_S
         and (np.linalg.norm(spot.sweeps[0].points, axis=1) < _NEAR_M).any()
     ]
-    if len(moving) < 2:
-        text = f"the vehicle drives in {len(moving)} of the places looked at, two are needed"
+    if len(driving_spots) < 2:
+        text = f"the vehicle drives in {len(driving_spots)} of the places looked at, two are needed"
         return [finding("own vehicle", UNKNOWN, text)]
-    returns = _own_returns(moving)
-    num, least_m = len(returns), sample.settings.min_range_m
+    returns = _own_returns(driving_spots)
+    num = len(returns)
+    least_m = sample.settings.min_range_m
+    # The farthest 1 % may be chance returns.
     range_m = float(np.percentile(np.linalg.norm(returns, axis=1), 99)) if num else 0.0
     values: dict[str, Value] = {"farthest_m": range_m, "num_returns": num}
     if num < _LEAST_RETURNS:
@@ -168,24 +184,34 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
 
 def _own_returns(spots: list[Spot]) -> Float:
     """Return (N,3) metres, cells of 0.1 m of one sweep's returns that all end sweeps have too."""
-    # The ground is excluded, because it is at the same position in all sweeps too.
     R_level_lidar = find_upright([spot.sweeps[0] for spot in spots])
-    cells = []
-    for sweep, twist in [(s, spot.twist) for spot in spots for s in _ends(spot)]:
-        range_m = np.linalg.norm(sweep.points, axis=1)
-        close = sweep.points[range_m < _CLOSE_M]
-        right = np.array([twist[4], -twist[3]]) / np.hypot(twist[3], twist[4])
-        close = close[np.abs(close[:, :2] @ right) < _WIDEST_M]
-        around, levelled = (
-            points @ R_level_lidar.T for points in (sweep.points[range_m < _NEAR_M], close)
-        )
-        # Mirror images pull the local ground of one sweep.
-        floor_m = np.percentile(around[:, 2], 10)
-        above_m = np.minimum(HeightMap.of([around]).above(levelled), levelled[:, 2] - floor_m)
-        close = close[above_m > _LEAST_HEIGHT_M]
-        cells.append([*map(tuple, np.floor(close / _CELL_M).astype(np.int64))])
+    cells = []  # of each sweep, a cell for each return
+    for spot in spots:
+        for sweep in _ends(spot):
+            candidates = _own_candidates(sweep.points, spot.twist, R_level_lidar)
+            cells.append([*map(tuple, np.floor(candidates / _CELL_M).astype(np.int64))])
     common = set.intersection(*map(set, cells))
-    return (np.array([c for c in cells[0] if c in common]).reshape(-1, 3) + 0.5) * _CELL_M
+    own_cells = [cell for cell in cells[0] if cell in common]
+    return (np.array(own_cells).reshape(-1, 3) + 0.5) * _CELL_M  # middles of the cells
+
+
+def _own_candidates(points: Float, twist: Float, R_level_lidar: Float) -> Float:
+    """Return the points (K,3) of a sweep that are near enough to be of the own vehicle.
+
+    The ground is excluded, because it is at the same position in all sweeps too. ``twist`` (6,) is
+    the velocity of the lidar.
+    """
+    range_m = np.linalg.norm(points, axis=1)
+    close = points[range_m < _CLOSE_M]
+    right = np.array([twist[4], -twist[3]]) / np.hypot(twist[3], twist[4])
+    close = close[np.abs(close[:, :2] @ right) < _WIDEST_M]
+    near_levelled = points[range_m < _NEAR_M] @ R_level_lidar.T
+    close_levelled = close @ R_level_lidar.T
+    # Mirror images pull down the local ground of one sweep. The lower height counts.
+    floor_m = np.percentile(near_levelled[:, 2], 10)
+    above_ground_m = HeightMap.of([near_levelled]).above(close_levelled)
+    above_m = np.minimum(above_ground_m, close_levelled[:, 2] - floor_m)
+    return close[above_m > _LEAST_HEIGHT_M]
 
 
 def check_deskewing(sample: Sample) -> list[Finding]:
@@ -198,47 +224,61 @@ def check_deskewing(sample: Sample) -> list[Finding]:
     if reason := sample.too_slow(_LEAST_DESKEWING_M_S):
         return [finding("deskewing", UNKNOWN, reason)]
 
-    def with_times(sign: int) -> Spot:
-        sweeps = (
-            replace(s, offset_ns=sign * s.offset_ns if sign and s.offset_ns is not None else None)
-            for s in spot.sweeps
-        )
-        return Spot.of(tuple(sweeps), sample.settings)
-
-    given_m, reversed_m, without_m = map(_apart_m, (spot, with_times(-1), with_times(0)))
+    given_m = _apart_m(spot)
+    reversed_m = _apart_m(_with_times(sample, spot, -1))
+    without_m = _apart_m(_with_times(sample, spot, 0))
     values = {"given_m": given_m, "reversed_m": reversed_m, "without_m": without_m}
     text = (
         f"sweeps {len(spot.sweeps) - 1} apart lie {given_m * 100:.1f} cm from each other with the "
         f"point times as given, {reversed_m * 100:.1f} cm with the times reversed, "
         f"{without_m * 100:.1f} cm without times"
     )
-    verdict, remedy = FINE, "correct the sign of the point times, or --set register.deskew=false"
+    verdict = FINE
+    remedy = "correct the sign of the point times, or --set register.deskew=false"
     if min(reversed_m, without_m) * _CLEARLY_NEARER < given_m:
         verdict = WRONG
     elif given_m * _NEARER >= min(reversed_m, without_m):
-        verdict, text = UNKNOWN, f"{text}: too slow here to tell"
+        verdict = UNKNOWN
+        text += ": too slow here to tell"
     return [finding("deskewing", verdict, text, remedy, **values)]
 
 
+def _with_times(sample: Sample, spot: Spot, sign: int) -> Spot:
+    """Return a spot with the point times multiplied by ``sign``, without times if it is 0."""
+    sweeps = []
+    for sweep in spot.sweeps:
+        offset_ns = sweep.offset_ns
+        if offset_ns is not None:
+            offset_ns = sign * offset_ns if sign else None
+        sweeps.append(replace(sweep, offset_ns=offset_ns))
+    return Spot.of(tuple(sweeps), sample.settings)
+
+
 def _apart_m(spot: Spot) -> float:
-    """Return the median distance (m) of near points above ground between a spot's end sweeps."""
+    """Return the median distance (m) of near points above ground between a spot's end sweeps.
+
+    It is at most 1 m, and 1 m for spots that are not registered or have too few points.
+    """
     if spot.trajectory is None:
         return _APART_M
     first, last = spot.stretch.sweeps[0], spot.stretch.sweeps[-1]
-    points, last_points = _above_ground(first.sweep.points), _above_ground(last.sweep.points)
-    if min(len(points), len(last_points)) < _LEAST_POINTS:
+    first_points = _near_above_ground(first.sweep.points)
+    last_points = _near_above_ground(last.sweep.points)
+    if min(len(first_points), len(last_points)) < _LEAST_POINTS:
         return _APART_M
     T_first_last = poses.inverse(first.T_world_lidar) @ last.T_world_lidar
-    moved = poses.transform(T_first_last, last_points)
-    distance_m, _ = cKDTree(points).query(moved[::4], distance_upper_bound=_APART_M, workers=-1)
+    queries = poses.transform(T_first_last, last_points)[::4]  # every fourth is enough
+    tree = cKDTree(first_points)
+    distance_m, _ = tree.query(queries, distance_upper_bound=_APART_M, workers=-1)
     return float(np.median(np.minimum(distance_m, _APART_M)))
 
 
-def _above_ground(points: Float) -> Float:
-    points = points[np.linalg.norm(points, axis=1) < _NEAR_M]
-    if not len(points):
-        return points
-    return points[points[:, 2] > np.percentile(points[:, 2], 10) + _ABOVE_GROUND_M]
+def _near_above_ground(points: Float) -> Float:
+    """Return the points (K,3) within 25 m that are clearly higher than the lowest tenth."""
+    near = points[np.linalg.norm(points, axis=1) < _NEAR_M]
+    if not len(near):
+        return near
+    return near[near[:, 2] > np.percentile(near[:, 2], 10) + _ABOVE_GROUND_M]
 
 
 def check_rings(sample: Sample) -> list[Finding]:
@@ -251,11 +291,12 @@ def check_rings(sample: Sample) -> list[Finding]:
         points = _returns_of(sample, lidar) @ R.T
         if len(points) < _LEAST_RING_POINTS:
             text = f"{len(points)} near points, {_LEAST_RING_POINTS} are needed to tell"
-            findings.append(finding(_position_of(lidar), UNKNOWN, text))
+            findings.append(finding(_check_name(lidar), UNKNOWN, text))
             continue
         sharpest_m = find_origin(points, given_m)
-        findings.append(_check_origin(lidar, points, R, (given_m, sharpest_m)))
-        findings.append(_check_compensation(sample, lidar, R, (given_m, sharpest_m)))
+        origins_m = (given_m, sharpest_m)
+        findings.append(_check_origin(lidar, points, R, origins_m))
+        findings.append(_check_compensation(sample, lidar, R, origins_m))
     return findings
 
 
@@ -265,58 +306,72 @@ def _returns_of(sample: Sample, lidar: int) -> Float:
     for middle in sample.middles:
         sweep = middle.select(middle.lidar == lidar)
         points.append(sweep.points[sample_rows(sweep, _FAR_M)])
-    return np.concatenate(points)[:: len(points)]
+    return np.concatenate(points)[:: len(points)]  # about as many as of one sweep
 
 
 def _check_origin(lidar: int, points: Float, R: Float, origins_m: tuple[Float, Float]) -> Finding:
     """Compare a scanner's given position (3,) with that of the sharpest rings, scanner axes."""
-    given_sharpness, best = (sharpness(points, origin_m) for origin_m in origins_m)
+    given_sharpness, best_sharpness = (sharpness(points, origin_m) for origin_m in origins_m)
     off_m = float(np.linalg.norm(origins_m[1] - origins_m[0]))
     given_m, best_m = (origin_m @ R for origin_m in origins_m)
     values = {"given_m": given_m.tolist(), "found_m": best_m.tolist(), "off_m": off_m}
-    values |= {"sharpness_given": given_sharpness, "sharpness_found": best}
+    values |= {"sharpness_given": given_sharpness, "sharpness_found": best_sharpness}
     text = (
-        f"rings are sharpest ({best:.2f}) seen from {_position(best_m)}; from the given "
-        f"{_position(given_m)}: {given_sharpness:.2f}"
+        f"rings are sharpest ({best_sharpness:.2f}) seen from {_format_position(best_m)}; from the "
+        f"given {_format_position(given_m)}: {given_sharpness:.2f}"
     )
-    line = f"scanner_origins: {[[round(float(v), 2) for v in best_m]]}"
-    verdict, remedy = FINE, f"give the scanner's place in the points' frame ({line})"
-    if best < LEAST_SHARPNESS:
-        verdict, text = UNKNOWN, f"{text}; no distinct rings"
-    elif off_m > _OFF_M and best > CLEARLY * given_sharpness:
+    line = f"scanner_origins: {[[round(float(coordinate), 2) for coordinate in best_m]]}"
+    verdict = FINE
+    remedy = f"give the scanner's place in the points' frame ({line})"
+    if best_sharpness < LEAST_SHARPNESS:
+        verdict = UNKNOWN
+        text += "; no distinct rings"
+    elif off_m > _OFF_M and best_sharpness > CLEARLY * given_sharpness:
         verdict = WRONG
-    return finding(_position_of(lidar), verdict, text, remedy, **values)
+    return finding(_check_name(lidar), verdict, text, remedy, **values)
 
 
-def _position_of(lidar: int) -> str:
+def _check_name(lidar: int) -> str:
+    """Return the name of the check of a scanner's position."""
     return "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
 
 
-def _position(position_m: Float) -> str:
-    return "(" + ", ".join(f"{v:.2f}" for v in position_m) + ")"
+def _format_position(position_m: Float) -> str:
+    """Return the coordinates of a position (3,) as a text."""
+    return "(" + ", ".join(f"{coordinate:.2f}" for coordinate in position_m) + ")"
 
 
 def find_origin(points: Float, start_m: Float) -> Float:
-    """Return (3,) the position near a start where the rings are sharpest, in axes of the points."""
-    axes = [np.arange(-r, r + 1e-9, step) for r, step in zip(_REACH_M, _GRID_M, strict=True)]
+    """Return the (3,) position near a start (3,) where the rings of points (N,3) are sharpest.
+
+    All are in metres, in the axes of the scanner.
+    """
+    # a coarse grid, with a sample of far points
+    axes = [
+        np.arange(-reach_m, reach_m + 1e-9, step_m)
+        for reach_m, step_m in zip(_REACH_M, _GRID_M, strict=True)
+    ]
     grid = start_m + np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    far = points[np.linalg.norm(points, axis=1) > _COARSE_FROM_M]
-    coarse = far[:: len(far) // _COARSE_POINTS + 1]
-    value = np.array([sharpness(coarse, origin_m, _COARSE_BINS) for origin_m in grid])
-    starts = [start_m.astype(np.float64), *grid[np.argsort(-value)[:_NUM_STARTS]]]
+    far_points = points[np.linalg.norm(points, axis=1) > _COARSE_FROM_M]
+    sample = far_points[:: len(far_points) // _COARSE_POINTS + 1]
+    values = np.array([sharpness(sample, origin_m, _COARSE_BINS) for origin_m in grid])
+
+    # then steps uphill from the start and from the best positions of the grid
+    positions = [start_m.astype(np.float64), *grid[np.argsort(-values)[:_NUM_STARTS]]]
     for step_m, bins in _FINER:
-        starts = [_climb(points, origin_m, step_m, bins) for origin_m in starts]
-    return max(starts, key=lambda origin_m: sharpness(points, origin_m))
+        positions = [_climb(points, position_m, step_m, bins) for position_m in positions]
+    return max(positions, key=lambda position_m: sharpness(points, position_m))
 
 
 def _climb(points: Float, origin_m: Float, step_m: float, bins: int) -> Float:
     """Return the position (3,) to which the steepest steps along a grid of ``step_m`` lead."""
     for _ in range(_MOST_STEPS):
-        around = origin_m + step_m * _CUBE
-        best = int(np.argmax([sharpness(points, neighbour_m, bins) for neighbour_m in around]))
-        if not _CUBE[best].any():
+        neighbours_m = origin_m + step_m * _CUBE
+        values = [sharpness(points, neighbour_m, bins) for neighbour_m in neighbours_m]
+        best = int(np.argmax(values))
+        if not _CUBE[best].any():  # the position itself is best
             break
-        origin_m = around[best]
+        origin_m = neighbours_m[best]
     return origin_m
 
 
@@ -327,26 +382,31 @@ def _check_compensation(
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     if reason := sample.too_slow(LEAST_SPEED_M_S):
         return finding(name, UNKNOWN, reason)
-    spot, period_s = sample.fastest, sample.timeline.period_ns * 1e-9
+    spot = sample.fastest
+    period_s = sample.timeline.period_ns * 1e-9
     sweep = spot.middle.select(spot.middle.lidar == lidar)
     rows = sample_rows(sweep, COMPENSATED_M)
-    points, is_untimed = sweep.points[rows], sweep.offset_ns is None
+    points = sweep.points[rows]
+    is_untimed = sweep.offset_ns is None
     if sweep.offset_ns is None:
         offset_s = turning_s(points, period_s)
     else:
         offset_s = np.asarray(sweep.offset_ns[rows] * 1e-9, np.float64)
     rings = rings_by_motion(points, offset_s, spot.twist, R, origins_m)
-    if not rings.are_distinct:  # the origin was looked for in smeared rings
-        straight = poses.transform_each(-offset_s[:, None] * spot.twist, points) @ R.T
-        rings = rings._replace(undone=sharpness(straight, find_origin(straight, origins_m[0])))
+    if not rings.are_distinct:
+        # The origin was searched in smeared rings. It is searched again in points as fired.
+        as_fired = poses.transform_each(-offset_s[:, None] * spot.twist, points) @ R.T
+        rings = rings._replace(undone=sharpness(as_fired, find_origin(as_fired, origins_m[0])))
     text = (
         f"at {spot.speed_m_s:.1f} m/s the rings' sharpness is {rings.as_stored:.2f} as stored, "
         f"{rings.undone:.2f} with a compensation undone, {rings.done:.2f} with the motion "
         f"compensated"
     )
-    verdict, remedy = FINE, "--set register.deskew=false"
+    verdict = FINE
+    remedy = "--set register.deskew=false"
     if not rings.are_distinct:
-        verdict, text = UNKNOWN, f"{text}; no distinct rings"
+        verdict = UNKNOWN
+        text += "; no distinct rings"
     elif rings.are_compensated and is_untimed:
         text += f": compensated to {rings.moment}, without times"
     elif rings.are_compensated:
@@ -354,9 +414,11 @@ def _check_compensation(
         text += f": the sweeps are compensated already, to {rings.moment}, and would be a second"
         text += " time"
     elif rings.as_stored < CLEARLY * rings.undone:
-        verdict, text = UNKNOWN, f"{text}: too alike to tell"
+        verdict = UNKNOWN
+        text += ": too alike to tell"
     elif is_untimed:
-        verdict, remedy = SUSPICIOUS, "give the points times (a column t in the files)"
+        verdict = SUSPICIOUS
+        remedy = "give the points times (a column t in the files)"
         text += ": the sweeps are as they were fired and no point has a time, so they stay"
         text += f" stretched by {spot.speed_m_s * period_s:.2f} m"
     else:
@@ -365,32 +427,39 @@ def _check_compensation(
     return finding(name, verdict, text, remedy, **values)
 
 
-def changed(
+def change_pose(
     rotation: Callable[[Float], Float] = np.copy, scale: float = 1.0
 ) -> Callable[[Float], Float]:
     """Return a function on poses (4,4) that maps the rotation (3,3) and scales the translation."""
 
     def change(T: Float) -> Float:
-        new = np.eye(4)
-        new[:3, :3], new[:3, 3] = rotation(T[:3, :3]), scale * T[:3, 3]
-        return new
+        T_changed = np.eye(4)
+        T_changed[:3, :3] = rotation(T[:3, :3])
+        T_changed[:3, 3] = scale * T[:3, 3]
+        return T_changed
 
     return change
 
 
-def _rolled(by: int) -> Callable[[Float], Float]:
+def _roll_quaternion(places: int) -> Callable[[Float], Float]:
     """Return a function that rolls a rotation's quaternion x y z w, as `numpy.roll`."""
-    return lambda R: Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), by)).as_matrix()
+
+    def roll(R: Float) -> Float:
+        quaternion = np.roll(Rotation.from_matrix(R).as_quat(), places)
+        rolled: Float = Rotation.from_quat(quaternion).as_matrix()
+        return rolled
+
+    return roll
 
 
 HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
     "they are inverted (T_lidar_world instead of T_world_lidar)": poses.inverse,
     "they are a camera's, not the lidar's": lambda T: poses.inverse(CAM_AXES) @ T @ CAM_AXES,
-    "they are in millimetres": changed(scale=1e-3),
-    "they are in kilometres": changed(scale=1e3),
-    "their quaternions are x y z w, read as w x y z": changed(_rolled(1)),
-    "their quaternions are w x y z, read as x y z w": changed(_rolled(-1)),
-    "their rotations are transposed": changed(np.transpose),
+    "they are in millimetres": change_pose(scale=1e-3),
+    "they are in kilometres": change_pose(scale=1e3),
+    "their quaternions are x y z w, read as w x y z": change_pose(_roll_quaternion(1)),
+    "their quaternions are w x y z, read as x y z w": change_pose(_roll_quaternion(-1)),
+    "their rotations are transposed": change_pose(np.transpose),
 }
 """Common mistake of poses -> the function (4,4) -> (4,4) that corrects it."""
 
@@ -399,34 +468,46 @@ def check_poses(sample: Sample) -> list[Finding]:
     """Compare the poses as given, and corrected for each of `HYPOTHESES`, with odometry."""
     spots = sample.registered
     try:
-        ends = [[sample.sequence.T_world_lidar(s.frame) for s in _ends(spot)] for spot in spots]
+        recorded_ends = [
+            [sample.sequence.T_world_lidar(sweep.frame) for sweep in _ends(spot)] for spot in spots
+        ]
     except InputError as error:
         if "no poses" in str(error):
             return [finding("poses", FINE, "none; the sweeps register themselves")]
         return [finding("poses", WRONG, str(error), "--set register.source=kiss-icp")]
     if not spots:
         return [finding("poses", UNKNOWN, "no sweeps could be registered to compare with")]
-    odometry = [_between([s.stretch.sweeps[row].T_world_lidar for row in (0, -1)]) for s in spots]
-    recorded = [_between(pair) for pair in ends]
-    off = RecordedError.of(recorded, odometry)
-    text = f"off by {off.m:.2f} m and {off.deg:.2f} deg from odometry over {off.way_m:.1f} m"
-    values = {"off_m": off.m, "off_deg": off.deg, "way_m": off.way_m}
-    corrected = {
-        name: RecordedError.of([_between([change(T) for T in pair]) for pair in ends], odometry)
-        for name, change in HYPOTHESES.items()
-    }
-    best = min(corrected, key=lambda name: corrected[name].cost)
+    # motions from the first to the last sweep of each spot
+    odometry = [
+        _motion_between([spot.stretch.sweeps[row].T_world_lidar for row in (0, -1)])
+        for spot in spots
+    ]
+    recorded = [_motion_between(ends) for ends in recorded_ends]
+    error_given = RecordedError.of(recorded, odometry)
+    text = (
+        f"off by {error_given.m:.2f} m and {error_given.deg:.2f} deg from odometry over "
+        f"{error_given.way_m:.1f} m"
+    )
+    values = {"off_m": error_given.m, "off_deg": error_given.deg, "way_m": error_given.way_m}
     remedy = "leave them out with --set register.source=kiss-icp"
-    if off.cost > 1 and corrected[best].cost < min(_MUCH_BETTER * off.cost, _WRONG_COST):
-        text += f", but only by {corrected[best].m:.2f} m and {corrected[best].deg:.2f} deg if "
-        text += best
+
+    errors = {}
+    for name, change in HYPOTHESES.items():
+        corrected = [_motion_between([change(T) for T in ends]) for ends in recorded_ends]
+        errors[name] = RecordedError.of(corrected, odometry)
+    best = min(errors, key=lambda name: errors[name].cost)
+    is_much_better = errors[best].cost < min(_MUCH_BETTER * error_given.cost, _WRONG_COST)
+    if error_given.cost > 1 and is_much_better:
+        text += f", but only by {errors[best].m:.2f} m and {errors[best].deg:.2f} deg if {best}"
         return [finding("poses", WRONG, text, f"correct the poses, or {remedy}", **values)]
-    verdict = FINE if off.way_m >= _LEAST_WAY_M else UNKNOWN
-    if off.cost > 1:
-        verdict = WRONG if off.cost > _WRONG_COST else SUSPICIOUS
-        duration_s = np.mean([(b.stamp_ns - a.stamp_ns) * 1e-9 for a, b in map(_ends, spots)])
-        mistake, correction = main_error(recorded, odometry, float(duration_s))
-        text, remedy = text + mistake, correction + remedy
+
+    verdict = FINE if error_given.way_m >= _LEAST_WAY_M else UNKNOWN
+    if error_given.cost > 1:
+        verdict = WRONG if error_given.cost > _WRONG_COST else SUSPICIOUS
+        durations_s = [(last.stamp_ns - first.stamp_ns) * 1e-9 for first, last in map(_ends, spots)]
+        mistake, correction = main_error(recorded, odometry, float(np.mean(durations_s)))
+        text += mistake
+        remedy = correction + remedy
     elif verdict == UNKNOWN:
         text += "; the vehicle hardly moves"
     return [finding("poses", verdict, text, remedy, **values), _check_clock(sample, odometry)]
@@ -436,54 +517,62 @@ def _check_clock(sample: Sample, odometry: list[Float]) -> Finding:
     """Measure at which time shift the poses agree best with odometry (4,4) of each spot."""
     # It is observable only where the vehicle turns or changes its speed.
     late_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
-    cost, num_used = np.zeros(len(late_s)), 0
+    cost = np.zeros(len(late_s))
+    num_used = 0
     for spot, T_first_last in zip(sample.registered, odometry, strict=True):
         first_ns, last_ns = (end.stamp_ns for end in _ends(spot))
-        track = _track(sample, first_ns, last_ns)
-        if track is None:  # at the recording's ends
+        track = _poses_around(sample, first_ns, last_ns)
+        if track is None:
             continue
         num_used += 1
         for row, seconds in enumerate(late_s):
             ends_ns = [int(ns + 1e9 * seconds) for ns in (first_ns, last_ns)]
-            recorded = _between([track.at(ns) for ns in ends_ns])
-            off = poses.log(poses.inverse(recorded) @ T_first_last)
-            cost[row] += np.sum((off[3:] / _NOISE_M) ** 2) + np.sum((off[:3] / _NOISE_RAD) ** 2)
+            recorded = _motion_between([track.at(ns) for ns in ends_ns])
+            error = poses.log(poses.inverse(recorded) @ T_first_last)
+            cost[row] += np.sum((error[3:] / _NOISE_M) ** 2) + np.sum((error[:3] / _NOISE_RAD) ** 2)
     if not num_used:
         text = "the recording has too few poses before and after the sweeps looked at"
         return finding("clock of poses", UNKNOWN, text)
-    good = late_s[cost < cost.min() + _EVEN_COST]
-    low_s, high_s, best_s = float(good.min()), float(good.max()), float(late_s[np.argmin(cost)])
+    likely_s = late_s[cost < cost.min() + _EVEN_COST]
+    low_s = float(likely_s.min())
+    high_s = float(likely_s.max())
+    best_s = float(late_s[np.argmin(cost)])
     text = (
         f"odometry agrees best with the poses stamped {best_s * 1e3:+.0f} ms "
         f"({low_s * 1e3:+.0f} to {high_s * 1e3:+.0f}) later"
     )
-    verdict, remedy = FINE, f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
+    verdict = FINE
+    remedy = f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
     if high_s - low_s > _WIDEST_CLOCK_S:
-        verdict, text = UNKNOWN, f"{text}; the vehicle drives too evenly to tell"
+        verdict = UNKNOWN
+        text += "; the vehicle drives too evenly to tell"
     elif low_s > _CLOCK_OFF_S or high_s < -_CLOCK_OFF_S:
         verdict = SUSPICIOUS
     values = {"late_s": best_s, "low_s": low_s, "high_s": high_s}
     return finding("clock of poses", verdict, text, remedy, **values)
 
 
-def _track(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:
+def _poses_around(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:
     """Return the recording's poses around a spot; None at its ends or if a pose is missing."""
     reach_ns = int(1e9 * _CLOCK_S)
     timeline = sample.timeline
+    # Twice the reach, to hold a sweep before and after it.
     frames = timeline.within(first_ns - 2 * reach_ns, last_ns + 2 * reach_ns)
-    stamp_ns = np.array([timeline.stamp_of(f) for f in frames], np.int64)
+    stamp_ns = np.array([timeline.stamp_of(frame) for frame in frames], np.int64)
     if stamp_ns[0] > first_ns - reach_ns or stamp_ns[-1] < last_ns + reach_ns:
         return None
     try:
-        T_world_lidar = np.stack([sample.sequence.T_world_lidar(f) for f in frames])
+        T_world_lidar = np.stack([sample.sequence.T_world_lidar(frame) for frame in frames])
         return PoseTrack(sample.sequence.name, stamp_ns, T_world_lidar)
     except InputError:
         return None
 
 
 def _ends(spot: Spot) -> tuple[Sweep, Sweep]:
+    """Return the first and the last sweep of a spot."""
     return spot.sweeps[0], spot.sweeps[-1]
 
 
-def _between(pair: list[Float]) -> Float:
-    return poses.inverse(pair[0]) @ pair[1]
+def _motion_between(ends: list[Float]) -> Float:
+    """Return the (4,4) motion from the first of two poses to the last."""
+    return poses.inverse(ends[0]) @ ends[1]

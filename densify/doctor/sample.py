@@ -17,9 +17,9 @@ from densify.readers.timeline import Timeline, in_range
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
 
-_NUM_SPOTS = 3
-_NUM_SWEEPS = 5  # of a spot
-_STEP_S = 0.1
+_NUM_SPOTS = 3  # greatest number of spots of a sample
+_NUM_SWEEPS = 5  # number of sweeps of a spot
+_STEP_S = 0.1  # time between the sweeps of a spot
 
 
 class Verdict(IntEnum):
@@ -71,7 +71,8 @@ class Spot:
         if len(sweeps) < 2:
             return Spot(sweeps, None, "one sweep alone cannot be registered")
         try:
-            trajectory = find_trajectory([in_range(s, settings) for s in sweeps], settings)
+            sweeps_in_range = [in_range(sweep, settings) for sweep in sweeps]
+            trajectory = find_trajectory(sweeps_in_range, settings)
         except SweepError as error:
             return Spot(sweeps, None, str(error))
         return Spot(sweeps, trajectory)
@@ -138,7 +139,7 @@ class Sample:
     @property
     def lidars(self) -> list[int]:
         """Indices of the scanners."""
-        return sorted({int(n) for sweep in self.middles for n in np.unique(sweep.lidar)})
+        return sorted({int(number) for sweep in self.middles for number in np.unique(sweep.lidar)})
 
     @property
     def registered(self) -> list[Spot]:
@@ -168,13 +169,14 @@ class Sample:
 def choose_frames(timeline: Timeline) -> list[list[int]]:
     """Return the frame numbers of each spot: sweeps about 0.1 s apart, without a hole in time."""
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
-    unbroken = timeline.runs(timeline.frames)
-    length = min(max(map(len, unbroken)), stride * (_NUM_SWEEPS - 1) + 1)
-    spots = [
+    runs = timeline.runs(timeline.frames)  # without a hole in time
+    # from the first to the last sweep of a spot, both included
+    length = min(max(map(len, runs)), stride * (_NUM_SWEEPS - 1) + 1)
+    candidates = [
         run[start : start + length : stride]
-        for run in unbroken
+        for run in runs
         for start in range(len(run) - length + 1)
     ]
     num_spots = min(_NUM_SPOTS, max(1, len(timeline.frames) // length))
-    rows = np.rint(np.linspace(0, len(spots) - 1, num_spots)).astype(int)
-    return [spots[row] for row in np.unique(rows)]
+    rows = np.rint(np.linspace(0, len(candidates) - 1, num_spots)).astype(int)
+    return [candidates[row] for row in np.unique(rows)]

@@ -10,16 +10,17 @@ from densify.free_space.raw_sweeps import (
     LOST_DEG,
     MAP_FRAME_REMEDY,
     blind_sector,
-    by_azimuth,
+    count_by_azimuth,
     lost_deg,
 )
 from densify.geometry.types import Float, Sweep
-from densify.readers.timeline import format_frames
+from densify.readers.timeline import Timeline, format_frames
 
-_SHORT = 0.3  # of the usual size of a file
+_SHORT = 0.3  # a file below this share of the usual size is short
 _FETCH = "fetch these files again; windows end before sweeps that cannot be read"
 _PERIODS_S = (0.015, 1.1)  # range of existing scanners, 50 Hz to 1 Hz
-_HOLE_PERIODS = 3.1
+_HOLE_PERIODS = 3.1  # a longer step between sweeps is a hole in time
+# Common mistake -> factor that corrects a period
 _STAMP_UNITS = {
     "seconds taken for nanoseconds": 1e9,
     "milliseconds taken for nanoseconds": 1e6,
@@ -29,11 +30,12 @@ _STAMP_UNITS = {
     "nanoseconds taken for seconds": 1e-9,
 }
 _WHOLE_SWEEP = (0.5, 1.5)  # plausible time from first to last point, in periods
-_TURN_S = (0.04, 0.25)  # of existing scanners, 25 to 4 Hz
-_WRONG_SPAN = (0.02, 10)  # periods; beyond, the unit of the point times is wrong
-_MEDIAN_RANGE_M = (1.5, 60.0)
-_LENGTH_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
+_TURN_S = (0.04, 0.25)  # duration of a turn of existing scanners, 25 to 4 Hz
+_WRONG_SPAN = (0.02, 10)  # in periods; outside, the unit of the point times is wrong
+_MEDIAN_RANGE_M = (1.5, 60.0)  # plausible median range of a sweep
+_LENGTH_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}  # in metres
 _FAR_OFF = 10.0  # distance from the origin, as a multiple of the spread of the points
+# Name of an axis -> unit vector along it; z first, because equal shares go to the first
 _UP = {
     sign + axis: (-1.0 if sign else 1.0) * np.eye(3)["xyz".index(axis)]
     for axis in "zyx"
@@ -44,11 +46,11 @@ _UP_MEANS = {
     "-y": "a camera's axes: x right, y down, z forward",
     "y": "y up",
 }
-_NEAR_M = 25.0
-_LAYER_M = 0.3
-_LEAST_GROUND, _MOST_BELOW = 0.08, 0.2  # shares of the near returns
-_HIGHEST_M = 0.3  # in a vehicle frame the road is at height 0
-_CLEARLY = 1.5
+_NEAR_M = 25.0  # range of the returns in which the ground is searched
+_LAYER_M = 0.3  # thickness of the layer that holds the ground
+_LEAST_GROUND, _MOST_BELOW = 0.08, 0.2  # shares of the near returns in and below the ground
+_HIGHEST_M = 0.3  # highest ground; in a vehicle frame the road is at height 0
+_CLEARLY = 1.5  # ratio of two shares from which the larger one is clearly better
 
 
 def check_sweep_files(sample: Sample) -> list[Finding]:
@@ -82,7 +84,8 @@ def check_sweep_files(sample: Sample) -> list[Finding]:
 def check_stamps(sample: Sample) -> list[Finding]:
     """Check the sweeps' reference times: order, rate and holes."""
     timeline = sample.timeline
-    frames, step_ns = timeline.frames, np.diff(timeline.stamp_ns)
+    frames = timeline.frames
+    step_ns = np.diff(timeline.stamp_ns)
     if timeline.unknown:
         frame, reason = next(iter(timeline.unknown.items()))
         text = (
@@ -103,29 +106,41 @@ def check_stamps(sample: Sample) -> list[Finding]:
         )
         remedy = "sort the sweeps by their stamps, or correct the file of stamps"
         return [finding("stamps", WRONG, text, remedy, num_backward=len(backward))]
-    findings = [_check_rate(timeline.period_ns * 1e-9)]
-    rows = np.flatnonzero(step_ns > _HOLE_PERIODS * timeline.period_ns)
-    if len(rows):
-        longest = int(rows[np.argmax(step_ns[rows])])
-        text = (
-            f"{len(rows)} of more than three periods, the longest of {step_ns[longest] * 1e-9:.1f} "
-            f"s after frame {frames[longest]}; windows end there (after frames "
-            f"{format_frames(frames[row] for row in rows)})"
-        )
-        remedy = "nothing, if the sweeps were never recorded; else fetch them again"
-        findings.append(finding("holes in time", SUSPICIOUS, text, remedy, num_holes=len(rows)))
-    return findings
+    return [_check_rate(timeline.period_ns * 1e-9), *_check_holes(timeline)]
+
+
+def _check_holes(timeline: Timeline) -> list[Finding]:
+    """Report holes in time between sweeps, if there are any."""
+    frames = timeline.frames
+    step_ns = np.diff(timeline.stamp_ns)
+    holes = np.flatnonzero(step_ns > _HOLE_PERIODS * timeline.period_ns)
+    if not len(holes):
+        return []
+    longest = int(holes[np.argmax(step_ns[holes])])
+    text = (
+        f"{len(holes)} of more than three periods, the longest of {step_ns[longest] * 1e-9:.1f} "
+        f"s after frame {frames[longest]}; windows end there (after frames "
+        f"{format_frames(frames[row] for row in holes)})"
+    )
+    remedy = "nothing, if the sweeps were never recorded; else fetch them again"
+    return [finding("holes in time", SUSPICIOUS, text, remedy, num_holes=len(holes))]
 
 
 def _check_rate(period_s: float) -> Finding:
+    """Check that the period of the sweeps is that of an existing scanner."""
     least_s, most_s = _PERIODS_S
     if least_s <= period_s <= most_s:
         return finding("stamps", FINE, f"{1 / period_s:.2f} Hz, ascending", period_s=period_s)
     text = f"from sweep to sweep {period_s:.3g} s pass, expected {least_s} to {most_s} s"
-    fits = [name for name, f in _STAMP_UNITS.items() if least_s <= period_s * f <= most_s]
-    if fits:
-        text += f"; it would be {1 / (period_s * _STAMP_UNITS[fits[0]]):.1f} Hz with {fits[0]}"
-    verdict = WRONG if fits else SUSPICIOUS
+    mistakes = [
+        mistake
+        for mistake, factor in _STAMP_UNITS.items()
+        if least_s <= period_s * factor <= most_s
+    ]
+    if mistakes:
+        rate_hz = 1 / (period_s * _STAMP_UNITS[mistakes[0]])
+        text += f"; it would be {rate_hz:.1f} Hz with {mistakes[0]}"
+    verdict = WRONG if mistakes else SUSPICIOUS
     return finding("stamps", verdict, text, "correct the unit of the stamps", period_s=period_s)
 
 
@@ -139,76 +154,96 @@ def check_point_times(sample: Sample) -> list[Finding]:
 
 
 def _check_point_times_of(sample: Sample, lidar: int) -> Finding:
+    """Check the firing times of one scanner."""
     period_s = sample.timeline.period_ns * 1e-9
     offsets_s = [
         sweep.offset_ns[sweep.lidar == lidar] * 1e-9
         for sweep in sample.middles
         if sweep.offset_ns is not None
     ]
+    # The first and the last 0.1 % may be stray.
     ends_s = [np.percentile(offset_s, [0.1, 99.9]) for offset_s in offsets_s if len(offset_s)]
     low_s, high_s = np.median(ends_s, axis=0).tolist()
-    span, share_before = (high_s - low_s) / period_s, -low_s / max(high_s - low_s, 1e-12)
+    span = (high_s - low_s) / period_s
+    share_before = -low_s / max(high_s - low_s, 1e-12)
     text = (
         f"{low_s * 1e3:+.1f} to {high_s * 1e3:+.1f} ms around the stamp, {span:.3g} periods; "
         f"the stamp is at {round(100 * share_before)} % of the sweep"
     )
-    verdict, remedy = SUSPICIOUS, "compare the point times with the scanner's rate"
+    verdict = SUSPICIOUS
+    remedy = "compare the point times with the scanner's rate"
     if _WHOLE_SWEEP[0] <= span <= _WHOLE_SWEEP[1]:
         verdict = FINE
     elif span < 1 and _TURN_S[0] <= high_s - low_s <= _TURN_S[1]:
-        verdict, text = FINE, f"{text}; one of {round(1 / span)} turns of the scanner was kept"
+        verdict = FINE
+        text += f"; one of {round(1 / span)} turns of the scanner was kept"
     elif not _WRONG_SPAN[0] <= span <= _WRONG_SPAN[1]:
-        verdict, remedy = WRONG, "correct the unit of the point times"
+        verdict = WRONG
+        remedy = "correct the unit of the point times"
     name = "point times" + f" of scanner {lidar}" * (lidar > 0)
     return finding(name, verdict, text, remedy, first_s=low_s, last_s=high_s)
 
 
 def check_units(sample: Sample) -> list[Finding]:
     """Check that the points are in metres and that the scanner is at the origin."""
-    name, (least_m, most_m) = "unit of points", _MEDIAN_RANGE_M
-    middles = [sweep.points for sweep in sample.middles]
-    range_m = float(np.median([_median_range_m(points) for points in middles]))
+    name = "unit of points"
+    least_m, most_m = _MEDIAN_RANGE_M
+    clouds = [sweep.points for sweep in sample.middles]
+    range_m = float(np.median([_median_range_m(points) for points in clouds]))
     if least_m <= range_m <= most_m:
         text = f"half of the returns within {range_m:.1f} m"
         return [finding(name, FINE, text, median_range_m=range_m)]
-    around_m = float(np.median([_median_range_m(p - np.median(p, axis=0)) for p in middles]))
-    fits = [u for u, f in _LENGTH_UNITS.items() if least_m <= range_m * f <= most_m]
+
+    # Points in a map's coordinates are far from the origin, but close to each other.
+    spreads_m = [_median_range_m(points - np.median(points, axis=0)) for points in clouds]
+    spread_m = float(np.median(spreads_m))
+    units = [
+        unit for unit, factor in _LENGTH_UNITS.items() if least_m <= range_m * factor <= most_m
+    ]
     text = f"half of the returns are farther than {range_m:.4g} m"
-    verdict, remedy = SUSPICIOUS, "scale the points to metres (sweeps: scale_m in densify.yaml)"
-    if least_m <= around_m <= most_m and range_m > _FAR_OFF * around_m:
-        text += f", and within {around_m:.1f} m of each other's middle, as if they were in a map's"
+    verdict = SUSPICIOUS
+    remedy = "scale the points to metres (sweeps: scale_m in densify.yaml)"
+    if least_m <= spread_m <= most_m and range_m > _FAR_OFF * spread_m:
+        text += f", and within {spread_m:.1f} m of each other's middle, as if they were in a map's"
         text += " coordinates"
-        verdict, remedy = WRONG, MAP_FRAME_REMEDY
+        verdict = WRONG
+        remedy = MAP_FRAME_REMEDY
     else:
         text += f", expected {least_m} to {most_m:.0f} m"
-        if fits:
-            verdict, text = WRONG, f"{text}, as if they were in {fits[0]}"
+        if units:
+            verdict = WRONG
+            text += f", as if they were in {units[0]}"
     return [finding(name, verdict, text, remedy, median_range_m=range_m)]
 
 
 def _median_range_m(points: Float) -> float:
+    """Return the median distance of points (N,3) from the origin."""
     return float(np.median(np.linalg.norm(points, axis=1)))
 
 
 def check_axes(sample: Sample) -> list[Finding]:
     """Check that z points up: one level layer, the ground, holds most returns, with few below."""
-    share = {
-        name: float(np.median([_ground_share(sweep, up) for sweep in sample.middles]))
-        for name, up in _UP.items()
+    shares = {
+        axis: float(np.median([_ground_share(sweep, up) for sweep in sample.middles]))
+        for axis, up in _UP.items()
     }
-    best = max(share, key=lambda name: share[name])
+    best = max(shares, key=lambda axis: shares[axis])
     text = (
-        f"{100 * share[best]:.0f} % of the near returns lie in one layer below the scanner if "
-        f"{best} is up" + (f", {100 * max(share['z'], 0):.0f} % if z is" if best != "z" else "")
+        f"{100 * shares[best]:.0f} % of the near returns lie in one layer below the scanner if "
+        f"{best} is up"
     )
-    verdict, remedy = WRONG, "turn the points so that z is up (sweeps: axes in densify.yaml)"
-    if share[best] < _LEAST_GROUND:
-        verdict, text = UNKNOWN, "no ground was found along any axis"
-    elif share["z"] >= _LEAST_GROUND or share[best] < _CLEARLY * share["z"]:
+    if best != "z":
+        text += f", {100 * max(shares['z'], 0):.0f} % if z is"
+    verdict = WRONG
+    remedy = "turn the points so that z is up (sweeps: axes in densify.yaml)"
+    if shares[best] < _LEAST_GROUND:
+        verdict = UNKNOWN
+        text = "no ground was found along any axis"
+    elif shares["z"] >= _LEAST_GROUND or shares[best] < _CLEARLY * shares["z"]:
         verdict = FINE
     elif best in _UP_MEANS:
         text += f" ({_UP_MEANS[best]})"
-    values = {f"share_{name}": number for name, number in share.items()}
+    values = {f"share_{axis}": share for axis, share in shares.items()}
     return [finding("axes", verdict, text, remedy, **values)]
 
 
@@ -219,24 +254,29 @@ def _ground_share(sweep: Sweep, up: Float) -> float:
     height_m = sweep.points[np.linalg.norm(sweep.points, axis=1) < _NEAR_M] @ up
     if not len(height_m):
         return 0.0
-    low_m, high_m = np.percentile(height_m, [0.5, 99.5])
+    low_m, high_m = np.percentile(height_m, [0.5, 99.5])  # without stray returns
+    # Bins are half a layer high. A layer is two neighbouring bins, and layers overlap.
     edges = np.arange(low_m - _LAYER_M, high_m + 2 * _LAYER_M, 0.5 * _LAYER_M)
-    share = np.histogram(height_m, edges)[0] / len(height_m)
-    layer = share[:-1] + share[1:]
-    below = np.cumsum(share)[:-1] - share[:-1]
-    even = _LAYER_M / max(float(high_m - low_m), _LAYER_M)
-    allowed = (below < _MOST_BELOW) & (edges[:-2] < _HIGHEST_M)
-    return float(layer[allowed].max(initial=0.0)) - even
+    bin_share = np.histogram(height_m, edges)[0] / len(height_m)
+    layer_share = bin_share[:-1] + bin_share[1:]
+    share_below = np.cumsum(bin_share)[:-1] - bin_share[:-1]
+    even_share = _LAYER_M / max(float(high_m - low_m), _LAYER_M)
+    is_allowed = (share_below < _MOST_BELOW) & (edges[:-2] < _HIGHEST_M)
+    return float(layer_share[is_allowed].max(initial=0.0)) - even_share
 
 
 def check_directions(sample: Sample) -> list[Finding]:
     """Check that sweeps have returns in all directions, as far as the scanner sees."""
-    returns = [np.stack([by_azimuth(s) for s in spot.sweeps]) for spot in sample.spots]
-    width_deg = [float(lost_deg(of_spot).max()) for of_spot in returns]
-    sectors = [blind_sector(of_spot) for of_spot in returns]
-    name, widest_deg = "directions", max(width_deg)
+    name = "directions"
+    spot_returns = [
+        np.stack([count_by_azimuth(sweep) for sweep in spot.sweeps]) for spot in sample.spots
+    ]
+    widths_deg = [float(lost_deg(returns).max()) for returns in spot_returns]
+    sectors = [blind_sector(returns) for returns in spot_returns]
+    widest_deg = max(widths_deg)
     if widest_deg >= LOST_DEG:
-        frames = format_frames(s.frame for s in sample.spots[int(np.argmax(width_deg))].sweeps)
+        spot = sample.spots[int(np.argmax(widths_deg))]
+        frames = format_frames(sweep.frame for sweep in spot.sweeps)
         text = (
             f"one of the sweeps {frames} lacks {widest_deg:.0f} deg of azimuth that the others "
             f"measured"
@@ -254,7 +294,8 @@ def check_intensity(sample: Sample) -> list[Finding]:
     """Check that intensities are between 0 and 1."""
     values = np.concatenate([sweep.intensity for sweep in sample.middles])
     low, high = float(values.min()), float(values.max())
-    verdict, text = FINE, f"{low:g} to {high:g}"
+    verdict = FINE
+    text = f"{low:g} to {high:g}"
     if low < 0 or high > 1:
         verdict = SUSPICIOUS
         text += ", expected 0 to 1; only pictures and the clouds' column suffer"

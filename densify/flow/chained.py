@@ -12,9 +12,9 @@ from densify.geometry import poses
 from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Float, FlowField, Int, Stretch
 
-_NUM_NEIGHBORS = 3
+_NUM_NEIGHBORS = 3  # points whose deviations are averaged
 _LINE_M = 0.05  # points with less scatter about a line count as on the line
-_MAX_GAP_M = 0.5
+_MAX_GAP_M = 0.5  # greatest distance to a moving point that continues a flow
 
 
 @dataclass(frozen=True)
@@ -36,28 +36,34 @@ class ChainedMotion:
         points. A point is lost if its object has no points in the next sweep, or if no moving point
         is within 0.5 m.
         """
-        i, j = self.stretch.frames.index(frame), self.stretch.frames.index(target)
-        return self._flow(i, j)
+        i = self.stretch.frames.index(frame)
+        j = self.stretch.frames.index(target)
+        return self._zero_flow(i) if i == j else self._flow(i, j)
+
+    def _zero_flow(self, i: int) -> FlowField:
+        """Return the flow of sweep index i to itself: 0, with the moving points of a step."""
+        num_sweeps = len(self.stretch.sweeps)
+        if num_sweeps == 1:
+            return FlowField.zero(len(self.stretch.sweeps[i].sweep))
+        step = self._flow(i, i + 1 if i + 1 < num_sweeps else i - 1)
+        return replace(step, displacement=np.zeros_like(step.displacement))
 
     def _flow(self, i: int, j: int) -> FlowField:
-        num_sweeps = len(self.stretch.sweeps)
-        if i == j and num_sweeps > 1:  # a step to a neighbour has the moving points
-            step = self._flow(i, i + 1 if i + 1 < num_sweeps else i - 1)
-            return replace(step, displacement=np.zeros_like(step.displacement))
-        if i == j:
-            return FlowField.zero(len(self.stretch.sweeps[i].sweep))
+        """Return the flow of sweep index i to another sweep index j; each pair is cached."""
         if (i, j) not in self._flows:
-            k = i + (1 if j > i else -1)  # the neighbour of sweep i towards j
-            if k == j:
-                flow = self._with_velocity(self.step(i, j), i, j)
+            neighbour = i + (1 if j > i else -1)  # next to sweep i, towards j
+            if neighbour == j:
+                flow = self._add_velocity(self.step(i, j), i, j)
             else:
-                flow = self._follow(i, k, self._flow(k, j))
+                flow = self._follow(i, neighbour, self._flow(neighbour, j))
             self._flows[i, j] = flow
         return self._flows[i, j]
 
-    def _with_velocity(self, step: FlowField, source: int, target: int) -> FlowField:
-        stamps_ns = [self.stretch.sweeps[i].sweep.stamp_ns for i in (source, target)]
-        velocity_m_s = step.displacement / ((stamps_ns[1] - stamps_ns[0]) * 1e-9)
+    def _add_velocity(self, step: FlowField, i: int, j: int) -> FlowField:
+        """Return the flow of sweep index i to j with its mean velocity."""
+        stamp_i_ns = self.stretch.sweeps[i].sweep.stamp_ns
+        stamp_j_ns = self.stretch.sweeps[j].sweep.stamp_ns
+        velocity_m_s = step.displacement / ((stamp_j_ns - stamp_i_ns) * 1e-9)
         return replace(step, velocity_m_s=velocity_m_s)
 
     def _follow(self, i: int, k: int, flow_k: FlowField) -> FlowField:
@@ -65,9 +71,11 @@ class ChainedMotion:
         step = self._flow(i, k)
         sweep_i, sweep_k = self.stretch.sweeps[i], self.stretch.sweeps[k]
         T_k_i = self.stretch.T_target_source(sweep_k.frame, sweep_i.frame)
-        displacement, lost = step.displacement.copy(), step.lost.copy()
+        R_k_i = T_k_i[:3, :3]
+        displacement = step.displacement.copy()
+        lost = step.lost.copy()
         velocity_m_s = np.zeros_like(displacement)
-        # (N,3) at the reference time of sweep k
+        # (N,3) points of sweep k at its reference time: ``total`` also moves them to the target
         points_k = sweep_k.sweep.points + flow_k.total - flow_k.displacement
         for instance in np.unique(step.instance[step.moving]):
             rows = np.flatnonzero(step.moving & (step.instance == instance))
@@ -76,17 +84,19 @@ class ChainedMotion:
                 lost[rows] = True
                 continue
             arrived = poses.transform(T_k_i, sweep_i.sweep.points[rows] + step.total[rows])
-            gap_m, nearest = nearest_k(tree_of(points_k[rows_k]), arrived, _NUM_NEIGHBORS)
+            members_k = points_k[rows_k]
+            gap_m, nearest = nearest_k(tree_of(members_k), arrived, _NUM_NEIGHBORS)
             weight = 1 / (gap_m + 1e-3)
             weight /= weight.sum(axis=1, keepdims=True)
-            rigid_flow, deviation = np.zeros_like(arrived), flow_k.displacement[rows_k]
             if instance >= 0:
-                T = _object_motion(points_k[rows_k], points_k[rows_k] + deviation)
+                target = members_k + flow_k.displacement[rows_k]
+                T = _object_motion(members_k, target)
                 rigid_flow = poses.transform(T, arrived) - arrived
-                deviation = points_k[rows_k] + deviation - poses.transform(T, points_k[rows_k])
-            else:
+                deviation = target - poses.transform(T, members_k)
+            else:  # moving points without an object
+                rigid_flow = np.zeros_like(arrived)
+                deviation = flow_k.displacement[rows_k]
                 lost[rows[gap_m[:, 0] > _MAX_GAP_M]] = True
-            R_k_i = T_k_i[:3, :3]
             displacement[rows] += (rigid_flow + _mean(deviation, nearest, weight)) @ R_k_i
             if flow_k.velocity_m_s is not None:
                 velocity_k_m_s = flow_k.velocity_m_s[rows_k]

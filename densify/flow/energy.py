@@ -46,6 +46,7 @@ def energy(
         source: (n,3) metres, points p.
         target: (m,3) metres, points q, in the frame of the source.
         laplacian: (n,n) L of `densify.flow.objective.laplacian`.
+        alpha: Weight of smoothness.
     """
     if flow.shape != source.shape:
         raise InputError(

@@ -75,7 +75,7 @@ def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> 
 
 
 def check_engine(spec: str) -> None:
-    """Import an engine ``NAME[:ARGUMENT]`` and check its argument."""
+    """Import an engine ``NAME[:ARGUMENT]`` and check its argument; InputError if it is bad."""
     row, argument = engine(spec)
     check = getattr(row.work(), "check_argument", None)
     if check is not None:

@@ -59,15 +59,15 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
         raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
     points = checked_cloud(points, "points")
     num = len(points)
-    num_listed = min(num_neighbors, num - 1) + 1  # with the point itself
-    nearest = cKDTree(points).query(points, np.arange(1, num_listed + 1))
-    distance_m, column = (np.ravel(array) for array in nearest)
-    row = np.repeat(np.arange(num), num_listed)
-    edge = column != row  # with more than k duplicates the point itself may be missing
-    listed = csr_array(
-        (np.exp(-(distance_m[edge] ** 2)), (row[edge], column[edge])), shape=(num, num)
-    )
-    weights = csr_array(listed.maximum(listed.T) + eye_array(num))
+    num_nearest = min(num_neighbors, num - 1) + 1  # with the point itself
+    distance_m, neighbour = cKDTree(points).query(points, np.arange(1, num_nearest + 1))
+    row = np.repeat(np.arange(num), num_nearest)
+    column = np.ravel(neighbour)
+    # With more than k duplicates, the point itself may be missing among the nearest.
+    is_edge = column != row
+    weight = np.exp(-(np.ravel(distance_m)[is_edge] ** 2))
+    directed = csr_array((weight, (row[is_edge], column[is_edge])), shape=(num, num))
+    weights = csr_array(directed.maximum(directed.T) + eye_array(num))
     weights.sort_indices()
     return weights
 
@@ -86,7 +86,7 @@ def laplacian(weights: csr_array) -> csr_array:
 
 SOLVERS = ("pcg", "adam")
 _LEARNING_RATE_M = 0.1  # of Adam, as published
-_FIRST_ALPHA = 1000.0  # whole surfaces slide at this alpha
+_FIRST_ALPHA = 1000.0  # whole surfaces move together at this alpha
 _LEVEL_FACTOR = 10 ** (2 / 3)  # greatest factor between the alphas of two levels
 _LEAST_ALPHA = 0.1  # last level for alpha = 0
 _LEVEL_TOLERANCE = 2e-3  # a level ends when an alternation lowers the energy by less (share)
@@ -142,20 +142,22 @@ def solve(
         initial: (n,3) flow to start from, None for 0. With it, pcg uses the final alpha at once.
     """
     settings = settings or SolverSettings()
-    moving, fixed = checked_cloud(source, "source"), checked_cloud(target, "target")
-    start = np.zeros_like(moving) if initial is None else checked_cloud(initial, "initial")
-    if start.shape != moving.shape:
-        raise InputError(f"initial: got shape {start.shape}, expected the source's {moving.shape}")
-    origin = moving.mean(axis=0)
-    smooth = laplacian(knn_graph(moving, settings.num_neighbors))
+    points = checked_cloud(source, "source")
+    target_points = checked_cloud(target, "target")
+    start = np.zeros_like(points) if initial is None else checked_cloud(initial, "initial")
+    if start.shape != points.shape:
+        raise InputError(f"initial: got shape {start.shape}, expected the source's {points.shape}")
+    graph_laplacian = laplacian(knn_graph(points, settings.num_neighbors))
+    origin = points.mean(axis=0)
+    points, target_points = points - origin, target_points - origin
     if settings.solver == "adam":
-        return _adam(moving - origin, fixed - origin, smooth, start, settings)
-    problem = _Problem(moving - origin, fixed - origin, smooth, settings.alpha)
-    first = settings.alpha if initial is not None else _FIRST_ALPHA
-    return _pcg(problem, start, _levels(first, settings.alpha))
+        return _solve_by_adam(points, target_points, graph_laplacian, start, settings)
+    problem = _Problem(points, target_points, graph_laplacian, settings.alpha)
+    first_alpha = settings.alpha if initial is not None else _FIRST_ALPHA
+    return _solve_by_pcg(problem, start, _levels(first_alpha, settings.alpha))
 
 
-def _adam(
+def _solve_by_adam(
     source: Float, target: Float, smooth: csr_array, start: Float, settings: SolverSettings
 ) -> Solution:
     """Return the solution by Adam, the published protocol, keeping the best flow of all steps."""
@@ -165,15 +167,17 @@ def _adam(
 
     with on_one_thread():
         flow = torch.from_numpy(start).requires_grad_()
-        points, goal = torch.from_numpy(source), torch.from_numpy(target)
+        points = torch.from_numpy(source)
+        target_points = torch.from_numpy(target)
         optimizer = torch.optim.Adam([flow], lr=_LEARNING_RATE_M)
-        value = energy(flow, points, goal, smooth, settings.alpha)
-        best_flow, best, energies = flow.detach().clone(), value, [value.total.item()]
+        value = energy(flow, points, target_points, smooth, settings.alpha)
+        best_flow, best = flow.detach().clone(), value
+        energies = [value.total.item()]
         for _ in range(settings.adam_num_steps):
             optimizer.zero_grad()
             value.total.backward()
             optimizer.step()
-            value = energy(flow, points, goal, smooth, settings.alpha)
+            value = energy(flow, points, target_points, smooth, settings.alpha)
             if value.total.item() < best.total.item():
                 best_flow, best = flow.detach().clone(), value
             energies.append(value.total.item())
@@ -190,14 +194,15 @@ class _Value:
         backward_m, to_source = cKDTree(moved).query(problem.target)
         self.flow = flow
         self.data = float(np.sum(forward_m**2) + np.sum(backward_m**2))  # E_d, m²
-        self.bent = problem.laplacian @ flow  # (n,3) L F
-        self.smoothness = float((flow * self.bent).sum())  # tr(FᵀLF), m²
+        self.laplacian_flow = problem.laplacian @ flow  # (n,3) L F
+        self.smoothness = float((flow * self.laplacian_flow).sum())  # tr(FᵀLF), m²
         self.total = self.data + problem.alpha * self.smoothness
-        back = problem.target - moved[to_source]
-        pulls = [np.bincount(to_source, back[:, axis], len(moved)) for axis in range(3)]
-        # (n,3) from each moved point to its matches: minus half the gradient of E_d
-        self.pull = problem.target[to_target] - moved + np.stack(pulls, axis=1)
-        # (n,) of each point, both ways
+        # (n,3) sums of the vectors from each moved point to its matches, in both directions. They
+        # are minus half the gradient of E_d.
+        offset = problem.target - moved[to_source]
+        backward_sum = [np.bincount(to_source, offset[:, axis], len(moved)) for axis in range(3)]
+        self.pull = problem.target[to_target] - moved + np.stack(backward_sum, axis=1)
+        # (n,) number of matches of each point, in both directions
         self.num_matches = 1.0 + np.bincount(to_source, minlength=len(moved))
 
     def at(self, alpha: float) -> float:
@@ -209,25 +214,28 @@ class _Problem:
     """A pair of clouds relative to the mean of the source, with the Laplacian and alpha."""
 
     def __init__(self, source: Float, target: Float, smooth: csr_array, alpha: float) -> None:
-        self.source, self.target = source, target
+        self.source = source
+        self.target = target
         self.target_tree = cKDTree(target)
-        self.laplacian, self.alpha = smooth, alpha
+        self.laplacian = smooth
+        self.alpha = alpha
         self.diagonal = smooth.diagonal()
 
 
-def _pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
+def _solve_by_pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
     """Return the solution by majorisation and minimisation, over levels of descending alpha."""
-    # At large alphas whole surfaces slide; from a small one points stick to their first neighbours.
+    # At large alphas whole surfaces move together. At a small alpha from the start, points would
+    # stay with their first neighbours.
     value = _Value(problem, start)
     energies = [value.total]
     for number, alpha in enumerate(levels):
         is_last = number == len(levels) - 1
         for _ in range(_MAX_LAST_ALTERNATIONS if is_last else _MAX_ALTERNATIONS):
-            before = value.at(alpha)
+            previous_energy = value.at(alpha)
             # With fixed matches, a quadratic bounds the energy above, tight at the current flow.
             value = _Value(problem, value.flow + _step(problem, value, alpha))
             energies.append(value.total)
-            if before - value.at(alpha) <= _LEVEL_TOLERANCE * value.at(alpha):
+            if previous_energy - value.at(alpha) <= _LEVEL_TOLERANCE * value.at(alpha):
                 break
     return Solution(value.flow, value.total, value.data, value.smoothness, tuple(energies))
 
@@ -239,18 +247,21 @@ def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
     diagonal = value.num_matches[:, None]
     inverse = 1.0 / (diagonal + alpha * problem.diagonal[:, None])
 
-    def product(x: Float) -> Float:
-        x = x.reshape(shape)
-        image: Float = diagonal * x + alpha * (problem.laplacian @ x)
-        return image.ravel()
+    def multiply(vector: Float) -> Float:
+        flow = vector.reshape(shape)
+        product: Float = diagonal * flow + alpha * (problem.laplacian @ flow)
+        return product.ravel()
+
+    def precondition(vector: Float) -> Float:
+        return (inverse * vector.reshape(shape)).ravel()
 
     size = (problem.source.size, problem.source.size)
     step, _ = cg(
-        LinearOperator(size, product),
-        (value.pull - alpha * value.bent).ravel(),
+        LinearOperator(size, multiply),
+        (value.pull - alpha * value.laplacian_flow).ravel(),
         rtol=_RESIDUAL_DROP,
         maxiter=_MAX_PRODUCTS,
-        M=LinearOperator(size, lambda x: (inverse * x.reshape(shape)).ravel()),
+        M=LinearOperator(size, precondition),
     )
     return step.reshape(shape)
 
@@ -260,6 +271,7 @@ def _levels(first: float, alpha: float) -> list[float]:
     lowest_alpha = max(alpha, _LEAST_ALPHA)
     if first <= lowest_alpha:
         return [alpha]
+    # 1e-9: rounding must not add a step to a whole number of them.
     num_steps = math.ceil(math.log(first / lowest_alpha) / math.log(_LEVEL_FACTOR) - 1e-9)
     return [*np.geomspace(first, lowest_alpha, num_steps + 1)[:-1].tolist(), alpha]
 
@@ -275,16 +287,16 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
 
 def _sweep_flow(scene: Scene, i: int, j: int, settings: Config) -> FlowField:
     """Return the flow of sweep index ``i`` to ``j``, in its lidar frame; 0 on the ground."""
-    clouds = [
-        poses.transform(s.T_world_lidar, s.sweep.points)
-        for s in (scene.stretch.sweeps[i], scene.stretch.sweeps[j])
-    ]
-    above, target_above = (scene.ground.above(c) >= ABOVE_GROUND_M for c in clouds)
+    source, target = scene.stretch.sweeps[i], scene.stretch.sweeps[j]
+    points = poses.transform(source.T_world_lidar, source.sweep.points)
+    target_points = poses.transform(target.T_world_lidar, target.sweep.points)
+    above = scene.ground.above(points) >= ABOVE_GROUND_M
+    target_above = scene.ground.above(target_points) >= ABOVE_GROUND_M
     field = FlowField.zero(len(above))
     if above.any() and target_above.any():
-        pair = flow_between(clouds[0][above], clouds[1][target_above], settings.objective)
-        R_world_lidar = scene.stretch.sweeps[i].T_world_lidar[:3, :3]
-        field.displacement[above] = pair.displacement @ R_world_lidar
+        pair = flow_between(points[above], target_points[target_above], settings.objective)
+        # From the world to the axes of the source's lidar
+        field.displacement[above] = pair.displacement @ source.T_world_lidar[:3, :3]
         field.moving[above] = pair.moving
     return field
 
@@ -306,23 +318,26 @@ def flow_between(
     )
     flow = solve(source, target, objective, initial).flow
     if settings.static_prior:
-        return _only_proven((np.asarray(source, float), np.asarray(target, float)), flow)
+        return _keep_moving_groups((np.asarray(source, float), np.asarray(target, float)), flow)
     static = FlowField.zero(len(flow))
     return replace(static, displacement=flow, moving=np.ones(len(flow), bool))
 
 
-def _only_proven(clouds: tuple[Float, Float], flow: Float) -> FlowField:
+def _keep_moving_groups(clouds: tuple[Float, Float], flow: Float) -> FlowField:
     """Keep the flow (N,3) of groups of points that certainly move; other points get flow 0."""
     field = FlowField.zero(len(flow))
-    source, target = (PairCloud(c, np.full(len(c), float(i))) for i, c in enumerate(clouds))
+    source = PairCloud(clouds[0], np.zeros(len(clouds[0])))
+    target = PairCloud(clouds[1], np.ones(len(clouds[1])))
     moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > MIN_MOTION_M)
     num_groups, group = link(source.points[moved], LINK_M)
     instance = 0
     for k in range(num_groups):
         rows = moved[group == k]
-        state, centre = np.append(np.median(flow[rows], axis=0), 0.0), source.points[rows].mean(0)
-        # by its common translation: the free flow always comes closer to the target
-        if judge(k, rows, RigidMotion(state, centre), source, target).moves():
+        # A group is judged by its common translation: the flow of single points always brings them
+        # closer to the target.
+        state = np.append(np.median(flow[rows], axis=0), 0.0)
+        motion = RigidMotion(state, source.points[rows].mean(0))
+        if judge(k, rows, motion, source, target).moves():
             field.displacement[rows] = flow[rows]
             field.moving[rows] = True
             field.instance[rows] = instance

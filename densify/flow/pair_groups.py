@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Find the rigid groups of one cloud that certainly moved to another position in another cloud.
 
-The rings of a scanner hit other parts of an object after it has moved. Therefore a point may lie
-anywhere along a surface of the other cloud, but not off it: the neighbours of a position are
-thinned until they span several rings, and a normal distribution is fitted to them (Biber, Straßer,
-"The Normal Distributions Transform", IROS 2003). A group starts at the displacements at which most
-of its points come close to the other cloud (Hough 1962), and is aligned from there. A motion is
-judged by the likelihood ratio of both clouds: the group moves, or it is static. Points with firing
-times are compared at their own times.
+The rings of a scanner hit other parts of an object after it has moved. A point therefore costs
+nothing anywhere along a surface of the other cloud, and costs more away from the surface. A surface
+is a normal distribution, fitted to neighbours that are thinned until they span several rings
+(Biber, Straßer, "The Normal Distributions Transform", IROS 2003).
+
+A vote proposes the displacements that bring most points of a group close to the other cloud (Hough
+1962). The group is aligned from each of them. A motion is judged by the likelihood ratio of both
+clouds: the group moves, or it is static. Points with firing times are compared at their own times.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 
@@ -39,7 +41,7 @@ SURFACE_M = 1.0
 MISSING = 3.0
 """Cost of a point without surface, and greatest cost."""
 _MIN_NEIGHBORS = 3
-_NOISE_M = 0.1  # of a point, of a motion, and of level ground; a closer point is a counterpart
+_NOISE_M = 0.1  # noise of a point and of level ground; a closer point is a counterpart
 _EVEN_M = 0.15  # voxel in which one point is kept, because points are denser along rings
 
 
@@ -59,12 +61,13 @@ class PairCloud:
 
     @cached_property
     def _even(self) -> Bool:
+        """(N,) True for the only point that is kept in its voxel of 0.15 m."""
         even = np.zeros(len(self.points), bool)
         even[thinned(self.points, np.arange(len(even)), _EVEN_M, 1)] = True
         return even
 
     def evenly(self, rows: Int) -> Int:
-        """Return the rows that are the only ones kept in their voxel of 0.15 m."""
+        """Return those of the given rows that are kept, at most one in each voxel of 0.15 m."""
         return rows[self._even[rows]]
 
     def rows_around(self, points: Float) -> Int:
@@ -83,22 +86,26 @@ class Surface:
 
     def cost(self, points: Float) -> Float:
         """Return (N,) costs of points (N,3), 0 to 3: half their squared Mahalanobis distances."""
-        cost, num = np.full(len(points), MISSING), min(NUM_NEAR, self._tree.n)
+        cost = np.full(len(points), MISSING)
+        num = min(NUM_NEAR, self._tree.n)
         if num < _MIN_NEIGHBORS:
             return cost
         ranks = np.arange(1, num + 1)
-        away_m, row = self._tree.query(points, ranks, distance_upper_bound=SURFACE_M)
-        exists = np.isfinite(away_m)
-        enough = np.flatnonzero(exists.sum(axis=1) >= _MIN_NEIGHBORS)
-        exists, row = exists[enough], np.asarray(row)[enough]
+        distance_m, neighbour = self._tree.query(points, ranks, distance_upper_bound=SURFACE_M)
+        exists = np.isfinite(distance_m)
+        on_surface = np.flatnonzero(exists.sum(axis=1) >= _MIN_NEIGHBORS)
+        exists = exists[on_surface]
+        neighbour = np.where(exists, np.asarray(neighbour)[on_surface], 0)
+        # The normal distribution of the neighbours
         weight = exists / exists.sum(axis=1, keepdims=True)
-        arms = self._points[np.where(exists, row, 0)]
+        arms = self._points[neighbour]
         mean = np.einsum("nk,nki->ni", weight, arms)
         arms -= mean[:, None]
         covariance = arms.transpose(0, 2, 1) @ (weight[..., None] * arms) + _NOISE_M**2 * np.eye(3)
-        off = points[enough] - mean
-        squared = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0])
-        cost[enough] = np.minimum(squared / 2, MISSING)
+        offset = points[on_surface] - mean
+        scaled_offset = np.linalg.solve(covariance, offset[..., None])[..., 0]
+        squared = np.einsum("ni,ni->n", offset, scaled_offset)
+        cost[on_surface] = np.minimum(squared / 2, MISSING)
         return cost
 
 
@@ -121,51 +128,61 @@ def find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
 def group_around(points: Float, unexplained: Bool) -> Int:
     """Return (N,) labels of the groups of points (N,3) that may be moving, -1 for none.
 
-    Connected points form one group if it is no longer than a vehicle. In longer groups only the
-    points close to unexplained points form groups.
+    Connected points form one group if it is no longer than a vehicle. In longer groups, such as
+    walls, only points close to ``unexplained`` (N,) points form groups.
     """
-    num, label = link(points, LINK_M)
-    low, high = np.full((num, 2), np.inf), np.full((num, 2), -np.inf)
-    np.minimum.at(low, label, points[:, :2])
-    np.maximum.at(high, label, points[:, :2])
-    whole = np.linalg.norm(high - low, axis=1) <= _MAX_EXTENT_M
-    group, long_rows = label.copy(), np.flatnonzero(~whole[label])
+    num_groups, group = link(points, LINK_M)
+    low = np.full((num_groups, 2), np.inf)
+    np.minimum.at(low, group, points[:, :2])
+    high = np.full((num_groups, 2), -np.inf)
+    np.maximum.at(high, group, points[:, :2])
+    is_vehicle_sized = np.linalg.norm(high - low, axis=1) <= _MAX_EXTENT_M
+    long_rows = np.flatnonzero(~is_vehicle_sized[group])
     _, cluster = cluster_around(points[long_rows], unexplained[long_rows])
-    group[long_rows] = np.where(cluster >= 0, num + cluster, -1)
-    return group
+    # Labels from num_groups on are in use for no other group.
+    label = group.copy()
+    label[long_rows] = np.where(cluster >= 0, num_groups + cluster, -1)
+    return label
 
 
 def road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
-    """Return the rows of each group that may be a road user, not a crown or a wall.
+    """Return the rows of each group that may be a road user, and not a treetop or a wall.
 
-    All arrays are (N,). ``group`` is -1 for none, ``height_m`` is above the ground.
+    Args:
+        group: (N,) label of each point's group, -1 for none.
+        unexplained: (N,) True for points without a counterpart in the other cloud.
+        height_m: (N,) height of the points above the ground.
     """
     rows = np.flatnonzero(group >= 0)
     rows = rows[np.argsort(group[rows], kind="stable")]
-    groups = np.split(rows, np.flatnonzero(np.diff(group[rows])) + 1)
+    begins = np.flatnonzero(np.diff(group[rows])) + 1  # where the label changes
     users = []
-    for members in groups:
+    for members in np.split(rows, begins):
         if len(members) >= MIN_POINTS and unexplained[members].sum() >= MIN_FIT:
+            # Percentiles, because single points may be of something else
             low_m, high_m = np.percentile(height_m[members], (5, 95))
             if low_m <= _MAX_LOW_M and high_m <= _MAX_HIGH_M:
                 users.append(members)
     return users
 
 
-_USUAL_S, _LONGEST_S = 0.1, 0.4  # assumed time between clouds if unknown; greatest time
+# Time between the clouds: assumed if unknown, and the longest that is searched
+_USUAL_S, _LONGEST_S = 0.1, 0.4
 MIN_MOTION_M = 0.1  # a shorter motion, or difference of two, may be an error of registration
 _NUM_STARTS, _APART_M = 5, 0.5  # displacements from the vote, and their least distance
 _PER_M = 1e-3  # loss of the vote per metre: of equal displacements the shortest is taken
 _REFINE_M = (0.08, 0.04, 0.02)  # steps of the refinement
 _YAW_PER_M = 0.25  # rad: 4 m from the centre, a point moves by the same step
-_START_M = 1.0  # standard deviation of a start
+_START_M = 1.0  # standard deviation of a voted displacement
 _MIN_GAIN = 10.0  # least log-likelihood ratio in each cloud: thousands of motions are tried
 _BALANCE = 0.25  # least gain of the target points, relative to the source: both are one object
 _MAX_MISFIT = 1.7  # greatest mean cost of the moved points
-_THIN_M, _ALONG = 0.05, 0.3  # a wall's thickness (rms), motion across
-_BAR_M, _LEVEL, _ACROSS = 0.12, 0.5, 0.2  # a rail's width (rms), rise, motion across
-_MAX_BAR_M, _MAX_BAR_POINTS = 0.75, 60  # length (rms) and points of a far car's back
-_SLOPE_STEP_M, _SLOPE_STEPS = 2.0, 4  # of the grid that is fitted around a position
+# Greatest thickness (RMS) of a wall, and greatest share of the motion across it
+_WALL_M, _WALL_ACROSS = 0.05, 0.3
+# Greatest width (RMS) of a rail, its greatest rise, and least share of the motion along it
+_RAIL_M, _RAIL_RISE, _RAIL_ALONG = 0.12, 0.5, 0.2
+_MAX_BACK_M, _MAX_BACK_POINTS = 0.75, 60  # length (RMS) and points of a far car's back
+_SLOPE_STEP_M, _SLOPE_STEPS = 2.0, 4  # the grid that is fitted around a position
 
 
 @dataclass(frozen=True)
@@ -202,65 +219,83 @@ class Proposal:
     @property
     def gain(self) -> float:
         """The log-likelihood ratio of both clouds, without target points that fit static better."""
-        # They would pull the motion: an object shows other parts after it has moved.
+        # An object shows other parts after it has moved. Target points on these parts fit static
+        # better, and would bias the motion.
         return self.source_gain + float(np.maximum(self.target_gain, 0.0).sum())
 
-    def goes_with(self, proposal: Proposal) -> bool:
-        """Return True if the motion of ``proposal``, at this group, is nearly the same."""
+    def moves_like(self, other_proposal: Proposal) -> bool:
+        """Return True if the motion of the other proposal, at this group, is nearly the same."""
         centre = self.motion.centre[None]
-        offset = self.motion.place(centre, 1.0) - proposal.motion.place(centre, 1.0)
+        offset = self.motion.place(centre, 1.0) - other_proposal.motion.place(centre, 1.0)
         return bool(np.linalg.norm(offset) < FIT_M)
 
     def moves(self, free: Bool | None = None) -> bool:
         """Return True if the group certainly moves.
 
-        free: (K,) True for target points that no other motion explains. None for all.
+        Args:
+            free: (K,) True for target points that no other motion explains. None for all.
         """
-        counted = (
-            self.target_gain if free is None else self.target_gain[free | (self.target_gain < 0)]
-        )
+        counted_gain = self.target_gain
+        if free is not None:
+            counted_gain = self.target_gain[free | (self.target_gain < 0)]
         min_gain = max(_MIN_GAIN, _BALANCE * self.source_gain)
-        gains_enough = self.source_gain > _MIN_GAIN and counted.sum() > min_gain
-        return bool(gains_enough and self.misfit < _MAX_MISFIT)
+        is_explained = self.source_gain > _MIN_GAIN and counted_gain.sum() > min_gain
+        return bool(is_explained and self.misfit < _MAX_MISFIT)
 
 
 def judge(
     group: int, members: Int, motion: RigidMotion, source: PairCloud, target: PairCloud
 ) -> Proposal:
-    """Return the evidence that the source points ``members`` move together, against static ones.
+    """Return a motion of one group as a proposal, with the evidence that the group moves.
 
     Source points are compared with the target. Target points are compared with the source, in which
     only the group moves: points that stay at its old position count against the motion.
+
+    Args:
+        group: Index of the group.
+        members: (K,) rows of the group's source points.
+        motion: Motion of the group that is judged.
     """
     static = replace(motion, state=np.zeros(4))
     members = source.evenly(members)
-    cost_static, near_static = compare(source, members, target, static)
-    cost_moved, near_moved = compare(source, members, target, motion)
-    rows = np.union1d(near_static, near_moved)
+    static_cost, static_rows = compare(source, members, target, static)
+    moved_cost, moved_rows = compare(source, members, target, motion)
+    rows = np.union1d(static_rows, moved_rows)
     points = target.points[rows]
-    rows_around = source.rows_around(points)
-    static_rows = np.setdiff1d(rows_around, members, assume_unique=True)
-    target_cost = Surface(motion.at_start(source, members)).cost(motion.at_start(target, rows))
-    target_cost = np.minimum(target_cost, Surface(source.points[static_rows]).cost(points))
-    target_gain = Surface(source.points[rows_around]).cost(points) - target_cost
-    gain = float((cost_static - cost_moved).sum())
-    return Proposal(group, motion, gain, float(cost_moved.mean()), rows, target_gain)
+    # If the group moves, a target point lies on the moved group or on the rest of the source.
+    source_rows = source.rows_around(points)
+    rest = np.setdiff1d(source_rows, members, assume_unique=True)
+    group_cost = Surface(motion.at_start(source, members)).cost(motion.at_start(target, rows))
+    target_moved_cost = np.minimum(group_cost, Surface(source.points[rest]).cost(points))
+    target_static_cost = Surface(source.points[source_rows]).cost(points)
+    return Proposal(
+        group=group,
+        motion=motion,
+        source_gain=float((static_cost - moved_cost).sum()),
+        misfit=float(moved_cost.mean()),
+        rows=rows,
+        target_gain=target_static_cost - target_moved_cost,
+    )
 
 
 def compare(
     source: PairCloud, members: Int, target: PairCloud, motion: RigidMotion
 ) -> tuple[Float, Int]:
-    """Compare source points ``members`` (N,), which make a motion, with the target's surfaces.
+    """Compare source points with the target's surfaces, which are moved back by a motion.
 
-    Return the (N,) costs, and the indices of the target points that come close to the source points
-    when they are moved back.
+    Args:
+        members: (K,) rows of the source points.
+
+    Returns:
+        The (K,) costs of the source points, and the indices of the target points that come close
+            to the source points when they are moved back.
     """
-    at_start = motion.at_start(source, members)
-    ends = [motion.place(at_start, limit(target.share)) for limit in (np.min, np.max)]
-    rows = target.rows_around(np.concatenate(ends))
-    back = motion.at_start(target, rows)
-    close = _in_box(back, at_start, SURFACE_M)
-    return Surface(back[close]).cost(at_start), rows[close]
+    points = motion.at_start(source, members)
+    positions = [motion.place(points, share) for share in (target.share.min(), target.share.max())]
+    rows = target.rows_around(np.concatenate(positions))
+    target_points = motion.at_start(target, rows)
+    is_close = _in_box(target_points, points, SURFACE_M)
+    return Surface(target_points[is_close]).cost(points), rows[is_close]
 
 
 @dataclass(frozen=True)
@@ -276,32 +311,32 @@ class Search:
     initial: Float | None
 
     def proposals(self, group: int, members: Int) -> list[Proposal]:
-        """Return the motions by which the points ``members`` may move, with their evidence."""
+        """Return the motions by which a group may move, with their evidence.
+
+        Args:
+            group: Index of the group.
+            members: (K,) rows of the group's source points.
+        """
         points = self.source.points[members]
         centre = points.mean(axis=0)
         reach_m = MAX_SPEED_M_S * min(self.apart_s or _USUAL_S, _LONGEST_S)
-        limit_m, starts = reach_m, []
+        limit_m = reach_m
+        displacements = []  # (3,) each, from which the group is aligned
         if self.initial is not None:
-            starts = [np.median(self.initial[members], axis=0)]
-            limit_m = max(reach_m, float(np.linalg.norm(starts[0])) + _APART_M)
+            displacements = [np.median(self.initial[members], axis=0)]
+            limit_m = max(reach_m, float(np.linalg.norm(displacements[0])) + _APART_M)
         room_m = np.array([limit_m, limit_m, 0.0]) + LINK_M
         rows = self.target.strips.rows_inside(points.min(0) - room_m, points.max(0) + room_m)
         rows = rows[self.movable[rows]]
         if not len(rows):
             return []
         slope = _slope_of(self.ground, centre)
-        starts += self._vote(members, rows, slope, reach_m)
-        judged, states = list[Proposal](), list[Float]()
-        for start in starts:
-            state = self._align(RigidMotion(np.append(start, 0.0), centre), members, rows)
-            if state is None or any(
-                np.abs(state - s)[[0, 1, 3]].max() < MIN_MOTION_M for s in states
-            ):
-                continue
-            states.append(state)
+        displacements += self._vote(members, rows, slope, reach_m)
+        judged = list[Proposal]()
+        for state in self._align_all(displacements, centre, members, rows):
             state[2] = state[:2] @ slope
             moved_m = np.linalg.norm(state[:2])
-            if MIN_MOTION_M < moved_m <= limit_m and not _ambiguous(points, state[:3]):
+            if MIN_MOTION_M < moved_m <= limit_m and not _is_ambiguous(points, state[:3]):
                 motion = RigidMotion(state, centre)
                 judged.append(judge(group, members, motion, self.source, self.target))
         return [proposal for proposal in judged if proposal.moves()]
@@ -309,9 +344,15 @@ class Search:
     def refine(self, proposal: Proposal, members: Int) -> Proposal:
         """Return the proposal with the most likely motion nearby, by a pattern search.
 
-        Hooke, Jeeves, JACM 1961. The alignment holds rings on rings, the likelihood does not.
+        Alignment is biased towards positions at which scan lines match scan lines. The likelihood
+        is not. Pattern search: Hooke, Jeeves, JACM 1961.
+
+        Args:
+            proposal: Motion of the group to start from.
+            members: (K,) rows of the group's source points.
         """
         slope = _slope_of(self.ground, proposal.motion.centre)
+        # Steps (x, y, z, yaw): along the motion, across the motion, and about the vertical
         x, y = proposal.motion.state[:2] / np.linalg.norm(proposal.motion.state[:2])
         axes = np.array([[x, y, 0, 0], [-y, x, 0, 0], [0, 0, 0, _YAW_PER_M]])
         for step_m in _REFINE_M:
@@ -323,14 +364,15 @@ class Search:
                     state[2] = state[:2] @ slope
                     motion = replace(proposal.motion, state=state)
                     trial = judge(proposal.group, members, motion, self.source, self.target)
-                    proposal = max(proposal, trial, key=lambda p: p.gain)
+                    proposal = max(proposal, trial, key=lambda candidate: candidate.gain)
         return proposal
 
     def _vote(self, members: Int, rows: Int, slope: Float, reach_m: float) -> list[Float]:
         """Return displacements (3,) that bring most members close to the target points ``rows``."""
-        source, target = self.source, self.target
-        group = Group.of(source.points[members], source.share[members]).thinned(FEW_POINTS)
-        field = DistanceField.of(target.points[rows], target.share[rows])
+        group = Group.of(self.source.points[members], self.source.share[members])
+        group = group.thinned(FEW_POINTS)
+        field = DistanceField.of(self.target.points[rows], self.target.share[rows])
+        # All horizontal displacements within reach, along the ground
         steps = np.arange(-(reach_m // STEP_M), reach_m // STEP_M + 1) * STEP_M
         displacements = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
         displacements = displacements[np.hypot(*displacements.T) <= reach_m]
@@ -344,15 +386,33 @@ class Search:
             score[np.linalg.norm(displacements - voted[-1], axis=1) < _APART_M] = -1.0
         return voted
 
+    def _align_all(
+        self, displacements: list[Float], centre: Float, members: Int, rows: Int
+    ) -> list[Float]:
+        """Return the different states (4,) to which a group is aligned from the displacements."""
+        states = list[Float]()
+        for displacement in displacements:
+            start = RigidMotion(np.append(displacement, 0.0), centre)
+            state = self._align(start, members, rows)
+            if state is not None and not any(_are_alike(state, earlier) for earlier in states):
+                states.append(state)
+        return states
+
     def _align(self, start: RigidMotion, members: Int, rows: Int) -> Float | None:
         """Return the state (4,) that aligns members with target rows, None for too few matches."""
         model = Model(start.at_start(self.source, self.source.evenly(members)))
-        back = start.at_start(self.target, self.target.evenly(rows))
-        arrived = start.place(back[_in_box(back, model.points, GATES_M[0])], 1.0)
+        target_points = start.at_start(self.target, self.target.evenly(rows))
+        is_close = _in_box(target_points, model.points, GATES_M[0])
+        arrived = start.place(target_points[is_close], 1.0)
         if len(arrived) < MIN_FIT:
             return None
         std = np.append([_START_M, _START_M], PREDICTION_STD[2])
         return model.align(arrived, start.centre, start.state, std)
+
+
+def _are_alike(state: Float, other_state: Float) -> bool:
+    """Return True if two states (4,) differ by less than 0.1 m in x and y, and 0.1 rad in yaw."""
+    return bool(np.abs(state - other_state)[[0, 1, 3]].max() < MIN_MOTION_M)
 
 
 def _in_box(points: Float, inner: Float, slack_m: float) -> Bool:
@@ -366,24 +426,25 @@ def _in_box(points: Float, inner: Float, slack_m: float) -> Bool:
 def _slope_of(ground: HeightMap, position: Float) -> Float:
     """Return the slope (2,) of the ground around a position (3,), 0 where it is not plane."""
     steps = np.arange(-_SLOPE_STEPS, _SLOPE_STEPS + 1) * _SLOPE_STEP_M
-    away = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    height_m = ground.under(position[:2] + away)
+    offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    height_m = ground.under(position[:2] + offset)
     height_m -= height_m.mean()
-    slope: Float = away.T @ height_m / (away**2).sum(axis=0)
-    is_plane = (height_m - away @ slope).std() <= _NOISE_M  # not in clouds without ground points
+    slope: Float = offset.T @ height_m / (offset**2).sum(axis=0)
+    # A cloud without ground points has no plane ground.
+    is_plane = (height_m - offset @ slope).std() <= _NOISE_M
     return slope if is_plane else np.zeros(2)
 
 
-def _ambiguous(points: Float, displacement: Float) -> bool:
+def _is_ambiguous(points: Float, displacement: Float) -> bool:
     """Return True if the moved group could be another part of the same wall or rail."""
     _, scale, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
-    length_m, width_m, thickness_m = scale / np.sqrt(len(points))
+    length_m, width_m, thickness_m = scale / np.sqrt(len(points))  # RMS along the three axes
     moved_m = np.linalg.norm(displacement)
-    if width_m < _BAR_M and abs(axes[0, 2]) < _LEVEL:  # a rail, or the back of a far car
-        far_car = len(points) < _MAX_BAR_POINTS and length_m < _MAX_BAR_M
-        return bool(not far_car or abs(axes[0] @ displacement) > _ACROSS * moved_m)
-    along = abs(axes[-1] @ displacement) < _ALONG * moved_m
-    return bool(thickness_m < _THIN_M and (along or width_m < _THIN_M))
+    if width_m < _RAIL_M and abs(axes[0, 2]) < _RAIL_RISE:  # a rail, or the back of a far car
+        is_far_car = len(points) < _MAX_BACK_POINTS and length_m < _MAX_BACK_M
+        return bool(not is_far_car or abs(axes[0] @ displacement) > _RAIL_ALONG * moved_m)
+    is_along_wall = abs(axes[-1] @ displacement) < _WALL_ACROSS * moved_m
+    return bool(thickness_m < _WALL_M and (is_along_wall or width_m < _WALL_M))
 
 
 _BESIDE_M = 5.0  # groups closer than this may be parts of one object
@@ -397,25 +458,32 @@ def find_movers(
     apart_s: float | None = None,
     initial: Float | None = None,
 ) -> tuple[list[RigidMotion], Int]:
-    """Return the motions of the moving groups, and (N,) the index of each source point's, or -1.
+    """Return the motions of the moving groups, and the group of each source point.
 
     Args:
+        source: N points above the ground.
+        target: M points of the other cloud above the ground, in the same frame.
         height_m: (N,) height of the source points above the ground.
         apart_s: Time between the clouds, None if unknown. The search covers up to 38 m/s.
-        initial: (N,3) flow. A group also starts at the median flow of its members.
+        initial: (N,3) flow. The search of a group also starts at the median flow of its members.
+
+    Returns:
+        The motions, and (N,) the index of each source point's motion, -1 for static points.
     """
     clouds = source, target
     with ThreadPoolExecutor(2) as pool:
         unexplained = list(pool.map(find_unexplained, clouds, clouds[::-1]))
-        label, target_label = pool.map(group_around, (c.points for c in clouds), unexplained)
-        groups = road_users(label, unexplained[0], height_m)
-        search = Search(source, target, target_label >= 0, ground, apart_s, initial)
-        of_groups = pool.map(search.proposals, range(len(groups)), groups)
-        chosen = _choose([p for proposals in of_groups for p in proposals], len(target.points))
-        refined = list(pool.map(search.refine, chosen, [groups[p.group] for p in chosen]))
+        points = [cloud.points for cloud in clouds]
+        group, target_group = pool.map(group_around, points, unexplained)
+        members = road_users(group, unexplained[0], height_m)
+        search = Search(source, target, target_group >= 0, ground, apart_s, initial)
+        proposals = list(chain(*pool.map(search.proposals, range(len(members)), members)))
+        chosen = _choose(proposals, len(target.points))
+        chosen_members = [members[proposal.group] for proposal in chosen]
+        refined = list(pool.map(search.refine, chosen, chosen_members))
     instance = np.full(len(source.points), -1)
     for k, proposal in enumerate(refined):
-        instance[groups[proposal.group]] = k
+        instance[members[proposal.group]] = k
     for k, proposal in enumerate(refined):
         _attach(k, proposal.motion, instance, source, target)
     return [proposal.motion for proposal in refined], instance
@@ -428,7 +496,8 @@ def _choose(proposals: list[Proposal], num_targets: int) -> list[Proposal]:
     for i in np.argsort(-_gain_with_neighbours(proposals), kind="stable"):
         proposal = proposals[i]
         # Two scanners see one object at two positions, hence its groups may share target points.
-        differs = [not proposal.goes_with(earlier) for earlier in chosen.values()]
+        differs = [not proposal.moves_like(earlier) for earlier in chosen.values()]
+        # The last entry, of index -1, stands for points that no motion explains.
         free = ~np.array([*differs, False])[explained_by[proposal.rows]]
         if proposal.group not in chosen and proposal.moves(free):
             explained_by[proposal.rows[proposal.target_gain > 0]] = len(chosen)
@@ -437,16 +506,16 @@ def _choose(proposals: list[Proposal], num_targets: int) -> list[Proposal]:
 
 
 def _gain_with_neighbours(proposals: list[Proposal]) -> Float:
-    """Return the (P,) gain of each proposal and the groups beside it that may go with it."""
-    # A car that two scanners see at two positions could also go half as fast, from the second
-    # position to the first one, but its other appearance could not.
-    centres = np.array([p.motion.centre for p in proposals]).reshape(-1, 3)
+    """Return the (P,) gain of each proposal, plus that of groups beside it that may move alike."""
+    # Two scanners see one car at two positions. A motion of half the speed could move the car from
+    # the second position to the first one, but would not fit the group at the first position.
+    centres = np.array([proposal.motion.centre for proposal in proposals]).reshape(-1, 3)
     total = np.zeros(len(proposals))
     for i, proposal in enumerate(proposals):
         gains = dict[int, float]()
         for j in np.flatnonzero(np.linalg.norm(centres - centres[i], axis=1) < _BESIDE_M):
             neighbour = proposals[j]
-            if neighbour.goes_with(proposal):
+            if neighbour.moves_like(proposal):
                 gains[neighbour.group] = max(neighbour.gain, gains.get(neighbour.group, 0.0))
         total[i] = sum((gains | {proposal.group: proposal.gain}).values())
     return total
@@ -463,5 +532,6 @@ def _attach(
     rows = rows[is_near(tree_of(members), source.points[rows], SURFACE_M)]
     if len(rows):
         static = RigidMotion(np.zeros(4), motion.centre)
-        cost_static, cost_moved = (compare(source, rows, target, m)[0] for m in (static, motion))
-        instance[rows[cost_moved < cost_static]] = k
+        static_cost, _ = compare(source, rows, target, static)
+        moved_cost, _ = compare(source, rows, target, motion)
+        instance[rows[moved_cost < static_cost]] = k

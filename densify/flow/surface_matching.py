@@ -13,20 +13,26 @@ from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Bool, Float, Int
 
-GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)
-MAX_WEIGHT = 60.0  # greatest sum over matches; errors of neighbours on a surface are correlated
+GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, per round
+# Greatest sum of the matches' weights: errors of neighbours on a surface are correlated.
+MAX_WEIGHT = 60.0
 NUM_NEAR = 12  # neighbours that span a surface
 MIN_FIT = 5  # least number of matches
 _SURFACE_M = 0.05  # noise of a surface point
 _RIDGE = 0.02  # share of the mean variance that is added, for points on a line
-_MAX_MODEL_POINTS, _NUM_ALIGNED = 1000, 250  # neighbours on a surface have the same error
-_LOOSE = 10.0  # factor of the covariance: surface points must not stop a slide along the surface
+# Points of a model, and points that are aligned: more would be neighbours with the same error
+_MAX_MODEL_POINTS, _NUM_ALIGNED = 1000, 250
+# Factor of the covariance: points of a surface must not stop a motion along the surface.
+_LOOSE = 10.0
 
 
 def apply(state: Float, points: Float, centre: Float) -> Float:
     """Return the (N,3) points of an object, turned about its centre and displaced.
 
-    The state is (4,) or, one for each point, (N,4); the centre is (3,) or (N,3).
+    Args:
+        state: (4,) state of all points, or (N,4) one for each point.
+        points: (N,3) metres.
+        centre: (3,) centre of the rotation, or (N,3) one for each point.
     """
     return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
@@ -38,18 +44,21 @@ def undo(state: Float, points: Float, centre: Float) -> Float:
 
 def _turned(arms: Float, yaw: float | Float) -> Float:
     """Return (N,3) vectors ``arms``, turned by ``yaw`` (rad) about the vertical."""
-    (x, y, _), c, s = arms.T, np.cos(yaw), np.sin(yaw)
+    x, y, _ = arms.T
+    cos, sin = np.cos(yaw), np.sin(yaw)
     turned = arms.copy()
-    turned[:, 0] = c * x - s * y
-    turned[:, 1] = s * x + c * y
+    turned[:, 0] = cos * x - sin * y
+    turned[:, 1] = sin * x + cos * y
     return turned
 
 
 def surface_information(points: Float, rows: Int, loose: float = 1.0) -> Float:
-    """Return (N,3,3) the inverse covariance (1/m²) of a surface of points (M,3) at N places.
+    """Return the (N,3,3) inverse covariances (1/m²) of a surface at N positions.
 
-    ``rows`` (N,k) are those of the neighbours that span the surface. ``loose`` multiplies the
-    covariance; above 1 the surface constrains less.
+    Args:
+        points: (M,3) points of the surface, metres.
+        rows: (N,k) rows of the neighbours that span the surface at each position.
+        loose: Factor of the covariance. Above 1 the surface constrains less.
     """
     offset = points[rows]
     offset -= offset.mean(axis=1, keepdims=True)
@@ -95,13 +104,15 @@ class Model:
             prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
         """
         points = np.ascontiguousarray(points[:: max(1, len(points) // _NUM_ALIGNED)])
-        state, prior = predicted.copy(), prediction_std**-2
+        state = predicted.copy()
+        prior = prediction_std**-2
         for gate_m in GATES_M:
-            H, g = np.zeros((3, 3)), np.zeros(3)
+            H, g = np.zeros((3, 3)), np.zeros(3)  # normal equations H x = g of x, y and yaw
             num = _add_matches(points, state, centre, self.points, self.information, gate_m, H, g)
             if num < MIN_FIT:
                 return None
             weight = min(1.0, MAX_WEIGHT / num)
+            # The prediction counts as one more match.
             H = weight * H + np.diag(prior)
             g = weight * g + prior * (predicted - state)[[0, 1, 3]]
             state[[0, 1, 3]] += np.linalg.solve(H, g)
@@ -110,21 +121,26 @@ class Model:
 
 @inlined
 def _nearest(point: Float, surface: Float, within_m: float) -> tuple[int, float]:
-    """Return the row of the nearest surface point (-1 for none nearer), and its square distance."""
-    # The surface ascends in x: only rows whose x is near enough are compared.
-    row, square = -1, within_m**2
+    """Return the row of the nearest surface point within ``within_m``, and its squared distance.
+
+    The row is -1 if there is none. ``surface`` (M,3) ascends in x.
+    """
+    # The search starts at the point's x, and ends where x alone is farther than the nearest point.
+    nearest_row, nearest_squared = -1, within_m**2
     middle = np.searchsorted(surface[:, 0], point[0])
     for step in (1, -1):
-        i = middle if step > 0 else middle - 1
-        while 0 <= i < len(surface):
-            along = (surface[i, 0] - point[0]) ** 2
-            if along >= square:
+        row = middle if step > 0 else middle - 1
+        while 0 <= row < len(surface):
+            x_squared = (surface[row, 0] - point[0]) ** 2
+            if x_squared >= nearest_squared:
                 break
-            apart = along + (surface[i, 1] - point[1]) ** 2 + (surface[i, 2] - point[2]) ** 2
-            if apart < square:
-                row, square = i, apart
-            i += step
-    return row, square
+            squared = (
+                x_squared + (surface[row, 1] - point[1]) ** 2 + (surface[row, 2] - point[2]) ** 2
+            )
+            if squared < nearest_squared:
+                nearest_row, nearest_squared = row, squared
+            row += step
+    return nearest_row, nearest_squared
 
 
 @Kernel
@@ -146,33 +162,37 @@ def _add_matches(
     g: Float,
 ) -> int:
     """Add the normal equations of x, y and yaw to H (3,3) and g (3,); return how many match."""
-    J, JA = np.empty((2, 3, 3))  # J: derivative of the model's point by x, y and yaw
+    J, JA = np.empty((2, 3, 3))  # J: derivative of the point by x, y and yaw, object's frame
     J[:] = 0.0
     J[0, 0] = J[1, 1] = np.cos(state[3])
     J[0, 1] = np.sin(state[3])
     J[1, 0] = -J[0, 1]
-    at_model, arm, off = np.empty((3, 3))
+    in_object, arm, from_centre, residual = np.empty((4, 3))
     num = 0
     for i in range(len(points)):
+        # The point in the object's frame, by the inverse of the state
         for a in range(3):
-            off[a] = points[i, a] - centre[a] - state[a]
-        arm[0] = J[0, 0] * off[0] + J[0, 1] * off[1]
-        arm[1] = J[1, 0] * off[0] + J[1, 1] * off[1]
-        arm[2] = off[2]
+            from_centre[a] = points[i, a] - centre[a] - state[a]
+        arm[0] = J[0, 0] * from_centre[0] + J[0, 1] * from_centre[1]
+        arm[1] = J[1, 0] * from_centre[0] + J[1, 1] * from_centre[1]
+        arm[2] = from_centre[2]
         for a in range(3):
-            at_model[a] = arm[a] + centre[a]
-        row, square = _nearest(at_model, surface, gate_m)
+            in_object[a] = arm[a] + centre[a]
+        row, squared = _nearest(in_object, surface, gate_m)
         if row < 0:
             continue
         num += 1
-        A, weight = information[row], (1 - square / gate_m**2) ** 2
-        J[0, 2], J[1, 2] = -arm[1], arm[0]
+        # Gauss-Newton, with Tukey's weight
+        A = information[row]
+        weight = (1 - squared / gate_m**2) ** 2
+        J[0, 2] = -arm[1]
+        J[1, 2] = arm[0]
         for a in range(3):
-            off[a] = at_model[a] - surface[row, a]
+            residual[a] = in_object[a] - surface[row, a]
         for a in range(3):
             for b in range(3):
                 JA[a, b] = weight * (J[0, a] * A[0, b] + J[1, a] * A[1, b])
-            g[a] += JA[a, 0] * off[0] + JA[a, 1] * off[1] + JA[a, 2] * off[2]
+            g[a] += JA[a, 0] * residual[0] + JA[a, 1] * residual[1] + JA[a, 2] * residual[2]
             for b in range(3):
                 H[a, b] += JA[a, 0] * J[0, b] + JA[a, 1] * J[1, b]
     return num

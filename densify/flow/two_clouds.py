@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ from densify.geometry import poses
 from densify.geometry.nearest import nearest, tree_of
 from densify.geometry.types import Float, FlowField, Int, Motion, Stretch
 
-_MAX_EXTENT_M = 400.0  # of the points that are searched, from the middle
+_MAX_EXTENT_M = 400.0  # greatest distance in x and y, from the middle, of searched points
 _MIN_LOW_M = 0.04  # least height of points below a moving group
 _SCANNERS_APART_M = 1000.0  # lifts each scanner's points out of reach of the others'
 _BELOW_M = 0.3  # horizontal distance of points below a moving group
@@ -72,70 +72,98 @@ def estimate_flow(
             "alone are no recording"
         )
     clouds = checked_cloud(source, "source"), checked_cloud(target, "target")
-    times = _shares(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
+    times = _times_as_shares(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
     if not settings.objective.static_prior or settings.flow.engine == "paper":
         return flow_between(*clouds, settings.objective, initial)
-    start = None if initial is None else checked_cloud(initial, "initial")
-    if start is not None and start.shape != clouds[0].shape:
+    initial_flow = None if initial is None else checked_cloud(initial, "initial")
+    if initial_flow is not None and initial_flow.shape != clouds[0].shape:
         raise InputError(
-            f"initial: got shape {start.shape}, expected the source's {clouds[0].shape}"
+            f"initial: got shape {initial_flow.shape}, expected the source's {clouds[0].shape}"
         )
-    return _flow_of_groups(clouds, start, times, lidars)
+    return _flow_of_groups(clouds, initial_flow, times, lidars)
+
+
+class _PointTimes(NamedTuple):
+    """Firing times of two clouds, in units of the time between the clouds."""
+
+    shares: list[Float]  # (N,) and (M,): 0 at the middle of the source's times, 1 at the target's
+    apart_s: float  # time between the clouds
 
 
 def _flow_of_groups(
     clouds: tuple[Float, Float],
     initial: Float | None,
-    times: tuple[list[Float], float] | None,
+    times: _PointTimes | None,
     lidars: tuple[Int, Int] | None,
 ) -> FlowField:
-    middle = np.median(clouds[0], axis=0)  # map coordinates lose nothing
+    """Return the flow of the groups of the source that certainly move; see `estimate_flow`."""
+    # Coordinates of a map are large. Relative to the middle they lose no accuracy.
+    middle = np.median(clouds[0], axis=0)
     points = [cloud - middle for cloud in clouds]
-    inside = [np.flatnonzero((np.abs(p[:, :2]) < _MAX_EXTENT_M).all(1)) for p in points]
-    points_inside = [p[rows] for p, rows in zip(points, inside, strict=True)]
+    inside = [np.flatnonzero((np.abs(cloud[:, :2]) < _MAX_EXTENT_M).all(1)) for cloud in points]
+    points_inside = [cloud[rows] for cloud, rows in zip(points, inside, strict=True)]
     ground = HeightMap.of(points_inside)
-    heights_m = [ground.above(p) for p in points_inside]
-    above = [rows[h >= ABOVE_GROUND_M] for rows, h in zip(inside, heights_m, strict=True)]
+    heights_m = [ground.above(cloud) for cloud in points_inside]
+    above = [
+        rows[height_m >= ABOVE_GROUND_M] for rows, height_m in zip(inside, heights_m, strict=True)
+    ]
     field = FlowField.zero(len(clouds[0]))
     if not (len(above[0]) and len(above[1])):
         return field
-    share, apart_s = times or ([np.full(len(c), float(i)) for i, c in enumerate(clouds)], None)
-    if lidars is not None and times is None:  # each measures an object at another time
-        _, number = np.unique(np.concatenate(lidars), return_inverse=True)
-        for cloud, lidar in zip(points, np.split(number, [len(clouds[0])]), strict=True):
-            cloud[:, 2] += _SCANNERS_APART_M * lidar
-    source, target = (PairCloud(points[i][rows], share[i][rows]) for i, rows in enumerate(above))
-    start = None if initial is None else initial[above[0]]
-    height_m = heights_m[0][heights_m[0] >= ABOVE_GROUND_M]
+    if times is not None:
+        shares = times.shares
+    else:
+        shares = [np.zeros(len(clouds[0])), np.ones(len(clouds[1]))]
+        if lidars is not None:
+            _separate_scanners(points, lidars)
+
+    source, target = (PairCloud(points[i][rows], shares[i][rows]) for i, rows in enumerate(above))
+    source_height_m = heights_m[0][heights_m[0] >= ABOVE_GROUND_M]
+    apart_s = None if times is None else times.apart_s
+    source_initial = None if initial is None else initial[above[0]]
     motions, field.instance[above[0]] = find_movers(
-        source, target, height_m, ground, apart_s, start
+        source, target, source_height_m, ground, apart_s, source_initial
     )
-    low = (heights_m[0] < ABOVE_GROUND_M) & (heights_m[0] > _MIN_LOW_M)
-    _attach_below(points[0], field, inside[0][low])
+    is_low = (heights_m[0] < ABOVE_GROUND_M) & (heights_m[0] > _MIN_LOW_M)
+    _attach_below(points[0], field, inside[0][is_low])
+
     to_reference = np.zeros_like(clouds[0])
     for k, motion in enumerate(motions):
         rows = np.flatnonzero(field.instance == k)
         measured = points[0][rows]
-        at_reference = motion.undo(measured, share[0][rows])
+        at_reference = motion.undo(measured, shares[0][rows])
         field.displacement[rows] = motion.place(at_reference, 1.0) - at_reference
         to_reference[rows] = at_reference - measured
     field.moving[:] = field.instance >= 0
     return field if times is None else replace(field, to_reference=to_reference)
 
 
-def _attach_below(points: Float, field: FlowField, low: Int) -> None:
-    """Assign points ``low`` (indices) just below a moving group to the group, in place."""
+def _separate_scanners(points: list[Float], lidars: tuple[Int, Int]) -> None:
+    """Lift the points of each scanner, in place, out of reach of the other scanners' points."""
+    # Without times, the points of two scanners cannot be compared: each measures an object at
+    # another time.
+    _, scanner = np.unique(np.concatenate(lidars), return_inverse=True)
+    for cloud, number in zip(points, np.split(scanner, [len(points[0])]), strict=True):
+        cloud[:, 2] += _SCANNERS_APART_M * number
+
+
+def _attach_below(points: Float, field: FlowField, low_rows: Int) -> None:
+    """Assign points ``low_rows`` just below a moving group to the group, in place."""
     members = np.flatnonzero(field.instance >= 0)
-    if len(members) and len(low):
-        _, row = nearest(tree_of(points[members, :2]), points[low, :2], _BELOW_M)
-        field.instance[low[row >= 0]] = field.instance[members[row[row >= 0]]]
+    if len(members) and len(low_rows):
+        _, nearest_member = nearest(tree_of(points[members, :2]), points[low_rows, :2], _BELOW_M)
+        is_below = nearest_member >= 0
+        field.instance[low_rows[is_below]] = field.instance[members[nearest_member[is_below]]]
 
 
 def _columns(
     source: ArrayLike | None, target: ArrayLike | None, clouds: tuple[Float, Float], name: str
 ) -> tuple[Int, Int] | None:
-    """Return two clouds' values as int64 (N,) and (M,), None if none; InputError if wrong."""
+    """Return the values of two clouds' points as int64 (N,) and (M,); None if both are None.
+
+    ``name`` is the suffix of both arguments, for the message of the InputError.
+    """
     if source is None and target is None:
         return None
     columns = []
@@ -154,22 +182,24 @@ def _columns(
     return columns[0], columns[1]
 
 
-def _shares(times_ns: tuple[Int, Int] | None) -> tuple[list[Float], float] | None:
-    """Return firing times as shares of the time between the clouds, and this time (s)."""
+def _times_as_shares(times_ns: tuple[Int, Int] | None) -> _PointTimes | None:
+    """Return firing times (N,) and (M,) as shares; None without times, or if all are equal."""
     if times_ns is None:
         return None
-    low, high = (np.array([int(limit(times)) for times in times_ns]) for limit in (np.min, np.max))
-    middle = low + (high - low) // 2
-    span_ns, gap_ns = int((high - low).max()), int(middle[1] - middle[0])
-    if 2 * abs(gap_ns) < span_ns:
-        gap_ns = span_ns  # each from its own reference time: the next revolution
+    first_ns = np.array([int(np.min(cloud_ns)) for cloud_ns in times_ns])
+    last_ns = np.array([int(np.max(cloud_ns)) for cloud_ns in times_ns])
+    middle_ns = first_ns + (last_ns - first_ns) // 2
+    revolution_ns = int((last_ns - first_ns).max())
+    gap_ns = int(middle_ns[1] - middle_ns[0])
+    if 2 * abs(gap_ns) < revolution_ns:
+        # Middles closer than half a sweep: each cloud counts from its own reference time, and the
+        # target is the next revolution.
+        gap_ns = revolution_ns
     if gap_ns == 0:
         return None
-    # 0 at the middle of the source's times, 1 at the middle of the target's
-    shares = [
-        i + (times - m) / gap_ns for i, (times, m) in enumerate(zip(times_ns, middle, strict=True))
-    ]
-    return shares, abs(gap_ns) * 1e-9
+    source_share = (times_ns[0] - middle_ns[0]) / gap_ns
+    target_share = 1 + (times_ns[1] - middle_ns[1]) / gap_ns
+    return _PointTimes([source_share, target_share], abs(gap_ns) * 1e-9)
 
 
 # --- The engine ``pairs``
@@ -177,34 +207,41 @@ def _shares(times_ns: tuple[Int, Int] | None) -> tuple[list[Float], float] | Non
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     """Chain the flow of neighbouring sweeps: the engine ``pairs``, for recordings of two sweeps."""
-    of_groups = replace(settings, flow=replace(settings.flow, engine="groups"))
+    # The engine ``groups`` is the default of `estimate_flow`, which does not know ``pairs``.
+    pair_settings = replace(settings, flow=replace(settings.flow, engine="groups"))
 
     def step(i: int, j: int) -> FlowField:
-        return _step(scene.stretch, i, j, of_groups)
+        return _flow_to_neighbour(scene.stretch, i, j, pair_settings)
 
     return ChainedMotion(scene.stretch, step)
 
 
-def _step(stretch: Stretch, i: int, j: int, settings: Config) -> FlowField:
-    """Return the flow of sweep ``i`` to the reference time of ``j``, lidar frame."""
-    pair = [stretch.sweeps[k] for k in (i, j)]
-    sweeps = [s.sweep for s in pair]
-    if min(map(len, sweeps)) == 0:
-        return FlowField.zero(len(sweeps[0]))
-    source, target = (poses.transform(s.T_world_lidar, s.sweep.points) for s in pair)
-    times_ns = [s.offset_ns for s in sweeps]
-    apart_ns = sweeps[1].stamp_ns - sweeps[0].stamp_ns
-    if times_ns[0] is None or times_ns[1] is None:
-        times_ns = [None, None]
+def _flow_to_neighbour(stretch: Stretch, i: int, j: int, settings: Config) -> FlowField:
+    """Return the flow of sweep index i to the reference time of sweep index j, lidar frame of i."""
+    source, target = stretch.sweeps[i], stretch.sweeps[j]
+    if min(len(source.sweep), len(target.sweep)) == 0:
+        return FlowField.zero(len(source.sweep))
+    source_ns, target_ns = source.sweep.offset_ns, target.sweep.offset_ns
+    apart_ns = target.sweep.stamp_ns - source.sweep.stamp_ns
+    if source_ns is None or target_ns is None:
+        source_ns = target_ns = None
     else:
-        times_ns[1] = times_ns[1] + apart_ns
-    lidars = [s.lidar for s in sweeps] if any(s.lidar.any() for s in sweeps) else [None, None]
-    field = estimate_flow(source, target, settings, None, *times_ns, *lidars)
-    R_lidar_world = pair[0].T_world_lidar[:3, :3].T
+        target_ns = target_ns + apart_ns  # both since the stamp of the source
+    has_scanners = source.sweep.lidar.any() or target.sweep.lidar.any()
+    field = estimate_flow(
+        poses.transform(source.T_world_lidar, source.sweep.points),
+        poses.transform(target.T_world_lidar, target.sweep.points),
+        settings,
+        source_offset_ns=source_ns,
+        target_offset_ns=target_ns,
+        source_lidar=source.sweep.lidar if has_scanners else None,
+        target_lidar=target.sweep.lidar if has_scanners else None,
+    )
+    R_lidar_world = source.T_world_lidar[:3, :3].T
     displacement = field.displacement @ R_lidar_world.T
     to_reference = None
-    if field.to_reference is not None and times_ns[0] is not None:
-        # It leads to the middle of the firing times, which need not be the stamp of a sweep.
-        middle_ns = int(times_ns[0].min()) + np.ptp(times_ns[0]) / 2
+    if field.to_reference is not None and source_ns is not None:
+        # The flow's reference is the middle of the firing times. The stamp may be another time.
+        middle_ns = int(source_ns.min()) + np.ptp(source_ns) / 2
         to_reference = field.to_reference @ R_lidar_world.T - displacement * (middle_ns / apart_ns)
     return replace(field, displacement=displacement, to_reference=to_reference)

@@ -19,18 +19,22 @@ ABOVE_GROUND_M = 0.2
 _BELOW_M = 0.5  # points this far below the ground are no surface: mirror images, multipath
 _STRAY = 0.02  # largest share of the points of a cell that are mirror images or noise
 _DENSE_M = 30.0  # range within which every sweep measures the ground
-_MOST_CELLS = 1 << 18  # 512 m x 512 m
+_MOST_CELLS = 1 << 18  # largest grid, 512 m x 512 m
 CELL_M = 1.0  # smaller cells follow kerbs, larger ones bridge holes
 MAX_SLOPE = 0.15  # rise per metre; steeper surfaces are objects
 _WINDOW = 7  # cells; a narrower hump or pit is not ground
 
-_NUM_POINTS, _NUM_TRIES = 2000, 200
+_NUM_POINTS, _NUM_TRIES = 2000, 200  # points and sampled planes of RANSAC
 _LEAST_SHARE = 0.1  # share of points on a ground plane minus share of points below it
 
 
 def ground(stretch: Stretch) -> HeightMap:
     """Return the ground height under all sweeps of a window, in the world frame with z up."""
-    return HeightMap.of([poses.transform(s.T_world_lidar, s.sweep.points) for s in stretch.sweeps])
+    clouds = [
+        poses.transform(registered.T_world_lidar, registered.sweep.points)
+        for registered in stretch.sweeps
+    ]
+    return HeightMap.of(clouds)
 
 
 @dataclass(frozen=True)
@@ -51,27 +55,34 @@ class HeightMap:
         cars and walls, and narrow humps are removed. The points near the resulting lower hull are
         averaged.
         """
-        inside = bulk(np.concatenate([points[:, :2] for points in clouds]), CELL_M, _MOST_CELLS)
-        ends = np.cumsum([len(points) for points in clouds])[:-1]
-        cloud_rows = zip(clouds, np.split(inside, ends), strict=True)
-        clouds = [points[rows] for points, rows in cloud_rows]
-        low, shape = _grid(clouds)
-        cells = [_cells(points, low, shape[1]) for points in clouds]
-        heights = _median_of_low(clouds, cells, shape[0] * shape[1]).reshape(shape)
+        clouds = _drop_far_points(clouds)
+        low_m, shape = _grid_around(clouds)
+        cells = [_cells_of(points, low_m, shape[1]) for points in clouds]
+        heights = _median_of_lowest(clouds, cells, shape[0] * shape[1]).reshape(shape)
 
-        known = np.isfinite(heights)
-        nearest = ndimage.distance_transform_edt(
-            ~known, return_distances=False, return_indices=True
+        is_measured = np.isfinite(heights)
+        nearest_cell = tuple(
+            ndimage.distance_transform_edt(
+                ~is_measured, return_distances=False, return_indices=True
+            )
         )
-        around, rise_m = ndimage.median_filter(heights[tuple(nearest)], _WINDOW), MAX_SLOPE * CELL_M
-        heights = np.where(known & (heights < around - rise_m * (_WINDOW // 2)), around, heights)
-        heights = _slope_limited(heights, rise_m)
-        hull = HeightMap(_without_humps(heights[tuple(nearest)]), low, CELL_M)
-        return HeightMap(_averaged(hull, clouds, cells), low, CELL_M)
+        # A cell lower than the greatest slope allows over half a window is a mirror image.
+        median_m = ndimage.median_filter(heights[nearest_cell], _WINDOW)
+        rise_m = MAX_SLOPE * CELL_M
+        is_pit = is_measured & (heights < median_m - rise_m * (_WINDOW // 2))
+        heights = np.where(is_pit, median_m, heights)
+
+        heights = _limit_slope(heights, rise_m)
+        hull = HeightMap(_remove_humps(heights[nearest_cell]), low_m, CELL_M)
+        return HeightMap(_average_heights(hull, clouds, cells), low_m, CELL_M)
 
     def under(self, points: Float) -> Float:
-        """Return (N,) ground heights, m, at points (N,2) or (N,3); beyond the grid, at its edge."""
-        x, y = ((points[:, i] - self.low_m[i]) / self.cell_m - 0.5 for i in (0, 1))
+        """Return (N,) ground heights in metres at points (N,2) or (N,3).
+
+        Points beyond the grid take the height of its nearest edge.
+        """
+        # Heights are those of the middles of cells, half a cell from the corner.
+        x, y = ((points[:, axis] - self.low_m[axis]) / self.cell_m - 0.5 for axis in (0, 1))
         ground_m: Float = ndimage.map_coordinates(self.heights_m, (x, y), order=1, mode="nearest")
         return ground_m
 
@@ -91,54 +102,76 @@ class HeightMap:
         return is_below
 
 
-def _grid(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
+def _drop_far_points(clouds: Sequence[Float]) -> list[Float]:
+    """Return the clouds (N,3) without the few points that are too far away for a grid."""
+    in_grid = bulk(np.concatenate([points[:, :2] for points in clouds]), CELL_M, _MOST_CELLS)
+    ends = np.cumsum([len(points) for points in clouds])[:-1]
+    masks = np.split(in_grid, ends)
+    return [points[mask] for points, mask in zip(clouds, masks, strict=True)]
+
+
+def _grid_around(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
     """Return the (2,) lower corner of a grid around all points, and its numbers of cells."""
-    low = np.array([min(p[:, i].min(initial=np.inf) for p in clouds) for i in (0, 1)])
-    high = np.array([max(p[:, i].max(initial=-np.inf) for p in clouds) for i in (0, 1)])
-    low = np.floor(low / CELL_M) * CELL_M
-    num_x, num_y = ((high - low) / CELL_M).astype(np.int64) + 1
-    return low, (int(num_x), int(num_y))
+    low_m = np.array(
+        [min(points[:, axis].min(initial=np.inf) for points in clouds) for axis in (0, 1)]
+    )
+    high_m = np.array(
+        [max(points[:, axis].max(initial=-np.inf) for points in clouds) for axis in (0, 1)]
+    )
+    low_m = np.floor(low_m / CELL_M) * CELL_M
+    num_x, num_y = ((high_m - low_m) / CELL_M).astype(np.int64) + 1
+    return low_m, (int(num_x), int(num_y))
 
 
-def _cells(points: Float, low_m: Float, num_y: int) -> Int:
+def _cells_of(points: Float, low_m: Float, num_y: int) -> Int:
     """Return the (N,) number of each point's grid cell; a row of the grid has ``num_y`` cells."""
-    x, y = (((points[:, i] - low_m[i]) / CELL_M).astype(np.int64) for i in (0, 1))
+    x, y = (((points[:, axis] - low_m[axis]) / CELL_M).astype(np.int64) for axis in (0, 1))
     return x * num_y + y
 
 
-def _median_of_low(clouds: Sequence[Float], cells: Sequence[Int], num_cells: int) -> Float:
-    """Return the (num_cells,) median over clouds of their low points, inf in empty cells."""
-    low = np.full((len(clouds), num_cells), np.nan, np.float32)
-    for points, cell, low_m in zip(clouds, cells, low, strict=True):
+def _median_of_lowest(clouds: Sequence[Float], cells: Sequence[Int], num_cells: int) -> Float:
+    """Return the (num_cells,) median over clouds of their lowest points, inf in empty cells."""
+    lowest_m = np.full((len(clouds), num_cells), np.nan, np.float32)
+    for points, cell, cloud_lowest_m in zip(clouds, cells, lowest_m, strict=True):
         z = points[:, 2]
+        # Cell numbers are integers. A height scaled to less than 1 orders the points of a cell.
         scaled_height = (z - z.min(initial=0)) / (z.max(initial=0) - z.min(initial=0) + 1)
-        order = np.argsort(cell + scaled_height)  # by cell, then by height
-        first = np.flatnonzero(np.diff(cell[order], prepend=-1))  # of each cell, lowest first
-        count = np.diff(first, append=len(order))
-        stray = np.maximum(1, (_STRAY * count).astype(int))
-        low_m[cell[order[first]]] = z[order[first + np.minimum(count - 1, stray)]]
-    known = ~np.isnan(low).all(axis=0)
+        order = np.argsort(cell + scaled_height)
+        first = np.flatnonzero(np.diff(cell[order], prepend=-1))  # lowest point of each cell
+        num_points = np.diff(first, append=len(order))
+        num_stray = np.maximum(1, (_STRAY * num_points).astype(int))
+        ground_row = order[first + np.minimum(num_points - 1, num_stray)]
+        cloud_lowest_m[cell[order[first]]] = z[ground_row]
+    is_measured = ~np.isnan(lowest_m).all(axis=0)
     heights = np.full(num_cells, np.inf)
-    heights[known] = np.nanmedian(low[:, known], axis=0)
+    heights[is_measured] = np.nanmedian(lowest_m[:, is_measured], axis=0)
     return heights
 
 
-def _averaged(hull: HeightMap, clouds: Sequence[Float], cells: Sequence[Int]) -> Float:
+def _average_heights(hull: HeightMap, clouds: Sequence[Float], cells: Sequence[Int]) -> Float:
     """Return the (X,Y) mean height of the points close to the hull around each cell."""
     # The hull is lower where more points were measured: an object driving there would climb.
-    total, number = np.zeros((2, hull.heights_m.size))
+    sum_m = np.zeros(hull.heights_m.size)
+    num_points = np.zeros(hull.heights_m.size)
     for points, cell in zip(clouds, cells, strict=True):
-        over_m = points[:, 2] - hull.under(points)
-        rows = np.flatnonzero(np.abs(over_m) < MAX_SLOPE * CELL_M)
-        np.add.at(number, cell[rows], 1)
-        np.add.at(total, cell[rows], over_m[rows])
-    total, number = (n.reshape(hull.heights_m.shape) for n in (total, number))
-    total, number = (ndimage.uniform_filter(n, 3, mode="constant") * 9 for n in (total, number))
-    mean: Float = hull.heights_m + total / np.maximum(number, 1)
-    return mean
+        above_hull_m = points[:, 2] - hull.under(points)
+        rows = np.flatnonzero(np.abs(above_hull_m) < MAX_SLOPE * CELL_M)
+        np.add.at(num_points, cell[rows], 1)
+        np.add.at(sum_m, cell[rows], above_hull_m[rows])
+    shape = hull.heights_m.shape
+    sum_m = _sum_3x3(sum_m.reshape(shape))
+    num_points = _sum_3x3(num_points.reshape(shape))
+    mean_m: Float = hull.heights_m + sum_m / np.maximum(num_points, 1)
+    return mean_m
 
 
-def _without_humps(heights: Float) -> Float:
+def _sum_3x3(values: Float) -> Float:
+    """Return the (X,Y) sums of each cell and its eight neighbours."""
+    mean: Float = ndimage.uniform_filter(values, 3, mode="constant")
+    return mean * 9
+
+
+def _remove_humps(heights: Float) -> Float:
     """Remove narrow humps, such as a vehicle that is always parked. Slopes and kerbs stay."""
     # Morphological opening: Zhang et al., "A Progressive Morphological Filter for Removing
     # Nonground Measurements from Airborne LIDAR Data", TGRS 2003.
@@ -146,9 +179,10 @@ def _without_humps(heights: Float) -> Float:
     return np.where(heights - opened > ABOVE_GROUND_M, opened, heights)
 
 
-def _slope_limited(heights: Float, rise: float) -> Float:
-    """Return the largest map below ``heights`` that rises by at most ``rise`` per cell."""
-    cone = -rise * np.hypot(*np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]))
+def _limit_slope(heights: Float, rise_m: float) -> Float:
+    """Return the largest map below ``heights`` that rises by at most ``rise_m`` per cell."""
+    cone = -rise_m * np.hypot(*np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]))
+    # A low cell limits its neighbours, these limit theirs, and so on.
     while True:
         lower = ndimage.grey_erosion(heights, structure=cone, mode="nearest")
         if np.array_equal(lower, heights):
@@ -163,17 +197,20 @@ def find_upright(sweeps: Sequence[Sweep]) -> Float:
     the lidar is above it. The lidar is upside down if this holds only after turning it over.
     Without a ground plane the result is the identity. Slopes below 0.075 are not levelled.
     """
-    num = sum(map(len, sweeps)) // _NUM_POINTS + 1
-    points = np.concatenate([s.points[::num] for s in sweeps])
-    for R_hung_lidar in (np.eye(3), np.diag([1.0, -1.0, -1.0])):
-        up = _ground_normal(points @ R_hung_lidar.T)
+    stride = sum(map(len, sweeps)) // _NUM_POINTS + 1
+    points = np.concatenate([sweep.points[::stride] for sweep in sweeps])
+    as_measured = np.eye(3)
+    turned_over = np.diag([1.0, -1.0, -1.0])
+    for R_turned_lidar in (as_measured, turned_over):
+        up = _ground_normal(points @ R_turned_lidar.T)
         if up is not None:
-            return _level(up) @ R_hung_lidar
+            return _rotation_to_z(up) @ R_turned_lidar
     return np.eye(3)
 
 
-def _level(up: Float) -> Float:
+def _rotation_to_z(up: Float) -> Float:
     """Return the smallest rotation (3,3) that turns a unit vector (3,) to z."""
+    # A slope of 0.075 may be the road's own.
     if np.hypot(*up[:2]) < 0.5 * MAX_SLOPE * up[2]:
         return np.eye(3)
     R: Float = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
@@ -184,21 +221,29 @@ def _ground_normal(points: Float) -> Float | None:
     """Return the (3,) unit normal of the ground plane, pointing up, None if there is no ground."""
     if len(points) < 3:
         return None
+
+    # planes through random triples of points
     rng = np.random.default_rng(0)
-    a, b, c = points[rng.integers(len(points), size=(_NUM_TRIES, 3))].transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
+    corner_a, corner_b, corner_c = points[
+        rng.integers(len(points), size=(_NUM_TRIES, 3))
+    ].transpose(1, 0, 2)
+    normal = np.cross(corner_b - corner_a, corner_c - corner_a)
     normal *= np.where(normal[:, 2:] < 0, -1, 1)
     is_floor = normal[:, 2] > np.hypot(*normal[:, :2].T)  # a floor and not a wall
     normal = normal[is_floor] / np.linalg.norm(normal[is_floor], axis=1, keepdims=True)
-    from_origin = np.einsum("ij,ij->i", normal, a[is_floor])
-    height_m = points @ normal.T - from_origin
+
+    # the plane with the most points on it and the fewest below, under the lidar
+    plane_z_m = np.einsum("ij,ij->i", normal, corner_a[is_floor])
+    height_m = points @ normal.T - plane_z_m
     on_plane = np.abs(height_m) < ABOVE_GROUND_M
-    share = np.where(from_origin < 0, on_plane.mean(axis=0), 0) - (height_m < -ABOVE_GROUND_M).mean(
-        axis=0
-    )
-    if share.max(initial=0) < _LEAST_SHARE:
+    share_on = np.where(plane_z_m < 0, on_plane.mean(axis=0), 0)
+    share_below = (height_m < -ABOVE_GROUND_M).mean(axis=0)
+    score = share_on - share_below
+    if score.max(initial=0) < _LEAST_SHARE:
         return None
-    ground = points[on_plane[:, np.argmax(share)]]
-    _, _, axes = np.linalg.svd(ground - ground.mean(axis=0), full_matrices=False)
+
+    # The normal is the direction in which the points of the plane vary least.
+    ground_points = points[on_plane[:, np.argmax(score)]]
+    _, _, axes = np.linalg.svd(ground_points - ground_points.mean(axis=0), full_matrices=False)
     fitted: Float = axes[2] * np.sign(axes[2, 2])
     return fitted

@@ -23,31 +23,34 @@ from numpy.typing import NDArray
 from densify.free_space.rays import (
     BLOCK,
     FEW_POINTS,
-    Aimed,
-    aimed,
-    at_time,
+    AimedRays,
+    Layout,
+    aim_rays,
     azimuth_of,
     fires_by_azimuth,
-    from_scanner,
-    measure,
+    measure_layout,
+    move_to_scanner,
+    move_to_time,
 )
 from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
 
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
-_MIN_ROW_RAD = np.deg2rad(0.45)
-# Closer rings always share a row. Other rings have their own rows from the range at
-# which three rings span more than the error of registration.
+_MIN_ROW_RAD = np.deg2rad(0.45)  # least height of a row for near points
+# Rings closer than this always share a row. Other rings have their own rows from the range at
+# which three rings span more than `_SLACK_M`, the error of registration.
 _MIN_FAR_ROW_RAD, _SLACK_M = np.deg2rad(0.15), 0.1
 # A ring this far from all others observes free space only at its rays. Three full cells suffice.
 _LONE_RAD = np.deg2rad(1.0)
-_SETTLED = 0.1  # share of a turn
+_SETTLED = 0.1  # two estimates of a firing time agree within this share of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
 _DENSEST = 10  # percent of the returns of an unordered scanner that set its finest cells
 MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
-_VOUCHED, _MAX_SIZES = 0.8, 5  # share of returns with enough filled cells; number of cell sizes
+# An unordered scanner gets larger cells, of up to `_MAX_SIZES` sizes, until this share of its
+# returns has enough filled cells.
+_VOUCHED, _MAX_SIZES = 0.8, 5
 _HIDES = 1000  # penalty of a hiding return, above the number of cells of all images added up
-_PI, _ZERO = np.float32(np.pi), np.float32(0)
+_PI, _ZERO = np.float32(np.pi), np.float32(0)  # float32, as all numbers in the kernels
 
 
 class ScannerImage(NamedTuple):
@@ -81,13 +84,15 @@ class RangeImage:
     def of(registered: RegisteredSweep, num_together: int = 1, by_ring: bool = False) -> RangeImage:
         """Return the range images of a deskewed sweep.
 
-        The columns are finer by ``num_together``, the number of sweeps whose counts are added up.
-        ``by_ring`` also uses single rings: dense rings for far points, where an error of
-        registration is smaller than their spacing, and isolated rings right at their rays.
+        Args:
+            num_together: Number of sweeps whose counts are added up. The columns are finer by this
+                factor.
+            by_ring: True also uses single rings: dense rings for far points, where an error of
+                registration is smaller than their spacing, and isolated rings at their rays.
         """
         scanners: list[ScannerImage] = []
         for lidar in np.unique(registered.sweep.lidar).tolist():
-            scanners += _images(registered, lidar, num_together, by_ring)
+            scanners += _scanner_images(registered, lidar, num_together, by_ring)
         return RangeImage(tuple(scanners))
 
     def sees_through(
@@ -107,89 +112,111 @@ class RangeImage:
 
         Args:
             points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
+            margin_m: Least distance in metres of a return beyond the point.
+            margin_fraction: Least distance of a return beyond the point, as a share of its range.
+            min_filled: Least number of filled cells.
             velocity_m_s: (N,3) lidar frame, without ego-motion; None for static points.
         """
-        beyond = self.num_beyond(points, (margin_m, margin_fraction), min_filled, velocity_m_s)
-        return np.asarray((beyond >= min_filled).any(axis=0))
+        margins = margin_m, margin_fraction
+        num_beyond = self.count_beyond(points, margins, min_filled, velocity_m_s)
+        return np.asarray((num_beyond >= min_filled).any(axis=0))
 
-    def num_beyond(
+    def count_beyond(
         self,
         points: Float,
-        margins_m: tuple[float, float],
+        margins: tuple[float, float],
         min_filled: int = 1,
         velocity_m_s: Float | Float32 | None = None,
     ) -> NDArray[np.int16]:
-        """Return (S,N) for each of S images the filled cells around N points, if all are beyond.
+        """Return the (S,N) number of filled cells around each of N points in each of S images.
 
-        The count is far below 0 if a return is not beyond the point by ``margins_m`` (metres, share
-        of the range), and 0 if fewer than ``min_filled`` of nine cells are filled. The counts of
-        several sweeps may be added. Points and velocities are as in `sees_through`.
+        The 3 x 3 cells around a point's direction are counted. There are three cases:
+
+        - The count is 0 if fewer than ``min_filled`` cells are filled.
+        - It is the number of filled cells if all their returns are beyond the point.
+        - It is far below 0 if any of these returns is not beyond the point.
+
+        The counts of several sweeps may be added.
+
+        Args:
+            points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
+            margins: Least distance of a return beyond a point: metres, and share of the range. The
+                larger one counts.
+            min_filled: Least number of filled cells.
+            velocity_m_s: (N,3) lidar frame, without ego-motion; None for static points.
         """
         points32 = np.ascontiguousarray(points, np.float32)
         velocity = np.zeros((1, 3)) if velocity_m_s is None else velocity_m_s
         velocity32 = np.ascontiguousarray(velocity, np.float32)
-        margins = np.array(margins_m, np.float32)
-        beyond = np.zeros((len(self.scanners), len(points)), np.int16)
-        for scanner, scanner_beyond in zip(self.scanners, beyond, strict=True):
-            _see_beyond.over_rows(
-                len(points), points32, velocity32, scanner, margins, min_filled, scanner_beyond
+        margins32 = np.array(margins, np.float32)
+        num_beyond = np.zeros((len(self.scanners), len(points)), np.int16)
+        for image, image_count in zip(self.scanners, num_beyond, strict=True):
+            _count_beyond.over_rows(
+                len(points), points32, velocity32, image, margins32, min_filled, image_count
             )
-        return beyond
+        return num_beyond
 
 
 class _Cells(NamedTuple):
-    """The cells of one image: edges of the rows (R+1,), and the range in which it is used."""
+    """The cells of one image, and the range in which it is used."""
 
-    row_edges_rad: Float32
+    row_edges_rad: Float32  # (R+1,) float32 elevations of the row borders, ascending
     num_columns: int
     from_m: float = 0.0
     to_m: float = np.inf
-    lone: bool = False  # every other row is a single ring, and the rows between hold no ring
-    coarser: bool = False  # used only where the previous image has too many empty cells
+    # True if every other row is a single ring, and the rows between hold no ring
+    has_lone_rings: bool = False
+    # True if the image is used only where the previous image has too many empty cells
+    is_coarser: bool = False
 
 
-def _images(
+class _Times(NamedTuple):
+    """The times at which a scanner faces the columns (1,C) or the cells (R,C) of an image."""
+
+    offset_s: Float32  # seconds after the reference time, middle of all such times
+    spread_s: Float32  # greatest difference from that time in seconds
+
+
+def _scanner_images(
     registered: RegisteredSweep, lidar: int, num_together: int, by_ring: bool
 ) -> list[ScannerImage]:
     """Return the images of scanner ``lidar``, finest first; arguments as in `RangeImage.of`."""
-    rays = aimed(registered, lidar)
+    rays = aim_rays(registered, lidar)
     images: list[ScannerImage] = []
-    for cells in _cells(rays, num_together, by_ring):
-        if cells.coarser and images and _share_vouched(images[-1], rays) >= _VOUCHED:
+    for cells in _choose_cells(rays, num_together, by_ring):
+        if cells.is_coarser and images and _share_vouched(images[-1], rays) >= _VOUCHED:
             break  # still larger cells would call the gaps between posts free
-        images.append(_image(registered, lidar, rays, cells))
+        images.append(_make_image(registered, lidar, rays, cells))
     return images
 
 
-def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) -> ScannerImage:
-    """Make the range image of one scanner from its rays."""
-    sweep, shape = registered.sweep, (len(cells.row_edges_rad) - 1, cells.num_columns)
+def _make_image(
+    registered: RegisteredSweep, lidar: int, rays: AimedRays, cells: _Cells
+) -> ScannerImage:
+    """Return the range image of one scanner, made from its rays."""
+    sweep = registered.sweep
+    num_rows = len(cells.row_edges_rad) - 1
     row, column = _cell_of(rays, cells.row_edges_rad, cells.num_columns)
-    inside = np.flatnonzero(row >= 0)
-    cell = row[inside] * cells.num_columns + column[inside]
+    in_rows = np.flatnonzero(row >= 0)
+    cell = row[in_rows] * cells.num_columns + column[in_rows]
 
-    nearest_m = np.full(shape, np.inf, np.float32)
-    np.minimum.at(nearest_m.reshape(-1), cell, rays.range_m[inside])
-    num_filled = _over_3x3(np.add, np.isfinite(nearest_m).astype(np.uint8), 0)
-    if cells.lone:
-        num_filled[::2] *= 2
+    nearest_m = np.full((num_rows, cells.num_columns), np.inf, np.float32)
+    np.minimum.at(nearest_m.reshape(-1), cell, rays.range_m[in_rows])
+    num_filled = _join_3x3(np.add, np.isfinite(nearest_m).astype(np.uint8), 0)
+    if cells.has_lone_rings:
+        num_filled[::2] *= 2  # three full cells of a single ring suffice
         num_filled[1::2] = 0  # a cell between two single rings is no evidence
+
     if fires_by_azimuth(rays):
         offset_s = _offset_per_column(column, rays.offset_s, cells.num_columns)[None]
-        spread_s = np.zeros_like(offset_s)
+        times = _Times(offset_s, np.zeros_like(offset_s))
     else:
-        first, last = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
-        np.minimum.at(first.reshape(-1), cell, rays.offset_s[inside])
-        np.maximum.at(last.reshape(-1), cell, rays.offset_s[inside])
-        first, last = _over_3x3(np.minimum, first, np.inf), _over_3x3(np.maximum, last, -np.inf)
-        known, half = np.isfinite(first), np.float32(0.5)
-        first, last = np.where(known, first, _ZERO), np.where(known, last, _ZERO)
-        offset_s, spread_s = half * (first + last), half * (last - first)
+        times = _times_per_cell(cell, rays.offset_s[in_rows], nearest_m.shape)
     return ScannerImage(
-        offset_s=offset_s,
-        spread_s=spread_s,
+        offset_s=times.offset_s,
+        spread_s=times.spread_s,
         settled_s=_SETTLED * float(np.ptp(rays.offset_s)),
-        nearest_m=_over_3x3(np.minimum, nearest_m, np.inf),
+        nearest_m=_join_3x3(np.minimum, nearest_m, np.inf),
         num_filled=num_filled,
         row_edges_rad=cells.row_edges_rad,
         origin_m=sweep.origin_m(lidar).astype(np.float32),
@@ -200,94 +227,127 @@ def _image(registered: RegisteredSweep, lidar: int, rays: Aimed, cells: _Cells) 
     )
 
 
-def _cell_of(rays: Aimed, row_edges_rad: Float32, num_columns: int) -> tuple[Int, Int]:
+def _cell_of(rays: AimedRays, row_edges_rad: Float32, num_columns: int) -> tuple[Int, Int]:
     """Return the row (-1 outside) and the column of each ray, (N,) each."""
     row = np.searchsorted(row_edges_rad, rays.elevation, side="right") - 1
-    row[row == len(row_edges_rad) - 1] = -1
+    row[row == len(row_edges_rad) - 1] = -1  # above the last edge
     column = ((rays.azimuth + _PI) * (np.float32(num_columns) / (_PI + _PI))).astype(np.int64)
     return row, column % num_columns
 
 
-def _over_3x3(join: Callable[..., Any], cells: NDArray[Any], empty: float) -> NDArray[Any]:
-    """Join each of the (R,C) cells with its eight neighbours; columns wrap; ``empty``: outside."""
-    beside = join(join(np.roll(cells, 1, axis=1), cells), np.roll(cells, -1, axis=1))
-    padded = np.pad(beside, ((1, 1), (0, 0)), constant_values=empty)
+def _join_3x3(join: Callable[..., Any], cells: NDArray[Any], empty: float) -> NDArray[Any]:
+    """Join each of the (R,C) cells with its eight neighbours, ``empty`` outside; columns wrap."""
+    with_sides = join(join(np.roll(cells, 1, axis=1), cells), np.roll(cells, -1, axis=1))
+    padded = np.pad(with_sides, ((1, 1), (0, 0)), constant_values=empty)
     return np.asarray(join(join(padded[:-2], padded[1:-1]), padded[2:]))
 
 
 def _offset_per_column(column: Int, offset_s: Float32, num_columns: int) -> Float32:
     """Return the (C,) mean firing time of each column, interpolated in columns without rays."""
-    num_rays, sum_s = np.bincount(column), np.bincount(column, offset_s)
-    filled = np.flatnonzero(num_rays)
-    if not len(filled):
+    num_rays = np.bincount(column)
+    sum_s = np.bincount(column, offset_s)
+    with_rays = np.flatnonzero(num_rays)
+    if not len(with_rays):
         return np.zeros(num_columns, np.float32)
-    mean_s = np.interp(np.arange(num_columns), filled, sum_s[filled] / num_rays[filled])
+    known_s = sum_s[with_rays] / num_rays[with_rays]
+    mean_s = np.interp(np.arange(num_columns), with_rays, known_s)
     return mean_s.astype(np.float32)
 
 
-def _share_vouched(image: ScannerImage, rays: Aimed) -> float:
+def _times_per_cell(cell: Int, offset_s: Float32, shape: tuple[int, ...]) -> _Times:
+    """Return the times of the 3 x 3 cells around each cell (R,C), 0 where none holds a ray."""
+    first_s = np.full(shape, np.inf, np.float32)
+    last_s = np.full(shape, -np.inf, np.float32)
+    np.minimum.at(first_s.reshape(-1), cell, offset_s)
+    np.maximum.at(last_s.reshape(-1), cell, offset_s)
+    first_s = _join_3x3(np.minimum, first_s, np.inf)
+    last_s = _join_3x3(np.maximum, last_s, -np.inf)
+    has_rays = np.isfinite(first_s)
+    first_s = np.where(has_rays, first_s, _ZERO)
+    last_s = np.where(has_rays, last_s, _ZERO)
+    half = np.float32(0.5)  # stays in float32
+    return _Times(offset_s=half * (first_s + last_s), spread_s=half * (last_s - first_s))
+
+
+def _share_vouched(image: ScannerImage, rays: AimedRays) -> float:
     """Return the share of rays with enough filled cells around them."""
     row, column = _cell_of(rays, image.row_edges_rad, image.num_filled.shape[1])
     return float((image.num_filled[np.maximum(row, 0), column] >= MIN_FILLED).mean())
 
 
-def _cells(rays: Aimed, num_together: int, by_ring: bool) -> list[_Cells]:
+def _choose_cells(rays: AimedRays, num_together: int, by_ring: bool) -> list[_Cells]:
     """Choose the cells of one scanner's images, finest first; arguments as in `RangeImage.of`."""
     if len(rays.azimuth) < FEW_POINTS:
         return [_grid(_uniform_edges(rays.elevation, np.deg2rad(2.0)), np.deg2rad(1.0))]
-    layout = measure([rays])
-    step = layout.azimuth_step_rad / num_together
+    layout = measure_layout([rays])
+    step_rad = layout.azimuth_step_rad / num_together
     if layout.rings_rad is not None:
-        return _cells_of_rings(layout.rings_rad, _CELLS_PER_STEP * step, by_ring)
+        return _cells_of_rings(layout.rings_rad, _CELLS_PER_STEP * step_rad, by_ring)
     if not layout.unordered:
-        row_step = _CELLS_PER_STEP * float(np.median(layout.table.along))
-        return [_grid(_uniform_edges(rays.elevation, row_step), _CELLS_PER_STEP * step)]
-    spacing = layout.table.at(rays.azimuth, rays.elevation)[:, 1]
-    finest = _CELLS_PER_STEP * float(np.percentile(spacing, _DENSEST))
-    flatten = float(np.cos(np.median(rays.elevation)))
+        row_rad = _CELLS_PER_STEP * float(np.median(layout.table.elevation_gap_rad))
+        return [_grid(_uniform_edges(rays.elevation, row_rad), _CELLS_PER_STEP * step_rad)]
+    return _cells_of_unordered(rays, layout)
+
+
+def _cells_of_unordered(rays: AimedRays, layout: Layout) -> list[_Cells]:
+    """Return square cells of several sizes, each twice as large as the one before."""
+    gap_rad = layout.table.at(rays.azimuth, rays.elevation)[:, 1]
+    finest_rad = _CELLS_PER_STEP * float(np.percentile(gap_rad, _DENSEST))
+    # A step of azimuth is shorter on the sphere by the cosine of the elevation.
+    shortening = float(np.cos(np.median(rays.elevation)))
     return [
-        _grid(_uniform_edges(rays.elevation, size), size / flatten)._replace(coarser=True)
-        for size in finest * 2.0 ** np.arange(_MAX_SIZES)
+        _grid(_uniform_edges(rays.elevation, side_rad), side_rad / shortening)._replace(
+            is_coarser=True
+        )
+        for side_rad in finest_rad * 2.0 ** np.arange(_MAX_SIZES)
     ]
 
 
-def _cells_of_rings(rings: Float, step: float, by_ring: bool) -> list[_Cells]:
+def _cells_of_rings(rings: Float, column_rad: float, by_ring: bool) -> list[_Cells]:
     """Return cells whose rows reach half way to the neighbouring rings, and as far outwards."""
-    middle = 0.5 * (rings[1:] + rings[:-1])
-    outer: Float = 2 * rings[[0, -1]] - middle[[0, -1]]
-    edges: Float = np.concatenate([outer[:1], middle, outer[1:]])
-    # coarse rows for near points, fine rows for far points
-    coarse, fine = (_no_closer(edges, row_rad) for row_rad in (_MIN_ROW_RAD, _MIN_FAR_ROW_RAD))
-    if by_ring and len(coarse) != len(fine):
-        far_m = _SLACK_M / (1.5 * float(np.diff(fine).min()))
-        return [_grid(coarse, step)._replace(to_m=far_m), _grid(fine, step)._replace(from_m=far_m)]
-    gaps = np.diff(rings, prepend=-np.inf, append=np.inf)
-    lone = rings[np.minimum(gaps[:-1], gaps[1:]) >= _LONE_RAD]
-    if not by_ring or not len(lone):
-        return [_grid(coarse, step)]
-    on_rings: Float = (lone[:, None] + [-_MIN_FAR_ROW_RAD, _MIN_FAR_ROW_RAD]).ravel()
-    return [_grid(coarse, step), _grid(on_rings, step)._replace(lone=True)]
+    borders = 0.5 * (rings[1:] + rings[:-1])
+    outer: Float = 2 * rings[[0, -1]] - borders[[0, -1]]
+    edges: Float = np.concatenate([outer[:1], borders, outer[1:]])
+    near_cells = _grid(_merge_rows(edges, _MIN_ROW_RAD), column_rad)
+    far_edges = _merge_rows(edges, _MIN_FAR_ROW_RAD)
+    if by_ring and len(near_cells.row_edges_rad) != len(far_edges):
+        # Three rings span about 1.5 of the lowest rows.
+        far_m = _SLACK_M / (1.5 * float(np.diff(far_edges).min()))
+        far_cells = _grid(far_edges, column_rad)
+        return [near_cells._replace(to_m=far_m), far_cells._replace(from_m=far_m)]
+
+    gap_rad = np.diff(rings, prepend=-np.inf, append=np.inf)
+    is_lone = np.minimum(gap_rad[:-1], gap_rad[1:]) >= _LONE_RAD
+    if not by_ring or not is_lone.any():
+        return [near_cells]
+    # a row around each lone ring, and a row between two of them
+    lone_edges: Float = rings[is_lone][:, None] + [-_MIN_FAR_ROW_RAD, _MIN_FAR_ROW_RAD]
+    return [near_cells, _grid(lone_edges.ravel(), column_rad)._replace(has_lone_rings=True)]
 
 
-def _grid(edges: NDArray[np.floating], step: float) -> _Cells:
-    num_columns = int(np.clip(round(2 * np.pi / step), _MIN_COLUMNS, _MAX_COLUMNS))
-    return _Cells(edges.astype(np.float32), num_columns)
+def _grid(row_edges_rad: NDArray[np.floating], column_rad: float) -> _Cells:
+    """Return cells with these edges of rows (R+1,), and columns of about this width."""
+    num_columns = int(np.clip(round(2 * np.pi / column_rad), _MIN_COLUMNS, _MAX_COLUMNS))
+    return _Cells(row_edges_rad.astype(np.float32), num_columns)
 
 
-def _no_closer(edges: Float, distance: float) -> Float:
+def _merge_rows(edges: Float, min_rad: float) -> Float:
     """Drop edges until rows have at least this height. The first and the last edge stay."""
     # Dense rings share a row, because a slight error of registration moves points to another ring.
-    kept = [edges[0]]
+    merged = [edges[0]]
     for edge in edges[1:]:
-        if edge - kept[-1] >= distance:
-            kept.append(edge)
-    return np.array([*kept[: max(1, len(kept) - 1)], edges[-1]])
+        if edge - merged[-1] >= min_rad:
+            merged.append(edge)
+    # The last edge replaces the last one found, unless that is the first edge.
+    return np.array([*merged[: max(1, len(merged) - 1)], edges[-1]])
 
 
-def _uniform_edges(elevation: Float32, step: float) -> NDArray[np.floating]:
-    low = float(elevation.min(initial=0.0)) - 0.5 * step
-    num_rows = int((float(elevation.max(initial=0.0)) - low) / step) + 1
-    return low + step * np.arange(num_rows + 1)
+def _uniform_edges(elevation: Float32, row_rad: float) -> NDArray[np.floating]:
+    """Return the edges (R+1,) of equal rows that cover all elevations and 0."""
+    # The lowest ray is in the middle of its row.
+    low_rad = float(elevation.min(initial=0.0)) - 0.5 * row_rad
+    num_rows = int((float(elevation.max(initial=0.0)) - low_rad) / row_rad) + 1
+    return low_rad + row_rad * np.arange(num_rows + 1)
 
 
 @inlined
@@ -301,7 +361,7 @@ def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
+def _fill_rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
     """Fill ``row`` with the interval of the ascending edges of each elevation, -1 outside."""
     # a binary search of many elevations at once, with the steps as the outer loop
     last, step = np.int32(len(edges) - 1), np.int32(1)
@@ -310,16 +370,16 @@ def _rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
         step *= np.int32(2)
     while step > 0:
         for k in range(size):
-            at = min(row[k] + step, last)
-            row[k] = at if elevation[k] >= edges[at] else row[k]
+            higher = min(row[k] + step, last)
+            row[k] = higher if elevation[k] >= edges[higher] else row[k]
         step //= np.int32(2)
     for k in range(size):
-        inside = elevation[k] >= edges[0] and elevation[k] < edges[last]
-        row[k] = row[k] if inside else np.int32(-1)
+        is_inside = elevation[k] >= edges[0] and elevation[k] < edges[last]
+        row[k] = row[k] if is_inside else np.int32(-1)
 
 
 @inlined
-def _speed(point, velocity, twist):  # type: ignore[no-untyped-def]
+def _speed_of(point, velocity, twist):  # type: ignore[no-untyped-def]
     """Return the speed in m/s of a point relative to the lidar."""
     vx = velocity[0] - (twist[3] + twist[1] * point[2] - twist[2] * point[1])
     vy = velocity[1] - (twist[4] + twist[2] * point[0] - twist[0] * point[2])
@@ -328,38 +388,42 @@ def _speed(point, velocity, twist):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column):  # type: ignore[no-untyped-def]
-    """Move ``size`` points to the time at which the scanner faced them, which is found too."""
-    # Two rounds from the position at the reference time converge.
+def _find_cells(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column):  # type: ignore[no-untyped-def]
+    """Fill the position, time, row and column at which the scanner faced each of ``size`` points.
+
+    The position ``x``, ``y``, ``z`` is in the scanner's frame at ``time_s``.
+    """
+    # The time gives the position, the position gives the cell, and the cell gives the time. Two
+    # rounds from the position at the reference time converge; the third finds the last cell.
     num_columns, by_azimuth = image.nearest_m.shape[1], len(image.offset_s) == 1
     time_s[:size] = _ZERO
     for round in range(3):
         for k in range(size):
             i, t = start + k, time_s[k]
             j = min(i, len(velocity) - 1)
-            x[k], y[k], z[k] = at_time(
+            x[k], y[k], z[k] = move_to_time(
                 points[i, 0] + t * velocity[j, 0], points[i, 1] + t * velocity[j, 1],
                 points[i, 2] + t * velocity[j, 2], t, image.twists,
             )  # fmt: skip
-        from_scanner(x, y, z, size, image.origin_m, image.axes)
+        move_to_scanner(x, y, z, size, image.origin_m, image.axes)
         for k in range(size):
             column[k] = _column(azimuth_of(x[k], y[k]), num_columns)
         if round == 2 or not by_azimuth:
             for k in range(size):
                 elevation[k] = azimuth_of(np.sqrt(x[k] * x[k] + y[k] * y[k]), z[k])
-            _rows(elevation, size, image.row_edges_rad, row)
+            _fill_rows(elevation, size, image.row_edges_rad, row)
         if round < 2:
             for k in range(size):
                 time_s[k] = image.offset_s[0 if by_azimuth else max(row[k], 0), column[k]]
 
 
 @Kernel
-def _see_beyond(begin, end, points, velocity, image, margins, min_filled, beyond):  # type: ignore[no-untyped-def]
-    """Add to ``beyond`` (N,) int16 the number of returns of one scanner beyond each point.
+def _count_beyond(begin, end, points, velocity, image, margins, min_filled, num_beyond):  # type: ignore[no-untyped-def]
+    """Add to ``num_beyond`` (N,) int16 the number of filled cells beyond each point.
 
-    Counted are the filled cells among the 3 x 3 cells around a point, if they are at least
-    ``min_filled``. If any of their returns is not beyond the point, `_HIDES` is subtracted instead.
-    All other arrays are float32.
+    The filled cells among the 3 x 3 cells around a point count if they are at least ``min_filled``.
+    If any of their returns is not beyond the point, `_HIDES` is subtracted instead. All other
+    arrays are float32.
 
     Args:
         points: (N,3) positions in metres, lidar frame at the reference time.
@@ -374,7 +438,7 @@ def _see_beyond(begin, end, points, velocity, image, margins, min_filled, beyond
     # Each point needs a long chain of steps. A block of points takes every step in parallel.
     for start in range(begin, end, BLOCK):
         size = min(BLOCK, end - start)
-        _face(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column)
+        _find_cells(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column)
         for k in range(size):
             i, horizontal_m = start + k, np.sqrt(x[k] * x[k] + y[k] * y[k])
             r, c = row[k], column[k]
@@ -384,16 +448,18 @@ def _see_beyond(begin, end, points, velocity, image, margins, min_filled, beyond
             if range_m < image.from_m or range_m >= image.to_m:
                 continue
             margin_m = max(margins[0], margins[1] * range_m)
-            away_s = abs(image.offset_s[0 if by_azimuth else r, c] - time_s[k])
+            error_s = abs(image.offset_s[0 if by_azimuth else r, c] - time_s[k])
             if by_azimuth:
                 # Between two turns a spinning scanner skips or repeats a sector.
-                if away_s > settled_s:
+                if error_s > settled_s:
                     continue
             else:
-                away_s += image.spread_s[r, c]
+                # Within the uncertain time the point may have moved.
+                error_s += image.spread_s[r, c]
                 twist = image.twists[0 if time_s[k] < _ZERO else 1]
-                margin_m += away_s * _speed(points[i], velocity[min(i, len(velocity) - 1)], twist)
+                speed_m_s = _speed_of(points[i], velocity[min(i, len(velocity) - 1)], twist)
+                margin_m += error_s * speed_m_s
             if image.nearest_m[r, c] > range_m + margin_m:
-                beyond[i] += image.num_filled[r, c]
+                num_beyond[i] += image.num_filled[r, c]
             else:
-                beyond[i] -= _HIDES
+                num_beyond[i] -= _HIDES

@@ -17,27 +17,28 @@ from scipy import ndimage
 from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Float, Float32, Int, RegisteredSweep
 
-FEW_POINTS = 200  # too few to measure anything
-_DEFAULT_RAD = tuple(np.deg2rad([0.18, 0.40]))  # of a 64-beam scanner, along and between its rings
-_MANY_POINTS, _SECTOR_RAD = 15_000, np.deg2rad(5.0)  # of these, every fourth sector is enough
+FEW_POINTS = 200  # with fewer returns nothing can be measured
+_DEFAULT_RAD = tuple(np.deg2rad([0.18, 0.40]))  # gaps of a 64-beam scanner: on a ring, to the next
+# A sweep of more returns is measured in every fourth sector of this width.
+_MANY_POINTS, _SECTOR_RAD = 15_000, np.deg2rad(5.0)
 
-# Bins of elevation in which rings and lines are found; cells of direction, and columns of azimuth
+# Heights of the bins of elevation in which rings and lines are found; side of a cell of direction
 _RING_BIN_RAD, _LINE_BIN_RAD, _CELL_RAD = np.deg2rad([0.02, 0.5, 1.0])
-_MIN_NUM = 24  # returns or gaps that give a mean: of a ring, of a bin, of a cell
-_EVEN = 0.2  # share of the usual gap by which a ray may be off its place
+_MIN_NUM = 24  # least number of returns or gaps for a mean in a ring, a bin or a cell
+_EVEN = 0.2  # greatest deviation of a ray from an even spacing, as a share of the usual gap
 _VALLEY = 0.5  # greatest count between two rings, as a share of both peaks
-_MIN_RING_SHARE = 0.8  # of the returns are on rings
+_MIN_RING_SHARE = 0.8  # least share of the returns that lie on rings
 
-_BAND_RAD = np.deg2rad(0.1)  # returns of about equal elevation
-_MIN_GAP_RAD, _MAX_GAP_RAD = 1e-4, np.deg2rad(4.0)
-_MIN_EVEN_SHARE = 0.5  # of the gaps along lines are even
-_MIN_PER_COLUMN = 5
-_APART_RAD = 4 * np.pi  # more than twice the range of angles
-_AT_ONCE = 0.03  # share of the duration of a sweep
+_BAND_RAD = np.deg2rad(0.1)  # height of a band of returns of about equal elevation
+_MIN_GAP_RAD, _MAX_GAP_RAD = 1e-4, np.deg2rad(4.0)  # smaller gaps are noise, larger ones holes
+_MIN_EVEN_SHARE = 0.5  # least share of even gaps along lines
+_MIN_PER_COLUMN = 5  # least number of rays that show the spread of a column's firing times
+_APART_RAD = 4 * np.pi  # shift between groups of angles, twice the range of angles
+_AT_ONCE = 0.03  # greatest spread of a column's firing times, as a share of a sweep's duration
 
-_NUM_WINDOWS = 5  # of 1, 3, 7, 15, 31 cells, for the density of an unordered scanner
+_NUM_WINDOWS = 5  # windows of 1, 3, 7, 15, 31 cells, for the density of an unordered scanner
 
-BLOCK = 128  # points that a kernel moves together
+BLOCK = 128  # number of points that a kernel moves together
 _PI, _HALF_PI = np.float32(np.pi), np.float32(0.5 * np.pi)
 _HALF, _ZERO = np.float32(0.5), np.float32(0)
 # Abramowitz and Stegun, "Handbook of Mathematical Functions", 4.4.47: arctan within 1e-5 rad, far
@@ -64,7 +65,7 @@ def azimuth_of(x, y):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def at_time(x, y, z, time_s, twists):  # type: ignore[no-untyped-def]
+def move_to_time(x, y, z, time_s, twists):  # type: ignore[no-untyped-def]
     """Move a point from the reference time to the lidar frame at ``time_s``: undo deskewing."""
     # The rotation is taken to second order, because within a sweep it stays below 0.1 rad.
     w = 0 if time_s < _ZERO else 1
@@ -79,7 +80,7 @@ def at_time(x, y, z, time_s, twists):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def from_scanner(x, y, z, size, origin, R):  # type: ignore[no-untyped-def]
+def move_to_scanner(x, y, z, size, origin, R):  # type: ignore[no-untyped-def]
     """Move ``size`` points from the lidar frame to the scanner's origin and axes R, in place."""
     for k in range(size):
         x[k], y[k], z[k] = x[k] - origin[0], y[k] - origin[1], z[k] - origin[2]
@@ -110,10 +111,10 @@ def aim(begin, end, points, offset_s, origin, axes, twists, rays):  # type: igno
         size = min(BLOCK, end - start)
         for k in range(size):
             i = start + k
-            x[k], y[k], z[k] = at_time(
+            x[k], y[k], z[k] = move_to_time(
                 points[i, 0], points[i, 1], points[i, 2], offset_s[i], twists
             )
-        from_scanner(x, y, z, size, origin, axes)
+        move_to_scanner(x, y, z, size, origin, axes)
         for k in range(size):
             horizontal_m = np.sqrt(x[k] * x[k] + y[k] * y[k])
             rays[0, start + k] = azimuth_of(x[k], y[k])
@@ -121,7 +122,7 @@ def aim(begin, end, points, offset_s, origin, axes, twists, rays):  # type: igno
             rays[2, start + k] = np.sqrt(horizontal_m * horizontal_m + z[k] * z[k])
 
 
-class Aimed(NamedTuple):
+class AimedRays(NamedTuple):
     """The N rays of one scanner at their firing times, in its frame; (N,) float32 each."""
 
     azimuth: Float32  # azimuth in radians, positive to the left
@@ -130,9 +131,13 @@ class Aimed(NamedTuple):
     offset_s: Float32  # firing time in seconds after the reference time of the sweep
 
 
-def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
-    """Return the rays of one scanner, with deskewing undone."""
-    sweep, rows = registered.sweep, np.flatnonzero(registered.sweep.lidar == lidar)
+def aim_rays(registered: RegisteredSweep, lidar: int) -> AimedRays:
+    """Return the rays of the scanner with index ``lidar`` in a deskewed sweep.
+
+    Deskewing is undone: each ray is as it left the scanner at its own firing time.
+    """
+    sweep = registered.sweep
+    rows = np.flatnonzero(sweep.lidar == lidar)
     offset_s = np.zeros(len(rows), np.float32)
     if sweep.offset_ns is not None:
         offset_s = (sweep.offset_ns[rows] * 1e-9).astype(np.float32)
@@ -146,32 +151,40 @@ def aimed(registered: RegisteredSweep, lidar: int) -> Aimed:
         np.stack([registered.twist_before, registered.twist_after]).astype(np.float32),
         rays,
     )
-    return Aimed(rays[0], rays[1], rays[2], offset_s)
+    return AimedRays(rays[0], rays[1], rays[2], offset_s)
 
 
 class RayTable(NamedTuple):
-    """Angles between neighbouring rays in B bins of elevation by C bins of azimuth, radians."""
+    """Angles (rad) between neighbouring rays, in B bins of elevation by C bins of azimuth.
+
+    Bins of azimuth start at -pi. C is 1 if the angles do not depend on the azimuth.
+    """
 
     # Lowest elevation of bin 0. The outermost bins also stand for all elevations beyond.
     low_rad: float
     bin_rad: float  # height of a bin of elevation
-    across: Float32  # (B,C) float32 angle between rays along the azimuth
-    # (B,C) float32 angle between rays along the elevation. Bins of azimuth start at -pi; C is 1 if
-    # the azimuth does not matter.
-    along: Float32
+    # (B,C) float32 angle between neighbouring rays of a ring: they differ in azimuth
+    azimuth_gap_rad: Float32
+    # (B,C) float32 angle between neighbouring rings: their rays differ in elevation
+    elevation_gap_rad: Float32
 
     @staticmethod
-    def by_elevation(low_rad: float, bin_rad: float, across: Float, along: Float) -> RayTable:
-        """Return the table of the angles (B,) ``across`` and ``along`` of each bin of elevation."""
-        columns = (column[:, None].astype(np.float32) for column in (across, along))
+    def by_elevation(
+        low_rad: float, bin_rad: float, azimuth_gap_rad: Float, elevation_gap_rad: Float
+    ) -> RayTable:
+        """Return a table that depends on elevation alone, from the (B,) gaps of its B bins."""
+        columns = (
+            gap_rad[:, None].astype(np.float32) for gap_rad in (azimuth_gap_rad, elevation_gap_rad)
+        )
         return RayTable(low_rad, float(bin_rad), *columns)
 
     def at(self, azimuth: NDArray[np.floating], elevation: NDArray[np.floating]) -> Float:
-        """Return the (N,2) angles ``across`` and ``along`` at N directions in radians."""
-        rows, columns = self.along.shape
-        row = np.clip((elevation - self.low_rad) / self.bin_rad, 0, rows - 1).astype(np.int64)
-        column = ((azimuth + np.pi) * (columns / (2 * np.pi))).astype(np.int64) % columns
-        return np.stack([self.across[row, column], self.along[row, column]], 1).astype(np.float64)
+        """Return the (N,2) gaps in azimuth and in elevation at (N,) directions, in radians."""
+        num_rows, num_columns = self.elevation_gap_rad.shape
+        row = np.clip((elevation - self.low_rad) / self.bin_rad, 0, num_rows - 1).astype(np.int64)
+        column = ((azimuth + np.pi) * (num_columns / (2 * np.pi))).astype(np.int64) % num_columns
+        gaps_rad = [self.azimuth_gap_rad[row, column], self.elevation_gap_rad[row, column]]
+        return np.stack(gaps_rad, 1).astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -187,179 +200,241 @@ class Layout:
     table: RayTable  # angles between neighbouring rays by direction
 
 
-def measure(sweeps: Sequence[Aimed]) -> Layout:
+def measure_layout(sweeps: Sequence[AimedRays]) -> Layout:
     """Return the layout of one scanner, measured in its rays of a few sweeps.
 
-    Lasers that do not share an origin, as in KITTI's HDL-64E, mix their rings at close range. Their
-    returns still follow at even steps along the azimuth: such a scanner samples in lines.
+    There are three outcomes. Most scanners have distinct rings. Lasers that do not share an origin,
+    as in KITTI's HDL-64E, mix their rings at close range, but their returns still follow at even
+    steps along the azimuth: the scanner samples in lines. All other scanners are unordered. Fewer
+    than 200 returns in all give the default layout, lines with the spacing of a 64-beam scanner.
     """
     if sum(len(rays.azimuth) for rays in sweeps) < FEW_POINTS:
-        step, along = _DEFAULT_RAD
-        return Layout(
-            None, False, step, RayTable.by_elevation(0.0, 1.0, np.array([step]), np.array([along]))
-        )
-    sampled = [_some_sectors(rays) for rays in sweeps]
+        return _default_layout()
+    sampled = [_select_sectors(rays) for rays in sweeps]
+
     rings = find_rings(np.concatenate([rays.elevation for rays in sampled]))
     if rings is not None:
-        step = float(np.median([_step_along(rays, rings) for rays in sampled]))
-        return Layout(rings, False, step, _table_of_rings(rings, step))
-    step, even_share = np.median([_even_step(rays) for rays in sampled], axis=0).tolist()
+        step_rad = float(np.median([_step_on_rings(rays, rings) for rays in sampled]))
+        return Layout(rings, False, step_rad, _table_of_rings(rings, step_rad))
+
+    step_rad, even_share = np.median([_even_step(rays) for rays in sampled], axis=0).tolist()
     if even_share >= _MIN_EVEN_SHARE and fires_by_azimuth(sampled[0]):
-        return Layout(None, False, step, _table_of_lines(sweeps, step))
+        return Layout(None, False, step_rad, _table_of_lines(sweeps, step_rad))
+
     table = _table_of_density(sweeps)
-    step = float(np.median(table.at(sweeps[0].azimuth, sweeps[0].elevation)[:, 0]))
-    return Layout(None, True, step, table)
+    azimuth_gap_rad = table.at(sweeps[0].azimuth, sweeps[0].elevation)[:, 0]
+    return Layout(None, True, float(np.median(azimuth_gap_rad)), table)
+
+
+def _default_layout() -> Layout:
+    """Return lines with the spacing of a 64-beam scanner."""
+    step_rad, gap_rad = _DEFAULT_RAD
+    table = RayTable.by_elevation(0.0, 1.0, np.array([step_rad]), np.array([gap_rad]))
+    return Layout(None, False, step_rad, table)
 
 
 def find_rings(elevation: Float32) -> Float | None:
     """Return the (K,) ascending elevations of the rings, None if the returns are not on rings.
 
-    Merged scanners, processed clouds, and lasers that do not share an origin have none. Rings are
-    separate peaks of a fine histogram of (N,) elevations that hold nearly all returns. Each ring is
-    the mean elevation of the returns close to it.
+    Rings are separate peaks of a fine histogram of (N,) elevations that hold nearly all returns.
+    Each ring is the mean elevation of the returns close to it. Merged scanners, processed clouds,
+    and lasers that do not share an origin have no rings.
     """
-    of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
-    returns = np.bincount(of_return, minlength=int(np.pi / _RING_BIN_RAD) + 2).astype(float)
-    count = ndimage.gaussian_filter1d(returns, 1.0)
-    peaks = _peaks(count)
+    # The last bin but one holds the zenith; one more is spare for rounding.
+    num_bins = int(np.pi / _RING_BIN_RAD) + 2
+    bin_of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
+    num_in_bin = np.bincount(bin_of_return, minlength=num_bins).astype(float)
+    peaks = _find_peaks(ndimage.gaussian_filter1d(num_in_bin, 1.0))
     if not 3 <= len(peaks) <= len(elevation) / _MIN_NUM:
         return None
+
+    # the middle of each peak's bin
     rings: Float = (peaks + 0.5) * _RING_BIN_RAD - 0.5 * np.pi
-    nearest = np.searchsorted(0.5 * (rings[1:] + rings[:-1]), elevation)
-    close = np.abs(elevation - rings[nearest]) < _EVEN * np.gradient(rings)[nearest]
-    if close.mean() < _MIN_RING_SHARE:
+    ring = _nearest_ring(rings, elevation)
+    is_close = np.abs(elevation - rings[ring]) < _EVEN * np.gradient(rings)[ring]
+    if is_close.mean() < _MIN_RING_SHARE:
         return None
-    total = np.bincount(nearest[close], elevation[close].astype(float), len(rings))
-    return total / np.bincount(nearest[close], minlength=len(rings))
+    sum_rad = np.bincount(ring[is_close], elevation[is_close].astype(float), len(rings))
+    return sum_rad / np.bincount(ring[is_close], minlength=len(rings))
 
 
-def _peaks(count: Float) -> Int:
+def _nearest_ring(rings: Float, elevation: Float32) -> Int:
+    """Return the (N,) index of the ring (K,) nearest to each elevation."""
+    return np.searchsorted(0.5 * (rings[1:] + rings[:-1]), elevation)
+
+
+def _find_peaks(counts: Float) -> Int:
     """Return the indices of maxima (ascending) with a valley of half their height between them."""
-    peaks, top, bottom, rises = [], 0, 0, True
-    for i, num in enumerate(count.tolist()):
-        if rises and num > count[top]:
+    peaks = []
+    top = bottom = 0  # indices of the highest count of this rise, and the lowest of this fall
+    rises = True
+    for i, count in enumerate(counts.tolist()):
+        if rises and count > counts[top]:
             top = i
-        elif rises and num < _VALLEY * count[top]:
+        elif rises and count < _VALLEY * counts[top]:
             peaks.append(top)
-            bottom, rises = i, False
-        elif not rises and num < count[bottom]:
             bottom = i
-        elif not rises and _VALLEY * num > count[bottom]:
-            top, rises = i, True
+            rises = False
+        elif not rises and count < counts[bottom]:
+            bottom = i
+        elif not rises and _VALLEY * count > counts[bottom]:
+            top = i
+            rises = True
     return np.array(peaks, np.int64)
 
 
-def fires_by_azimuth(rays: Aimed) -> bool:
-    """Return True if rays of the same azimuth are fired at nearly one time, or have no times."""
+def fires_by_azimuth(rays: AimedRays) -> bool:
+    """Return True if rays of the same azimuth are fired at nearly one time, or have no times.
+
+    More than half of the columns of 1 degree must have a spread of firing times below 3 % of the
+    sweep's duration.
+    """
     duration_s = float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
     if duration_s == 0.0:
         return True
     column = ((rays.azimuth + np.pi) / _CELL_RAD).astype(np.int64)
-    num = np.bincount(column)
-    mean_s = np.bincount(column, rays.offset_s) / np.maximum(num, 1)
-    square = np.bincount(column, (rays.offset_s - mean_s[column]) ** 2)
-    spread_s = np.sqrt(square / np.maximum(num, 1))[num >= _MIN_PER_COLUMN]
+    num_rays = np.bincount(column)
+    mean_s = np.bincount(column, rays.offset_s) / np.maximum(num_rays, 1)
+    sum_squares = np.bincount(column, (rays.offset_s - mean_s[column]) ** 2)
+    spread_s = np.sqrt(sum_squares / np.maximum(num_rays, 1))[num_rays >= _MIN_PER_COLUMN]
     return not len(spread_s) or bool(np.mean(spread_s < _AT_ONCE * duration_s) > 0.5)
 
 
-def _some_sectors(rays: Aimed) -> Aimed:
-    """Return every fourth sector of an all-round view, which is enough evidence."""
+def _select_sectors(rays: AimedRays) -> AimedRays:
+    """Return every fourth sector of many rays, which is enough evidence."""
     if len(rays.azimuth) > _MANY_POINTS:
-        in_sector = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
-        if in_sector.mean() > 0.1:
-            return Aimed(*(column[in_sector] for column in rays))
+        is_sampled = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
+        if is_sampled.mean() > 0.1:  # a narrow view may miss these sectors
+            return AimedRays(*(column[is_sampled] for column in rays))
     return rays
 
 
-def _in_groups(group: NDArray[Any], angle: Float32) -> Float:
-    """Return the angles in ascending order, group by group, with large gaps between groups."""
+def _sort_in_groups(group: NDArray[Any], angle: Float32) -> Float:
+    """Return the angles in ascending order, each shifted by its group's number of `_APART_RAD`."""
     return np.sort(group * _APART_RAD + angle.astype(np.float64))
 
 
-def _gaps(group: NDArray[Any], angle: Float32) -> Float:
-    """Return the differences between neighbouring angles of the same group, see `_in_groups`."""
-    gaps: Float = np.diff(_in_groups(group, angle))
-    return gaps[gaps < 2 * np.pi]
+def _gaps_in_groups(group: NDArray[Any], angle: Float32) -> Float:
+    """Return the differences between neighbouring angles of the same group."""
+    gap_rad: Float = np.diff(_sort_in_groups(group, angle))
+    return gap_rad[gap_rad < 2 * np.pi]  # larger gaps are between two groups
 
 
-def _step_along(rays: Aimed, rings: Float) -> float:
-    """Return the median azimuth difference between neighbours on a ring."""
-    ring = np.searchsorted(0.5 * (rings[1:] + rings[:-1]), rays.elevation)
-    along = _gaps(ring, rays.azimuth)
-    along = along[along > _RING_BIN_RAD]
-    return float(np.median(along)) if len(along) else _DEFAULT_RAD[0]
+def _step_on_rings(rays: AimedRays, rings: Float) -> float:
+    """Return the median azimuth difference (rad) between neighbours on a ring."""
+    gap_rad = _gaps_in_groups(_nearest_ring(rings, rays.elevation), rays.azimuth)
+    gap_rad = gap_rad[gap_rad > _RING_BIN_RAD]
+    return float(np.median(gap_rad)) if len(gap_rad) else _DEFAULT_RAD[0]
 
 
-def _even_step(rays: Aimed) -> tuple[float, float]:
-    """Return the usual azimuth step of returns of about equal elevation, and its share of them."""
-    gap = _gaps(np.floor(rays.elevation / _BAND_RAD), rays.azimuth)
-    gap = gap[gap > _MIN_GAP_RAD]
-    if not len(gap):
+def _even_step(rays: AimedRays) -> tuple[float, float]:
+    """Return the median azimuth gap (rad) at about equal elevation, and the share close to it."""
+    gap_rad = _gaps_in_groups(np.floor(rays.elevation / _BAND_RAD), rays.azimuth)
+    gap_rad = gap_rad[gap_rad > _MIN_GAP_RAD]
+    if not len(gap_rad):
         return _DEFAULT_RAD[0], 0.0
-    usual = float(np.median(gap))
+    usual_rad = float(np.median(gap_rad))
     # The share is more than half for a spinning scanner, and a fifth for scattered returns.
-    return usual, float(np.mean(np.abs(gap - usual) < _EVEN * usual))
+    return usual_rad, float(np.mean(np.abs(gap_rad - usual_rad) < _EVEN * usual_rad))
 
 
 def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
     """Return the table whose spacing at a ring is the mean distance to both neighbouring rings."""
-    low = float(rings[0]) - _CELL_RAD
-    num_bins = int((float(rings[-1]) + _CELL_RAD - low) / _RING_BIN_RAD) + 1
-    elevation = low + (np.arange(num_bins) + 0.5) * _RING_BIN_RAD
-    along = np.interp(elevation, rings, np.gradient(rings, edge_order=1))
-    return RayTable.by_elevation(low, _RING_BIN_RAD, step_rad * np.cos(elevation), along)
+    low_rad = float(rings[0]) - _CELL_RAD
+    num_bins = int((float(rings[-1]) + _CELL_RAD - low_rad) / _RING_BIN_RAD) + 1
+    elevation = _bin_middles(low_rad, _RING_BIN_RAD, num_bins)
+    gap_rad = np.interp(elevation, rings, np.gradient(rings, edge_order=1))
+    return RayTable.by_elevation(low_rad, _RING_BIN_RAD, step_rad * np.cos(elevation), gap_rad)
 
 
-def _table_of_lines(sweeps: Sequence[Aimed], step_rad: float) -> RayTable:
+def _bin_middles(low_rad: float, bin_rad: float, num_bins: int) -> Float:
+    """Return the (num_bins,) elevations in the middle of each bin."""
+    return np.asarray(low_rad + (np.arange(num_bins) + 0.5) * bin_rad, np.float64)
+
+
+def _table_of_lines(sweeps: Sequence[AimedRays], step_rad: float) -> RayTable:
     """Return the table of median elevation differences within sectors of 1 degree, by elevation."""
-    gaps, middles = [], []
-    for rays in sweeps:
-        ordered = _in_groups(np.floor(rays.azimuth / _CELL_RAD), rays.elevation)
-        gap = np.diff(ordered)
-        # not across missing returns, and not within one line
-        kept = (gap < _MAX_GAP_RAD) & (gap > max(step_rad / 2, _MIN_GAP_RAD))
-        gaps.append(gap[kept])
-        middle = ordered[:-1][kept] + gap[kept] / 2
-        middles.append(middle - _APART_RAD * np.rint(middle / _APART_RAD))
-    low = float(min(r.elevation.min() for r in sweeps)) - _LINE_BIN_RAD
-    high = float(max(r.elevation.max() for r in sweeps)) + _LINE_BIN_RAD
-    num_bins = int((high - low) / _LINE_BIN_RAD) + 2
-    in_bin = ((np.concatenate(middles) - low) / _LINE_BIN_RAD).astype(np.int64)
-    bins = np.flatnonzero(np.bincount(in_bin, minlength=num_bins) >= _MIN_NUM)
-    along = np.full(num_bins, _DEFAULT_RAD[1])
-    if len(bins):
-        medians = ndimage.median(np.concatenate(gaps), in_bin, bins)
-        along = np.interp(np.arange(num_bins), bins, medians)
-    elevation = low + (np.arange(num_bins) + 0.5) * _LINE_BIN_RAD
-    return RayTable.by_elevation(low, _LINE_BIN_RAD, step_rad * np.cos(elevation), along)
+    gaps = [_line_gaps(rays, step_rad) for rays in sweeps]
+    size_rad = np.concatenate([sweep_gaps.size_rad for sweep_gaps in gaps])
+    middle_rad = np.concatenate([sweep_gaps.middle_rad for sweep_gaps in gaps])
+
+    # one bin below the lowest ray and one above the highest, with their own gaps unknown
+    low_rad = float(min(rays.elevation.min() for rays in sweeps)) - _LINE_BIN_RAD
+    high_rad = float(max(rays.elevation.max() for rays in sweeps)) + _LINE_BIN_RAD
+    num_bins = int((high_rad - low_rad) / _LINE_BIN_RAD) + 2
+    bin_of_gap = ((middle_rad - low_rad) / _LINE_BIN_RAD).astype(np.int64)
+    full_bins = np.flatnonzero(np.bincount(bin_of_gap, minlength=num_bins) >= _MIN_NUM)
+    gap_rad = np.full(num_bins, _DEFAULT_RAD[1])
+    if len(full_bins):
+        medians_rad = ndimage.median(size_rad, bin_of_gap, full_bins)
+        gap_rad = np.interp(np.arange(num_bins), full_bins, medians_rad)
+    elevation = _bin_middles(low_rad, _LINE_BIN_RAD, num_bins)
+    return RayTable.by_elevation(low_rad, _LINE_BIN_RAD, step_rad * np.cos(elevation), gap_rad)
 
 
-def _table_of_density(sweeps: Sequence[Aimed]) -> RayTable:
+class _LineGaps(NamedTuple):
+    """The G gaps in elevation between neighbouring lines of a sweep."""
+
+    size_rad: Float  # (G,) elevation difference
+    middle_rad: Float  # (G,) elevation in the middle of the gap
+
+
+def _line_gaps(rays: AimedRays, step_rad: float) -> _LineGaps:
+    """Return the gaps between lines, measured within each sector of 1 degree of azimuth."""
+    # Each elevation is shifted by a multiple of `_APART_RAD`, the number of its sector.
+    shifted_rad = _sort_in_groups(np.floor(rays.azimuth / _CELL_RAD), rays.elevation)
+    gap_rad = np.diff(shifted_rad)
+    # A wide gap is due to missing returns or lies between two sectors. A gap below half a step of
+    # azimuth lies within one line.
+    is_gap = (gap_rad < _MAX_GAP_RAD) & (gap_rad > max(step_rad / 2, _MIN_GAP_RAD))
+    size_rad = gap_rad[is_gap]
+    shifted_middle_rad = shifted_rad[:-1][is_gap] + size_rad / 2
+    # Elevations are small against the shift. The nearest multiple of it is therefore the shift.
+    shift_rad = _APART_RAD * np.rint(shifted_middle_rad / _APART_RAD)
+    return _LineGaps(size_rad, shifted_middle_rad - shift_rad)
+
+
+def _table_of_density(sweeps: Sequence[AimedRays]) -> RayTable:
     """Return the table of the side of the square that a return has to itself, by direction."""
-    # Returns are counted in the smallest window around each cell of a degree that holds enough.
-    low = float(min(r.elevation.min() for r in sweeps))
-    rows = int((float(max(r.elevation.max() for r in sweeps)) - low) / _CELL_RAD) + 1
-    columns = round(2 * np.pi / _CELL_RAD)
-    count = np.zeros((rows, columns))
+    low_rad = float(min(rays.elevation.min() for rays in sweeps))
+    high_rad = float(max(rays.elevation.max() for rays in sweeps))
+    num_rows = int((high_rad - low_rad) / _CELL_RAD) + 1
+    num_columns = round(2 * np.pi / _CELL_RAD)
+    num_returns = np.zeros((num_rows, num_columns))
     for rays in sweeps:
-        row = ((rays.elevation - low) / _CELL_RAD).astype(np.int64)
-        column = ((rays.azimuth + np.pi) / _CELL_RAD).astype(np.int64) % columns
-        np.add.at(count, (row, column), 1)
-    in_view = ndimage.binary_closing(np.pad(count > 0, 1))[1:-1, 1:-1] | (count > 0)
-    cell_sr = _CELL_RAD**2 * np.cos(low + (np.arange(rows) + 0.5) * _CELL_RAD)[:, None] * in_view
-    density = np.zeros((rows, columns))
+        row = ((rays.elevation - low_rad) / _CELL_RAD).astype(np.int64)
+        column = ((rays.azimuth + np.pi) / _CELL_RAD).astype(np.int64) % num_columns
+        np.add.at(num_returns, (row, column), 1)
+
+    # Single empty cells between others are in view, too.
+    is_filled = num_returns > 0
+    in_view = ndimage.binary_closing(np.pad(is_filled, 1))[1:-1, 1:-1] | is_filled
+    elevation = _bin_middles(low_rad, _CELL_RAD, num_rows)
+    cell_sr = _CELL_RAD**2 * np.cos(elevation)[:, None] * in_view
+    density = _density_in_windows(num_returns, cell_sr)
+
+    # Cells without a density take the spacing of the nearest cell with one.
+    has_density = in_view & (density > 0)
+    spacing_rad = np.sqrt(len(sweeps) / np.where(has_density, density, 1.0))
+    nearest_cell = ndimage.distance_transform_edt(~has_density, return_indices=True)[1]
+    spacing_rad = spacing_rad[tuple(nearest_cell)].astype(np.float32)
+    return RayTable(low_rad, float(_CELL_RAD), spacing_rad, spacing_rad)
+
+
+def _density_in_windows(num_returns: Float, cell_sr: Float) -> Float:
+    """Return the (R,C) returns per steradian in the smallest window that holds enough returns."""
+    density = np.zeros(num_returns.shape)
+    # From the largest window, which always counts, to a single cell: smaller windows overwrite.
     for k in range(_NUM_WINDOWS, 0, -1):
-        num_in_window, sr = (_in_windows(values, 2**k - 1) for values in (count, cell_sr))
-        enough = (num_in_window >= _MIN_NUM) | (k == _NUM_WINDOWS)
-        density = np.where(enough & (sr > 0), num_in_window / np.maximum(sr, 1e-12), density)
-    known = in_view & (density > 0)
-    spacing = np.sqrt(len(sweeps) / np.where(known, density, 1.0))
-    nearest = ndimage.distance_transform_edt(~known, return_indices=True)[1]
-    spacing = spacing[tuple(nearest)].astype(np.float32)
-    return RayTable(low, float(_CELL_RAD), spacing, spacing)
+        num_in_window = _sum_in_windows(num_returns, 2**k - 1)
+        window_sr = _sum_in_windows(cell_sr, 2**k - 1)
+        is_enough = (num_in_window >= _MIN_NUM) | (k == _NUM_WINDOWS)
+        window_density = num_in_window / np.maximum(window_sr, 1e-12)
+        density = np.where(is_enough & (window_sr > 0), window_density, density)
+    return density
 
 
-def _in_windows(values: Float, cells: int) -> Float:
+def _sum_in_windows(values: Float, cells: int) -> Float:
     """Return the sums of values (R,C) over square windows. The azimuth wraps around."""
     mean: Float = ndimage.uniform_filter(values, cells, mode=("constant", "wrap"))
     return mean * cells**2

@@ -18,7 +18,8 @@ from densify.geometry.types import Bool, Float, Stretch
 
 REACH_S = 1.0
 """Greatest time between a sweep and the sweeps that are tested against its points."""
-FREE_MARGIN = 0.4, 0.015  # m, share of the range: the larger tolerates errors of registration
+FREE_MARGIN = 0.4, 0.015
+"""Least distance of a return beyond a seen-through point: the larger of metres, share of range."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +41,21 @@ class FreeSpace:
         image = partial(RangeImage.of, num_together=max(map(len, batches)), by_ring=True)
         with ThreadPoolExecutor(num_threads()) as pool:
             images = tuple(pool.map(image, stretch.sweeps))
-        T_lidar_world = tuple(poses.inverse(s.T_world_lidar) for s in stretch.sweeps)
+        T_lidar_world = tuple(
+            poses.inverse(registered.T_world_lidar) for registered in stretch.sweeps
+        )
         return FreeSpace(images, T_lidar_world, clock, Sensors.of(stretch.sweeps), batches)
 
     def gap_m(self, position: Float, i: int) -> float:
         """Return the metres between neighbouring rings of sweep i at a (3,) world position."""
-        in_lidar = poses.transform(self.T_lidar_world[i], position[None])
-        return float(self.sensors.finest_gap_m(in_lidar)[0])
+        position_lidar = poses.transform(self.T_lidar_world[i], position[None])
+        return float(self.sensors.finest_gap_m(position_lidar)[0])
 
     def others(self, i: int) -> list[int]:
-        """Return the indices of the sweeps, one of each other batch, to test against sweep i."""
+        """Return the indices of the sweeps to test against sweep i, one for each other batch.
+
+        A batch is tested if any of its sweeps is within `REACH_S` of sweep i.
+        """
         return [
             batch[0]
             for batch in self.batches
@@ -71,20 +77,23 @@ class FreeSpace:
             points: (N,3) positions in the world frame at the reference time of sweep j.
             velocity_m_s: (N,3) velocities in the world frame, None for static points.
         """
-        batch, num_beyond = self._batch_of[j], []
+        batch = self._batch_of[j]
+        # In a single sweep the image counts only full neighbourhoods; of several, the sum decides.
+        min_filled = MIN_FILLED if len(batch) == 1 else 1
+        counts = []  # one (S,N) array for each sweep of the batch
         for k in batch:
-            points_k, T_lidar_world = points, self.T_lidar_world[k]
-            if velocity_m_s is not None and k != j:
-                points_k = points + (self.clock.time_s[k] - self.clock.time_s[j]) * velocity_m_s
-            num_beyond.append(
-                self.images[k].num_beyond(
-                    poses.transform(T_lidar_world, points_k),
-                    FREE_MARGIN,
-                    MIN_FILLED if len(batch) == 1 else 1,
-                    None if velocity_m_s is None else poses.rotate(T_lidar_world, velocity_m_s),
-                )
-            )
-        # Sweeps without this scanner cannot be added to the others.
-        together = [num for num in num_beyond if len(num) == len(num_beyond[0])]
-        free: Bool = (np.sum(together, axis=0) >= MIN_FILLED).any(axis=0)
-        return free
+            T_lidar_world = self.T_lidar_world[k]
+            points_k = points
+            velocity_lidar = None
+            if velocity_m_s is not None:
+                velocity_lidar = poses.rotate(T_lidar_world, velocity_m_s)
+                if k != j:
+                    duration_s = self.clock.time_s[k] - self.clock.time_s[j]
+                    points_k = points + duration_s * velocity_m_s
+            points_lidar = poses.transform(T_lidar_world, points_k)
+            image = self.images[k]
+            counts.append(image.count_beyond(points_lidar, FREE_MARGIN, min_filled, velocity_lidar))
+        # A sweep that lacks a scanner has fewer images: its counts cannot be added to the others.
+        addable = [count for count in counts if len(count) == len(counts[0])]
+        is_free: Bool = (np.sum(addable, axis=0) >= MIN_FILLED).any(axis=0)
+        return is_free

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.free_space.rays import Layout, aimed, measure
+from densify.free_space.rays import Layout, aim_rays, measure_layout
 from densify.geometry.types import Bool, Float, Float32, RegisteredSweep
 
 _NUM_SWEEPS = 3  # number of sweeps in which a scanner is measured
@@ -42,40 +42,62 @@ class SensorModel(Layout):
     @staticmethod
     def of(sweeps: Sequence[RegisteredSweep], lidar: int) -> SensorModel:
         """Return the scanner with number ``lidar``, measured in up to three deskewed sweeps."""
-        holding = [s for s in sweeps if (s.sweep.lidar == lidar).any()]
-        middles = (np.arange(_NUM_SWEEPS) + 0.5) * len(holding) / _NUM_SWEEPS
-        chosen = [holding[i] for i in np.unique(middles.astype(int))]
-        aimed_sweeps = [aimed(s, lidar) for s in chosen]
-        elevation = np.concatenate([rays.elevation for rays in aimed_sweeps])
+        with_returns = [
+            registered for registered in sweeps if (registered.sweep.lidar == lidar).any()
+        ]
+        # the middle sweep of each third of them
+        middles = (np.arange(_NUM_SWEEPS) + 0.5) * len(with_returns) / _NUM_SWEEPS
+        chosen = [with_returns[index] for index in np.unique(middles.astype(int))]
+        sampled = [aim_rays(registered, lidar) for registered in chosen]
+        elevation = np.concatenate([rays.elevation for rays in sampled])
+        azimuth = np.concatenate([rays.azimuth for rays in sampled])
         return SensorModel(
-            **vars(measure(aimed_sweeps)),
+            **vars(measure_layout(sampled)),
             origin_m=chosen[0].sweep.origin_m(lidar),
             axes=chosen[0].sweep.axes(lidar),
             elevation_rad=(float(elevation.min()), float(elevation.max())),
-            azimuth_rad=_view(np.concatenate([rays.azimuth for rays in aimed_sweeps])),
+            azimuth_rad=_find_view(azimuth),
         )
 
     @property
     def grid(self) -> RayGrid:
-        """The grid: a row for each ring, or cells as small as the closest unordered rays."""
-        low, bin_rad = self.table.low_rad, self.table.bin_rad
+        """The grid: a row for each ring or line, or square cells for unordered rays."""
         if self.unordered:
-            bin_rad = float(np.percentile(self.table.along, 5))
-            num_rows = int((self.elevation_rad[1] - low) / bin_rad) + 1
-            num_columns = round(2 * np.pi / bin_rad)
-            return RayGrid(low, bin_rad, np.arange(num_rows + 1.0), num_rows, num_columns)
-        if self.rings_rad is None:
-            row_of = np.append(0.0, np.cumsum(bin_rad / self.table.along[:, 0].astype(np.float64)))
-        else:
-            edges = low + bin_rad * np.arange(len(self.table.along) + 1)
-            row_of = 0.5 + np.interp(edges, self.rings_rad, np.arange(len(self.rings_rad)))
+            return self._grid_of_unordered()
+        low_rad, bin_rad = self.table.low_rad, self.table.bin_rad
+        row_of = self._rows_of_lines() if self.rings_rad is None else self._rows_of(self.rings_rad)
         num_columns = round(2 * np.pi / self.azimuth_step_rad)
-        return RayGrid(low, bin_rad, row_of, int(row_of[-1]) + 2, num_columns)
+        # Rows are counted from 0. One more row is for directions above the last bin.
+        num_rows = int(row_of[-1]) + 2
+        return RayGrid(low_rad, bin_rad, row_of, num_rows, num_columns)
+
+    def _grid_of_unordered(self) -> RayGrid:
+        """Return a grid with one row for each bin, and cells as small as the closest rays."""
+        # The densest 5 % of the directions are left out: their spacing is measured in few returns.
+        side_rad = float(np.percentile(self.table.elevation_gap_rad, 5))
+        low_rad = self.table.low_rad
+        num_rows = int((self.elevation_rad[1] - low_rad) / side_rad) + 1
+        num_columns = round(2 * np.pi / side_rad)
+        return RayGrid(low_rad, side_rad, np.arange(num_rows + 1.0), num_rows, num_columns)
+
+    def _rows_of_lines(self) -> Float:
+        """Return the (B+1,) number of lines below each border of a bin of elevation."""
+        num_lines = self.table.bin_rad / self.table.elevation_gap_rad[:, 0].astype(np.float64)
+        return np.append(0.0, np.cumsum(num_lines))
+
+    def _rows_of(self, rings_rad: Float) -> Float:
+        """Return the (B+1,) number of rows below each border of a bin, one row for each ring."""
+        borders_rad = self.table.low_rad + self.table.bin_rad * np.arange(
+            len(self.table.elevation_gap_rad) + 1
+        )
+        # A ring lies in the middle of its row, half a row above the row's lower border.
+        rows: Float = 0.5 + np.interp(borders_rad, rings_rad, np.arange(len(rings_rad)))
+        return rows
 
     def directions(self, points: Float) -> tuple[Float, Float, Float]:
-        """Return azimuth, elevation (rad) and range (m), (N,) each, of points (N,3), lidar frame.
+        """Return azimuth and elevation (rad) and range (m) of points (N,3), lidar frame.
 
-        They are as seen from the scanner, in its axes.
+        They are (N,) each, as seen from the scanner, in its axes.
         """
         ray = points - self.origin_m
         x, y, z = (ray if np.array_equal(self.axes, np.eye(3)) else ray @ self.axes.T).T
@@ -85,17 +107,18 @@ class SensorModel(Layout):
     def sees(self, azimuth: Float, elevation: Float) -> Bool:
         """Return (N,) True for directions, in radians, within the scanner's field of view."""
         right, left = self.azimuth_rad
-        inside = (azimuth - right) % (2 * np.pi) <= (left - right) % (2 * np.pi)
+        in_view = (azimuth - right) % (2 * np.pi) <= (left - right) % (2 * np.pi)
         if left - right >= 2 * np.pi:
-            inside[:] = True
+            in_view[:] = True
         low, high = self.elevation_rad
-        return inside & (elevation >= low) & (elevation <= high)
+        return in_view & (elevation >= low) & (elevation <= high)
 
     def gap_m(self, points: Float) -> tuple[Float, Bool]:
         """Return the (N,) distance in metres to the next ring, and (N,) True for points in view.
 
         For a scanner without rings it is the distance to the next ray. The width of a beam is
-        added, because a return may be from anywhere within the beam. points: (N,3) lidar frame.
+        added, because a return may be from anywhere within the beam. ``points`` (N,3) are in metres
+        in the lidar frame.
         """
         azimuth, elevation, range_m = self.directions(points)
         gap_rad = self.table.at(azimuth, elevation)[:, 1]
@@ -111,8 +134,10 @@ class Sensors:
     @staticmethod
     def of(sweeps: Sequence[RegisteredSweep]) -> Sensors:
         """Return all scanners, measured in the deskewed sweeps."""
-        numbers = {int(n) for s in sweeps for n in np.unique(s.sweep.lidar)}
-        return Sensors({n: SensorModel.of(sweeps, n) for n in sorted(numbers)})
+        numbers = {
+            int(number) for registered in sweeps for number in np.unique(registered.sweep.lidar)
+        }
+        return Sensors({number: SensorModel.of(sweeps, number) for number in sorted(numbers)})
 
     @property
     def origins_m(self) -> Float:
@@ -123,7 +148,10 @@ class Sensors:
         return origins_m
 
     def gap_m(self, points: Float, lidar: NDArray[np.uint8]) -> Float:
-        """Return `SensorModel.gap_m` (N,) at points (N,3) of the scanner ``lidar`` (N,) of each."""
+        """Return the (N,) distance in metres to the next ring of each point's own scanner.
+
+        ``points`` (N,3) are in the lidar frame; ``lidar`` (N,) are the indices of their scanners.
+        """
         gap_m = np.zeros(len(points))
         for number, model in self.models.items():
             rows = np.flatnonzero(lidar == number)
@@ -135,16 +163,17 @@ class Sensors:
 
         Points out of all views take the spacing of the coarsest scanner.
         """
-        gaps_m, sees = zip(*(m.gap_m(points) for m in self.models.values()), strict=True)
-        finest = np.where(sees, gaps_m, np.inf).min(axis=0)
-        return np.where(np.isfinite(finest), finest, np.max(gaps_m, axis=0))
+        gaps_m, in_view = zip(*(model.gap_m(points) for model in self.models.values()), strict=True)
+        finest_m = np.where(in_view, gaps_m, np.inf).min(axis=0)
+        return np.where(np.isfinite(finest_m), finest_m, np.max(gaps_m, axis=0))
 
 
-def _view(azimuth: Float32) -> tuple[float, float]:
+def _find_view(azimuth: Float32) -> tuple[float, float]:
     """Return the right and the left end of the field of view, radians."""
     angles = np.unique(azimuth).astype(np.float64)
-    gap = np.diff(angles, append=angles[0] + 2 * np.pi)
-    widest = int(np.argmax(gap))
-    if gap[widest] < _HOLE_RAD:  # a building can cause it
+    gap_rad = np.diff(angles, append=angles[0] + 2 * np.pi)
+    widest = int(np.argmax(gap_rad))
+    if gap_rad[widest] < _HOLE_RAD:  # a building can cause it
         return -np.pi, np.pi
+    # The view begins to the left of the widest gap, and ends at the gap's right side.
     return float(angles[(widest + 1) % len(angles)]), float(angles[widest])

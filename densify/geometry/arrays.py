@@ -27,32 +27,41 @@ def select_rows(container: T, keep: Bool | Int | slice, columns: Sequence[str] =
     names = columns or _field_names(container)
     arrays = {name: getattr(container, name) for name in names}
     rows = np.arange(len(arrays[names[0]]))[keep]  # once for all columns
-    return _replaced(
-        container, {n: None if a is None else a.take(rows, axis=0) for n, a in arrays.items()}
-    )
+    selected = {
+        name: None if array is None else array.take(rows, axis=0) for name, array in arrays.items()
+    }
+    return _replace_columns(container, selected)
 
 
 def joined_rows(containers: Iterable[T]) -> T:
-    """Return one dataclass or named tuple, all of whose fields are columns, of several."""
+    """Return one dataclass or named tuple with the rows of all ``containers``, in order.
+
+    Every field of the containers is a column.
+    """
     pieces = list(containers)
-    names = _field_names(pieces[0])
-    return _replaced(pieces[0], {n: np.concatenate([getattr(p, n) for p in pieces]) for n in names})
+    columns = {
+        name: np.concatenate([getattr(piece, name) for piece in pieces])
+        for name in _field_names(pieces[0])
+    }
+    return _replace_columns(pieces[0], columns)
 
 
 def _field_names(container: Any) -> Sequence[str]:
-    return getattr(container, "_fields", None) or [f.name for f in fields(container)]
+    """Return the names of the fields of a dataclass or named tuple."""
+    return getattr(container, "_fields", None) or [field.name for field in fields(container)]
 
 
-def _replaced(container: Any, columns: Mapping[str, Any]) -> Any:
+def _replace_columns(container: Any, columns: Mapping[str, Any]) -> Any:
+    """Return a dataclass or named tuple with other values for some of its fields."""
     is_tuple = isinstance(container, tuple)
     return container._replace(**columns) if is_tuple else replace(container, **columns)
 
 
 def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
     """Return an (M,) structured array of (M,) columns, by field name, without padding."""
-    rows = np.empty(
-        len(next(iter(columns.values()))), [(name, c.dtype) for name, c in columns.items()]
-    )
+    num_rows = len(next(iter(columns.values())))
+    dtype = [(name, column.dtype) for name, column in columns.items()]
+    rows = np.empty(num_rows, dtype)
     for name, column in columns.items():
         rows[name] = column
     return rows

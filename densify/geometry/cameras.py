@@ -29,10 +29,12 @@ from densify.config.errors import InputError
 from densify.geometry.types import Bool, Camera, Float, Float32
 
 NEAREST_M = 0.1
+"""Least depth of a visible point."""
+# Possible numbers of coefficients of each model
 _COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
 _RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # all others are 0
-_NUM_ANGLES = 4096
-_NUM_STEPS = 10  # of Newton's method
+_NUM_ANGLES = 4096  # samples of a lens from which its inverse is interpolated
+_NUM_STEPS = 10  # greatest number of steps of Newton's method
 _STEP_RAD = np.cbrt(np.finfo(float).eps)  # step of differences with the least rounding error
 _CONVERGED = np.sqrt(np.finfo(float).eps)  # from here one more step of Newton's method is exact
 
@@ -51,13 +53,14 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
             and is farther than 0.1 m: in z for a pinhole, in range for other lenses.
     """
     lens = _lens(camera)
-    uv, visible = np.full((len(points_cam), 2), np.nan), np.zeros(len(points_cam), bool)
+    uv = np.full((len(points_cam), 2), np.nan)
+    visible = np.zeros(len(points_cam), bool)
     depth_m = points_cam[:, 2] if camera.model == "pinhole" else np.linalg.norm(points_cam, axis=1)
-    rows = np.flatnonzero(depth_m > NEAREST_M)
-    points_ahead = points_cam.take(rows, axis=0)
+    rows_ahead = np.flatnonzero(depth_m > NEAREST_M)
+    points_ahead = points_cam.take(rows_ahead, axis=0)
     in_view = np.flatnonzero(_in_view(camera, lens, points_ahead))
-    rows, points_ahead = rows[in_view], points_ahead.take(in_view, axis=0)
-    uv[rows] = _pixels(camera, lens, points_ahead)
+    rows = rows_ahead[in_view]
+    uv[rows] = _pixels(camera, lens, points_ahead.take(in_view, axis=0))
     u, v = np.rint(uv.take(rows, axis=0)).T
     with np.errstate(invalid="ignore"):
         visible[rows] = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
@@ -71,10 +74,10 @@ def rays(camera: Camera, uv: Float) -> Float:
     outside the view of the lens.
     """
     lens = _lens(camera)
-    on_plane = (np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T)[:, :2]
+    plane_xy = (np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T)[:, :2]
     if not camera.is_rectified:
-        on_plane = _unbent(lens, on_plane)
-    ray = _direction(camera, *on_plane.T)
+        plane_xy = _undistort(lens, plane_xy)
+    ray = _direction(camera, *plane_xy.T)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
         ray[~_in_view(camera, lens, ray)] = np.nan
@@ -90,13 +93,15 @@ def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
     lens = _lens(camera)
     range_m = np.linalg.norm(points_cam, axis=1, keepdims=True)
     ray = points_cam / range_m
-    across = np.cross(ray, np.eye(3)[np.argmin(np.abs(ray), axis=1)])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    # An axis perpendicular to each ray: its product with the coordinate axis farthest from it.
+    normal = np.cross(ray, np.eye(3)[np.argmin(np.abs(ray), axis=1)])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     jacobian = np.zeros((len(ray), 2, 3))
     # Central differences along two axes: along the ray nothing changes.
-    for axis in (across, np.cross(ray, across)):
-        uv_a, uv_b = (_pixels(camera, lens, ray + step * axis) for step in (_STEP_RAD, -_STEP_RAD))
-        jacobian += ((uv_a - uv_b) / (2 * _STEP_RAD))[:, :, None] * axis[:, None, :]
+    for axis in (normal, np.cross(ray, normal)):
+        uv_ahead = _pixels(camera, lens, ray + _STEP_RAD * axis)
+        uv_behind = _pixels(camera, lens, ray + -_STEP_RAD * axis)
+        jacobian += ((uv_ahead - uv_behind) / (2 * _STEP_RAD))[:, :, None] * axis[:, None, :]
     return jacobian / range_m[:, :, None]
 
 
@@ -106,24 +111,30 @@ def depth_along(points_cam: Float, measure: str) -> Float:
 
 
 def converted(camera: Camera, depth_m: Float32, from_measure: str, to_measure: str) -> Float32:
-    """Convert an (H,W) depth map (metres, 0 none) of a camera from one measure to another.
+    """Return a depth map of a camera converted from one measure of depth to another.
 
-    Measures are ``z``, along the optical axis, and ``range``. Pixels whose ray has z <= 0 become 0,
-    unless the measures are the same and the map is returned unchanged.
+    Pixels whose ray has z <= 0 become 0. If the measures are the same, the map is returned
+    unchanged.
+
+    Args:
+        depth_m: (H,W) depth in metres, 0 for none.
+        from_measure: ``z``, along the optical axis, or ``range``.
+        to_measure: ``z`` or ``range``.
     """
     if from_measure == to_measure:
         return depth_m
     v, u = np.divmod(np.arange(depth_m.size, dtype=np.float64), camera.width_px)
-    z = rays(camera, np.column_stack([u, v]))[:, 2].reshape(depth_m.shape)
-    ahead = (z > 0) & (depth_m > 0)
-    factor = z if to_measure == "z" else 1 / np.where(ahead, z, 1.0)
-    return np.where(ahead, depth_m * factor, 0.0).astype(np.float32)
+    z = rays(camera, np.column_stack([u, v]))[:, 2].reshape(depth_m.shape)  # of unit vectors
+    has_depth = (z > 0) & (depth_m > 0)
+    factor = z if to_measure == "z" else 1 / np.where(has_depth, z, 1.0)
+    return np.where(has_depth, depth_m * factor, 0.0).astype(np.float32)
 
 
 class _Lens(NamedTuple):
     """The distortion of a lens, which moves points of the plane in the module's docstring."""
 
-    numerator: Polynomial  # over the denominator, of the squared radius: the radial factor
+    # The radial factor is numerator / denominator, both polynomials of the squared radius.
+    numerator: Polynomial
     denominator: Polynomial
     p1: float  # tangential coefficients of OpenCV
     p2: float
@@ -152,7 +163,8 @@ def _lens(camera: Camera) -> _Lens:
 @lru_cache
 def _lens_of(model: str, coef: tuple[float, ...]) -> _Lens:
     """Return the lens of a model with these coefficients."""
-    denominator_terms, p1, p2 = [1.0], 0.0, 0.0
+    denominator_terms = [1.0]
+    p1 = p2 = 0.0
     if model == "fisheye":
         numerator_terms = [1.0, *coef]
     elif model == "mei":
@@ -161,23 +173,25 @@ def _lens_of(model: str, coef: tuple[float, ...]) -> _Lens:
     else:
         padded = (*coef, *[0.0] * len(_RATIONAL))[: len(_RATIONAL)]
         k1, k2, p1, p2, k3, *k4_to_k6 = padded
-        numerator_terms, denominator_terms = [1.0, k1, k2, k3], [1.0, *k4_to_k6]
-    numerator, denominator = Polynomial(numerator_terms), Polynomial(denominator_terms)
-    limit = _stops_growing(numerator, denominator)
+        numerator_terms = [1.0, k1, k2, k3]
+        denominator_terms = [1.0, *k4_to_k6]
+    numerator = Polynomial(numerator_terms)
+    denominator = Polynomial(denominator_terms)
+    limit = _growth_limit(numerator, denominator)
     if model == "fisheye":
-        limit = min(limit, np.pi**2)
+        limit = min(limit, np.pi**2)  # the angle off the axis is at most pi
     return _Lens(numerator, denominator, p1, p2, limit)
 
 
-def _stops_growing(n: Polynomial, d: Polynomial) -> float:
+def _growth_limit(n: Polynomial, d: Polynomial) -> float:
     """Return the squared radius up to which the distorted radius grows."""
     # The radial factor of radius r is n(s)/d(s) with s = r², and n', d' are derivatives by s. The
     # distorted radius r n/d stops growing at the first positive root of n d + 2 s (n' d - n d').
     # Beyond the first root of d it has no meaning.
     growth = n * d + Polynomial([0.0, 2.0]) * (n.deriv() * d - n * d.deriv())
     roots = np.concatenate([growth.trim(1e-15).roots(), d.trim(1e-15).roots()])
-    stops = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-    return float(stops.min(initial=np.inf))
+    positive_roots = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    return float(positive_roots.min(initial=np.inf))
 
 
 def _in_view(camera: Camera, lens: _Lens, points_cam: Float) -> Bool:
@@ -228,49 +242,71 @@ def _direction(camera: Camera, x: Float, y: Float) -> Float:
     return np.column_stack([stretch * x, stretch * y, np.cos(angle)])
 
 
-def _bent(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float]:
+def _distort(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float]:
     """Return (N,) distorted x and y on the plane."""
     s = x**2 + y**2
     factor = lens.numerator(s) / lens.denominator(s)
-    bent_x = factor * x + 2 * lens.p1 * x * y + lens.p2 * (s + 2 * x**2)
-    return bent_x, factor * y + lens.p1 * (s + 2 * y**2) + 2 * lens.p2 * x * y
+    distorted_x = factor * x + 2 * lens.p1 * x * y + lens.p2 * (s + 2 * x**2)
+    distorted_y = factor * y + lens.p1 * (s + 2 * y**2) + 2 * lens.p2 * x * y
+    return distorted_x, distorted_y
 
 
 def _pixels(camera: Camera, lens: _Lens, points_cam: Float) -> Float:
     """Return (N,2) image coordinates of points (N,3) in the view of the lens."""
     x, y = _plane(camera, points_cam)
     if not camera.is_rectified:
-        x, y = _bent(lens, x, y)
+        x, y = _distort(lens, x, y)
     u = camera.K[0, 0] * x + camera.K[0, 1] * y + camera.K[0, 2]
-    return np.column_stack([u, camera.K[1, 1] * y + camera.K[1, 2]])
+    v = camera.K[1, 1] * y + camera.K[1, 2]
+    return np.column_stack([u, v])
 
 
-def _unbent(lens: _Lens, wanted: Float) -> Float:
-    """Return the (N,2) inverse of `_bent`, NaN where the inverse does not exist."""
-    # Evenly in angle, because the plane of a lens with a half-space view is infinite.
+def _undistort(lens: _Lens, distorted: Float) -> Float:
+    """Return the (N,2) inverse of `_distort`, NaN where the inverse does not exist."""
+    # Start from the radial distortion alone, tabulated. The table is even in angle, because the
+    # plane of a lens with a half-space view is infinite.
     radius = np.tan(np.linspace(0, np.arctan(np.sqrt(lens.limit)), _NUM_ANGLES))
     radius = radius[radius < 1e3]
-    bent = radius * lens.numerator(radius**2) / lens.denominator(radius**2)
-    r_bent = np.hypot(*wanted.T)
+    table_distorted = radius * lens.numerator(radius**2) / lens.denominator(radius**2)
+    from_axis = np.hypot(*distorted.T)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        xy = wanted * np.where(r_bent > 0, np.interp(r_bent, bent, radius) / r_bent, 1.0)[:, None]
-        unsolved, error = np.arange(len(wanted)), np.full(len(wanted), np.inf)
+        start_radius = np.interp(from_axis, table_distorted, radius)
+        xy = distorted * np.where(from_axis > 0, start_radius / from_axis, 1.0)[:, None]
+
+        # Newton's method, with the inverse of the symmetric 2 x 2 matrix of slopes
+        unsolved = np.arange(len(distorted))
+        error = np.full(len(distorted), np.inf)
         for _ in range(_NUM_STEPS):
-            residual = np.stack(_bent(lens, *xy[unsolved].T)) - wanted[unsolved].T
-            by_x, cross, by_y = _slopes(lens, *xy[unsolved].T)
-            step = np.stack([by_y, -cross]) * residual[0] + np.stack([-cross, by_x]) * residual[1]
-            xy[unsolved] -= (step / (by_x * by_y - cross**2)).T
-            error[unsolved] = np.abs(residual).max(axis=0) / (1 + r_bent[unsolved])
-            unsolved = unsolved[~(error[unsolved] < _CONVERGED)]
-        converged = (error < _CONVERGED) & ((xy**2).sum(axis=1) < lens.limit)
-    return np.where(converged[:, None], xy, np.nan)
+            residual = np.stack(_distort(lens, *xy[unsolved].T)) - distorted[unsolved].T
+            slopes = _slopes_of(lens, *xy[unsolved].T)
+            column_x = np.stack([slopes.y_by_y, -slopes.x_by_y])
+            column_y = np.stack([-slopes.x_by_y, slopes.x_by_x])
+            determinant = slopes.x_by_x * slopes.y_by_y - slopes.x_by_y**2
+            step = column_x * residual[0] + column_y * residual[1]
+            xy[unsolved] -= (step / determinant).T
+            error[unsolved] = np.abs(residual).max(axis=0) / (1 + from_axis[unsolved])
+            unsolved = unsolved[~(error[unsolved] < _CONVERGED)]  # NaN stays unsolved
+        is_solved = (error < _CONVERGED) & ((xy**2).sum(axis=1) < lens.limit)
+    return np.where(is_solved[:, None], xy, np.nan)
 
 
-def _slopes(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float, Float]:
-    """Return (N,) slopes of the distortion: x by x, x by y (equal to y by x), and y by y."""
-    s, n, d = x**2 + y**2, lens.numerator, lens.denominator
-    factor = n(s) / d(s)
-    growth = 2 * (n.deriv()(s) - factor * d.deriv()(s)) / d(s)
-    by_x = factor + growth * x**2 + 2 * lens.p1 * y + 6 * lens.p2 * x
-    by_y = factor + growth * y**2 + 6 * lens.p1 * y + 2 * lens.p2 * x
-    return by_x, growth * x * y + 2 * (lens.p1 * x + lens.p2 * y), by_y
+class _Slopes(NamedTuple):
+    """Derivatives of the distorted x and y by the undistorted ones, (N,) each."""
+
+    x_by_x: Float
+    x_by_y: Float  # equal to y by x
+    y_by_y: Float
+
+
+def _slopes_of(lens: _Lens, x: Float, y: Float) -> _Slopes:
+    """Return the slopes of `_distort` at (N,) x and y."""
+    s = x**2 + y**2
+    numerator, denominator = lens.numerator(s), lens.denominator(s)
+    factor = numerator / denominator
+    # twice the derivative of the factor by s
+    growth = 2 * (lens.numerator.deriv()(s) - factor * lens.denominator.deriv()(s)) / denominator
+    return _Slopes(
+        x_by_x=factor + growth * x**2 + 2 * lens.p1 * y + 6 * lens.p2 * x,
+        x_by_y=growth * x * y + 2 * (lens.p1 * x + lens.p2 * y),
+        y_by_y=factor + growth * y**2 + 6 * lens.p1 * y + 2 * lens.p2 * x,
+    )

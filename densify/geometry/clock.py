@@ -22,8 +22,9 @@ class Clock:
 
     @staticmethod
     def of(stretch: Stretch) -> Clock:
-        """Build the clock of a stretch of sweeps; time 0 is its first sweep's reference time."""
-        stamp_ns = np.array([s.sweep.stamp_ns for s in stretch.sweeps], np.int64)
+        """Return the clock of a stretch of sweeps; time 0 is its first sweep's reference time."""
+        stamps_ns = [registered.sweep.stamp_ns for registered in stretch.sweeps]
+        stamp_ns = np.array(stamps_ns, np.int64)
         return Clock(stamp_ns - stamp_ns[:1])
 
     @cached_property
@@ -53,25 +54,26 @@ class Clock:
         batch is one sweep.
         """
         groups: list[list[int]] = []
-        for j, time_ns in enumerate(self.time_ns.tolist()):
-            since_ns = time_ns - self.time_ns[groups[-1][0]] if groups else np.inf
-            if since_ns + 0.5 * self.period_ns < _BATCH_S * 1e9:
-                groups[-1].append(j)
+        for i, time_ns in enumerate(self.time_ns.tolist()):
+            since_first_ns = time_ns - self.time_ns[groups[-1][0]] if groups else np.inf
+            # The middle of the sweep must lie within the batch.
+            if since_first_ns + 0.5 * self.period_ns < _BATCH_S * 1e9:
+                groups[-1].append(i)
             else:
-                groups.append([j])
+                groups.append([i])
         return tuple(map(tuple, groups))
 
     def at(self, i: int, later_s: float) -> int | None:
-        """Return the sweep nearest to ``later_s`` after sweep i, None if no sweep is on that side.
+        """Return the index of the sweep nearest to ``later_s`` after sweep i.
 
-        A negative ``later_s`` searches the sweeps before i.
+        A negative ``later_s`` searches the sweeps before i. None if no sweep is on that side.
         """
-        side = range(i + 1, len(self.time_ns)) if later_s > 0 else range(i - 1, -1, -1)
+        candidates = range(i + 1, len(self.time_ns)) if later_s > 0 else range(i - 1, -1, -1)
         wanted_ns = self.time_ns[i] + later_s * 1e9
-        return min(side, key=lambda j: abs(self.time_ns[j] - wanted_ns), default=None)
+        return min(candidates, key=lambda j: abs(self.time_ns[j] - wanted_ns), default=None)
 
     def nearest(self, j: int, among: Iterable[int]) -> int:
-        """Return the candidate nearest in time to sweep j, the earlier candidate of two."""
+        """Return the index ``among`` others that is nearest in time to sweep j, or the earlier."""
         return min(among, key=lambda k: (abs(self.time_ns[k] - self.time_ns[j]), k))
 
     def from_end_s(self, i: int) -> float:

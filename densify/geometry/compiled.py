@@ -71,7 +71,9 @@ def _imported_code(function: Callable[..., Any]) -> str:
     """Return a digest of the source files of inlined functions, "" if all are in the same file."""
     # Numba's cache detects changes of the function's own file only.
     files = {
-        f.__code__.co_filename for f in function.__globals__.values() if isinstance(f, Dispatcher)
+        value.__code__.co_filename
+        for value in function.__globals__.values()
+        if isinstance(value, Dispatcher)
     }
     other_files = sorted(files - {function.__code__.co_filename})
     code = b"".join(Path(file).read_bytes() for file in other_files)
@@ -81,7 +83,9 @@ def _imported_code(function: Callable[..., Any]) -> str:
 @cache
 def _is_open(folder: Path) -> bool:
     """Return True, and warn, if other users can write to the folder or to its parent."""
-    open_folder = next((f for f in (folder, folder.parent) if others_can_write(f)), None)
+    open_folder = next(
+        (place for place in (folder, folder.parent) if others_can_write(place)), None
+    )
     if open_folder is not None:
         _log.warning(
             "%s: others can write to it; compiled code is not kept there: chmod 700 it, or name "
@@ -169,6 +173,7 @@ def num_threads() -> int:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
+    """Return the threads that share the rows of kernels."""
     return ThreadPoolExecutor(num_threads(), "densify-kernel")
 
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.compiled import Kernel, inlined
 
-_SHARES = (0.9999, 0.999, 0.99)  # of the points that stay in a grid
+_SHARES = (0.9999, 0.999, 0.99)  # shares of the points that stay in a grid, tried in this order
 
 
 def tree_of(points: Float) -> cKDTree:
@@ -33,7 +33,10 @@ def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Fl
 
 
 def nearest_k(tree: cKDTree, queries: Float, k: int) -> tuple[Float, Int]:
-    """Return (N,k) ascending distances to the k nearest points (or all), and their rows."""
+    """Return (N,k) ascending distances from queries (N,d) to the k nearest points, and their rows.
+
+    A tree of fewer than k points gives all of them.
+    """
     distance_m, row = tree.query(queries, np.arange(1, min(k, tree.n) + 1))
     return np.asarray(distance_m), np.asarray(row, np.int64)
 
@@ -44,52 +47,72 @@ def is_near(tree: cKDTree, queries: Float, within_m: float) -> Bool:
 
 
 def thinned(points: Float | Float32, order: Int, step: float, max_per_cell: int) -> Int:
-    """Thin points (N,3) by a grid, and return the rows of the points that are kept, ascending.
+    """Return the ascending rows of the points that stay after thinning by a grid.
 
-    The rows ``order`` (K,) are the candidates, the preferred ones first. Each cell of side ``step``
-    keeps up to ``max_per_cell`` of them. The box around the points has at most 2^63 / N cells.
+    Args:
+        points: (N,3) coordinates. The box around them has at most 2^63 / N cells.
+        order: (K,) rows of the candidates, the preferred ones first.
+        step: Side of a cell, in the unit of the points.
+        max_per_cell: Greatest number of points that a cell keeps.
     """
     cell = np.zeros(len(points), np.int64)
-    for x in points.T:
-        index = ((x - x.min(initial=np.inf)) / step).astype(np.int64)
+    for coordinate in points.T:
+        index = ((coordinate - coordinate.min(initial=np.inf)) / step).astype(np.int64)
         cell *= index.max(initial=0) + 1
         cell += index
-    bits = len(order).bit_length()  # the lower bits say the place in the order
-    ranked = np.sort((cell[order] << bits) + np.arange(len(order)))
-    cell, kept = ranked >> bits, np.ones(len(ranked), bool)
-    kept[max_per_cell:] = cell[max_per_cell:] != cell[:-max_per_cell]
-    return np.sort(order[ranked[kept] & ((1 << bits) - 1)])
+    # Candidates are sorted by one number: the cell in its upper bits, the rank in its lower bits.
+    rank_bits = len(order).bit_length()
+    sorted_keys = np.sort((cell[order] << rank_bits) + np.arange(len(order)))
+    sorted_cell = sorted_keys >> rank_bits
+    rank = sorted_keys & ((1 << rank_bits) - 1)
+    # A candidate is too many if the one max_per_cell before it is in the same cell.
+    stays = np.ones(len(sorted_keys), bool)
+    stays[max_per_cell:] = sorted_cell[max_per_cell:] != sorted_cell[:-max_per_cell]
+    return np.sort(order[rank[stays]])
 
 
 def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
     """Return (N,) True for the points (N,D) around which a grid fits into memory.
 
-    These are all points if the box around them has at most ``most_cells`` cells of side ``cell``.
-    Otherwise up to 1 % of them, the farthest from their median, are left out, such as a few stray
-    returns. If their box is still too large, the points are spread out, and none is left out.
+    These are all points if the box around them is small enough. Otherwise up to 1 % of them, the
+    farthest from their median, are left out, such as a few stray returns. If the box is still too
+    large, the points are spread out, and none is left out.
+
+    Args:
+        points: (N,D) coordinates.
+        cell: Side of a cell of the grid, in the unit of the points.
+        most_cells: Greatest number of cells.
     """
     all_points = np.ones(len(points), bool)
     if not len(points) or _num_cells(points, cell) <= most_cells:
         return all_points
     distance = np.abs(points - np.median(points, axis=0)).max(axis=1)
     for share in _SHARES:
-        kept = distance <= np.quantile(distance, share)
-        if _num_cells(points[kept], cell) <= most_cells:
-            return kept
+        stays = distance <= np.quantile(distance, share)
+        if _num_cells(points[stays], cell) <= most_cells:
+            return stays
     return all_points
 
 
 def _num_cells(points: NDArray[Any], cell: float) -> float:
+    """Return the number of cells, not rounded, of the box around points (N,D)."""
     return math.prod(float(np.ptp(coordinate)) / cell + 1 for coordinate in points.T)
 
 
 def link(points: Float, distance_m: float) -> tuple[int, Int]:
-    """Return groups of points by single linkage: points closer than ``distance_m`` share a group.
+    """Group points by single linkage: points closer than ``distance_m`` share a group.
 
-    The points (N,3) are sorted into a grid whose cell diagonal equals the distance, hence all
-    points of a cell are linked. Only neighbouring cells are compared, and the cost does not grow
-    with the square of the point density. Returns the number of groups G, and (N,) group labels 0 to
-    G - 1, numbered by the first point of each group.
+    The points are sorted into a grid whose cell diagonal equals the distance, hence all points of a
+    cell are linked. Only neighbouring cells are compared, and the cost does not grow with the
+    square of the point density.
+
+    Args:
+        points: (N,3) positions in metres.
+        distance_m: Distance below which two points are linked.
+
+    Returns:
+        num_groups: Number of groups G.
+        label: (N,) group of each point, 0 to G - 1, numbered by the first point of each group.
     """
     if not len(points):
         return 0, np.zeros(0, np.int64)
@@ -97,15 +120,20 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
     cell = np.floor((points - points.min(axis=0)) / side_m).astype(np.int64)
     cells, cell_of_point = np.unique(cell, axis=0, return_inverse=True)
     cell_of_point = cell_of_point.ravel()
-    # Points of cells farther apart than (2, 2, 1) are farther apart than the distance.
+
+    # Pairs of cells, the nearest first, because these link most points. Points of cells farther
+    # apart than (2, 2, 1), whose distance is 3, are farther apart than the distance.
     pairs = cKDTree(cells).query_pairs(3.0 + 1e-9, output_type="ndarray")
     num_apart = np.abs(cells[pairs[:, 0]] - cells[pairs[:, 1]]).sum(axis=1)
+    nearest_first = pairs[np.argsort(num_apart, kind="stable")]
+
+    # Points in the order of their cells, and the first point of each cell
     order = np.argsort(cell_of_point, kind="stable")
     start = np.searchsorted(cell_of_point[order], np.arange(len(cells) + 1))
-    parent = np.arange(len(cells))
-    nearest_first = pairs[np.argsort(num_apart, kind="stable")]
-    _join(np.ascontiguousarray(points[order], float), start, nearest_first, distance_m**2, parent)
-    _, first, label = np.unique(parent[cell_of_point], return_index=True, return_inverse=True)
+    root = np.arange(len(cells))
+    _join(np.ascontiguousarray(points[order], float), start, nearest_first, distance_m**2, root)
+
+    _, first, label = np.unique(root[cell_of_point], return_index=True, return_inverse=True)
     renumbered = np.empty(len(first), np.int64)
     renumbered[np.argsort(first)] = np.arange(len(first))
     return len(first), renumbered[label]
@@ -114,21 +142,25 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
 def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
     """Return (N,) True for the points (N,3) closer than ``within_m`` to a dense seed.
 
-    A seed, of the mask ``seed`` (N,), is dense if at least ``least_share`` of the points within
-    ``within_m`` of it are seeds.
+    Args:
+        points: (N,3) positions in metres.
+        seed: (N,) True for seeds.
+        within_m: Radius around a seed.
+        least_share: Least share of seeds among the points around a dense seed.
     """
-    close, seeds = np.zeros(len(points), bool), points[seed]
+    is_close = np.zeros(len(points), bool)
+    seeds = points[seed]
     if not len(seeds):
-        return close
+        return is_close
     near_rows = np.flatnonzero(is_near(tree_of(seeds), points, within_m))
     num_points, num_seeds = (
         tree_of(cloud).query_ball_point(seeds, within_m, return_length=True)
         for cloud in (points[near_rows], seeds)
     )
-    dense = seeds[num_seeds >= least_share * num_points]
-    if len(dense):
-        close[near_rows] = is_near(tree_of(dense), points[near_rows], within_m)
-    return close
+    dense_seeds = seeds[num_seeds >= least_share * num_points]
+    if len(dense_seeds):
+        is_close[near_rows] = is_near(tree_of(dense_seeds), points[near_rows], within_m)
+    return is_close
 
 
 @Kernel

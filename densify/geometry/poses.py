@@ -11,16 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from densify.geometry.arrays import Float, Int
 
-_ROWS = 8192  # per product; for more, OpenBLAS wakes threads that spin longer than they work
-_HOLD = 1e-9  # relative weight of no rotation, which decides where points leave it open
+_ROWS = 8192  # rows of a product; for more, OpenBLAS wakes threads that spin longer than they work
+_HOLD = 1e-9  # relative weight of no rotation, which decides where points do not determine it
 
 
 def inverse(T_a_b: Float) -> Float:
     """Return the inverse ``T_b_a`` (...,4,4) of poses ``T_a_b`` (...,4,4)."""
     R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
     T_b_a = np.zeros(T_a_b.shape)
-    T_b_a[..., :3, :3], T_b_a[..., 3, 3] = R_b_a, 1
+    T_b_a[..., :3, :3] = R_b_a
     T_b_a[..., :3, 3:] = -R_b_a @ T_a_b[..., :3, 3:]
+    T_b_a[..., 3, 3] = 1
     return T_b_a
 
 
@@ -33,9 +34,11 @@ def transform(T_a_b: Float, points_b: Float) -> Float:
 
 def rotate(T_a_b: Float, vectors_b: Float) -> Float:
     """Return (N,3) vectors, given in frame b, in the axes of frame a."""
-    R, vectors_a = T_a_b[:3, :3].T, np.empty(vectors_b.shape)
-    for i in range(0, len(vectors_b), _ROWS):
-        np.matmul(vectors_b[i : i + _ROWS], R, out=vectors_a[i : i + _ROWS])
+    R_b_a = T_a_b[:3, :3].T
+    vectors_a = np.empty(vectors_b.shape)
+    for first in range(0, len(vectors_b), _ROWS):
+        rows = slice(first, first + _ROWS)
+        np.matmul(vectors_b[rows], R_b_a, out=vectors_a[rows])
     return vectors_a
 
 
@@ -45,15 +48,16 @@ def log(T_a_b: Float) -> Float:
     The translation is the pose's own, not the one of a screw motion. For a vehicle that turns by at
     most 0.1 rad within a sweep the two paths differ by millimetres.
     """
-    turn = Rotation.from_matrix(T_a_b[..., :3, :3]).as_rotvec()
-    return np.concatenate([turn, T_a_b[..., :3, 3]], axis=-1)
+    rotation = Rotation.from_matrix(T_a_b[..., :3, :3]).as_rotvec()
+    return np.concatenate([rotation, T_a_b[..., :3, 3]], axis=-1)
 
 
 def exp(twist: Float) -> Float:
     """Return the poses (...,4,4) of twists (...,6) in rad and m; inverts `log`."""
     T_a_b = np.zeros((*twist.shape[:-1], 4, 4))
     T_a_b[..., :3, :3] = Rotation.from_rotvec(twist[..., :3]).as_matrix()
-    T_a_b[..., :3, 3], T_a_b[..., 3, 3] = twist[..., 3:], 1
+    T_a_b[..., :3, 3] = twist[..., 3:]
+    T_a_b[..., 3, 3] = 1
     return T_a_b
 
 
@@ -71,9 +75,10 @@ def twist_to(T_world_lidar: Float, stamp_ns: Int, i: int) -> Float:
 def carried(T_a_b: Float, twist_b: Float) -> Float:
     """Return twists (...,6) of frame b in frame a of the same rigid body, by the adjoint."""
     R_a_b = T_a_b[..., :3, :3]
-    turn = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., :3])
-    along = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., 3:])
-    return np.concatenate([turn, along + np.cross(T_a_b[..., :3, 3], turn)], axis=-1)
+    rotation = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., :3])
+    translation = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., 3:])
+    lever = np.cross(T_a_b[..., :3, 3], rotation)  # motion of a's origin by the rotation about b's
+    return np.concatenate([rotation, translation + lever], axis=-1)
 
 
 def transform_each(twist: Float, points: Float) -> Float:
@@ -93,12 +98,14 @@ def fit_rigid(source: Float, target: Float) -> Float:
 
     A rotation that the points do not determine, as about a line of points, is zero (Kabsch 1976).
     """
-    from_m, to_m = source.mean(axis=0), target.mean(axis=0)
+    source_mean = source.mean(axis=0)
+    target_mean = target.mean(axis=0)
     # einsum and not BLAS: its sums do not depend on the number of threads.
-    spread = np.einsum("ni,nj->ij", target - to_m, source - from_m)
-    spread += _HOLD * np.square(source - from_m).sum() * np.eye(3)
-    left, _, right = np.linalg.svd(spread)
+    covariance = np.einsum("ni,nj->ij", target - target_mean, source - source_mean)
+    covariance += _HOLD * np.square(source - source_mean).sum() * np.eye(3)
+    left, _, right = np.linalg.svd(covariance)
     T = np.eye(4)
+    # The determinant turns a reflection into a rotation.
     T[:3, :3] = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    T[:3, 3] = to_m - T[:3, :3] @ from_m
+    T[:3, 3] = target_mean - T[:3, :3] @ source_mean
     return T

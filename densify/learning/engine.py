@@ -28,18 +28,25 @@ def check_argument(argument: str) -> None:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """Return the motion of a scene by a model file (`densify.flow.engines.EngineModule`)."""
-    model, sweeps = read_model(Path(argument)), scene.stretch.sweeps
+    """Return the motion of a scene by a trained network.
+
+    ``argument`` is the path of the model file; `densify.flow.engines.EngineModule` describes the
+    rest. Raise InputError if the file is no model.
+    """
+    model = read_model(Path(argument))
+    sweeps = scene.stretch.sweeps
     pairs = zip(sweeps, scene.candidates, strict=True)
     above = [AboveGround.of(sweep, scene.ground, candidates.row) for sweep, candidates in pairs]
-    flows = flows_of(model, above, [s.T_world_lidar[:3, 3] for s in sweeps])
-    stamps_s = [s.sweep.stamp_ns * 1e-9 for s in sweeps]
+    flows = flows_of(model, above, [registered.T_world_lidar[:3, 3] for registered in sweeps])
+    stamps_s = [registered.sweep.stamp_ns * 1e-9 for registered in sweeps]
     all_grouped, velocities = [], []
-    for i, candidates in enumerate(scene.candidates):
-        duration_s = stamps_s[_neighbor(i, len(above))] - stamps_s[i] if len(above) > 1 else 1
-        velocity_m_s = flows[i] / duration_s
+    for index, candidates in enumerate(scene.candidates):
+        duration_s = 1.0
+        if len(above) > 1:
+            duration_s = stamps_s[_neighbor(index, len(above))] - stamps_s[index]
+        velocity_m_s = flows[index] / duration_s
         velocity_m_s[:, 2] = 0.0
-        grouped, common_m_s = _grouped(scene, i, candidates, above[i], velocity_m_s)
+        grouped, common_m_s = _grouped(scene, index, candidates, above[index], velocity_m_s)
         all_grouped.append(grouped)
         velocities.append(common_m_s)
     return motion_of(scene, tuple(all_grouped), velocities)
@@ -48,39 +55,45 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
 def flows_of(model: Model, above: list[AboveGround], origins: list[Float]) -> list[Float]:
     """Return for each sweep the flow (n,3) to the next sweep, metres, world, ego-motion removed.
 
-    The last sweep has its flow to the previous sweep. ``origins`` are (3,) scanner positions.
+    The last sweep has its flow to the previous sweep. A single sweep has flow 0.
+
+    Args:
+        above: The n points above the ground of each sweep.
+        origins: (3,) position of the scanner in each sweep, world.
     """
     flows = []
-    for i, source in enumerate(above):
+    for index, source in enumerate(above):
         if len(above) < 2 or not len(source.row):
             flows.append(np.zeros((len(source.row), 3)))
             continue
-        numbers = order_for(i, _neighbor(i, len(above)), len(above), NUM_SWEEPS)
-        flows.append(
-            model.flow([None if n is None else above[n].cloud(origins[i]) for n in numbers])
-        )
+        numbers = order_for(index, _neighbor(index, len(above)), len(above), NUM_SWEEPS)
+        clouds = [
+            None if number is None else above[number].cloud(origins[index]) for number in numbers
+        ]
+        flows.append(model.flow(clouds))
     return flows
 
 
-def _neighbor(i: int, count: int) -> int:
-    return i + 1 if i + 1 < count else i - 1
+def _neighbor(index: int, num_sweeps: int) -> int:
+    """Return the index of the next sweep, for the last sweep that of the sweep before it."""
+    return index + 1 if index + 1 < num_sweeps else index - 1
 
 
 def _grouped(
-    scene: Scene, i: int, candidates: Candidates, above: AboveGround, velocity_m_s: Float
+    scene: Scene, index: int, candidates: Candidates, above: AboveGround, velocity_m_s: Float
 ) -> tuple[Candidates, Float]:
-    """Return the candidates of sweep i for tracking, and their (n,3) velocities, m/s, world."""
+    """Return the candidates of a sweep for tracking, and their (n,3) velocities, m/s, world."""
     # Clusters that move according to the network may start a track, at their median velocity.
     # Clusters from free-space violations alone may only join a track that was started elsewhere.
     moves = np.linalg.norm(velocity_m_s, axis=1) >= MOVES_M_S
-    registered = scene.stretch.sweeps[i]
+    registered = scene.stretch.sweeps[index]
     row = candidates.row
     gap_m = scene.space.sensors.gap_m(registered.sweep.points[row], registered.sweep.lidar[row])
     squeezed = closer_rings(above.points - registered.T_world_lidar[:3, 3], gap_m)
     num, cluster = cluster_around(squeezed, moves)
     common_m_s = np.zeros_like(velocity_m_s)
-    for k in range(num):
-        members = cluster == k
+    for number in range(num):
+        members = cluster == number
         common_m_s[members] = np.median(velocity_m_s[members & moves], axis=0)
     only_evidence = (cluster < 0) & (candidates.cluster >= 0)
     label = np.where(only_evidence, num + candidates.cluster, cluster)

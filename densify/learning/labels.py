@@ -81,8 +81,9 @@ def label_sweeps(
 
 
 def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: int) -> Label | None:
+    """Return the label of a sweep, None without a next sweep or without boxes of both."""
     stretch = recording.window(frame)
-    following = next((f for f in stretch.frames if f > frame), None)
+    following = next((other for other in stretch.frames if other > frame), None)
     if following is None:
         return None
     source_boxes, target_boxes = boxes(frame), boxes(following)
@@ -120,6 +121,7 @@ def flow_of_boxes(
         after: Next sweep in the same world. Only its pose and time are used.
         boxes: Boxes of ``source``.
         next_boxes: Boxes of ``after``. Boxes of one object share the track name.
+        margins: Margins around the boxes, None for the defaults.
 
     Returns:
         The flow with ego-motion removed, in the lidar frame of ``source``; ``instance`` is the row
@@ -130,13 +132,15 @@ def flow_of_boxes(
     margins = margins or BoxMargins()
     points = source.sweep.points
     field = FlowField.zero(len(points))
-    num_inside, is_near_box = np.zeros(len(points), np.int64), np.zeros(len(points), bool)
+    num_inside = np.zeros(len(points), np.int64)  # number of boxes that hold each point
+    is_near_box = np.zeros(len(points), bool)
     sure = _is_annotated(boxes.view, points)
     least_m = _MOVES_M_S * (after.sweep.stamp_ns - source.sweep.stamp_ns) * 1e-9
     T_source_after = poses.inverse(source.T_world_lidar) @ after.T_world_lidar
     T_source_next_boxes = T_source_after @ _at_reference(next_boxes, after)
     next_pose = dict(zip(next_boxes.track, T_source_next_boxes, strict=True))
     for k, T_source_box in enumerate(_at_reference(boxes, source)):
+        # Points in the grown box, by their positions in the frame of the box
         rows = _rows_around(boxes, k, T_source_box, source, margins)
         in_box = poses.transform(poses.inverse(T_source_box), points[rows])
         outside_m = (np.abs(in_box) - boxes.size_m[k] / 2).max(axis=1)
@@ -145,6 +149,8 @@ def flow_of_boxes(
         rows, in_box = rows[inside], in_box[inside]
         num_inside[rows] += 1
         field.instance[rows] = k
+
+        # Their motion with the box
         T_source_next_box = next_pose.get(boxes.track[k]) if boxes.track[k] else None
         if T_source_next_box is None:
             sure[rows] = False
@@ -152,10 +158,10 @@ def flow_of_boxes(
             field.displacement[rows] = poses.transform(T_source_next_box, in_box) - points[rows]
             field.moving[rows] = True
             sure[rows[in_box[:, 2] < margins.foot_m - boxes.size_m[k, 2] / 2]] = False
-    twice = num_inside > 1
-    sure &= ~twice & ~(is_near_box & (num_inside == 0))
-    field.displacement[twice] = 0.0
-    field.moving[twice] = False
+    is_in_several = num_inside > 1
+    sure &= ~is_in_several & ~(is_near_box & (num_inside == 0))
+    field.displacement[is_in_several] = 0.0
+    field.moving[is_in_several] = False
     return field, sure
 
 

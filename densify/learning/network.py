@@ -82,11 +82,15 @@ class AboveGround(NamedTuple):
 def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> list[int | None]:
     """Return the indices of the sweeps that the network needs for the flow from source to target.
 
-    Sweeps before the source (after it if the target is earlier) follow. None is beyond the ends.
+    They are source, target, and further sweeps on the other side of the source.
+
+    Args:
+        num_sweeps: Number of existing sweeps; other indices become None.
+        num_wanted: Number of sweeps that the network takes.
     """
     step = source - target
-    wanted = [source, target, *(source + step * n for n in range(1, num_wanted - 1))]
-    return [n if 0 <= n < num_sweeps else None for n in wanted]
+    wanted = [source, target, *(source + step * number for number in range(1, num_wanted - 1))]
+    return [index if 0 <= index < num_sweeps else None for index in wanted]
 
 
 Sweeps = Sequence[NetworkCloud | None]
@@ -177,6 +181,7 @@ class _Block(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return the features (1,num_out,h,w) of an image (1,num_in,H,W)."""
         out: Tensor = self.layers(x)
         return out
 
@@ -197,6 +202,7 @@ class _Pillars:
 
     @staticmethod
     def of(cloud: NetworkCloud) -> _Pillars:
+        """Return the points of a cloud within the grid, with their features."""
         xy = (cloud.points[:, :2] + REACH_M) / CELL_M  # in cells
         row = torch.nonzero(((xy >= 0) & (xy < NUM_CELLS)).all(dim=1))[:, 0]
         cell = xy[row].floor().long()
@@ -260,7 +266,7 @@ def write_model(path: Path, model: Model) -> None:
 
 
 def read_model(path: Path) -> Model:
-    """Return the model of a file."""
+    """Return the model in a file; raise InputError if the file is no model of this version."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a model that densify train flow wrote")
     arrays = read_arrays(path)
@@ -279,7 +285,7 @@ def read_model(path: Path) -> Model:
     if not all(np.isfinite(array).all() for array in weights.values()):
         raise InputError(f"{path}: weights that are not finite; train it again")
     try:
-        network.load_state_dict({name: torch.from_numpy(a) for name, a in weights.items()})
+        network.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
     except (RuntimeError, TypeError) as error:
         raise InputError(f"{path}: damaged: {error}; train it again") from error
     return Model(network.train(False), training)

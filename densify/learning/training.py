@@ -207,7 +207,9 @@ def _new_street(spec: str, rng: np.random.Generator) -> LidarSequence:
 def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
     """Return the clip of up to 7 sweeps around a key frame.
 
-    Labels are the ground truth ("truth"), the flow of the engine ``groups`` ("engine"), else none.
+    Args:
+        teacher: Source of the labels: "truth" for the ground truth, "engine" for the flow of the
+            engine ``groups``; other names give no labels.
     """
     stretch = Recording(sequence, settings, _CLIP_SWEEPS // 2, [key]).window(key)
     heights, frames = ground(stretch), stretch.frames
@@ -223,10 +225,10 @@ def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str)
         flow = moving = None
         if teacher == "truth" and sequence.truth is not None:
             row = registered.sweep.row[above.row]
-            flow = [sequence.truth.displacement(frame, f)[row] for f in (before, after)]
+            flow = [sequence.truth.displacement(frame, target)[row] for target in (before, after)]
             moving = sequence.truth.sweep(frame).moving[row]
         elif motion is not None:
-            fields = [motion.flow(frame, f) for f in (before, after)]
+            fields = [motion.flow(frame, target) for target in (before, after)]
             flow = [field.displacement[above.row] for field in fields]
             moving = (fields[0].moving & ~fields[0].lost)[above.row]
         if flow is not None:
@@ -288,7 +290,11 @@ def sample_of(
     num_wanted: int,
     rng: np.random.Generator | None = None,
 ) -> Sample:
-    """Return the sample of two neighbouring sweeps (indices), random where ``rng`` is given."""
+    """Return the training sample of two neighbouring sweeps of a clip.
+
+    ``source`` and ``target`` are indices in the clip, ``num_wanted`` the number of sweeps that the
+    network takes. With ``rng`` the sample is turned, mirrored, scaled and drawn at random.
+    """
     source_sweep, target_sweep = clip[source], clip[target]
     augmentation = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
     scale = np.float32(np.linalg.norm(augmentation[2]))
@@ -299,7 +305,7 @@ def sample_of(
         return NetworkCloud(points, torch.from_numpy(sweep.height_m * scale))
 
     numbers = order_for(source, target, len(clip), num_wanted)
-    sweeps = tuple(None if n is None else cloud(n) for n in numbers)
+    sweeps = tuple(None if number is None else cloud(number) for number in numbers)
     points = cloud(source).points, cloud(target).points
     in_reach = [(xyz[:, :2].abs() < REACH_M).all(dim=1) for xyz in points]
     drawn = [_draw(is_within.numpy(), rng) for is_within in in_reach]
@@ -333,7 +339,10 @@ def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
 
 
 def objective_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the published objective for the drawn points of a sample, m² per point, 0-d."""
+    """Return the published objective for the drawn points of a sample, m² per point, 0-d.
+
+    ``predict`` is the network: it returns the (n,3) flow of the source points.
+    """
     source: Tensor = sample.sweeps[0].points[sample.drawn]  # type: ignore[union-attr]
     graph = knn_graph(source.detach().cpu().double().numpy(), NUM_NEIGHBORS)
     flow = predict(sample.sweeps)[sample.drawn]
@@ -342,7 +351,10 @@ def objective_loss(predict: Predict, sample: Sample) -> Tensor:
 
 
 def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the sum of the mean errors over static, slow and fast points, metres, 0-d."""
+    """Return the sum of the mean errors over static, slow and fast points, metres, 0-d.
+
+    ``predict`` is the network: it returns the (n,3) flow of the source points.
+    """
     flow, true, moving = predict(sample.sweeps), sample.flow, sample.moving
     fast = true.norm(dim=1) >= _FAST_M_S * sample.duration_s
     # The gradient of the norm itself is not a number at 0.

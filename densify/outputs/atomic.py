@@ -18,8 +18,8 @@ import numpy as np
 
 from densify.config.errors import OutputError
 
-LEFT_AFTER_S = 600.0  # longer than the writing of any file
-_MOST_LETTERS = 100  # of a name: with the random letters it stays below the file system's 255
+LEFT_AFTER_S = 600.0  # age of leftovers, longer than the writing of any file
+_MOST_LETTERS = 100  # letters of a name; with random letters it stays below the system's limit, 255
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -40,7 +40,8 @@ def file_aside(path: Path) -> Iterator[Path]:
 def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
     """Yield a folder to write into, which becomes ``folder`` if the block ends without an error.
 
-    On an error ``folder`` is as before. Of its entries, only ``owned`` are replaced or removed.
+    ``owned`` names the entries of ``folder`` that are replaced or removed; others stay. On an error
+    ``folder`` is as before. Raise OutputError if it cannot be written.
     """
     folder = Path(os.path.realpath(folder))
     missing_parents = [parent for parent in folder.parents if not parent.exists()]
@@ -100,7 +101,7 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a value in types of JSON and YAML: arrays as lists, NaN and infinity as None."""
+    """Return a value in the types of JSON and YAML: arrays become lists, NaN and infinity None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -63,7 +63,9 @@ class StoredCloud:
     def joined(clouds: Sequence[StoredCloud]) -> StoredCloud:
         """Return one cloud with the points of all clouds, in the given order."""
         names = [field.name for field in fields(StoredCloud)]
-        columns = {n: np.concatenate([getattr(cloud, n) for cloud in clouds]) for n in names}
+        columns = {
+            name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in names
+        }
         return StoredCloud(**columns)
 
     @property
@@ -87,15 +89,20 @@ class StoredCloud:
         return np.where(self.observed[:, None], self.rgb, _UNOBSERVED)
 
     def sweep(self, frame: int) -> StoredCloud:
-        """Return the points of one sweep of the window."""
+        """Return the points of the sweep with this frame number, if it is in the window."""
         return self.select((self.frame == frame) & ~self.far)
 
     def select(self, keep: Bool | Int) -> StoredCloud:
         """Return a cloud with only the points of a mask (M,), or of an array of point indices."""
-        return StoredCloud(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+        columns = {field.name: getattr(self, field.name)[keep] for field in fields(self)}
+        return StoredCloud(**columns)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return column name -> (M,) values. Booleans become uint8, positions float32."""
+        """Return the (M,) values of each column, by name; booleans as uint8, positions as float32.
+
+        The names are x, y, z, displaced_x, displaced_y, displaced_z, red, green, blue, intensity,
+        confidence, displaced, frame, instance, gps_time, moving and far.
+        """
         names = ("intensity", "confidence", "displaced", "frame", "instance", "gps_time")
         return {  # float32 keeps 1 mm up to 8 km
             **dict(zip("xyz", self.points.T.astype(np.float32), strict=True)),
@@ -145,7 +152,7 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
 
 
 def read_cloud(path: Path) -> StoredCloud:
-    """Return the cloud in a file that `write_cloud` wrote."""
+    """Return the cloud in a file that `write_cloud` wrote; raise InputError for other files."""
     las = read_las(path)
     known = {*_STANDARD_DIMENSIONS, *(name for name, _, _ in _EXTRA_DIMENSIONS)}
     if missing := known - set(las.point_format.dimension_names):

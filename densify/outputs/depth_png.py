@@ -52,12 +52,18 @@ def write_depth_png(path: Path, depth_m: Float32) -> None:
 
 
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
-    """Write an (H,W) map by `stored_confidence`, 0 where `write_depth_png` stores no depth."""
+    """Write an (H,W) map of confidence, 0 to 1, as 8-bit PNG with values of `stored_confidence`.
+
+    Pixels are 0 where `write_depth_png` stores no depth.
+    """
     _write_where_depth(path, depth_m, confidence, stored_confidence)
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
-    """Write an (H,W) map by `stored_age`, 0 where `write_depth_png` stores no depth."""
+    """Write an (H,W) map of ages in seconds as 16-bit PNG with values of `stored_age`.
+
+    Pixels are 0 where `write_depth_png` stores no depth.
+    """
     _write_where_depth(path, depth_m, age_s, stored_age)
 
 
@@ -77,7 +83,10 @@ def stored_confidence(confidence: ArrayLike) -> NDArray[np.uint8]:
 
 
 def confidence_of(stored: NDArray[np.uint8]) -> Float32:
-    """Return (H,W) the confidence 0 to 1 of values of `stored_confidence`, 0 without depth."""
+    """Return the (H,W) confidence, 0 to 1, of stored pixel values, 0 without depth.
+
+    `stored_confidence` describes the values.
+    """
     return np.maximum(stored.astype(np.float32) - 1, 0) / np.float32(STEPS_OF_CONFIDENCE)
 
 
@@ -88,7 +97,7 @@ def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
 
 
 def age_of(stored: NDArray[np.uint16]) -> Float32:
-    """Return (H,W) the age in seconds of values of `stored_age`, 0 without depth."""
+    """Return the (H,W) age in seconds of stored pixel values, 0 without depth; see `stored_age`."""
     return np.maximum(stored.astype(np.float32) - 1, 0) / np.float32(_STEPS_PER_S)
 
 
@@ -119,7 +128,7 @@ PixelType = type[np.uint8] | type[np.uint16]
 
 
 def read_stored(path: Path, kind: PixelType, map_name: str) -> NDArray[Any]:
-    """Return the (H,W) pixel values as stored; ``kind`` is their type, ``map_name`` for errors."""
+    """Return the (H,W) pixel values of a PNG as stored."""
     image = read_image(path, as_stored=True)
     if image.dtype != kind or image.ndim != 2:
         got = f"{image.dtype} of shape {image.shape}"
@@ -137,6 +146,7 @@ def read_mask_png(path: Path) -> Bool:
 
 
 def _quantised(depth_m: Float32) -> NDArray[np.uint16]:
+    """Return depths in 256ths of a metre, 0 beyond 256 m."""
     if not (np.isfinite(depth_m) & (depth_m >= 0)).all():
         raise ValueError("depth_m: expected finite depths, 0 or more")
     steps = np.rint(_STEPS_PER_M * depth_m.astype(np.float64))

@@ -55,7 +55,9 @@ def export_run(
         run: Folder of one key sweep, or of several for formats of whole drives.
         to: Name of a format in `densify.config.plugins.EXPORTS`.
         out: Folder to write into, None for ``RUN/export/FORMAT``.
-        min_confidence: As in `Thresholds`, and so are ``max_age_ms`` and ``cameras``.
+        min_confidence: Least confidence of pixels and points, 0 to 1.
+        max_age_ms: Greatest time from the measurement to the exposure (pixels) or the key sweep
+            (points); None for any.
         overwrite: Replace an earlier export.
     """
     if not 0 <= min_confidence <= 1:
@@ -89,7 +91,7 @@ def export_run(
 
 
 def facts(export: Export) -> dict[str, Any]:
-    """Return the fields ``density`` and ``num_points`` of export.yaml, without unknown values."""
+    """Return the fields ``density`` and ``num_points`` of export.yaml, each only if known."""
     density = {
         camera: {product: kept._asdict() for product, kept in products.items()}
         for camera, products in export.density.items()
@@ -108,7 +110,7 @@ def _total(runs: Sequence[FinishedRun]) -> Kept | None:
 
 
 def write_npy(run: FinishedRun, folder: Path) -> None:
-    """Write (H,W) float32 .npy: depth, depth_filled (metres, 0 none) and confidence (0 to 1)."""
+    """Write each map as (H,W) float32 .npy: depth, depth_filled (metres, 0 none) and confidence."""
     _write_maps(run, folder, ".npy", lambda path, _, values: np.save(path, values))
 
 

@@ -128,7 +128,7 @@ class FinishedRun:
     """The folder of one densified key sweep. Files are read on demand and may raise InputError."""
 
     def __init__(self, folder: Path, thresholds: Thresholds = EVERYTHING) -> None:
-        """Open a folder."""
+        """Open a folder with run.yaml; raise InputError without it."""
         path = folder / "run.yaml"
         if not path.is_file():
             raise InputError(
@@ -137,11 +137,12 @@ class FinishedRun:
             )
         with _damage_named(path):
             record = read_yaml(path)[0]
-            # stamp_ns: the key sweep's reference time in ns since 1970; data: text of --data
-            self.key, self.stamp_ns = int(record["key"]), int(record["stamp_ns"])
-            data = str(record["data"])
+            self.key = int(record["key"])
+            self.stamp_ns = int(record["stamp_ns"])  # reference time of the key sweep, since 1970
+            data = str(record["data"])  # text of --data
             self.recording = str(record.get("recording") or data.rstrip("/").rpartition("/")[2])
-        self.folder, self._cameras = folder, thresholds.cameras
+        self.folder = folder
+        self._cameras = thresholds.cameras
         max_age_ms = np.inf if thresholds.max_age_ms is None else thresholds.max_age_ms
         self._min_confidence = stored_confidence(thresholds.min_confidence)
         self._max_age = stored_age(max_age_ms / 1000)
@@ -158,7 +159,8 @@ class FinishedRun:
         existing = sorted({name.partition("/")[0] for name in names})
         if unknown := {*(self._cameras or ())} - {*existing}:
             raise InputError(f"camera {min(unknown)}: expected one of {', '.join(existing)}")
-        return [n for n in names if n.partition("/")[0] in (self._cameras or existing)]
+        chosen = self._cameras or existing
+        return [name for name in names if name.partition("/")[0] in chosen]
 
     @cached_property
     def scene(self) -> SceneFile:
@@ -182,7 +184,7 @@ class FinishedRun:
         return Kept(sum(k.before for k in counts), sum(k.after for k in counts)) if counts else None
 
     def measure(self, camera: str) -> str:
-        """Return ``z`` (depth along the camera's axis) or ``range`` (distance from the lens)."""
+        """Return "z" if a map has depth along the camera's axis, "range" if from the lens."""
         path = self.folder / "metrics.json"
         with _damage_named(path):
             return str(read_json(path)["measure"][camera])
@@ -211,7 +213,11 @@ class FinishedRun:
         return data
 
     def maps(self, camera: str) -> dict[str, NDArray[Any]]:
-        """Return kind (as in `_KINDS`) -> (H,W) stored values, 0 beyond a threshold."""
+        """Return the (H,W) stored values of a camera's maps, 0 beyond a threshold.
+
+        The keys are depth, depth_filled, confidence and age; `densify.outputs.depth_png` converts
+        the values. Raise InputError for missing, damaged or unequal maps.
+        """
         maps: dict[str, NDArray[Any]] = {}
         for kind, dtype in _KINDS.items():
             path = map_path(self.folder, kind, camera)
@@ -229,7 +235,7 @@ class FinishedRun:
         return {kind: stored * keep for kind, stored in maps.items()}
 
     def full_m(self, camera: str) -> Float32:
-        """Return (H,W) filled depth in metres, completed with a prior if present, 0 for none."""
+        """Return (H,W) filled depth in metres, completed with a prior if there is one, 0 none."""
         stored = self.maps(camera)["depth_filled"]
         path = map_path(self.folder, "depth_full", camera)
         if path.is_file():
@@ -255,7 +261,10 @@ class FinishedRun:
 
 
 def finished_runs(folder: Path, thresholds: Thresholds = EVERYTHING) -> list[FinishedRun]:
-    """Return the run in a folder, or the runs below it by parent folder and frame number."""
+    """Return the run in a folder, or the runs up to two levels below, by parent folder and frame.
+
+    Raise InputError if there is none.
+    """
     paths = [path for depth in ("*", "*/*") for path in folder.glob(f"{depth}/run.yaml")]
     folders = sorted(path.parent for path in paths)
     if (folder / "run.yaml").is_file() or not folders:
@@ -302,7 +311,7 @@ def _without_run(folder: Path) -> str:
 
 
 def read_scene(path: Path) -> SceneFile:
-    """Read and check scene.json."""
+    """Return the content of scene.json; raise InputError if it is damaged."""
     with _damage_named(path):
         table = read_json(path)
         T_key_lidar = {sweep["frame"]: sweep["T_key_lidar"] for sweep in table["sweeps"]}
@@ -314,7 +323,7 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def read_tracks(path: Path) -> list[ObjectTrack]:
-    """Read and check the tracks of moving objects in movers.json."""
+    """Return the tracks of moving objects in movers.json; raise InputError if it is damaged."""
     with _damage_named(path):
         table = read_json(path)
         tracks = [_track(entry) for entry in table["objects"]]

@@ -41,7 +41,11 @@ flow to the previous sweep instead."""
 def flow_writer(
     form: str, sequence: LidarSequence, out: Path, frames: Sequence[int], overwrite: bool
 ) -> Iterator[FlowWriter]:
-    """Yield a function that writes the flow of one sweep, ``form`` by the module's docstring."""
+    """Yield a function that writes the flow of one sweep; some forms are completed at the end.
+
+    ``form`` is "npz", "av2", "opensceneflow", "semantickitti" or "doc-depth"; ``frames`` are the
+    ascending frame numbers of all sweeps that will be written.
+    """
     paths = {frame: _path_of(form, sequence, out, frame) for frame in frames}
     if form == "av2":
         needed("pyarrow.feather", "argoverse", "Argoverse 2's flow files")
@@ -58,9 +62,9 @@ def flow_writer(
         def write(frame: int, flow: StretchFlow) -> Path:
             path = paths[frame]
             T_world_lidar[frame] = _chained_pose(T_world_lidar, frame, flow.stretch)
-            to_next = StretchFlow(
-                flow.stretch, {s: f for s, f in flow.steps.items() if s[0] < s[1]}
-            )
+            # Without the last sweep's flow to the previous sweep
+            steps = {step: field for step, field in flow.steps.items() if step[0] < step[1]}
+            to_next = StretchFlow(flow.stretch, steps)
             if form == "opensceneflow":
                 _add_sweep(file, frame, to_next, T_world_lidar[frame])
             elif form == "av2":
@@ -98,7 +102,10 @@ def _npz_path(folder: Path, frame: int, target: int) -> Path:
 
 
 def write_flow_npz(folder: Path, flow: StretchFlow, recording: str) -> None:
-    """Write a file, such as ``folder/000119_000120.npz``, for each step."""
+    """Write a file for each step between two sweeps, such as ``folder/000119_000120.npz``.
+
+    ``recording`` is the name that the files store.
+    """
     for (frame, target), field in flow.steps.items():
         data = flow_npz(
             field,

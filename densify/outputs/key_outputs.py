@@ -54,10 +54,7 @@ def check_writable(
 def write_result(
     result: Result, out: Path, *, config: Mapping[str, Any], data: str, overwrite: bool = False
 ) -> list[Path]:
-    """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
-
-    ``config`` is the merged configuration, ``data`` the recording as the user named it.
-    """
+    """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files."""
     check_recording(out, result.recording, data, [result.key])
     with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:
         for write in _WRITERS.values():
@@ -101,7 +98,11 @@ def write_comparison(
 
 @contextmanager
 def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
-    """Yield a folder for the entries ``owned`` (as `staged_folder`), after all checks."""
+    """Check that a folder can be written, and yield the folder to write into (`staged_folder`).
+
+    ``owned`` names the entries that are written. ``out`` is the user's folder, for messages. Raise
+    InputError if entries exist and ``overwrite`` is False.
+    """
     _check_folder(folder, owned, out, overwrite)
     with staged_folder(folder, owned) as staging:
         yield staging
@@ -212,8 +213,8 @@ def _write_tracks(result: Result, folder: Path) -> None:
     objects = []
     for track in result.tracks:
         poses = [
-            {"frame": frame, **{name: getattr(track, name)[i] for name in names}}
-            for i, frame in enumerate(track.frames)
+            {"frame": frame, **{name: getattr(track, name)[row] for name in names}}
+            for row, frame in enumerate(track.frames)
         ]
         fields = ("instance", "size_m", "seen_size_m", "sides_seen")
         objects.append({**{name: getattr(track, name) for name in fields}, "poses": poses})
@@ -272,6 +273,7 @@ def _write_scene(result: Result, folder: Path) -> None:
             write_depth_png(map_path(scene, method, name), baseline.depth[name].depth_m)
         if name in result.truth_m:
             write_depth_png(map_path(scene, "truth", name), result.truth_m[name])
+        # Frame number -> 1 + index of the sweep; the last entry, for frame -1, is 0.
         lookup = np.zeros(max(row_of) + 2, np.uint16)
         lookup[[*row_of]] = 1 + np.arange(len(row_of))
         write_file(map_path(scene, "sweep", name), encode_png(lookup[maps.frame]))

@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 
 from densify.config.errors import InputError
-from densify.depth.rays import corners_of, grown
+from densify.depth.rays import corners_of, grow_box
 from densify.geometry import cameras, poses
 from densify.geometry.types import CameraView, DepthMap, Float, ObjectTrack
 from densify.outputs.atomic import plain, write_file, write_json
@@ -40,6 +40,7 @@ README = "README.txt"
 
 _KIND_OF = {"depth": "groundtruth", "depth_filled": "groundtruth_filled"}
 _UNKNOWN = 3  # occluded: unknown
+# Limits of the types: height and length of a car, width of a vehicle, length of a pedestrian
 _TALL_M, _CAR_M, _WIDE_M, _WALKER_M = 2.2, 6.0, 1.4, 1.2
 _ENDS = (("rear", "front"), ("right", "left"))  # sides of a box, by axis
 
@@ -66,8 +67,11 @@ def write_key(
 ) -> dict[str, FileRecord]:
     """Write the depth maps of one key sweep, and return path in the tree -> size and hash.
 
-    ``folder`` is the drive's, ``val/2011_09_26_drive_0013_sync``. ``sparse`` has the maps of the
-    key sweep alone, ``dense`` those of all sweeps, by camera. Equal maps give equal bytes.
+    Equal maps give equal bytes.
+
+    Args:
+        sparse: Maps of the key sweep alone, by camera.
+        dense: Maps of all sweeps, by camera.
     """
     paths = []
     for camera, maps in dense.items():
@@ -284,14 +288,17 @@ def _distance_m(track: ObjectTrack, earlier: ObjectTrack, T_track_earlier: Float
 
 def _sized(track: ObjectTrack, of_object: Sequence[ObjectTrack]) -> ObjectTrack:
     """Return a track with the length and width that its object has in all keys (``of_object``)."""
-    # Keys that saw both ends count, else the longest box. A side that was seen keeps its place.
+    # The size is the median over keys that observed both ends, else that of the longest box. A side
+    # that was observed keeps its position; without such a side both ends grow by half.
     for axis, ends in enumerate(_ENDS):
-        whole = [t.size_m[axis] for t in of_object if {*ends} <= {*t.sides_seen}]
-        size_m = float(np.median(whole)) if whole else max(float(t.size_m[axis]) for t in of_object)
+        complete_m = [other.size_m[axis] for other in of_object if {*ends} <= {*other.sides_seen}]
+        longest_m = max(float(other.size_m[axis]) for other in of_object)
+        size_m = float(np.median(complete_m)) if complete_m else longest_m
         missing_m = size_m - track.size_m[axis]
-        unseen = np.array([end not in track.sides_seen for end in ends])
-        share = unseen if unseen.any() and not unseen.all() else np.array([0.5, 0.5])
-        track = grown(track, axis, *(missing_m * share))
+        is_unseen = np.array([end not in track.sides_seen for end in ends])
+        is_one_sided = is_unseen.any() and not is_unseen.all()
+        share = is_unseen if is_one_sided else np.array([0.5, 0.5])
+        track = grow_box(track, axis, *(missing_m * share))
     return track
 
 

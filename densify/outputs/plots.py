@@ -45,10 +45,15 @@ _SIDE = re.compile(r"left|right|side|rear|back", re.IGNORECASE)
 def front_first(
     names: Sequence[str], views: Mapping[str, CameraView], T_key_lidar: Mapping[int, Float]
 ) -> list[str]:
-    """Return the names of maps, that of the camera which looks ahead first, the others in order.
+    """Return the names of maps: first that of the camera that looks ahead, the others in order.
 
-    Ahead is where the vehicle goes in the window. At rest it is the camera called front.
-    ``T_key_lidar`` has (4,4) lidar poses in the key frame by frame number. ``views`` may lack maps.
+    Ahead is the direction of the vehicle's motion in the window. Without motion, a camera whose
+    name holds "front" is taken.
+
+    Args:
+        names: Names of the maps.
+        views: Camera and pose of each map; it may lack some.
+        T_key_lidar: (4,4) lidar poses in the key sweep's lidar frame, by frame number.
     """
     frames = sorted(T_key_lidar)
     travel_m = np.zeros(3)
@@ -57,10 +62,12 @@ def front_first(
     if np.linalg.norm(travel_m) >= _MIN_TRAVEL_M:
         # Row z of a camera's rotation is its optical axis in the key frame.
         ahead = [
-            float(views[n].T_cam_key[2, :3] @ travel_m) if n in views else -np.inf for n in names
+            float(views[name].T_cam_key[2, :3] @ travel_m) if name in views else -np.inf
+            for name in names
         ]
     else:
-        ahead = [float("front" in n.lower()) - 0.5 * bool(_SIDE.search(n)) for n in names]
+        # "front" counts more than a word such as "left" in the same name.
+        ahead = [float("front" in name.lower()) - 0.5 * bool(_SIDE.search(name)) for name in names]
     first = int(np.argmax(ahead)) if len(names) else 0
     return [*names[first : first + 1], *names[:first], *names[first + 1 :]]
 
@@ -71,7 +78,11 @@ def write_key_figure(result: Result, folder: Path) -> None:
 
 
 def write_figure(path: Path, results: Mapping[str, Result]) -> None:
-    """Write each method's measured depth, and completed depth, in the camera that looks ahead."""
+    """Write a figure of each method's measured depth in the camera that looks ahead.
+
+    The last method's depth completed with a prior is added if there is one. Without maps nothing is
+    written.
+    """
     method, last = list(results.items())[-1]
     if not last.depth:
         return
@@ -106,7 +117,8 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
     """
     kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
     gray = (_BRIGHTNESS * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8)
-    enlarge, rows = max(1.0, _MIN_WIDTH_PX / image.shape[1]), []
+    enlarge = max(1.0, _MIN_WIDTH_PX / image.shape[1])
+    rows = []
     for title, depth_m in panels.items():
         nearest_m = np.where(depth_m > 0, depth_m, _NO_DEPTH_M)
         nearest_m = cv2.erode(nearest_m, kernel).astype(np.float32, copy=False)
@@ -131,14 +143,17 @@ def coloured(depth_m: Float32) -> Picture:
 def _scale(width_px: int) -> Picture:
     """Return the (h,w,3) colour scale with its ticks."""
     scale = np.full((_SCALE_PX, width_px, 3), 255, np.uint8)
-    left, long_px = width_px // 20, width_px - 2 * (width_px // 20)
-    log = np.linspace(np.log(_NEAR_M), np.log(_FAR_M), long_px)
-    bar = scale[_MARGIN_PX : _MARGIN_PX + _BAR_PX, left : left + long_px]
-    bar[:] = coloured(np.exp(log).astype(np.float32)[None])
+    left = width_px // 20
+    bar_width_px = width_px - 2 * left
+    bottom = _MARGIN_PX + _BAR_PX
+    log_m = np.linspace(np.log(_NEAR_M), np.log(_FAR_M), bar_width_px)
+    bar = scale[_MARGIN_PX:bottom, left : left + bar_width_px]
+    bar[:] = coloured(np.exp(log_m).astype(np.float32)[None])
+    # A tick is 2 px wide and 4 px high, with its label below.
     for tick_m in _TICKS_M:
-        at = left + int(np.searchsorted(log, np.log(tick_m) - 1e-9))
-        scale[_MARGIN_PX + _BAR_PX : _MARGIN_PX + _BAR_PX + 4, at - 1 : at + 1] = 0
-        _write(scale[_MARGIN_PX + _BAR_PX :], f"{tick_m} m", at - left, at + left, centred=True)
+        column = left + int(np.searchsorted(log_m, np.log(tick_m) - 1e-9))
+        scale[bottom : bottom + 4, column - 1 : column + 1] = 0
+        _write(scale[bottom:], f"{tick_m} m", column - left, column + left, centred=True)
     return scale
 
 

@@ -47,7 +47,10 @@ def split_of(recording: str) -> Split:
 
 
 def drive_folder(recording: str) -> str:
-    """Return a valid, unique folder name. A valid name, such as KITTI's names, is kept."""
+    """Return a folder name for a recording's name, different for different recordings.
+
+    A name that is valid for a folder, such as KITTI's, is kept.
+    """
     # street:highway?seed=0&sensor=hdl64 -> street-highway_seed-0_sensor-hdl64
     if recording == _DEFAULT_STREET:
         return "street"
@@ -66,11 +69,10 @@ def default_folder(recording: str) -> Path:
 def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = ()) -> None:
     """Raise InputError if a folder holds results of another recording, by `is_same`.
 
-    Results without the name of a recording are not compared. ``recording`` and ``data`` (text of
-    ``--data``) are of the results to be written, for the frame numbers ``keys``.
+    Results without the name of a recording are not compared.
     """
     for result in _stored_results(out, keys):
-        if not any(is_same(recording, data, s.recording, s.data) for s in result):
+        if not any(is_same(recording, data, stored.recording, stored.data) for stored in result):
             stored = result[0]
             source = f" ({stored.data})" if stored.data else ""
             raise InputError(
@@ -80,7 +82,10 @@ def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = 
 
 
 def is_same(recording: str, data: str, stored_recording: str, stored_data: str) -> bool:
-    """Return True if two names and texts of ``--data`` are of one recording, moved or not."""
+    """Return True if two pairs of a recording's name and text of ``--data`` mean one recording.
+
+    A recording that was moved is still the same.
+    """
     if drive_folder(recording) != drive_folder(stored_recording):
         return False
     path, stored_path = (Spec.parse(text).path.resolve() for text in (data, stored_data))

@@ -57,10 +57,10 @@ _COLOUR_MAPS = {
     "inferno": cv2.COLORMAP_INFERNO,
     "turbo": cv2.COLORMAP_TURBO,
 }
-_TRIAL_EFFORT, _EFFORT = 1, 7  # of compression
-_SOURCE_BITS = 17  # above the bits of a pixel's age (16) and of measured or filled (1)
+_TRIAL_EFFORT, _EFFORT = 1, 7  # effort of compression, for the comparison and for the page
+_SOURCE_BITS = 17  # bits of a pixel's code below its sweep: age (16), and measured or filled (1)
 _MAX_UINT16 = 65535
-_ZERO_DISPLACED = 32768  # the middle of 16 bits
+_ZERO_DISPLACED = 32768  # stored value of a displacement of 0, the middle of 16 bits
 _MOST_POINTS = 500_000
 _CONFIDENCE_STEPS = 31
 _GRAY = 50, 190  # gray of reflectance 0 and 1, for points without colour
@@ -79,7 +79,7 @@ class KeyFiles:
 
     @staticmethod
     def of_run(folder: Path) -> KeyFiles:
-        """Return the files of a run."""
+        """Return the files of a run; raise InputError without a readable run.yaml."""
         files = KeyFiles(folder, _mapping(read_yaml(folder / "run.yaml")[0]), {})
         metrics = _mapping(files.read(read_json, "metrics.json"))
         method = str(files.about.get("method", "run"))
@@ -90,13 +90,21 @@ class KeyFiles:
     def of_comparison(folder: Path) -> KeyFiles:
         """Return the files of a comparison. Raise InputError unless compare.json is whole."""
         about = _mapping(read_json(folder / "compare.json"))
-        methods = {str(m): _mapping(s) for m, s in _mapping(about.get("methods")).items()}
+        methods = {
+            str(method): _mapping(scores)
+            for method, scores in _mapping(about.get("methods")).items()
+        }
         if not methods:
             raise InputError(f"{folder}/compare.json: names no methods; compare the key again")
         return KeyFiles(folder / "compare", about, methods)
 
     def read(self, read: Callable[[Path], T], name: str, optional: bool = False) -> T | None:
-        """Return a file's content by a function of its path; note it in ``missing`` if damaged."""
+        """Read a file of the folder; None, with a note in ``missing``, if it cannot be read.
+
+        Args:
+            read: Function that returns the content of a path.
+            optional: True to return None without a note if the file does not exist.
+        """
         path = self.maps / name
         if optional and not path.is_file():
             return None
@@ -107,10 +115,13 @@ class KeyFiles:
             return None
 
     def camera(self, name: str) -> dict[str, NDArray[Any]]:
-        """Return kind or name of a baseline -> (H,W) stored values of a map and its scene."""
+        """Return the (H,W) stored values of all readable maps of a camera, by kind.
+
+        The kinds are those of `_MAPS` without "scene/", and the names of the baselines.
+        """
         maps: dict[str, NDArray[Any]] = {}
-        of_methods = {f"scene/{method}": np.uint16 for method in self.methods}
-        for folder, pixel_type in {**_MAPS, **of_methods}.items():
+        maps_of_methods = {f"scene/{method}": np.uint16 for method in self.methods}
+        for folder, pixel_type in {**_MAPS, **maps_of_methods}.items():
             stored = partial(read_stored, kind=pixel_type, map_name="a map")
             image = self.read(stored, f"{folder}/{name}.png", optional=True)
             kind = folder.removeprefix("scene/")
@@ -136,29 +147,38 @@ def _mapping(value: Any) -> Mapping[str, Any]:
 
 
 def key_page(files: KeyFiles, shown_folder: str) -> bytes:
-    """Return the HTML page.
+    """Return the bytes of the HTML page of a key sweep.
 
-    ``shown_folder`` is the run's folder as the user names it, "" for a comparison.
+    ``shown_folder`` is the run's folder as the user names it, "" for a comparison. Files that
+    cannot be read are named in the page. Raise InputError if there is neither a map nor a cloud.
     """
     scene = files.read(read_scene, "scene/scene.json", optional=True)
     views, sweeps = (scene.table["views"], scene.table["sweeps"]) if scene else ({}, [])
     tracks = files.read(read_tracks, "movers.json", optional=True) or []
     tracks.sort(key=lambda track: -int(track.num_points.sum()))
-    blobs, cameras = Blobs(), {}
+
+    # Maps, then the cloud
+    blobs = Blobs()
+    cameras = {}
     names = map_names(files.maps / "depth", files.maps / "depth_filled")
     for name in front_first(names, scene.views, scene.T_key_lidar) if scene else names:
         if maps := files.camera(name):
             view = scene.views.get(name) if scene else None
             focal_px = view.camera.focal_px if view else None
             cameras[name] = _packed_camera(blobs, maps, files.image(name), focal_px)
-    cloud, packed_points = files.read(read_cloud, "cloud.laz"), None
+    cloud = files.read(read_cloud, "cloud.laz")
+    packed_points = None
     if not cameras and cloud is None:
         raise InputError(f"{files.maps}: no depth map and no cloud in it that can be read")
     if cloud is not None and len(cloud.points):
-        frames, instances = [s["frame"] for s in sweeps], [track.instance for track in tracks]
+        frames = [sweep["frame"] for sweep in sweeps]
+        instances = [track.instance for track in tracks]
         packed_points = packed_cloud(blobs, cloud, frames, instances)
-    about, methods = files.about, list(files.methods)
-    key, data = about.get("key"), str(about.get("data"))
+
+    about = files.about
+    methods = list(files.methods)
+    key = about.get("key")
+    data = str(about.get("data"))
     name = data.rstrip("/").rpartition("/")[2] or data
     page = {
         "subtitle": f"{name}, key {key}",
@@ -173,7 +193,7 @@ def key_page(files: KeyFiles, shown_folder: str) -> bytes:
         "movers": [_mover(track, key) for track in tracks],
         "cloud": packed_points,
         "about": {"stages": about.get("stages")},
-        "warnings": [str(w) for w in about.get("warnings") or ()],
+        "warnings": [str(warning) for warning in about.get("warnings") or ()],
         "missing": files.missing,
     }
     title = f"{name}, key {key}" + ("" if shown_folder else f": {', '.join(methods)}")
@@ -199,17 +219,23 @@ class Blobs:
     """Collect the packed arrays of a page, which ``page/unpack.js`` unpacks."""
 
     def __init__(self) -> None:
-        # Name -> bytes sorted by significance, deflated, base64; 16-bit PNG would come as 8 bits.
+        # Name -> bytes sorted by significance, deflated, in base64. A browser would decode a 16-bit
+        # PNG to 8 bits.
         self.texts: dict[str, str] = {}
 
     def add(self, array: NDArray[Any]) -> dict[str, Any]:
-        """Pack integers (N,) or (H,W), 0 to 2^32, and return how the page unpacks them.
+        """Pack an array of integers, and return the description with which the page unpacks it.
 
-        They are stored directly or as differences along the last axis, whichever is smaller.
+        Args:
+            array: (N,) or (H,W) whole numbers from 0 to 2^32 - 1.
+
+        Returns:
+            ``blob``, name of the packed bytes; ``bytes``, size of an element; ``shape``; ``delta``,
+            True if differences along the last axis are stored, which is done if they are smaller.
         """
         array = array.astype(np.min_scalar_type(int(array.max(initial=0))))
         steps = np.diff(array, axis=-1, prepend=array.dtype.type(0))
-        plain_size, step_size = (len(_deflated(v, _TRIAL_EFFORT)) for v in (array, steps))
+        plain_size, step_size = (len(_deflated(values, _TRIAL_EFFORT)) for values in (array, steps))
         is_delta = step_size < plain_size
         return {
             "blob": self._keep(_deflated(steps if is_delta else array, _EFFORT)),
@@ -219,10 +245,11 @@ class Blobs:
         }
 
     def add_file(self, data: bytes, mime: str) -> dict[str, Any]:
-        """Add an image file unchanged and return its description."""
+        """Add an image file unchanged, and return its description: ``blob`` (name) and ``mime``."""
         return {"blob": self._keep(data), "mime": mime}
 
     def _keep(self, data: bytes) -> str:
+        """Store bytes and return their name."""
         name = f"blob-{len(self.texts)}"
         self.texts[name] = base64.b64encode(data).decode()
         return name
@@ -256,9 +283,13 @@ def _packed_camera(
         "source": blobs.add(source.reshape(codes.shape)),
         "sources": np.stack([known >> _SOURCE_BITS, (known >> 1) & _MAX_UINT16, known & 1], axis=1),
         "density": {"measured": np.mean(measured), "filled": np.mean(filled > 0)},
-        "others": {k: blobs.add(m) for k, m in maps.items() if k not in _NOT_OF_METHODS},
+        "others": {
+            kind: blobs.add(values) for kind, values in maps.items() if kind not in _NOT_OF_METHODS
+        },
     }
-    entry |= {k: blobs.add(maps[k]) for k in ("confidence", "reason", "truth") if k in maps}
+    entry |= {
+        kind: blobs.add(maps[kind]) for kind in ("confidence", "reason", "truth") if kind in maps
+    }
     if jpeg is not None:
         entry["image"] = blobs.add_file(jpeg, "image/jpeg")
     return entry
@@ -269,10 +300,13 @@ def packed_cloud(
 ) -> dict[str, Any]:
     """Pack a thinned cloud into ``blobs`` and return its entry in the page, moving points first.
 
-    Positions are ``low_m`` + ``step_m`` times 16-bit integers. ``sweep`` has indices in ``frames``.
-    ``mover`` is 0 for static points, 1 for moving points without a track, 2 and up for tracked
-    objects, by ``instances``. ``displaced``, for moving points only, is 32768 plus the displacement
-    beyond rigid alignment in steps of ``displaced_step_m``.
+    ``frames`` are the sweeps of the page, ``instances`` the numbers of its tracked objects.
+
+    Returns:
+        The entry. Positions are ``low_m`` + ``step_m`` times 16-bit integers. ``sweep`` has indices
+            in ``frames``. ``mover`` is 0 for static points, 1 for moving points without a track, 2
+            and up for tracked objects by ``instances``. ``displaced``, for moving points only, is
+            32768 plus the displacement beyond rigid alignment in steps of ``displaced_step_m``.
     """
     rows = thinned(cloud.points, cloud.moving, _MOST_POINTS)
     chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])
@@ -351,6 +385,7 @@ def page_file(title: str, data: Mapping[str, Any], blobs: Blobs) -> bytes:
 
 
 def _source(name: str) -> str:
+    """Return the text of a file of the folder ``page``."""
     return (package_files("densify.outputs") / "page" / name).read_text("utf-8")
 
 

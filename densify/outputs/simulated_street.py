@@ -89,7 +89,7 @@ class Excerpt:
     def of(
         cls, street: Street, frames: Sequence[int], cameras: Sequence[str] | None = None
     ) -> Excerpt:
-        """Return an excerpt with checked frames and cameras, None for all cameras of the street."""
+        """Return an excerpt; raise InputError for unknown frames or cameras. None: all cameras."""
         names = tuple(street.cameras if cameras is None else cameras)
         for name in names:
             checks.camera_named(street.cameras, name, Path(street.name))
@@ -114,8 +114,11 @@ class Excerpt:
         return encode_png(self.street.image(camera, number)[:, :, ::-1])
 
     def T_world_ego(self, stamp_ns: Int, T_lidar_ego: Float | None = None) -> Float:
-        """Return (n,4,4) true poses of an ego frame, None the lidar's, at (n,) times (ns)."""
-        T_world_lidar = [self.street.simulator.T_world_lidar_at(int(t)) for t in stamp_ns]
+        """Return the (n,4,4) true poses of an ego frame at (n,) times (ns).
+
+        ``T_lidar_ego`` is the (4,4) pose of the ego frame in the lidar frame, None for the lidar.
+        """
+        T_world_lidar = [self.street.simulator.T_world_lidar_at(int(ns)) for ns in stamp_ns]
         return np.stack(T_world_lidar) @ (np.eye(4) if T_lidar_ego is None else T_lidar_ego)
 
     def poses(self, T_lidar_ego: Float | None = None) -> PoseTrack:
@@ -157,6 +160,7 @@ def _write_truth(folder: Path, excerpt: Excerpt, bodies: Bodies, renumbered: boo
 
 
 def _write_folder(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
+    """Write the excerpt as a plain folder, with sweeps and images numbered from 0."""
     street = excerpt.street
     stamps_ns = [street.stamp_ns(frame) for frame in excerpt.frames]
     for number, frame in _numbered(excerpt.frames, progress):
@@ -220,6 +224,7 @@ def _camera_table(camera: Camera) -> dict[str, Any]:
 
 
 def _write_kitti(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
+    """Write the excerpt as a KITTI raw drive with its calibration."""
     street, drive = excerpt.street, folder / _DRIVE
     tilt_deg, usual = street.simulator.tilt_deg, CAMERAS[USUAL[0]]
     sizes = [f"S_rect_0{n}: {usual.width_px} {usual.height_px}\n" for n in range(4)]
@@ -276,7 +281,10 @@ def stamp_lines(stamps_ns: Int) -> str:
 
 
 def sweep_data(street: Street, frame: int, points: Float | Float32 | None = None) -> bytes:
-    """Return a KITTI sweep file: float32 x y z intensity; ``points`` (N,3) replace positions."""
+    """Return the bytes of a KITTI sweep file: float32 x y z intensity for each return of a sweep.
+
+    ``points`` (N,3) replaces the positions if given.
+    """
     returns = street.returns(frame)
     columns = [returns.points if points is None else points, returns.intensity]
     return np.column_stack(columns).astype("<f4").tobytes()
@@ -288,7 +296,10 @@ def T_lidar_imu(tilt_deg: float) -> Float:
 
 
 def oxts_line(street: Street, frame: int, first: int) -> str:
-    """Return an oxts record of the true pose. Velocities, accelerations and turn rates are 0."""
+    """Return the line of an oxts record with the true pose of the inertial unit at a frame.
+
+    ``first`` is the first frame of the drive. Velocities, accelerations and turn rates are 0.
+    """
     # Readers take the Mercator scale from the latitude of frame ``first``, which is fixed.
     T_lidar_ego = T_lidar_imu(street.simulator.tilt_deg)
     T_world_now, T_world_first = (

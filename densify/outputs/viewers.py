@@ -81,7 +81,7 @@ class Timeline(NamedTuple):
 
 
 def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
-    """Yield one run with all sweeps of its window, or several runs with their key sweeps."""
+    """Yield the content for viewers: of one run all sweeps, of several runs their key sweeps."""
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
         cloud, sweeps = run.cloud(), []
         for sweep in run.scene.table["sweeps"]:

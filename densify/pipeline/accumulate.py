@@ -20,37 +20,46 @@ from densify.geometry.types import (
 )
 
 _LEAST_SEEN = 3  # points of an object in one sweep; fewer do not determine its rotation
-_AXLE = 0.3  # of the length, from the middle of a vehicle to its rear axle, which does not slip
+_AXLE = 0.3  # from the middle of a vehicle to its rear axle, as a share of its length
 _BEYOND_PERCENT = 0.2  # percent of the points outside the object's box, on each side
 
 
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
     """Return the points of all sweeps as one cloud in the lidar frame of the key sweep.
 
-    Moving points are displaced by their scene flow, ``fields``, from each sweep to the key sweep's
-    reference time. Static points keep their rigid positions, bit for bit. Moving points that cannot
-    be followed to the key sweep are left out with ``drop_lost``, else they keep their rigid
-    positions.
+    Moving points are displaced by their scene flow from each sweep to the key sweep's reference
+    time. Static points keep their rigid positions, bit for bit.
+
+    Args:
+        fields: Flow of each sweep's points to the key sweep.
+        drop_lost: Leave out moving points that cannot be followed to the key sweep, else they keep
+            their rigid positions.
     """
-    kept = [np.flatnonzero(~(drop_lost & flow.lost)) for flow in fields]
-    cloud, first = _empty_cloud(sum(map(len, kept))), 0
-    for registered, flow, rows in zip(stretch.sweeps, fields, kept, strict=True):
+    sweep_rows = [np.flatnonzero(~(drop_lost & flow.lost)) for flow in fields]
+    cloud = _empty_cloud(sum(map(len, sweep_rows)))
+    first = 0  # first row of the sweep in the cloud
+    for registered, flow, rows in zip(stretch.sweeps, fields, sweep_rows, strict=True):
         span = slice(first, first + len(rows))
-        first, sweep = span.stop, registered.sweep
+        sweep = registered.sweep
         T_key_lidar = stretch.T_target_source(key, registered.frame)
         cloud.rigid_points[span] = poses.transform(T_key_lidar, sweep.points).take(rows, axis=0)
         cloud.points[span] = cloud.rigid_points[span]
-        since_key_ns = sweep.stamp_ns - stretch[key].sweep.stamp_ns
-        cloud.frame[span], cloud.since_key_ns[span] = registered.frame, since_key_ns
+        cloud.frame[span] = registered.frame
+        cloud.since_key_ns[span] = sweep.stamp_ns - stretch[key].sweep.stamp_ns
         cloud.intensity[span] = sweep.intensity[rows]
-        cloud.row[span], cloud.lidar[span] = sweep.row[rows], sweep.lidar[rows]
-        cloud.moving[span], cloud.instance[span] = flow.moving[rows], flow.instance[rows]
+        cloud.row[span] = sweep.row[rows]
+        cloud.lidar[span] = sweep.lidar[rows]
+        cloud.moving[span] = flow.moving[rows]
+        cloud.instance[span] = flow.instance[rows]
 
-        moving = np.flatnonzero((flow.moving & ~flow.lost)[rows])
-        cloud_rows, rows = span.start + moving, rows[moving]
-        cloud.points[cloud_rows] += poses.rotate(T_key_lidar, flow.total[rows])
+        followed = np.flatnonzero((flow.moving & ~flow.lost)[rows])
+        cloud_rows = first + followed
+        flow_rows = rows[followed]
+        cloud.points[cloud_rows] += poses.rotate(T_key_lidar, flow.total[flow_rows])
         if flow.velocity_m_s is not None:
-            cloud.velocity_m_s[cloud_rows] = poses.rotate(T_key_lidar, flow.velocity_m_s[rows])
+            velocity_m_s = poses.rotate(T_key_lidar, flow.velocity_m_s[flow_rows])
+            cloud.velocity_m_s[cloud_rows] = velocity_m_s
+        first = span.stop
     cloud.confidence[:] = confidence_by_age(cloud.since_key_ns)
     return cloud
 
@@ -88,12 +97,26 @@ def object_tracks(
     """Return the track of each moving object, ordered by instance number.
 
     The pose at a sweep comes from the rigid motion that best fits, in least squares, the flow of
-    the object's points to the key sweep. Sweeps with fewer than three of these points have no pose.
-    Objects without such a sweep are left out. The x axis of an object points along its velocity, or
-    along its path over the window if that is longer. For objects of 3 m and more these are taken at
-    the rear axle, where a vehicle that turns moves where it points. The arguments are as in
-    `accumulate`.
+    the object's points to the key sweep. A sweep with fewer than three of these points has no pose,
+    and an object needs at least one pose.
+
+    The x axis of an object points along its velocity, or along its path over the window if that is
+    longer. For objects of 3 m and more these are taken at the rear axle, where a vehicle that turns
+    moves where it points. ``fields`` are the flow of each sweep's points to the key sweep.
     """
+    objects = _collect_objects(stretch, fields, key)
+    stamps_ns = {registered.frame: registered.sweep.stamp_ns for registered in stretch.sweeps}
+    return tuple(
+        _fit_track(instance, objects[instance], key, stamps_ns)
+        for instance in sorted(objects)
+        if max(len(seen.at_sweep) for seen in objects[instance].values()) >= _LEAST_SEEN
+    )
+
+
+def _collect_objects(
+    stretch: Stretch, fields: Sequence[FlowField], key: int
+) -> dict[int, dict[int, _ObjectPoints]]:
+    """Return instance number -> frame -> points of the moving object in that sweep."""
     objects: dict[int, dict[int, _ObjectPoints]] = {}
     for registered, flow in zip(stretch.sweeps, fields, strict=True):
         followed = flow.moving & ~flow.lost & (flow.instance >= 0)
@@ -109,65 +132,87 @@ def object_tracks(
         velocity_m_s = np.zeros(points.shape)
         if flow.velocity_m_s is not None:
             velocity_m_s = poses.rotate(T_key_lidar, flow.velocity_m_s[followed])
-        for k in np.unique(instance).tolist():
-            in_object = instance == k
+        for number in np.unique(instance).tolist():
+            in_object = instance == number
             median_m_s = np.median(velocity_m_s[in_object], axis=0)
-            objects.setdefault(k, {})[registered.frame] = _ObjectPoints(
+            objects.setdefault(number, {})[registered.frame] = _ObjectPoints(
                 at_sweep[in_object], at_key[in_object], median_m_s
             )
-    stamps_ns = {s.frame: s.sweep.stamp_ns for s in stretch.sweeps}
-    return tuple(
-        _track(k, objects[k], key, stamps_ns)
-        for k in sorted(objects)
-        if max(len(s.at_sweep) for s in objects[k].values()) >= _LEAST_SEEN
-    )
+    return objects
 
 
-def _track(
+def _fit_track(
     instance: int, by_frame: dict[int, _ObjectPoints], key: int, stamps_ns: dict[int, int]
 ) -> ObjectTrack:
     """Return the track of an object from its points and the sweeps' reference times by frame."""
-    at_key = np.concatenate([s.at_key for s in by_frame.values()])
     # Motion of the object from the key to each sweep, in the key sweep's lidar frame.
     T_sweep_key = {
-        frame: poses.fit_rigid(s.at_key, s.at_sweep)
-        for frame, s in by_frame.items()
-        if len(s.at_sweep) >= _LEAST_SEEN
+        frame: poses.fit_rigid(seen.at_key, seen.at_sweep)
+        for frame, seen in by_frame.items()
+        if len(seen.at_sweep) >= _LEAST_SEEN
     }
     T_sweep_key[key] = np.eye(4)
     frames = sorted(T_sweep_key)
-    velocity_m_s = np.median([s.velocity_m_s for s in by_frame.values()], axis=0)
-    middle = np.median(at_key, axis=0)
-    ends = [poses.transform(T_sweep_key[f], middle[None])[0] for f in (frames[0], frames[-1])]
     duration_s = (stamps_ns[frames[-1]] - stamps_ns[frames[0]]) * 1e-9
-    direction = velocity_m_s * duration_s if duration_s else velocity_m_s
-    direction = max(direction, ends[1] - ends[0], key=lambda xyz: float(np.hypot(*xyz[:2])))
-    yaw_first, yaw_last = (poses.log(T_sweep_key[f])[2] for f in (frames[0], frames[-1]))
+    velocity_m_s = np.median([seen.velocity_m_s for seen in by_frame.values()], axis=0)
+    points = np.concatenate([seen.at_key for seen in by_frame.values()])
+    box = _fit_box(
+        points, velocity_m_s, T_sweep_key[frames[0]], T_sweep_key[frames[-1]], duration_s
+    )
+
+    T = np.stack([T_sweep_key[frame] @ box.T_key_object for frame in frames])
+    stamp_ns = np.array([stamps_ns[frame] for frame in frames], np.int64)
+    velocities_m_s = velocity_m_s[None]
+    if len(frames) > 1:
+        velocities_m_s = np.gradient(T[:, :3, 3], (stamp_ns - stamps_ns[key]) * 1e-9, axis=0)
+    num_points = [len(by_frame[frame].at_sweep) if frame in by_frame else 0 for frame in frames]
+    return ObjectTrack(
+        instance=instance,
+        size_m=box.size_m,
+        frames=tuple(frames),
+        stamp_ns=stamp_ns,
+        T_key_object=T,
+        velocity_m_s=velocities_m_s,
+        num_points=np.array(num_points, np.int64),
+        seen_size_m=box.size_m,
+    )
+
+
+class _Box(NamedTuple):
+    """The box around the points of an object."""
+
+    T_key_object: Float  # (4,4) pose at the key's time, key sweep's lidar frame
+    size_m: Float  # (3,) length, width, height
+
+
+def _fit_box(
+    points: Float, velocity_m_s: Float, T_first_key: Float, T_last_key: Float, duration_s: float
+) -> _Box:
+    """Return the box around points (N,3) at the key's time, whose x axis is along the motion.
+
+    Args:
+        points: (N,3) metres, key sweep's lidar frame.
+        velocity_m_s: (3,) velocity of the object, same frame.
+        T_first_key: (4,4) motion of the object from the key to the first sweep, same frame.
+        T_last_key: (4,4) motion of the object from the key to the last sweep, same frame.
+        duration_s: Time from the first to the last sweep.
+    """
+    reference = np.median(points, axis=0)
+    begin, end = (poses.transform(T, reference[None])[0] for T in (T_first_key, T_last_key))
+    by_velocity = velocity_m_s * duration_s if duration_s else velocity_m_s
+    direction = max(by_velocity, end - begin, key=lambda xyz: float(np.hypot(*xyz[:2])))
+    yaw_first, yaw_last = (poses.log(T)[2] for T in (T_first_key, T_last_key))
+    # The second round takes the direction at the rear axle that the first round has found.
     for _ in range(2):
         heading = np.arctan2(direction[1], direction[0])
         T_key_object = poses.exp(np.array([0, 0, heading, 0, 0, 0]))
-        in_axes = poses.rotate(poses.inverse(T_key_object), at_key)
+        in_axes = poses.rotate(poses.inverse(T_key_object), points)
         low, high = np.percentile(in_axes, [_BEYOND_PERCENT, 100 - _BEYOND_PERCENT], axis=0)
         if high[0] - low[0] < LONG_M:
             break
         axle = (low + high) / 2 - [_AXLE * (high[0] - low[0]), 0, 0]
-        x, y, _ = T_key_object[:3, :3] @ axle - middle
-        middle = middle + [x, y, 0]
+        x, y, _ = T_key_object[:3, :3] @ axle - reference
+        reference = reference + [x, y, 0]
         direction = direction + (yaw_last - yaw_first) * np.array([-y, x, 0])
     T_key_object[:3, 3] = T_key_object[:3, :3] @ ((low + high) / 2)
-    T = np.stack([T_sweep_key[frame] @ T_key_object for frame in frames])
-    stamp_ns = np.array([stamps_ns[frame] for frame in frames], np.int64)
-    speeds_m_s = velocity_m_s[None]
-    if len(frames) > 1:
-        speeds_m_s = np.gradient(T[:, :3, 3], (stamp_ns - stamps_ns[key]) * 1e-9, axis=0)
-    num_points = [len(by_frame[f].at_sweep) if f in by_frame else 0 for f in frames]
-    return ObjectTrack(
-        instance=instance,
-        size_m=high - low,
-        frames=tuple(frames),
-        stamp_ns=stamp_ns,
-        T_key_object=T,
-        velocity_m_s=speeds_m_s,
-        num_points=np.array(num_points, np.int64),
-        seen_size_m=high - low,
-    )
+    return _Box(T_key_object, high - low)

@@ -17,8 +17,8 @@ from densify.config.errors import InputError
 from densify.depth.confidence import (
     expected_outliers,
     reliability,
-    unconfirmed,
     with_max_outliers,
+    without_confirmation,
     without_times,
 )
 from densify.depth.exposure import Shot
@@ -41,12 +41,13 @@ _log = logging.getLogger("densify")
 class Method(NamedTuple):
     """The stages that a method uses."""
 
-    all_sweeps: bool  # use all sweeps of the window, else the key sweep alone
+    all_sweeps: bool  # true if all sweeps of the window are used, else the key sweep alone
     # Name of the scene-flow engine (``flow.engine``), "" for the configured engine, None for rigid
     # accumulation
     engine: str | None
-    visible: bool  # reject occluded and unsupported points, else each pixel shows its nearest point
-    far: bool  # add static surfaces beyond the window (``accumulate.far_m``)
+    # True if occluded and unsupported points are rejected, else each pixel shows its nearest point
+    visible: bool
+    far: bool  # true if static surfaces beyond the window are added (``accumulate.far_m``)
 
 
 METHODS = {
@@ -58,8 +59,9 @@ METHODS = {
     "paper": Method(True, "paper", True, True),
     "flow": Method(True, "", True, True),
 }
-"""Methods, in order: single sweep; rigid accumulation of the window; with the far range added; with
-visibility too; scene flow without visibility; the published scene flow; our scene flow."""
+"""Methods by name, in this order: single sweep; rigid accumulation of the window; the same with the
+far range; the same with far range and visibility; scene flow without visibility; the published
+scene flow; our scene flow."""
 
 RUN = ("none", "icp", "flow")
 """The methods of `run`; if scored, a method has the methods before it as its baselines."""
@@ -68,7 +70,10 @@ COMPARED = ("none", "icp", "flow")
 
 
 def methods_of_run(method: str, settings: Config) -> tuple[str, ...]:
-    """Return the method of `RUN`, preceded by its simpler baselines if results are scored."""
+    """Return the method of `RUN`, preceded by its simpler baselines if results are scored.
+
+    Raises InputError if the method is not one of `RUN`.
+    """
     if method not in RUN:
         raise InputError(f"method {method}: expected one of {', '.join(RUN)}")
     return RUN[: RUN.index(method) + 1] if settings.is_scored else (method,)
@@ -112,27 +117,26 @@ def result_of_method(
 
     far = _see_far(scene, method)
     cloud, flow, tracks = moments.pop(name)
-    seen = _see_window(scene, cloud, visible).joined(far)
-    cloud, held_out = seen.cloud, None
-    if scene.held_out is not None:
-        with watch.stage("held out"):
-            held_out = scene.held_out.scores(seen, visible)
+    seen = _see_window(scene, cloud, visible).with_far_points(far)
+    cloud = seen.cloud
+    held_out = _score_held_out(scene, seen, visible)
+
     with watch.stage("project"):
         movers = {}
         if output.movers == "separate":
             movers = views.movers(cloud, visible, seen.bodies, scene.images)
         if output.movers != "keep":
             static = cloud.select(~cloud.moving & ~cloud.far)
-            seen = views.see(static).joined(far)
-        depth = _add_ages(scene, method, _depth(scene, seen, visible, filled))
+            seen = views.see(static).with_far_points(far)
+        depth = _add_ages(scene, method, _make_maps(scene, seen, visible, filled))
     cloud = seen.cloud
     if scene.images:
         with watch.stage("colour"):
-            cloud = views.coloured(seen, depth, scene.images)
+            cloud = views.with_colours(seen, depth, scene.images)
     if visible:
-        cloud = views.confident(seen, cloud, depth)
+        cloud = views.with_confidence(seen, cloud, depth)
     with watch.stage("score"):
-        metrics = _metrics(scene, cloud, depth, visible) | {"held_out": held_out}
+        metrics = _score(scene, cloud, depth, visible) | {"held_out": held_out}
     return Result(
         method=name,
         key=scene.key,
@@ -144,12 +148,12 @@ def result_of_method(
         tracks=tracks,
         movers=movers,
         optical_flow=views.optical_flow(cloud, depth) if output.optical_flow else {},
-        rejected=views.rejected(seen, depth) if output.rejected else {},
+        rejected=views.rejection_reasons(seen, depth) if output.rejected else {},
         images=scene.images,
         stamp_ns=stretch[scene.key].sweep.stamp_ns,
         views=views.cameras(),
-        truth_m={name: true_m for name, (true_m, _) in scene.truth.items()},
-        T_key_lidar={f: stretch.T_target_source(scene.key, f) for f in stretch.frames},
+        truth_m={map_name: true_m for map_name, (true_m, _) in scene.truth.items()},
+        T_key_lidar={frame: stretch.T_target_source(scene.key, frame) for frame in stretch.frames},
         far_frames=() if far is None else tuple(np.unique(far.cloud.frame).tolist()),
         far_left_out=scene.beyond.standing.left_out if far and scene.beyond else (),
     )
@@ -158,14 +162,14 @@ def result_of_method(
 def see(scene: KeyScene, name: str, cloud: Cloud) -> SeenCloud:
     """Return the accumulated points of the method ``name`` as the cameras see them."""
     visible = METHODS[name].visible and scene.settings.project.visibility
-    return _see_window(scene, cloud, visible).joined(_see_far(scene, METHODS[name]))
+    return _see_window(scene, cloud, visible).with_far_points(_see_far(scene, METHODS[name]))
 
 
 def _see_window(scene: KeyScene, cloud: Cloud, visible: bool) -> SeenCloud:
     """Return the accumulated points as the cameras see them, with the bodies of moving objects."""
     with scene.watch.stage("project"):
         seen = scene.views.see(cloud)
-        return seen._replace(bodies=scene.views.bodies(cloud)) if visible else seen
+        return seen._replace(bodies=scene.views.find_bodies(cloud)) if visible else seen
 
 
 def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
@@ -173,17 +177,17 @@ def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
     if not method.far or scene.beyond is None:
         return None
     with scene.watch.stage("far"):
-        return scene.views.far(*scene.beyond, scene.stretch, standing_only=method.visible)
+        return scene.views.see_far(*scene.beyond, scene.stretch, standing_only=method.visible)
 
 
 def _add_ages(
     scene: KeyScene, method: Method, depth: Mapping[str, DepthMap]
 ) -> dict[str, DepthMap]:
     """Return the maps with the time between the exposure and the source sweep of each pixel."""
-    stamps_ns = {s.frame: s.sweep.stamp_ns for s in scene.stretch.sweeps}
+    stamps_ns = {registered.frame: registered.sweep.stamp_ns for registered in scene.stretch.sweeps}
     if method.far and scene.beyond is not None:
-        far = scene.beyond.standing
-        stamps_ns |= zip(far.frames, far.stamp_ns.tolist(), strict=True)
+        surfaces = scene.beyond.standing
+        stamps_ns |= zip(surfaces.frames, surfaces.stamp_ns.tolist(), strict=True)
     exposures = scene.views.exposures
     return {
         name: with_ages(maps, stamps_ns, scene.key, exposures[name].late_s)
@@ -191,40 +195,54 @@ def _add_ages(
     }
 
 
-def _depth(scene: KeyScene, seen: SeenCloud, visible: bool, filled: bool) -> dict[str, DepthMap]:
-    """Return the depth maps of the points, with the expected outliers that are asked for."""
-    depth = scene.views.depth(seen, visible, filled)
+def _make_maps(
+    scene: KeyScene, seen: SeenCloud, visible: bool, filled: bool
+) -> dict[str, DepthMap]:
+    """Return the depth maps of the points, limited to ``project.max_outliers``."""
+    depth = scene.views.depth_maps(seen, visible, filled)
     if visible:
-        depth = _less_certain(scene, depth)
+        depth = _lower_confidence(scene, depth)
     max_outliers = scene.settings.project.max_outliers
     return {name: with_max_outliers(maps, max_outliers) for name, maps in depth.items()}
 
 
-def _less_certain(scene: KeyScene, depth: dict[str, DepthMap]) -> dict[str, DepthMap]:
+def _lower_confidence(scene: KeyScene, depth: dict[str, DepthMap]) -> dict[str, DepthMap]:
     """Return the maps with a lower confidence for a single sweep, and for sweeps without times."""
-    sweeps, at = [s.sweep for s in scene.stretch.sweeps], scene.stretch[scene.key]
-    untimed = np.mean([sweep.offset_ns is None for sweep in sweeps])
+    sweeps = [registered.sweep for registered in scene.stretch.sweeps]
+    key_sweep = scene.stretch[scene.key]
+    untimed_share = np.mean([sweep.offset_ns is None for sweep in sweeps])
     if len(sweeps) == 1:
-        return {name: unconfirmed(maps) for name, maps in depth.items()}
-    if not untimed or not scene.settings.register.deskew:
+        return {name: without_confirmation(maps) for name, maps in depth.items()}
+    if not untimed_share or not scene.settings.register.deskew:
         return depth
     period_s = float(np.median(np.diff([sweep.stamp_ns for sweep in sweeps]))) * 1e-9
     # Sweeps already compensated for motion need no point times.
-    if at.sweep.offset_ns is None and find_compensated(at.sweep, at.twist, period_s) is not None:
+    if key_sweep.sweep.offset_ns is None and (
+        find_compensated(key_sweep.sweep, key_sweep.twist, period_s) is not None
+    ):
         return depth
+    # Without a time a point is shifted by up to the motion in half a period.
     exposures = scene.views.exposures
     return {
         name: without_times(
             maps,
             0.5 * period_s * abs(float(exposures[name].twist[5])),
             exposures[name].camera,
-            float(untimed),
+            float(untimed_share),
         )
         for name, maps in depth.items()
     }
 
 
-def _metrics(
+def _score_held_out(scene: KeyScene, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
+    """Return the scores of maps made without the key sweep, None if they are not asked for."""
+    if scene.held_out is None:
+        return None
+    with scene.watch.stage("held out"):
+        return scene.held_out.scores(seen, visible)
+
+
+def _score(
     scene: KeyScene, cloud: Cloud, depth: Mapping[str, DepthMap], visible: bool
 ) -> dict[str, Any]:
     """Return the scores that need no ground truth, and depth scores if ground truth is given."""
@@ -251,7 +269,9 @@ def _metrics(
             for name, (true_m, _) in scene.truth.items()
         }
     if visible:
-        metrics["expected_outliers"] = {n: expected_outliers(m) for n, m in depth.items()}
+        metrics["expected_outliers"] = {
+            name: expected_outliers(maps) for name, maps in depth.items()
+        }
     metrics["measure"] = {name: maps.measure for name, maps in depth.items()}
     metrics["held_out"] = None  # its place; the scores come later
     if scene.settings.output.rejected:
@@ -268,25 +288,33 @@ def complete_with_prior(
 ) -> Result:
     """Return the result with completed maps (``full``) and their scores.
 
-    A prior that does not fit the measured depth is not used, and a warning is logged. ``shots`` and
-    ``truth``, depth (H,W) in metres and mask (H,W) of moving pixels, are by map name. ``kind`` is
-    the setting ``prior.kind``.
+    A prior that does not fit the measured depth is not used, and a warning is logged.
+
+    Args:
+        shots: Map name -> image that the map shows.
+        truth: Map name -> ground-truth depth (H,W) in metres and mask (H,W) of moving pixels.
+        kind: The setting ``prior.kind``.
+
+    Raises:
+        InputError: The prior has no depth image for any map of the key.
     """
-    full, metrics = {}, copy.deepcopy(dict(result.metrics))
-    for name, prior in _read(files, shots, result.key).items():
-        full[name] = maps = complete(result.depth[name], prior, kind)
-        if not maps.fit.used:
+    full = {}
+    metrics = copy.deepcopy(dict(result.metrics))
+    for name, prior in _read_priors(files, shots, result.key).items():
+        completed = complete(result.depth[name], prior, kind)
+        full[name] = completed
+        if not completed.fit.used:
             _log.warning(
                 "key %d: the prior %s is not used, depth_full is as depth_filled: after the best "
                 "fit %.0f %% of the measured pixels are off by more than 25 %%, expected at most "
                 "%.0f %%",
                 result.key,
-                maps.source,
-                100 * maps.fit.wrong,
+                completed.source,
+                100 * completed.fit.wrong,
                 100 * MAX_WRONG,
             )
-        prior_alone_m = np.where(maps.from_prior, maps.depth_m, np.float32(0))
-        for product, depth_m in (("full", maps.depth_m), ("prior", prior_alone_m)):
+        prior_alone_m = np.where(completed.from_prior, completed.depth_m, np.float32(0))
+        for product, depth_m in (("full", completed.depth_m), ("prior", prior_alone_m)):
             metrics["density"][name][product] = depth_metrics.image_density(depth_m)
             if name in truth:
                 metrics["depth"][name][product] = depth_metrics.scores_by_motion(
@@ -295,16 +323,19 @@ def complete_with_prior(
     return replace(result, full=full, metrics=metrics)
 
 
-def _read(files: PriorFiles, shots: Mapping[str, Shot], key: int) -> dict[str, Prior]:
+def _read_priors(files: PriorFiles, shots: Mapping[str, Shot], key: int) -> dict[str, Prior]:
     """Return map name -> prior, read by image number, or by key if the map shows no image."""
-    priors, lacking = {}, []
+    priors = {}
+    lacking = []  # texts for the maps without a prior
     for name, shot in shots.items():
         number = key if shot.number is None else shot.number
         prior = files.prior(shot.camera, number)
         if prior is not None:
             priors[name] = prior
         else:
-            lacking.append(f"{shot.camera.name} {number} ({files.said_of(shot.camera.name)})")
+            lacking.append(
+                f"{shot.camera.name} {number} ({files.describe_available(shot.camera.name)})"
+            )
     if lacking and not priors:
         raise InputError(f"prior {files.place}: key {key}: no depth image {', '.join(lacking)}")
     if lacking:

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from densify.geometry.types import Progress, StageCost
 
-# glibc's mallopt(3)
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
-_KEPT_BYTES = 2**30
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # parameters of glibc's mallopt(3)
+_KEPT_BYTES = 2**30  # arrays up to this size are on the heap, which keeps as much freed memory
 _MOST_OF_OLDER_BYTES = 2**25  # older releases refuse a larger threshold of mmap
-_PER_MB = 1024 * 1024 if sys.platform == "darwin" else 1024  # of getrusage(2)
+_PER_MB = 1024 * 1024 if sys.platform == "darwin" else 1024  # units of getrusage(2) in a MB
 
 
 class Watch:
@@ -41,7 +40,9 @@ class Watch:
     def stage(self, name: str) -> Iterator[None]:
         """Measure the work inside the ``with`` block as the stage of this name."""
         self._report(name, 0)
-        begin_s, inner_s = time.perf_counter(), getattr(self._thread, "inner_s", 0.0)
+        begin_s = time.perf_counter()
+        # Time of the stages that the outer stage has called before this one
+        siblings_s = getattr(self._thread, "inner_s", 0.0)
         self._thread.inner_s = 0.0
         try:
             yield
@@ -51,7 +52,7 @@ class Watch:
                 own_s = total_s - self._thread.inner_s
                 self._seconds[name] = self._seconds.get(name, 0.0) + own_s
                 self._peak_mb[name] = getrusage(RUSAGE_SELF).ru_maxrss / _PER_MB
-            self._thread.inner_s = inner_s + total_s
+            self._thread.inner_s = siblings_s + total_s
         self._report(name, 1)
 
     def restart(self) -> None:
@@ -64,9 +65,12 @@ class Watch:
         """Return the cost of each stage measured until now, repeated runs of a stage added up."""
         from densify.geometry.types import StageCost  # the command line starts without numpy
 
-        return tuple(StageCost(n, self._seconds[n], peak) for n, peak in self._peak_mb.items())
+        return tuple(
+            StageCost(name, self._seconds[name], peak_mb) for name, peak_mb in self._peak_mb.items()
+        )
 
     def _report(self, name: str, done: int) -> None:
+        """Report the begin (``done`` 0) or the end (1) of a stage."""
         if self._progress is not None:
             with self._lock:
                 self._progress(name, done, 1)

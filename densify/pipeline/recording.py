@@ -47,7 +47,7 @@ from densify.geometry.types import (
 )
 from densify.pipeline.accumulate import accumulate, object_tracks
 from densify.pipeline.process import Watch
-from densify.pipeline.road import Road, views_of
+from densify.pipeline.road import Road, choose_views
 from densify.pipeline.sweeps import Cut, Sweeps
 from densify.readers.timeline import (
     Timeline,
@@ -60,9 +60,9 @@ from densify.registration.trajectory import LeftOut, Registration, find_trajecto
 
 T = TypeVar("T")
 P = ParamSpec("P")
-_LEAD_IN_S = 0.5  # before a window or a block, in which odometry settles
-_MIN_LEAD_IN = 2  # sweeps that show the speed
-_SOME = 8  # every eighth point tells the share of points below the ground
+_LEAD_IN_S = 0.5  # time before a window or a block, in which odometry settles
+_MIN_LEAD_IN = 2  # least number of sweeps in it, which show the speed
+_STRIDE = 8  # every eighth point is enough for the share of points below the ground
 
 
 def _latest(
@@ -72,12 +72,20 @@ def _latest(
 
     @wraps(method)
     def call(recording: Recording, *args: P.args, **kwargs: P.kwargs) -> T:
-        step = recording._results.get(method.__name__)
-        if step is None or step[0] != args:
-            step = recording._results[method.__name__] = args, method(recording, *args, **kwargs)
-        return cast(T, step[1])
+        latest = recording._results.get(method.__name__)
+        if latest is None or latest.arguments != args:
+            latest = _Latest(args, method(recording, *args, **kwargs))
+            recording._results[method.__name__] = latest
+        return cast(T, latest.result)
 
     return call
+
+
+class _Latest(NamedTuple):
+    """The latest call of a method."""
+
+    arguments: tuple[Any, ...]
+    result: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,18 +106,18 @@ class Piece:
 
 
 class Moment(NamedTuple):
-    """Accumulated points at a key's time, flow from sweep to sweep (or None), objects' tracks."""
+    """The points of a window at the reference time of its key."""
 
-    cloud: Cloud
-    flow: StretchFlow | None
-    tracks: tuple[ObjectTrack, ...]
+    cloud: Cloud  # accumulated points
+    flow: StretchFlow | None  # flow of each sweep to the next one towards the key; None if unasked
+    tracks: tuple[ObjectTrack, ...]  # tracks of the moving objects
 
 
 class Beyond(NamedTuple):
-    """Static surfaces beyond a key's window, and the (4,4) pose of their world in the key frame."""
+    """The static surfaces beyond a key's window."""
 
     standing: StandingWorld
-    T_key_standing: Float
+    T_key_standing: Float  # (4,4) pose of their world in the key frame
 
 
 class Recording:
@@ -131,29 +139,38 @@ class Recording:
         Args:
             window: Number of sweeps on each side of a key.
             keys: Frame numbers, around which sweeps are read; None for every frame.
+            cache: Cache on disk for registration, motion and far; None for no cache.
             run: Name of a run whose processes share results through the cache; None for no sharing.
             looks_around: True also searches motion ``flow.look_around_s`` beyond the windows.
+
+        Raises:
+            InputError: A key does not exist, or the window is invalid.
         """
-        self.sequence, self.settings = sequence, settings
+        self.sequence = sequence
+        self.settings = settings
         self.timeline = timeline = Timeline.of(sequence)
-        self._num_around, self._watch, self._cache = window, watch or Watch(), cache
+        self._num_beside = window
+        self._watch = watch or Watch()
+        self._cache = cache
+        self._run = run
+        self._results: dict[str, _Latest] = {}  # latest call of each method with `_latest`
+
         keys = timeline.frames if keys is None else keys
-        Cut.of(timeline, window, keys)  # refuses bad ones before a sweep is read
+        Cut.of(timeline, window, keys)  # raises for a bad key or window before a sweep is read
         looks_around &= engine_row(settings.flow.engine)[0].shared
         around_s, step_s = self._look_around(keys) if looks_around else (0.0, 0.0)
         self.cut = Cut.of(timeline, window, keys, around_s)
         self._step_around = max(1, timeline.num_in(step_s))
         # The sweeps around a window count as lead-in, too.
         self._num_lead_in = max(_MIN_LEAD_IN, timeline.num_in(_LEAD_IN_S - around_s))
-        self._run = run
-        num_raw = max(map(len, self.cut.blocks), default=0) + self._num_lead_in
+
+        num_kept = max(map(len, self.cut.blocks), default=0) + self._num_lead_in
         self.sweeps = Sweeps(
-            sequence, timeline, settings.register, num_raw, cache, run, self._watch
+            sequence, timeline, settings.register, num_kept, cache, run, self._watch
         )
-        self._results: dict[str, tuple[tuple[Any, ...], Any]] = {}  # of `_latest`, by method
 
     def _look_around(self, keys: Collection[int]) -> tuple[float, float]:
-        """Return seconds around windows, and between sweeps, in which motion is searched."""
+        """Return the seconds around windows where motion is searched, and between its sweeps."""
         if not keys or self.settings.flow.look_around_s == 0:
             return 0.0, 0.0
         for key in sorted(keys):
@@ -165,27 +182,44 @@ class Recording:
     def window_frames(self, key: int) -> WindowFrames:
         """Return the frames of a key's window, and the reasons if it is smaller than requested.
 
-        Raises InputError if the key does not exist or is unusable, UnplacedSweepError if it cannot
-        be registered, SweepError if none of its neighbours can be registered.
+        Raises:
+            InputError: The key does not exist or is unusable.
+            UnplacedSweepError: The key cannot be registered.
+            SweepError: None of its neighbours can be registered.
         """
-        whole = self.timeline.window(key, self._num_around)
-        number = self.cut.number_of[key]
-        block = self.cut.blocks[number]
-        bad = {f: why for f, why in self.registration(number).bad.items() if f in block}
-        if key in bad:
-            raise bad[key].error(key)
-        reasons = {f: why.reason for f, why in bad.items()}
-        window = self.timeline.window(key, self._num_around, reasons)
-        piece = frozenset(self._piece(key).poses.frames)
-        window = WindowFrames(tuple(f for f in window.frames if f in piece), window.cuts)
-        failed = [f for f in whole.frames if f in bad and not bad[f].unreadable]
-        if failed and len(window.frames) == 1:
-            raise bad[failed[0]].error(failed[0])
+        requested = self.timeline.window(key, self._num_beside)
+        block_index = self.cut.number_of[key]
+        block = self.cut.blocks[block_index]
+        left_out = {
+            frame: cause
+            for frame, cause in self.registration(block_index).bad.items()
+            if frame in block
+        }
+        if key in left_out:
+            raise left_out[key].error(key)
+
+        # The window ends before a sweep that is left out, and at the end of the key's piece.
+        reasons = {frame: cause.reason for frame, cause in left_out.items()}
+        usable = self.timeline.window(key, self._num_beside, reasons)
+        in_piece = frozenset(self._piece(key).poses.frames)
+        window = WindowFrames(
+            tuple(frame for frame in usable.frames if frame in in_piece), usable.cuts
+        )
+
+        # The key is alone because a neighbour failed to register. An unreadable neighbour is no
+        # error: the recording may have lost it, and the key's own sweep gives a result.
+        unregistered = [
+            frame
+            for frame in requested.frames
+            if frame in left_out and not left_out[frame].unreadable
+        ]
+        if unregistered and len(window.frames) == 1:
+            raise left_out[unregistered[0]].error(unregistered[0])
         return window
 
     def window(self, key: int) -> Stretch:
-        """Return the registered, deskewed sweeps of a key's window. Raises as `window_frames`."""
-        frames = self.window_frames(key).frames  # raises first
+        """Return the registered, deskewed sweeps of a key's window; raise as `window_frames`."""
+        frames = self.window_frames(key).frames  # raises before a piece is looked up
         return self._stretch(self._piece(key), frames)
 
     def around(self, key: int) -> Stretch:
@@ -198,9 +232,13 @@ class Recording:
         return len(self._searched(self._piece(key))) == 2
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
-        """Return the flow of all points in a key's window; ``engine`` None is ``flow.engine``."""
+        """Return the scene flow of all points in a key's window; raise as `window_frames`.
+
+        ``engine`` None or "" is the configured engine ``flow.engine``.
+        """
         engine = engine or self.settings.flow.engine
-        window, piece = self.window(key), self._piece(key)
+        window = self.window(key)
+        piece = self._piece(key)
         # Two sweeps are too few for ``groups``.
         if engine == "groups" and self.is_pair(key):
             engine = "pairs"
@@ -208,34 +246,42 @@ class Recording:
             scene = Scene(window, self._ground(piece))
             return estimate_motion(scene, self.settings, engine)
         # All poses, but points only for the sweeps of the window.
-        with_points = {s.frame: s for s in window.sweeps}
+        with_points = {registered.frame: registered for registered in window.sweeps}
         sweeps = [
-            with_points.get(f) or RegisteredSweep.without_points(piece.poses, f)
-            for f in self._searched(piece)
+            with_points.get(frame) or RegisteredSweep.without_points(piece.poses, frame)
+            for frame in self._searched(piece)
         ]
         return self._motion(piece, engine).with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
-        """Return the flow of a sweep to the next, or else previous sweep; empty without either."""
+        """Return the flow of a sweep to the next sweep, or without one to the previous sweep.
+
+        Without neighbours in the window the flow has no steps.
+        """
         window = self.window(frame)
-        beside = [f for f in window.frames if f > frame] or [f for f in window.frames if f < frame]
-        if not beside:
+        later = [other for other in window.frames if other > frame]
+        earlier = [other for other in window.frames if other < frame]
+        targets = later or earlier
+        if not targets:
             return StretchFlow(window, {})
-        step = (frame, beside[0])
-        return StretchFlow(window, {step: self.motion(frame).flow(*step)})
+        hop = (frame, targets[0])
+        return StretchFlow(window, {hop: self.motion(frame).flow(*hop)})
 
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
     ) -> Moment:
-        """Accumulate the key sweep, or all sweeps of its window, at the key's reference time.
+        """Return the points of a key's window, accumulated at the key's reference time.
 
-        The scene flow is by ``engine``, "" for the configured engine, None for rigid accumulation.
-        ``with_flow`` also returns the flow of every sweep to the next sweep towards the key.
+        Args:
+            all_sweeps: Use all sweeps of the window, else the key sweep alone.
+            engine: Scene-flow engine, "" for the configured engine, None for rigid accumulation.
+            with_flow: Also return the flow of every sweep to the next sweep towards the key.
         """
-        stretch, flow = self.window(key), None
-        tracks: tuple[ObjectTrack, ...] = ()
+        stretch = self.window(key)
         used = stretch if all_sweeps else Stretch((stretch[key],))
-        fields = [FlowField.zero(len(s.sweep)) for s in used.sweeps]
+        fields = [FlowField.zero(len(registered.sweep)) for registered in used.sweeps]
+        flow = None
+        tracks: tuple[ObjectTrack, ...] = ()
         if engine is not None:
             with self._watch.stage("flow"):
                 motion = self.motion(key, engine)
@@ -248,53 +294,70 @@ class Recording:
             cloud = accumulate(used, fields, key, drop_lost)
             heights = self._ground(self._piece(key))
             tracks = complete_boxes(tracks, cloud, Rays(used, key), heights)
-            deep = heights.below(cloud.rigid_points, stretch[key].T_world_lidar)
-            return Moment(cloud.select(~deep) if deep.any() else cloud, flow, tracks)
+            is_below = heights.below(cloud.rigid_points, stretch[key].T_world_lidar)
+            return Moment(cloud.select(~is_below) if is_below.any() else cloud, flow, tracks)
 
     def share_below(self, key: int) -> float:
         """Return the share of the points of a key's window that lie below the ground."""
-        heights, sweeps = self._ground(self._piece(key)), self.window(key).sweeps
-        deep = [heights.below(s.sweep.points[::_SOME], s.T_world_lidar) for s in sweeps]
-        return float(np.concatenate(deep).mean())
+        heights = self._ground(self._piece(key))
+        is_below = [
+            heights.below(registered.sweep.points[::_STRIDE], registered.T_world_lidar)
+            for registered in self.window(key).sweeps
+        ]
+        return float(np.concatenate(is_below).mean())
 
-    def standing(self, key: int) -> Beyond | None:
-        """Return the static surfaces along the road beyond the key's window, None without any."""
-        if not self.settings.accumulate.far_m:  # not requested
+    def find_beyond(self, key: int) -> Beyond | None:
+        """Return the static surfaces along the road beyond the key's window.
+
+        None if the far range is not requested (``accumulate.far_m`` is 0), or if no sweep beyond
+        the window can be used.
+        """
+        if not self.settings.accumulate.far_m:
             return None
         piece = self._piece(key)
         surfaces = self._far(piece)
         return Beyond(surfaces, poses.inverse(piece.pose(key))) if surfaces.frames else None
 
     def _piece(self, key: int) -> Piece:
+        """Return the piece that holds the key sweep."""
         pieces = self._pieces(self.cut.number_of[key])
         return next(piece for piece in pieces if key in piece.frames)
 
     @_latest
     def registration(self, number: int) -> Registration:
-        """Register each run of consecutive sweeps, split at sweeps that cannot be registered."""
+        """Register each run of consecutive sweeps of a block, split at sweeps that are left out."""
         frames = self._registered_together(number)
 
         def make() -> Registration:
             self.sweeps.prepare(frames)
-            sweeps, bad, pieces = {}, {}, []
-            for frame in frames:
-                try:
-                    self.sweeps.recorded_pose(frame)
-                    sweeps[frame] = self.sweeps.read(frame)
-                except InputError as error:
-                    bad[frame] = LeftOut(str(error), unreadable=True)
+            sweeps, left_out = self._read_usable(frames)
+            pieces = []
             remaining = self.timeline.runs(sweeps)
             while remaining:
-                together = remaining.pop()
+                run = remaining.pop()
                 try:
-                    pieces.append(self._register([sweeps[f] for f in together]))
+                    pieces.append(self._register([sweeps[frame] for frame in run]))
                 except SweepError as error:
-                    unfit = isinstance(error, UnfitSweepError)
-                    bad[error.frame] = LeftOut(str(error), unreadable=False, unfit=unfit)
-                    remaining += self.timeline.runs([f for f in together if f != error.frame])
-            return Registration(tuple(sorted(pieces, key=lambda p: p.frames)), bad)
+                    # Without the sweep that failed, the rest is tried again.
+                    is_unfit = isinstance(error, UnfitSweepError)
+                    left_out[error.frame] = LeftOut(str(error), unreadable=False, unfit=is_unfit)
+                    remaining += self.timeline.runs([f for f in run if f != error.frame])
+            in_order = sorted(pieces, key=lambda piece: piece.frames)
+            return Registration(tuple(in_order), left_out)
 
-        return self._kept("registration", frames, make)
+        return self._cached("registration", frames, make)
+
+    def _read_usable(self, frames: Sequence[int]) -> tuple[dict[int, Sweep], dict[int, LeftOut]]:
+        """Return the sweeps that can be read, and the causes why others are left out, by frame."""
+        sweeps: dict[int, Sweep] = {}
+        left_out: dict[int, LeftOut] = {}
+        for frame in frames:
+            try:
+                self.sweeps.recorded_pose(frame)  # raises if the recording lacks the pose
+                sweeps[frame] = self.sweeps.read(frame)
+            except InputError as error:
+                left_out[frame] = LeftOut(str(error), unreadable=True)
+        return sweeps, left_out
 
     def _register(self, sweeps: Sequence[Sweep]) -> Trajectory:
         """Return the poses of consecutive sweeps; raise InputError if they are in a map's frame."""
@@ -322,12 +385,14 @@ class Recording:
     def _pieces(self, number: int) -> list[Piece]:
         """Return the pieces of a block, with their poses."""
         block = frozenset(self.cut.blocks[number])
-        wanted = block.union(self.timeline.before(self.cut.blocks[number][0], 1))
+        # The sweep before the block tells the twist of the block's first sweep.
+        with_pose = block.union(self.timeline.before(self.cut.blocks[number][0], 1))
         pieces = list[Piece]()
-        for piece in self.registration(number).pieces:
-            frames = tuple(f for f in piece.frames if f in block)
+        for registered in self.registration(number).pieces:
+            frames = tuple(frame for frame in registered.frames if frame in block)
             if frames:
-                trajectory = piece.part([f for f in piece.frames if f in wanted], origin=frames[0])
+                part = [frame for frame in registered.frames if frame in with_pose]
+                trajectory = registered.part(part, origin=frames[0])
                 pieces.append(Piece(number, len(pieces), trajectory, frames, {}))
         return pieces
 
@@ -343,12 +408,15 @@ class Recording:
     @_latest
     def _searched(self, piece: Piece) -> tuple[int, ...]:
         """Return the frames of a piece where motion is searched: windows, and every n-th around."""
-        frames, inside = piece.frames, self._in_windows(piece.number)
-        inside_rows = np.flatnonzero([frame in inside for frame in frames])
-        if self._step_around == 1 or not len(inside_rows):
+        frames = piece.frames
+        in_windows = self._in_windows(piece.number)
+        window_rows = np.flatnonzero([frame in in_windows for frame in frames])
+        if self._step_around == 1 or not len(window_rows):
             return frames
-        num_away = np.abs(np.arange(len(frames))[:, None] - inside_rows).min(axis=1)
-        return tuple(f for f, n in zip(frames, num_away, strict=True) if n % self._step_around == 0)
+        # Sweeps from the nearest sweep of a window: 0 within it, every n-th around it.
+        num_away = np.abs(np.arange(len(frames))[:, None] - window_rows).min(axis=1)
+        is_searched = num_away % self._step_around == 0
+        return tuple(frame for frame, used in zip(frames, is_searched, strict=True) if used)
 
     @_latest
     def _ground(self, piece: Piece) -> HeightMap:
@@ -360,33 +428,38 @@ class Recording:
     @_latest
     def _motion(self, piece: Piece, engine: str) -> SharedMotion:
         """Return the scene flow in a piece, without the sweeps to keep the cache small."""
-        asked, frames = self._in_windows(piece.number), self._searched(piece)
+        asked = self._in_windows(piece.number)
+        frames = self._searched(piece)
 
         def make() -> SharedMotion:
-            stretch, heights = self._stretch(piece, frames), self._ground(piece)
+            stretch = self._stretch(piece, frames)
+            heights = self._ground(piece)
             with self._watch.stage("flow"):
                 scene = Scene(stretch, heights, asked=asked)
                 motion = estimate_motion(scene, self.settings, engine)
             return cast(SharedMotion, motion).with_stretch(Stretch(()))
 
         settings = [engine, self.settings.flow, self.settings.objective, sorted(asked), piece.row]
-        return self._kept("motion", self._registered_together(piece.number), make, settings)
+        return self._cached("motion", self._registered_together(piece.number), make, settings)
 
     @_latest
     def _far(self, piece: Piece) -> StandingWorld:
         """Return the static surfaces along the road of a piece, in the piece's world."""
         # Sweeps of the block outside the windows belong to the far range.
-        inside = self._in_windows(piece.number)
-        in_windows = tuple(f for f in piece.frames if f in inside) or piece.frames
+        in_windows = self._in_windows(piece.number)
+        frames = tuple(frame for frame in piece.frames if frame in in_windows) or piece.frames
 
         def make() -> StandingWorld:
-            keys = [k for k in self.cut.keys_of(piece.number) if k in in_windows]
-            window, cameras = self._stretch(piece, in_windows), self.sequence.cameras.values()
+            keys = [key for key in self.cut.keys_of(piece.number) if key in frames]
+            window = self._stretch(piece, frames)
             with self._watch.stage("far"):
-                views, far_m = views_of(cameras, window, keys), self.settings.accumulate.far_m
+                views = choose_views(self.sequence.cameras.values(), window, keys)
+                far_m = self.settings.accumulate.far_m
                 register = self.settings.register
                 road = Road(self.timeline, self.sweeps, register, far_m, window, views)
-                return road.find_standing(with_window=len(keys) > 1)
+                # For one key the sweeps of the window are accumulated anyway. With more keys, the
+                # window of one is beyond the window of another.
+                return road.find_static_surfaces(with_window=len(keys) > 1)
 
         # Processes of one run share the result. A digest would read every sweep of the road.
         shared = self._cache if self._run is not None else None
@@ -396,10 +469,10 @@ class Recording:
     def _in_windows(self, number: int) -> frozenset[int]:
         """Return the frames of the windows of a block's keys."""
         keys = self.cut.keys_of(number)
-        windows = (self.timeline.window(key, self._num_around).frames for key in keys)
+        windows = (self.timeline.window(key, self._num_beside).frames for key in keys)
         return frozenset(frame for frames in windows for frame in frames)
 
-    def _kept(
+    def _cached(
         self,
         step: str,
         frames: Iterable[int],
@@ -409,8 +482,8 @@ class Recording:
         """Return the result of ``make``, or the cached result for the same sweeps and settings."""
 
         def inputs() -> Any:
-            content = [(f, self.sweeps.content(f)) for f in frames]
-            code, period_ns = code_digest(), self.timeline.period_ns
-            return [code, self.settings.register, period_ns, content, list(settings)]
+            content = [(frame, self.sweeps.content(frame)) for frame in frames]
+            period_ns = self.timeline.period_ns
+            return [code_digest(), self.settings.register, period_ns, content, list(settings)]
 
         return kept(self._cache, step, inputs, make)

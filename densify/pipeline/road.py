@@ -31,29 +31,41 @@ from densify.registration.alignment import Surface
 from densify.registration.deskew import deskew_sweep, twists
 from densify.registration.road_poses import follow_road, num_in_submap, relax_poses
 
-_STEP_M = 2.0  # along the road, between the sweeps that are used; half of it at least
-_MAX_S = 15.0  # on each side; a standing vehicle observes nothing new
-_SAME_VIEW_M = 3.0
+_STEP_M = 2.0  # usual distance along the road between the sweeps that are used
+_MIN_STEP_M = 0.5 * _STEP_M  # least distance between them
+_MAX_S = 15.0  # greatest time on each side; a parked vehicle observes nothing new
+_SAME_VIEW_M = 3.0  # keys closer than this share a view
 _UNSEEN_SHARE = 0.5  # of far_m where no camera looks: those sweeps are farther from what is seen
 _SLACK_M = 4.0  # motion of a lidar within a sweep, and of a camera until its exposure
 
 
-class _Passed(NamedTuple):
+class _RoadSweep(NamedTuple):
     """A sweep along the road."""
 
-    # Returns in view of a camera, with the pose; deskewed if ``known``, else raw
+    # Returns in view of a camera, with the pose; deskewed if ``in_window``, else raw
     registered: RegisteredSweep
     # Surface of all returns, deskewed, in the lidar frame; None with recorded poses
     surface: Surface | None
     travel_m: float  # distance along the road from the window's first sweep, negative before it
-    known: bool  # true if the sweep is in the window, where poses are known
+    in_window: bool  # true if the sweep is in the window, where poses are known
 
     def deskewed(self) -> RegisteredSweep:
         """Return the returns in view of a camera, deskewed."""
-        r = self.registered
-        if self.known:
-            return r
-        return deskew_sweep(r.sweep, r.T_world_lidar, r.twist_before, r.twist_after)
+        if self.in_window:
+            return self.registered
+        return deskew_sweep(
+            self.registered.sweep,
+            self.registered.T_world_lidar,
+            self.registered.twist_before,
+            self.registered.twist_after,
+        )
+
+
+class _RelaxedRoad(NamedTuple):
+    """The sweeps along the road with corrected poses."""
+
+    sweeps: list[_RoadSweep]
+    unreliable: frozenset[int]  # frames of the sweeps whose poses stay unreliable
 
 
 @dataclass(frozen=True)
@@ -69,163 +81,194 @@ class Road:
     window: Stretch  # deskewed sweeps of the window
     views: Sequence[tuple[Camera, Float]]  # cameras with their poses ``T_cam_world`` (4,4)
 
-    def find_standing(self, with_window: bool) -> StandingWorld:
+    def find_static_surfaces(self, with_window: bool) -> StandingWorld:
         """Return the static surfaces along the road, in the world of the window.
 
-        Only points that one of the views may see are kept. ``with_window`` includes the points of
-        the window's own sweeps.
+        Only points that one of the views may see are kept.
+
+        Args:
+            with_window: Include the points of the window's own sweeps.
         """
-        within = self._within()
+        window_sweeps = self._thin_window()
         with ThreadPoolExecutor(num_threads()) as pool:
-            behind, ahead = pool.map(self._beyond, (-1, 1))
-        passed, unreliable = [*behind[::-1], *within, *ahead], frozenset[int]()
-        if self._surfaces and len(passed) > 1:
-            passed, unreliable = self._relaxed(passed)
+            sweeps_before, sweeps_after = pool.map(self._collect_side, (-1, 1))
+        road = _RelaxedRoad([*sweeps_before[::-1], *window_sweeps, *sweeps_after], frozenset())
+        # Odometry drifts along the road, recorded poses do not.
+        has_odometry = bool(self._surfaces)
+        if has_odometry and len(road.sweeps) > 1:
+            road = self._relax(road.sweeps)
+
         used = [
-            p
-            for p in passed
-            if (with_window or not p.known) and p.registered.frame not in unreliable
+            road_sweep
+            for road_sweep in road.sweeps
+            if (with_window or not road_sweep.in_window)
+            and road_sweep.registered.frame not in road.unreliable
         ]
-        travel_m = np.array([p.travel_m for p in used])
-        standing = partial(far.standing, Sensors.of(self.window.sweeps))
+        travel_m = np.array([road_sweep.travel_m for road_sweep in used])
+        static_points = partial(far.static_points, Sensors.of(self.window.sweeps))
         with ThreadPoolExecutor(num_threads()) as pool:
-            deskewed = list(pool.map(_Passed.deskewed, used))
-            gone = far.departed(deskewed, travel_m)
-            worlds = list(pool.map(standing, deskewed, gone))
-        return replace(far.joined(worlds), left_out=tuple(sorted(unreliable)))
+            deskewed = list(pool.map(_RoadSweep.deskewed, used))
+            seen_through = far.find_seen_through(deskewed, travel_m)
+            static_surfaces = list(pool.map(static_points, deskewed, seen_through))
+        left_out = tuple(sorted(road.unreliable))
+        return replace(far.join_worlds(static_surfaces), left_out=left_out)
 
     @cached_property
     def _surfaces(self) -> dict[int, Surface]:
         """The surfaces of the window's sweeps by frame, {} with recorded poses."""
         if self.settings.source == "dataset":
             return {}
+        sweeps = [registered.sweep for registered in self.window.sweeps]
         with ThreadPoolExecutor(num_threads()) as pool:
-            surfaces = pool.map(Surface.of_sweep, (s.sweep for s in self.window.sweeps))
+            surfaces = pool.map(Surface.of_sweep, sweeps)
             return dict(zip(self.window.frames, surfaces, strict=True))
 
     @cached_property
     def _travel_m(self) -> Float:
         """The (n,) distances along the road, from the first sweep of the window to each."""
-        positions = np.stack([s.T_world_lidar[:3, 3] for s in self.window.sweeps])
+        positions = np.stack([registered.T_world_lidar[:3, 3] for registered in self.window.sweeps])
         return np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
 
-    def _within(self) -> list[_Passed]:
+    def _thin_window(self) -> list[_RoadSweep]:
         """Return the window's sweeps, thinned to at least 1 m between sweeps."""
-        passed, last_m = list[_Passed](), -np.inf
-        for s, at_m in zip(self.window.sweeps, self._travel_m.tolist(), strict=True):
-            if at_m - last_m >= 0.5 * _STEP_M:
-                last_m = at_m
-                surface = self._surfaces.get(s.frame)
-                passed.append(_Passed(self._in_view(s), surface, at_m, known=True))
-        return passed
+        road_sweeps = list[_RoadSweep]()
+        last_used_m = -np.inf
+        for registered, travel_m in zip(self.window.sweeps, self._travel_m.tolist(), strict=True):
+            if travel_m - last_used_m >= _MIN_STEP_M:
+                last_used_m = travel_m
+                surface = self._surfaces.get(registered.frame)
+                in_view = self._select_in_view(registered)
+                road_sweeps.append(_RoadSweep(in_view, surface, travel_m, in_window=True))
+        return road_sweeps
 
-    def _beyond(self, side: int) -> list[_Passed]:
+    def _collect_side(self, side: int) -> list[_RoadSweep]:
         """Return the sweeps before (side -1) or after (side 1) the window, nearest first."""
-        last = self.window.sweeps[0 if side < 0 else -1].T_world_lidar[:3, 3]
+        end_of_window = self.window.sweeps[0 if side < 0 else -1]
         begin_m = 0.0 if side < 0 else self._travel_m[-1]
-        passed, last_m, travel_m = list[_Passed](), 0.0, 0.0
         reach_m = self.far_m if self._is_seen(side) else _UNSEEN_SHARE * self.far_m
-        for registered, surface in self._sweeps_beyond(side, reach_m):
-            travel_m += float(np.linalg.norm(registered.T_world_lidar[:3, 3] - last))
-            last = registered.T_world_lidar[:3, 3]
-            if travel_m - last_m < 0.5 * _STEP_M:
+        road_sweeps = list[_RoadSweep]()
+        position = end_of_window.T_world_lidar[:3, 3]
+        last_used_m = travel_m = 0.0  # both from the end of the window
+        for registered, surface in self._register_side(side, reach_m):
+            travel_m += float(np.linalg.norm(registered.T_world_lidar[:3, 3] - position))
+            position = registered.T_world_lidar[:3, 3]
+            if travel_m - last_used_m < _MIN_STEP_M:
                 continue
-            last_m = travel_m
-            at_m = begin_m + side * travel_m
-            passed.append(_Passed(self._in_view(registered), surface, at_m, known=False))
-        return passed
+            last_used_m = travel_m
+            in_view = self._select_in_view(registered)
+            road_m = begin_m + side * travel_m
+            road_sweeps.append(_RoadSweep(in_view, surface, road_m, in_window=False))
+        return road_sweeps
 
     def _is_seen(self, side: int) -> bool:
         """Return True if a camera may see the road's end before (side -1) or after the window."""
         first, last = (self.window.sweeps[row].T_world_lidar[:3, 3] for row in (0, -1))
         length_m = float(np.linalg.norm(last - first))
-        if length_m < 0.5 * _STEP_M:  # the vehicle stands
+        if length_m < _MIN_STEP_M:  # at rest the direction of the road is unknown
             return True
         to_end = side * self.far_m * (last - first) / length_m
-        end = ((last if side > 0 else first) + to_end)[None].astype(np.float32)
-        return any(far.may_see(*view, end, _SLACK_M).any() for view in self.views)
+        road_end = ((last if side > 0 else first) + to_end)[None].astype(np.float32)
+        return any(far.may_see(*view, road_end, _SLACK_M).any() for view in self.views)
 
-    def _sweeps_beyond(
+    def _register_side(
         self, side: int, reach_m: float
     ) -> Iterator[tuple[RegisteredSweep, Surface | None]]:
-        """Yield each raw sweep with its pose, and its surface, nearest first."""
-        known = self.window.sweeps[::side]
-        beside = self.timeline.before if side < 0 else self.timeline.after
-        frames = beside(known[-1].frame, self._max_sweeps(reach_m))[::side]
+        """Yield each raw sweep before or after the window, with its surface, nearest first."""
+        window_sweeps = self.window.sweeps[::side]  # the last one is at the end of the window
+        end_of_window = window_sweeps[-1]
+        frames_beside = self.timeline.before if side < 0 else self.timeline.after
+        frames = frames_beside(end_of_window.frame, self._max_sweeps(reach_m))[::side]
         if not self._surfaces:
-            return self._recorded(known[-1], frames, reach_m)
-        stamp_ns = np.array([self.timeline.stamp_of(f) for f in frames], np.int64)
-        of_known, read = [self._surfaces[s.frame] for s in known], self.sweeps.read
-        return follow_road(known, of_known, frames, stamp_ns, read, reach_m, _STEP_M)
+            return self._follow_recorded(end_of_window, frames, reach_m)
+        stamp_ns = np.array([self.timeline.stamp_of(frame) for frame in frames], np.int64)
+        surfaces = [self._surfaces[registered.frame] for registered in window_sweeps]
+        return follow_road(
+            window_sweeps, surfaces, frames, stamp_ns, self.sweeps.read, reach_m, _STEP_M
+        )
 
     def _max_sweeps(self, reach_m: float) -> int:
         """Return the number of sweeps that cover a distance at half the speed of the window."""
         first, last = self.window.sweeps[0], self.window.sweeps[-1]
-        max_s, step_ns = _MAX_S, last.sweep.stamp_ns - first.sweep.stamp_ns
-        if step_ns > 0:
-            step = last.T_world_lidar[:3, 3] - first.T_world_lidar[:3, 3]
-            speed_m_s = float(np.linalg.norm(step)) / (1e-9 * step_ns)
+        max_s = _MAX_S
+        duration_ns = last.sweep.stamp_ns - first.sweep.stamp_ns
+        if duration_ns > 0:
+            travel = last.T_world_lidar[:3, 3] - first.T_world_lidar[:3, 3]
+            speed_m_s = float(np.linalg.norm(travel)) / (1e-9 * duration_ns)
             max_s = min(max_s, 2 * reach_m / max(speed_m_s, 1e-3))
         return int(max_s * 1e9 / self.timeline.period_ns)
 
-    def _recorded(
-        self, known: RegisteredSweep, frames: Sequence[int], reach_m: float
+    def _follow_recorded(
+        self, end_of_window: RegisteredSweep, frames: Sequence[int], reach_m: float
     ) -> Iterator[tuple[RegisteredSweep, None]]:
-        """Yield the values of `_sweeps_beyond` from the recording's own poses."""
-        travel_m, last_m, last, last_ns = 0.0, 0.0, known.T_world_lidar, known.sweep.stamp_ns
+        """Yield the sweeps of `_register_side` at the recording's own poses."""
+        travel_m = last_used_m = 0.0
+        T_last = end_of_window.T_world_lidar
+        last_ns = end_of_window.sweep.stamp_ns
         try:
-            T_world_recorded = last @ poses.inverse(self._recorded_pose(known.frame))
+            recorded_pose = self._recorded_pose(end_of_window.frame)
+            T_world_recorded = T_last @ poses.inverse(recorded_pose)
             for frame in frames:
                 T = T_world_recorded @ self._recorded_pose(frame)
                 stamp_ns = self.timeline.stamp_of(frame)
-                twist = poses.twist_between(last, T, (stamp_ns - last_ns) * 1e-9)
-                travel_m += float(np.linalg.norm(T[:3, 3] - last[:3, 3]))
-                last, last_ns = T, stamp_ns
+                twist = poses.twist_between(T_last, T, (stamp_ns - last_ns) * 1e-9)
+                travel_m += float(np.linalg.norm(T[:3, 3] - T_last[:3, 3]))
+                T_last = T
+                last_ns = stamp_ns
                 if travel_m > reach_m:
                     return
-                if travel_m - last_m >= 0.5 * _STEP_M:
-                    last_m = travel_m
+                if travel_m - last_used_m >= _MIN_STEP_M:
+                    last_used_m = travel_m
                     yield RegisteredSweep(self.sweeps.read(frame), T, twist, twist), None
         except InputError:  # the road ends without a pose or a sweep
             return
 
     def _recorded_pose(self, frame: int) -> Float:
-        """Return the recorded ``T_world_lidar`` (4,4) of a sweep."""
+        """Return the recorded ``T_world_lidar`` (4,4) of a sweep; raise InputError without one."""
         return cast(Float, self.sweeps.recorded_pose(frame))
 
-    def _relaxed(self, passed: Sequence[_Passed]) -> tuple[list[_Passed], frozenset[int]]:
-        """Correct the poses by `relax_poses`; return also the frames that stay unreliable."""
-        frames = tuple(p.registered.frame for p in passed)
+    def _relax(self, road_sweeps: Sequence[_RoadSweep]) -> _RelaxedRoad:
+        """Return the sweeps with poses corrected by `relax_poses`."""
+        frames = tuple(road_sweep.registered.frame for road_sweep in road_sweeps)
+        num_points = float(np.median([len(registered.sweep) for registered in self.window.sweeps]))
         relaxed = relax_poses(
-            [cast(Surface, p.surface) for p in passed],
-            np.stack([p.registered.T_world_lidar for p in passed]),
-            np.array([p.known for p in passed]),
-            num_in_submap(float(np.median([len(s.sweep) for s in self.window.sweeps]))),
+            [cast(Surface, road_sweep.surface) for road_sweep in road_sweeps],
+            np.stack([road_sweep.registered.T_world_lidar for road_sweep in road_sweeps]),
+            np.array([road_sweep.in_window for road_sweep in road_sweeps]),
+            num_in_submap(num_points),
         )
-        stamp_ns = np.array([p.registered.sweep.stamp_ns for p in passed], np.int64)
-        trajectory, moved = Trajectory(frames, stamp_ns, relaxed.T_world_lidar), []
-        for i, p in enumerate(passed):
-            if not p.known:  # poses of the window stay
-                T, sweep = relaxed.T_world_lidar[i], p.registered.sweep
-                p = p._replace(registered=RegisteredSweep(sweep, T, *twists(trajectory, i)))
-            moved.append(p)
-        unreliable = (f for f, holds in zip(frames, relaxed.holds, strict=True) if not holds)
-        return moved, frozenset(unreliable)
+        stamps_ns = [road_sweep.registered.sweep.stamp_ns for road_sweep in road_sweeps]
+        stamp_ns = np.array(stamps_ns, np.int64)
+        trajectory = Trajectory(frames, stamp_ns, relaxed.T_world_lidar)
 
-    def _in_view(self, registered: RegisteredSweep) -> RegisteredSweep:
+        corrected = list[_RoadSweep]()
+        for i, road_sweep in enumerate(road_sweeps):
+            if not road_sweep.in_window:  # poses of the window stay
+                T = relaxed.T_world_lidar[i]
+                sweep = road_sweep.registered.sweep
+                registered = RegisteredSweep(sweep, T, *twists(trajectory, i))
+                road_sweep = road_sweep._replace(registered=registered)
+            corrected.append(road_sweep)
+        unreliable = (
+            frame for frame, holds in zip(frames, relaxed.is_reliable, strict=True) if not holds
+        )
+        return _RelaxedRoad(corrected, frozenset(unreliable))
+
+    def _select_in_view(self, registered: RegisteredSweep) -> RegisteredSweep:
         """Return a sweep with only those returns that one of the views may see."""
         sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
-        keep = np.zeros(len(sweep), bool)
+        in_view = np.zeros(len(sweep), bool)
+        # Each view tests only the returns that no view before it may see.
         rows = np.flatnonzero(far.in_reach(sweep))
         points = sweep.points[rows].astype(np.float32)
         for camera, T_cam_world in self.views:
-            inside = far.may_see(camera, T_cam_world @ T_world_lidar, points, _SLACK_M)
-            keep[rows[inside]] = True
-            rows, points = rows[~inside], points[~inside]
-        return replace(registered, sweep=sweep.select(keep))
+            may_see = far.may_see(camera, T_cam_world @ T_world_lidar, points, _SLACK_M)
+            in_view[rows[may_see]] = True
+            rows = rows[~may_see]
+            points = points[~may_see]
+        return replace(registered, sweep=sweep.select(in_view))
 
 
-def views_of(
+def choose_views(
     cameras: Collection[Camera], window: Stretch, keys: Sequence[int]
 ) -> list[tuple[Camera, Float]]:
     """Return cameras with their ``T_cam_world`` (4,4); keys less than 3 m apart share a view."""

@@ -5,7 +5,7 @@
 
     register and deskew the window     recording.window
     accumulate rigidly, or with flow   recording.moment   (free space, ground, motion)
-    find static surfaces beyond it     recording.standing
+    find static surfaces beyond it     recording.find_beyond
     see, project, fill, score          densify.pipeline.key_result, method by method
     complete with a prior              densify.pipeline.key_result
     warn                               densify.pipeline.warnings
@@ -32,7 +32,14 @@ from densify.depth.views import HeldOut, Views
 from densify.flow.engines import check_engine
 from densify.free_space.range_image import RangeImage
 from densify.geometry.compiled import num_threads
-from densify.geometry.types import Cloud, LidarSequence, Progress, Result, StretchFlow
+from densify.geometry.types import (
+    Cloud,
+    LidarSequence,
+    Progress,
+    Result,
+    StageCost,
+    StretchFlow,
+)
 from densify.pipeline.key_result import (
     COMPARED,
     METHODS,
@@ -82,7 +89,7 @@ def run(
             scores of maps made without the key sweep.
     """
     results = run_keys(sequence, [key], window, method, cameras, config, progress, prior=prior)
-    ((_, result),) = results
+    ((_, result),) = results  # the pair of the only key
     if isinstance(result, Exception):
         raise result
     return result
@@ -105,7 +112,8 @@ def run_keys(
     sweeps of these windows, which can improve a key slightly over `run`. The ``cache`` keeps shared
     results on disk. The other arguments are as in `run`.
     """
-    methods, watch = methods_of_run(method, resolve(config)), Watch(progress)
+    methods = methods_of_run(method, resolve(config))
+    watch = Watch(progress)
     recording = _open(sequence, keys, window, methods, cameras, config, cache, watch)
     priors = _open_prior(prior, sequence, cameras)
 
@@ -139,7 +147,8 @@ def compare(
     Returns:
         Method -> result. Each result has the results before it as ``baselines``.
     """
-    watch, settings = Watch(progress), resolve(config).scored()
+    watch = Watch(progress)
+    settings = resolve(config).scored()
     recording = _open(sequence, [key], window, methods, cameras, settings, cache, watch)
     priors = _open_prior(prior, sequence, cameras)
     return densify(recording, key, methods, cameras, watch, priors=priors)
@@ -190,8 +199,10 @@ def densify(
             same either way.
         priors: Depth images that complete the maps of the last method.
     """
-    methods = tuple(dict.fromkeys(methods))
-    watch, sequence, settings = watch or Watch(), recording.sequence, recording.settings
+    methods = tuple(dict.fromkeys(methods))  # each once, in order
+    sequence = recording.sequence
+    settings = recording.settings
+    watch = watch or Watch()
     watch.restart()
     recording.window(key)  # raises its errors before an image is read
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
@@ -200,7 +211,7 @@ def densify(
 
     with ThreadPoolExecutor(num_threads()) as pool:
         wants_far = any(METHODS[name].far for name in methods)
-        far = pool.submit(recording.standing, key) if wants_far else None
+        far = pool.submit(recording.find_beyond, key) if wants_far else None
         with_flow = settings.output.flow != "none"
         moments = {
             name: recording.moment(key, METHODS[name].all_sweeps, METHODS[name].engine, with_flow)
@@ -212,21 +223,29 @@ def densify(
         scene = scene_of(
             recording, key, shots, images, beyond, moments[methods[-1]].cloud, with_images, watch
         )
-        filled = [settings.is_scored or name == methods[-1] for name in methods]
+        are_filled = [settings.is_scored or name == methods[-1] for name in methods]
         make = partial(result_of_method, scene, moments)
-        bare_results = list(pool.map(make, methods, filled))
+        results_alone = list(pool.map(make, methods, are_filled))
 
     if priors is not None:
         with watch.stage("prior"):
-            completed = bare_results[-1], priors, shots, scene.truth, settings.prior.kind
-            bare_results[-1] = complete_with_prior(*completed)
-    results: dict[str, Result] = {}
-    costs = watch.costs()
-    for result in bare_results:
-        results[result.method] = replace(
-            result, costs=costs, baselines=dict(results), recording=sequence.name
-        )
+            results_alone[-1] = complete_with_prior(
+                results_alone[-1], priors, shots, scene.truth, settings.prior.kind
+            )
+    results = _with_baselines(results_alone, watch.costs(), sequence.name)
     return add_warnings(results, recording, key, shots)
+
+
+def _with_baselines(
+    results: Sequence[Result], costs: tuple[StageCost, ...], recording: str
+) -> dict[str, Result]:
+    """Return method -> result, each with the results before it as baselines."""
+    by_method: dict[str, Result] = {}
+    for result in results:
+        by_method[result.method] = replace(
+            result, costs=costs, baselines=dict(by_method), recording=recording
+        )
+    return by_method
 
 
 def scene_of(
@@ -239,11 +258,17 @@ def scene_of(
     with_images: bool,
     watch: Watch,
 ) -> KeyScene:
-    """Return the shared inputs of a key's methods; ``cloud`` says which points of it move."""
-    sequence, settings, stretch = recording.sequence, recording.settings, recording.window(key)
+    """Return the shared inputs of a key's methods.
+
+    ``shots`` and ``images`` (H,W,3) are by map name. ``cloud`` says which points of the key sweep
+    move. ``with_images`` colours the cloud, and scores depth if there is ground truth.
+    """
+    sequence = recording.sequence
+    settings = recording.settings
+    stretch = recording.window(key)
     key_image = RangeImage.of(stretch[key])
     views = Views.of(sequence, stretch, key, shots, images, settings)
-    truth = views.truth(sequence.truth) if with_images and sequence.truth else {}
+    truth = views.true_maps(sequence.truth) if with_images and sequence.truth else {}
     held_out = None
     if settings.is_scored:
         with watch.stage("held out"):
@@ -263,11 +288,13 @@ def _or_error(make: Callable[[int], T], frame: int) -> T | ComputationError | In
 def _open_prior(
     prior: str | Path | None, sequence: LidarSequence, cameras: Sequence[str] | None
 ) -> PriorFiles | None:
+    """Return the depth images in the folder ``prior``, None without one."""
     if prior is None:
         return None
     from densify.readers.prior_files import PriorFiles
 
-    return PriorFiles.open(Path(prior), [c.name for c in choose_cameras(sequence, cameras)])
+    names = [camera.name for camera in choose_cameras(sequence, cameras)]
+    return PriorFiles.open(Path(prior), names)
 
 
 def _open(

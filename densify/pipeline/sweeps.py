@@ -11,12 +11,13 @@ from uuid import uuid4
 from densify.config import RegisterSettings
 from densify.config.cache import Cache, digest, kept
 from densify.config.errors import InputError
-from densify.free_space.raw_sweeps import by_azimuth
+from densify.free_space.raw_sweeps import count_by_azimuth
 from densify.geometry.types import Float, Int, LidarSequence, Sweep
 from densify.pipeline.process import Watch
 from densify.readers.timeline import Timeline, check_key, check_window, read_sweep
 
 BLOCK_S = 2.0
+"""Greatest time from the first key of a block to its last."""
 
 
 class Sweeps:
@@ -40,9 +41,13 @@ class Sweeps:
             run: Name of a run whose processes share digests of sweeps; None for no sharing.
             watch: Measures the stage ``read``.
         """
-        self._sequence, self._timeline, self._settings = sequence, timeline, settings
-        self._cache, self._run, self._watch = cache, run or uuid4().hex, watch
-        self._returns: dict[int, Int] = {}  # of sweeps read: frame -> `by_azimuth`
+        self._sequence = sequence
+        self._timeline = timeline
+        self._settings = settings
+        self._cache = cache
+        self._run = run or uuid4().hex
+        self._watch = watch
+        self._returns: dict[int, Int] = {}  # frame -> `count_by_azimuth`, of the sweeps read
         self.read = lru_cache(maxsize=num_kept)(self._read)
         self.content = lru_cache(maxsize=None)(self._content)
 
@@ -53,7 +58,10 @@ class Sweeps:
                 self._sequence.prepare(frames)
 
     def recorded_pose(self, frame: int) -> Float | None:
-        """Return the recording's own ``T_world_lidar`` (4,4), None if the settings ignore it."""
+        """Return the recording's own ``T_world_lidar`` (4,4), None if the settings ignore it.
+
+        Raises InputError if the recording has no pose for the frame.
+        """
         if self._settings.source != "dataset":
             return None
         return self._sequence.T_world_lidar(frame)
@@ -64,7 +72,7 @@ class Sweeps:
             raise InputError(self._timeline.unknown[frame])
         with self._watch.stage("read"):
             sweep = read_sweep(self._sequence, frame, self._settings)
-        self._returns[frame] = by_azimuth(sweep)
+        self._returns[frame] = count_by_azimuth(sweep)
         return sweep
 
     def returns_by_azimuth(self, frame: int) -> Int:
@@ -96,35 +104,48 @@ class Cut:
     number_of: Mapping[int, int]  # key -> index of its block
 
     def keys_of(self, number: int) -> list[int]:
-        """Return the keys of a block."""
-        return [key for key, n in self.number_of.items() if n == number]
+        """Return the keys of the block with index ``number``."""
+        return [key for key, block_number in self.number_of.items() if block_number == number]
 
     @staticmethod
     def of(timeline: Timeline, window: int, keys: Collection[int], beyond_s: float = 0.0) -> Cut:
-        """Cut blocks around the windows of some keys, ``beyond_s`` seconds longer on each side.
+        """Return the blocks around the windows of some keys.
 
-        Keys, in any order, share a block if their windows (``window`` sweeps on each side) overlap,
-        unless they are more than `BLOCK_S` apart.
+        Consecutive keys share a block if their windows overlap and the key is less than `BLOCK_S`
+        after the block's first key.
+
+        Args:
+            window: Number of sweeps on each side of a key.
+            keys: Frame numbers of the keys, in any order.
+            beyond_s: Seconds by which a block is longer than its windows, on each side.
+
+        Raises:
+            InputError: The window or a key is invalid, or a key does not exist.
         """
         check_window(window)
-        groups: list[list[int]] = []
-        last_row = -1  # of the last key's window
         for key in keys:
             check_key(key)
-        for key in sorted(set(keys)):
-            frames = timeline.window(key, window).frames
-            if timeline.row[frames[0]] <= last_row and (
-                timeline.stamp_of(key) - timeline.stamp_of(groups[-1][0]) < BLOCK_S * 1e9
-            ):
-                groups[-1].append(key)
-            else:
-                groups.append([key])
-            last_row = timeline.row[frames[-1]]
-        window += round(beyond_s * 1e9 / timeline.period_ns)
+        groups = _group_keys(timeline, window, sorted(set(keys)))
+        num_beside = window + round(beyond_s * 1e9 / timeline.period_ns)
         blocks = []
         for group in groups:
-            first = timeline.row[timeline.window(group[0], window).frames[0]]
-            last = timeline.row[timeline.window(group[-1], window).frames[-1]]
-            blocks.append(timeline.frames[first : last + 1])
+            first_row = timeline.row[timeline.window(group[0], num_beside).frames[0]]
+            last_row = timeline.row[timeline.window(group[-1], num_beside).frames[-1]]
+            blocks.append(timeline.frames[first_row : last_row + 1])
         number_of = {key: number for number, group in enumerate(groups) for key in group}
         return Cut(tuple(blocks), number_of)
+
+
+def _group_keys(timeline: Timeline, window: int, keys: Sequence[int]) -> list[list[int]]:
+    """Return ascending keys in groups that share a block."""
+    groups: list[list[int]] = []
+    last_row = -1  # row of the last sweep in the window of the key before
+    for key in keys:
+        frames = timeline.window(key, window).frames
+        overlaps = timeline.row[frames[0]] <= last_row
+        if overlaps and (timeline.stamp_of(key) - timeline.stamp_of(groups[-1][0]) < BLOCK_S * 1e9):
+            groups[-1].append(key)
+        else:
+            groups.append([key])
+        last_row = timeline.row[frames[-1]]
+    return groups

@@ -21,9 +21,9 @@ from densify.registration.trajectory import find_trajectory
 from densify.scores.depth_metrics import image_density
 from densify.scores.pose_metrics import RecordedError, main_error
 
-_LEAST_DENSITY = 0.001  # sixteen rings alone measure 0.5 % of an image
-_SLOW_S = 0.15  # period; at 5 Hz the motion of a truck along its own side is ambiguous
-_OTHER_CLOCK_S = 1.0  # from a sweep to the nearest image
+_LEAST_DENSITY = 0.001  # share of the pixels; sixteen rings alone measure 0.005
+_SLOW_S = 0.15  # period of sweeps; at 5 Hz the motion of a truck along its own side is ambiguous
+_OTHER_CLOCK_S = 1.0  # time from a sweep to the nearest image that suggests two clocks
 _LEAST_SIDE = 2  # sweeps on each side of the key, over which recorded poses are compared
 _MUCH_NEAR = 0.2  # share of the points; a car's own returns were 0 to 14 %
 _MUCH_BELOW = 0.0025  # share of the points; clean recordings have up to 0.0021
@@ -36,27 +36,35 @@ def add_warnings(
     key: int,
     shots: Mapping[str, Shot],
 ) -> dict[str, Result]:
-    """Return the ``results`` of one key, by method, with the field ``warnings`` filled in."""
-    sequence, stretch = recording.sequence, recording.window(key)
+    """Return the ``results`` of one key, by method, with the field ``warnings`` filled in.
+
+    ``shots`` are the images that the maps show, by map name.
+    """
+    sequence = recording.sequence
+    stretch = recording.window(key)
     cameras = {shot.camera.name for shot in shots.values()}
     shared = [
-        *_of_window(recording, key, looks_around([*results])),
+        *_warn_of_window(recording, key, looks_around([*results])),
         *(sequence.gaps() if hasattr(sequence, "gaps") else ()),
         *(
             f"{name} is left out: the recording has no images of it; ask with --camera {name}"
             for name in sequence.cameras
             if name not in cameras and not sequence.image_stamps_ns(name)
         ),
-        *_of_sweeps(recording, key),
-        *_of_sectors(stretch, recording),
-        *_of_motion(recording, key),
-        *_of_images(sequence, shots),
+        *_warn_of_sweeps(recording, key),
+        *_warn_of_sectors(stretch, recording),
+        *_warn_of_motion(recording, key),
+        *_warn_of_images(sequence, shots),
     ]
-    warnings = {n: dict.fromkeys([*shared, *of_result(r, stretch)]) for n, r in results.items()}
-    return {n: replace(result, warnings=tuple(warnings[n])) for n, result in results.items()}
+    warned = {}
+    for method, result in results.items():
+        # Each warning once, in the order of their first appearance.
+        warnings = dict.fromkeys([*shared, *warn_of_result(result, stretch)])
+        warned[method] = replace(result, warnings=tuple(warnings))
+    return warned
 
 
-def _of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
+def _warn_of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
     """Yield warnings about a small window. follows: True if a method estimates scene flow."""
     window = recording.window_frames(key)
     for cut in window.cuts:
@@ -65,9 +73,10 @@ def _of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
         yield "in two sweeps moving objects are found less well than in three or more"
 
 
-def _of_sweeps(recording: Recording, key: int) -> Iterator[str]:
-    """Yield warnings about missing point times and about points left out of the sweeps."""
-    settings, sweeps = recording.settings, [s.sweep for s in recording.window(key).sweeps]
+def _warn_of_sweeps(recording: Recording, key: int) -> Iterator[str]:
+    """Yield warnings about missing point times, silent scanners and points that are left out."""
+    settings = recording.settings
+    sweeps = [registered.sweep for registered in recording.window(key).sweeps]
     if settings.register.deskew and any(sweep.offset_ns is None for sweep in sweeps):
         yield "the points have no times of their own: motion within a sweep is not undone"
     untimed = {sweep.frame: sweep.num_untimed for sweep in sweeps if sweep.num_untimed}
@@ -76,13 +85,7 @@ def _of_sweeps(recording: Recording, key: int) -> Iterator[str]:
             f"{sum(untimed.values()):,} points of sweeps {format_frames(untimed)} are left out: "
             f"their times lie outside their sweep, the driver wrote them wrong"
         )
-    for lidar in np.unique(np.concatenate([np.unique(sweep.lidar) for sweep in sweeps])):
-        silent = [sweep.frame for sweep in sweeps if not (sweep.lidar == lidar).any()]
-        if silent:
-            yield (
-                f"sweeps {format_frames(silent)} have no returns of scanner {lidar}, which others "
-                f"have: static surfaces that it alone sees are of other sweeps"
-            )
+    yield from _warn_of_silent_scanners(sweeps)
     num_lone = sum(sweep.num_lone for sweep in sweeps)
     if num_lone:
         share = num_lone / (num_lone + sum(len(sweep) for sweep in sweeps))
@@ -90,19 +93,30 @@ def _of_sweeps(recording: Recording, key: int) -> Iterator[str]:
             f"{100 * share:.0f} % of the points are lone returns, as of snow, rain or dust; they "
             f"are left out, and motion is less certain"
         )
-    share = _share_near(sweeps)
-    if share > _MUCH_NEAR:
+    share_near = _share_near(sweeps)
+    if share_near > _MUCH_NEAR:
         yield (
-            f"register.min_range_m = {settings.register.min_range_m:g} takes {100 * share:.0f} % "
-            f"of the points as the own vehicle's; indoors and on small robots set it to the reach "
-            f"of the vehicle"
+            f"register.min_range_m = {settings.register.min_range_m:g} takes "
+            f"{100 * share_near:.0f} % of the points as the own vehicle's; indoors and on small "
+            f"robots set it to the reach of the vehicle"
         )
-    share = recording.share_below(key)
-    if share > _MUCH_BELOW:
+    share_below = recording.share_below(key)
+    if share_below > _MUCH_BELOW:
         yield (
-            f"{100 * share:.1f} % of the points lie below the ground, as mirror images of a wet "
-            f"road and echoes over two surfaces do; they are left out"
+            f"{100 * share_below:.1f} % of the points lie below the ground, as mirror images of a "
+            f"wet road and echoes over two surfaces do; they are left out"
         )
+
+
+def _warn_of_silent_scanners(sweeps: Sequence[Sweep]) -> Iterator[str]:
+    """Yield a warning for each scanner without returns in some of the sweeps."""
+    for lidar in np.unique(np.concatenate([np.unique(sweep.lidar) for sweep in sweeps])):
+        silent = [sweep.frame for sweep in sweeps if not (sweep.lidar == lidar).any()]
+        if silent:
+            yield (
+                f"sweeps {format_frames(silent)} have no returns of scanner {lidar}, which others "
+                f"have: static surfaces that it alone sees are of other sweeps"
+            )
 
 
 def _share_near(sweeps: Sequence[Sweep]) -> float:
@@ -111,16 +125,17 @@ def _share_near(sweeps: Sequence[Sweep]) -> float:
     return num_near / max(num_near + sum(len(sweep) for sweep in sweeps), 1)
 
 
-def _of_sectors(stretch: Stretch, recording: Recording) -> Iterator[str]:
+def _warn_of_sectors(stretch: Stretch, recording: Recording) -> Iterator[str]:
     """Yield warnings about directions in which raw sweeps lack returns."""
     if _share_near([registered.sweep for registered in stretch.sweeps]) > _MUCH_NEAR:
-        return  # they may lack those left out
-    returns = np.stack([recording.sweeps.returns_by_azimuth(f) for f in stretch.frames])
-    width_deg = zip(stretch.frames, lost_deg(returns), strict=True)
-    lacking = {frame: width for frame, width in width_deg if width >= LOST_DEG}
-    if lacking:
+        return  # they may lack the returns that are left out as the own vehicle's
+    returns = np.stack([recording.sweeps.returns_by_azimuth(frame) for frame in stretch.frames])
+    widths_deg = zip(stretch.frames, lost_deg(returns), strict=True)
+    lacking_deg = {frame: width for frame, width in widths_deg if width >= LOST_DEG}
+    if lacking_deg:
+        widest_deg = max(lacking_deg.values())
         yield (
-            f"sweeps {format_frames(lacking)} have no returns in up to {max(lacking.values()):.0f} "
+            f"sweeps {format_frames(lacking_deg)} have no returns in up to {widest_deg:.0f} "
             f"deg of azimuth where others have some, as after lost packets: static surfaces there "
             f"are of other sweeps, and motion is less certain"
         )
@@ -132,42 +147,45 @@ def _of_sectors(stretch: Stretch, recording: Recording) -> Iterator[str]:
         )
 
 
-def _of_motion(recording: Recording, key: int) -> Iterator[str]:
+def _warn_of_motion(recording: Recording, key: int) -> Iterator[str]:
     """Yield warnings if sweeps seem compensated already, or if given poses do not align them."""
-    settings, at = recording.settings.register, recording.window(key)[key]
+    settings = recording.settings.register
+    key_sweep = recording.window(key)[key]
     rings = None
-    if at.sweep.offset_ns is not None:
+    if key_sweep.sweep.offset_ns is not None:
         period_s = recording.timeline.period_ns * 1e-9
-        rings = find_compensated(recording.sweeps.read(key), at.twist, period_s)
+        rings = find_compensated(recording.sweeps.read(key), key_sweep.twist, period_s)
     if rings is not None:
         yield (
             f"the sweeps are compensated already, to {rings.moment}, and now a second time: the "
             f"rings are {rings.undone / rings.as_stored:.1f} times as sharp with a compensation "
             f"undone; --set register.deskew=false"
         )
-    if settings.source != "dataset":
-        return
-    yield from _of_recorded(recording, key)
+    if settings.source == "dataset":
+        yield from _warn_of_recorded_poses(recording, key)
 
 
-def _of_recorded(recording: Recording, key: int) -> Iterator[str]:
+def _warn_of_recorded_poses(recording: Recording, key: int) -> Iterator[str]:
     """Yield a warning if odometry does not confirm the recording's poses around the key."""
     timeline = recording.timeline
-    row, num = timeline.row[key], max(len(recording.window(key).frames) // 2, _LEAST_SIDE)
-    neighbours = timeline.frames[max(row - num, 0) : row + num + 1]
-    (around,) = (frames for frames in timeline.runs(neighbours) if key in frames)
+    row = timeline.row[key]
+    num_beside = max(len(recording.window(key).frames) // 2, _LEAST_SIDE)
+    neighbours = timeline.frames[max(row - num_beside, 0) : row + num_beside + 1]
+    (run,) = (frames for frames in timeline.runs(neighbours) if key in frames)
     settings = replace(recording.settings.register, source="kiss-icp")
     try:
-        sweeps = [recording.sweeps.read(frame) for frame in around]
+        sweeps = [recording.sweeps.read(frame) for frame in run]
         odometry = find_trajectory(sweeps, settings).T_world_lidar
-        recorded = [recording.sequence.T_world_lidar(frame) for frame in (around[0], around[-1])]
+        recorded = [recording.sequence.T_world_lidar(frame) for frame in (run[0], run[-1])]
     except InputError:
         return  # too short or too poor to compare
-    motions = [poses.inverse(ends[0]) @ ends[-1] for ends in (recorded, odometry)]
-    error = RecordedError.of(motions[:1], motions[1:])
+    # the motion from the first sweep to the last
+    recorded_motion = poses.inverse(recorded[0]) @ recorded[-1]
+    odometry_motion = poses.inverse(odometry[0]) @ odometry[-1]
+    error = RecordedError.of([recorded_motion], [odometry_motion])
     if error.cost > 1:
         duration_s = (sweeps[-1].stamp_ns - sweeps[0].stamp_ns) * 1e-9
-        mistake, remedy = main_error(motions[:1], motions[1:], duration_s)
+        mistake, remedy = main_error([recorded_motion], [odometry_motion], duration_s)
         yield (
             f"the recording's poses are off by {error.m:.2f} m and {error.deg:.1f} deg from "
             f"odometry over {error.way_m:.1f} m around sweep {key}{mistake}; {remedy}leave them "
@@ -175,7 +193,7 @@ def _of_recorded(recording: Recording, key: int) -> Iterator[str]:
         )
 
 
-def _of_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[str]:
+def _warn_of_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[str]:
     """Yield a warning for each depth map to which no image belongs."""
     for name, shot in shots.items():
         if shot.number is not None:
@@ -192,9 +210,9 @@ def _of_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Iterator[s
         )
 
 
-def of_result(result: Result, stretch: Stretch) -> Iterator[str]:
+def warn_of_result(result: Result, stretch: Stretch) -> Iterator[str]:
     """Yield the warnings about the result of one method; ``stretch`` holds the window's sweeps."""
-    stamps_ns = [s.sweep.stamp_ns for s in stretch.sweeps]
+    stamps_ns = [registered.sweep.stamp_ns for registered in stretch.sweeps]
     if METHODS[result.method].engine is not None and len(stamps_ns) > 1:
         period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
         if period_s > _SLOW_S:

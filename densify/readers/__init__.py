@@ -31,7 +31,7 @@ class ReaderModule(Protocol):
 
 
 class Spec(NamedTuple):
-    """A recording as ``--data`` names it."""
+    """The parts of a recording's specification, as given to ``--data``."""
 
     # Name in `READERS`; "street" for the simulated recording; None to recognise the files
     reader: str | None
@@ -40,7 +40,7 @@ class Spec(NamedTuple):
 
     @staticmethod
     def parse(text: str | Path) -> Spec:
-        """Parse ``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``."""
+        """Split a specification ``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``."""
         text = str(text)
         if text == "street" or text.startswith(("street:", "street?")):
             return Spec("street", text)
@@ -75,9 +75,13 @@ def _exists(location: str) -> bool:
 def open_sequence(spec: str | Path = "street") -> LidarSequence:
     """Open a recording; sweeps and images are read later, on demand.
 
-    ``spec`` is a path, ``READER:PATH[#SCENE]``, or ``street[:PRESET][?seed=N&sensor=NAME]`` for the
-    built-in simulated street. Without ``READER:`` the reader is recognised by the files. The first
-    image of each camera must fit its calibration.
+    Args:
+        spec: A path, ``READER:PATH[#SCENE]``, or ``street[:PRESET][?seed=N&sensor=NAME]`` for the
+            built-in simulated street. Without ``READER:`` the reader is recognised by the files.
+
+    Raises:
+        InputError: No reader recognises the path, the scene is missing or not unique, or the first
+            image of a camera does not have the size of its calibration.
     """
     parsed = Spec.parse(spec)
     if parsed.reader == "street":
@@ -145,7 +149,7 @@ def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:
 
 
 def describe(sequence: LidarSequence) -> str:
-    """Return a summary of a recording as aligned lines of text, as `findings` lists it."""
+    """Return a summary of a recording as aligned lines of text: the pairs of `findings`."""
     return in_lines(findings(sequence))
 
 
@@ -156,7 +160,10 @@ def in_lines(lines: Sequence[tuple[str, str]]) -> str:
 
 
 def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
-    """Summarise a recording as (name, text) pairs; load only its first and last readable sweep."""
+    """Return a summary of a recording as (name, text) pairs, such as frames, rate and cameras.
+
+    Only the first and the last readable sweep are loaded.
+    """
     timeline = Timeline.of(sequence)
     unreadable = dict(timeline.unknown)
     first = _readable(sequence, timeline.frames, unreadable)
@@ -194,6 +201,7 @@ def _readable(sequence: LidarSequence, frames: Sequence[int], unreadable: dict[i
 
 
 def _frames(sequence: LidarSequence) -> str:
+    """Describe the frame numbers, how many there are, and how many are missing."""
     frames = sequence.frames
     num_missing = frames[-1] - frames[0] + 1 - len(frames)
     gaps = f", {num_missing} missing between them" if num_missing else ", no gaps"
@@ -201,16 +209,20 @@ def _frames(sequence: LidarSequence) -> str:
 
 
 def _hertz(stamps_ns: Sequence[int] | Int) -> str:
-    period_ns = sorted(np.diff(stamps_ns).tolist())[(len(stamps_ns) - 2) // 2]
+    """Describe the rate of two or more stamps, by the lower median of their steps."""
+    steps_ns = sorted(np.diff(stamps_ns).tolist())
+    period_ns = steps_ns[(len(steps_ns) - 1) // 2]
     return f"{1e9 / period_ns:.2f} Hz" if period_ns > 0 else "unknown, stamps do not advance"
 
 
 def _num_points(sweep: Sweep) -> str:
+    """Describe the number of points, and of points left out for their time."""
     untimed = f" ({sweep.num_untimed:,} more left out: their times are not of the sweep)"
     return f"{len(sweep):,}{untimed * bool(sweep.num_untimed)}"
 
 
 def _point_times(first: Sweep) -> str:
+    """Describe the range of the firing times of a sweep."""
     if first.offset_ns is None:
         return "none: sweeps cannot be deskewed from the data's own times"
     low_ms, high_ms = first.offset_ns.min() / 1e6, first.offset_ns.max() / 1e6
@@ -218,6 +230,7 @@ def _point_times(first: Sweep) -> str:
 
 
 def _cameras(sequence: LidarSequence) -> list[tuple[str, str]]:
+    """Return the name and the description of each camera."""
     if not sequence.cameras:
         return [("cameras", "none")]
     lines = []
@@ -235,6 +248,7 @@ def _cameras(sequence: LidarSequence) -> list[tuple[str, str]]:
 
 
 def _poses(sequence: LidarSequence, frames: Sequence[int]) -> str:
+    """Describe the length of the recorded path, or the reason why there are no poses."""
     try:
         path = np.array([sequence.T_world_lidar(frame)[:3, 3] for frame in frames])
     except InputError as error:

@@ -40,7 +40,7 @@ _FX_FY_CX_CY = ("fx_px", "fy_px", "cx_px", "cy_px")
 
 
 def open_recording(path: Path, scene: str | None) -> Argoverse2:
-    """Open a log: its folder, or that of its split or the data set with its name as ``scene``."""
+    """Open a log by its folder; or, with its name as ``scene``, by its split or the data set."""
     if scene is None and (path / _TRACK).is_file():
         return Argoverse2(path)
     folders = (path, path / "train", path / "val", path / "test")
@@ -107,7 +107,10 @@ class Argoverse2(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's annotated boxes in the lidar frame; None in the test split."""
+        """Return a sweep's annotated boxes in the lidar frame.
+
+        None without a file of boxes (test split), or if the file has no boxes of this sweep.
+        """
         path, columns = self.where / "annotations.feather", self._annotations
         stamp_ns = self.stamp_ns(frame)
         rows = np.flatnonzero(columns["timestamp_ns"] == stamp_ns) if columns else np.zeros(0, int)

@@ -26,10 +26,11 @@ _ORTHONORMAL_TOLERANCE = 1e-3  # far above the rounding of text and float32 file
 def numbered_files(
     folder: Path, *suffixes: str, stem: re.Pattern[str] = _NUMBER
 ) -> dict[int, Path]:
-    """Return a folder's files by number, such as ``0000000120.bin``; earlier suffixes win.
+    """Return the numbered files of a folder, such as ``0000000120.bin``, by ascending number.
 
-    ``stem`` matches the names without suffix; its first group is the number. A single file is
-    taken as a folder of one.
+    Args:
+        *suffixes: Accepted suffixes. Of files with the same number, the earliest suffix is taken.
+        stem: Pattern of a whole name without suffix; its first group is the number.
     """
     entries = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
     files = [
@@ -60,11 +61,15 @@ def file_within(root: Path, name: str, where: Path | str) -> Path:
 
 def drive_around(path: Path) -> Path | None:
     """Return the KITTI raw drive that contains a path at most two levels deep, None if none."""
-    return next((p for p in path.absolute().parents[:2] if (p / "velodyne_points").is_dir()), None)
+    parents = path.absolute().parents[:2]
+    return next((parent for parent in parents if (parent / "velodyne_points").is_dir()), None)
 
 
 def of_frame(entries: Mapping[int, T], frame: int, kind: str, where: Path) -> T:
-    """Return the entry of a frame, such as a file or stamp; errors name ``kind`` and ``where``."""
+    """Return the entry of a frame, such as a file or stamp; raise InputError if it is missing.
+
+    The message begins with ``where`` and names the ``kind`` of the entry.
+    """
     if frame not in entries:
         raise InputError(
             f"{where}: no {kind} of frame {frame}; frames that exist: {format_frames(entries)}"
@@ -84,11 +89,11 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
 def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
     """Decode an image file's bytes to (H,W,3) uint8 RGB; a gray image has three equal channels."""
     bgr = decode_image(data, where)
-    image_size(bgr.shape, camera, where)
+    check_image_size(bgr.shape, camera, where)
     return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
 
 
-def image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> None:
+def check_image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> None:
     """Raise InputError if an image's shape (H,W,...) differs from the size of its camera."""
     if shape[:2] != (camera.height_px, camera.width_px):
         raise InputError(
@@ -106,7 +111,10 @@ def pinhole(
     where: str,
     **lens: Any,
 ) -> Camera:
-    """Return a camera with zero skew; ``lens`` has further arguments, such as ``distortion``."""
+    """Return a camera with zero skew; raise InputError for impossible numbers.
+
+    ``lens`` has further arguments of `Camera`, such as ``distortion``. ``where`` begins messages.
+    """
     fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
         raise InputError(
@@ -120,7 +128,12 @@ def pinhole(
 def chosen_scene(
     reader: str, path: Path, scene: str | None, names: Sequence[str], none: str
 ) -> str:
-    """Return the requested scene, for None the only one; ``none`` is the error without any."""
+    """Return the name of the requested scene; for None, the name of the only scene.
+
+    Args:
+        names: Names of the existing scenes.
+        none: Message of the InputError if there are no scenes.
+    """
     if not names:
         raise InputError(f"{path}: {none}")
     if scene in names or (scene is None and len(names) == 1):
@@ -140,7 +153,7 @@ def truth_beside(recording: Path) -> Truth | None:
 
 
 def parse_numbers(text: str, where: str, count: int) -> Float:
-    """Parse the (count,) finite numbers, separated by white space, of a line or file."""
+    """Parse a text of numbers separated by white space; return them as (count,)."""
     try:
         values = np.array(text.split(), np.float64)
     except ValueError as error:
@@ -153,7 +166,10 @@ def parse_numbers(text: str, where: str, count: int) -> Float:
 
 
 def rigid(T: Any, where: str) -> Float:
-    """Return a checked (4,4) rigid transform, given as (4,4), (3,4), or 16 or 12 numbers."""
+    """Return a (4,4) rigid transform after checks; raise InputError if it is none.
+
+    ``T`` is given as (4,4), (3,4), or 16 or 12 numbers. ``where`` begins messages.
+    """
     T = np.asarray(T, np.float64)
     T = T.reshape(-1, 4) if T.size in (12, 16) else T
     if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
@@ -172,7 +188,7 @@ def rigid(T: Any, where: str) -> Float:
 def scanner_axes(T_lidar_scanner: Float) -> Float:
     """Return (S,3,3) rotations from the lidar frame to scanner axes, of (S,4,4) mounting poses."""
     R = T_lidar_scanner[:, :3, :3]
-    # The axes of an upside-down scanner are turned by 180 degrees about x, until z is up.
+    # The axes of a scanner mounted upside down are turned by 180 degrees about x, so that z is up.
     upright = np.where(R[:, 2:, 2:] < 0, R * [1.0, -1.0, -1.0], R)
     return np.ascontiguousarray(upright.transpose(0, 2, 1))
 
@@ -204,8 +220,11 @@ def quaternion_pose(
 def upright_poses(centre_m: Float, heading_rad: Float) -> Float:
     """Return (K,4,4) poses at centres (K,3), turned about z by (K,) headings from x towards y."""
     T = np.tile(np.eye(4), (len(centre_m), 1, 1))
-    c, s = np.cos(heading_rad), np.sin(heading_rad)
-    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c
+    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
+    T[:, 0, 0] = cosine
+    T[:, 0, 1] = -sine
+    T[:, 1, 0] = sine
+    T[:, 1, 1] = cosine
     T[:, :3, 3] = centre_m
     return T
 
@@ -217,12 +236,12 @@ def boxes(
     where: str,
     lidar: Int | None = None,
 ) -> Boxes:
-    """Check and return the K boxes of a sweep; `Boxes` describes the arguments."""
-    bad = np.flatnonzero(~((size_m > 0) & (size_m < np.inf)).all(axis=1))
-    if len(bad):
+    """Return the K boxes of a sweep after checks; `Boxes` describes the arguments."""
+    wrong_rows = np.flatnonzero(~((size_m > 0) & (size_m < np.inf)).all(axis=1))
+    if len(wrong_rows):
         raise InputError(
-            f"{where}: a box has no size: got {size_m[bad[0]].tolist()}, expected length, width "
-            f"and height in metres above 0"
+            f"{where}: a box has no size: got {size_m[wrong_rows[0]].tolist()}, expected length, "
+            f"width and height in metres above 0"
         )
     T_lidar_box = np.reshape(T_lidar_box, (-1, 4, 4))
     if not np.isfinite(T_lidar_box).all():

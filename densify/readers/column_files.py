@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.config.file_content import gunzipped, needed, open_file, read_bytes, reason
 
-_KINDS = {  # what is expected, and the types of Arrow or of NumPy that fit
+# Letter of a kind -> words for messages, and kinds of NumPy types (a text) or names of Arrow types
+_KINDS = {
     "n": ("finite numbers", "iuf"),
     "m": ("numbers", "iuf"),
     "i": ("whole numbers", "iu"),
@@ -40,12 +41,13 @@ def read_arrow(
     """Return columns (N,) of a feather or parquet file by name.
 
     Args:
-        path: The suffix tells the format.
-        columns: Kind of each column: "n" finite numbers, "m" numbers or NaN, "i" integers, "s"
-            strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of arrays or
-            None).
+        path: File whose suffix is .feather or .parquet.
+        columns: Name of a column -> its kind: "n" finite numbers, "m" numbers or NaN, "i"
+            integers, "s" strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of
+            arrays or None).
         data_set: Extra that installs pyarrow, and the name of the recordings for messages.
-        where: Values by column of the rows that are read, in a parquet file; None for all rows.
+        where: Name of a column -> value that the rows to read have there, for a parquet file; None
+            for all rows.
     """
     needed("pyarrow", *data_set)
     is_feather = path.suffix == ".feather"
@@ -76,8 +78,11 @@ def read_arrow(
 
 
 def _arrow_array(column: Any, kind: str, where: str) -> NDArray[Any]:
+    """Return a column of Arrow as an array; raise InputError if it is not of the kind."""
     expected, types = _KINDS[kind]
-    type_name, num_null, num_not_finite = str(column.type), column.null_count, 0
+    type_name = str(column.type)
+    num_null = column.null_count
+    num_not_finite = 0
     if kind == "l":
         if "list" in type_name and any(name in type_name for name in types):
             lists = np.empty(len(column), object)
@@ -148,7 +153,8 @@ class _Unpickler(pickle._Unpickler):
 def read_pickled(path: Path) -> dict[str, NDArray[Any]]:
     """Return the columns (N,) of a gzipped, pickled pandas data frame, by name; no code is run.
 
-    A column of texts holds Python objects, whose type the caller must check.
+    A column of texts holds Python objects, whose type the caller must check. Raise InputError for
+    a damaged file or other content.
     """
     data = read_bytes(path)
     try:
@@ -164,13 +170,15 @@ def _pickled_columns(frame: Any) -> dict[str, NDArray[Any]]:
     """Return the columns of a frame; pandas stores the C columns of a type together, (C,N)."""
     if not isinstance(frame, _RECORDS[_FRAME]):
         raise ValueError(f"it holds a {type(frame).__name__}")
-    managed = frame.state["_data"].state[-1]["0.14.1"]
-    names = managed["axes"][0].args[1]["data"].state[-1]
+    manager_state = frame.state["_data"].state[-1]["0.14.1"]
+    names = manager_state["axes"][0].args[1]["data"].state[-1]
     columns = {}
-    for block in managed["blocks"]:
-        values, numbers = _pickled_array(block["values"]), block["mgr_locs"]
-        is_slice = isinstance(numbers, _RECORDS[_SLICE])
-        numbers = range(*numbers.args) if is_slice else _pickled_array(numbers).tolist()
+    for block in manager_state["blocks"]:
+        values = _pickled_array(block["values"])
+        # Numbers of the block's columns in the frame, as a slice or an array
+        placement = block["mgr_locs"]
+        is_slice = isinstance(placement, _RECORDS[_SLICE])
+        numbers = range(*placement.args) if is_slice else _pickled_array(placement).tolist()
         for row, number in enumerate(numbers):
             columns[str(names[number])] = values[row]
     return columns

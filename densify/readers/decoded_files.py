@@ -45,7 +45,7 @@ _RECORD_BYTES = 54  # smallest size of a variable length record
 
 
 def read_array(path: Path) -> NDArray[Any]:
-    """Return the array of a .npy file."""
+    """Return the array of a .npy file; raise InputError for a damaged file."""
     data = read_bytes(path)
     try:
         return _array(data)
@@ -56,12 +56,23 @@ def read_array(path: Path) -> NDArray[Any]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
 ) -> Arrays:
-    """Return the arrays of a .npz file by name: those in ``names``, None for all."""
+    """Return the arrays of a .npz file by name.
+
+    Args:
+        names: Names of the arrays to read, of which some may be missing; None for all.
+        most_bytes: Greatest size of these arrays together.
+    """
     data = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = {m.filename[:-4]: m for m in archive.infolist() if m.filename[-4:] == ".npy"}
-            wanted = {n: m for n, m in members.items() if names is None or n in names}
+            members = {
+                member.filename.removesuffix(".npy"): member
+                for member in archive.infolist()
+                if member.filename.endswith(".npy")
+            }
+            wanted = {
+                name: member for name, member in members.items() if names is None or name in names
+            }
             check_size(sum(member.file_size for member in wanted.values()), path, most_bytes)
             return {name: _array(archive.read(member)) for name, member in wanted.items()}
     except InputError:
@@ -71,7 +82,9 @@ def read_arrays(
 
 
 def _array(data: bytes) -> NDArray[Any]:
-    file, header = io.BytesIO(data), np.lib.format
+    """Return the array of .npy data; raise ValueError if the header claims more than follows."""
+    file = io.BytesIO(data)
+    header = np.lib.format
     version = header.read_magic(file)
     read = header.read_array_header_1_0 if version == (1, 0) else header.read_array_header_2_0
     shape, _, dtype = read(file)
@@ -94,7 +107,8 @@ def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
 def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDArray[Any]:
     """Decode the bytes of a PNG or JPEG file to (H,W,3) uint8 pixels in blue, green, red.
 
-    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16.
+    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16. Raise InputError
+    for a damaged image; a JPEG file with a mendable error is read with a warning.
     """
     import cv2
     from PIL import Image
@@ -158,9 +172,10 @@ def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
 
 
 def decode_jpeg(data: bytes) -> tuple[NDArray[np.uint8], str]:
-    """Return the pixels (H,W,3), as blue, green, red, of a JPEG, and what was mended, "" for none.
+    """Decode a JPEG file, after mending errors that leave all pixels.
 
-    Raise ValueError if pixels are missing or wrong.
+    Returns:
+        Pixels (H,W,3) in blue, green, red, and a description of the repairs, "" for none.
     """
     pixels, complaint = _decoded_strictly(data)
     repairs = []
@@ -190,13 +205,17 @@ def _decoded_strictly(data: bytes) -> tuple[NDArray[np.uint8] | None, str]:
 
 def _without_stray_bytes(data: bytes) -> tuple[bytes, int]:
     """Return mended data, and the number of markers after stray bytes; ValueError if damaged."""
-    num_mended, end = 0, data.rfind(_SCAN)
+    num_mended = 0
+    end = data.rfind(_SCAN)
+    # Marker by marker; ``end`` is the end of the marker before.
     for _ in range(_MOST_MARKERS):
         marker = _RESTART_OR_END.search(data, end)
         if marker is None or data[end - _MARKER_BYTES : end] == _END:
             return data, num_mended
-        begin, tail = marker.start(), data[marker.start() :]
-        # Without a byte that belongs to it, the interval before the marker is cut off.
+        begin = marker.start()
+        tail = data[begin:]
+        # Bytes are removed before the marker until the decoder misses one: the last removed byte
+        # belongs to the image, those before it were stray.
         num_stray = 0
         while num_stray <= _MOST_STRAY_BYTES:
             _, complaint = _decoded_strictly(data[: begin - num_stray - 1] + tail)
@@ -230,7 +249,7 @@ def _ends_in_ones(data: bytes, end: int) -> bool:
 
 
 def read_las(path: Path) -> Any:
-    """Return a `laspy.LasData` with all points of a LAS or LAZ file."""
+    """Read all points of a LAS or LAZ file as a `laspy.LasData`; raise InputError if damaged."""
     import laspy
 
     data = read_bytes(path)

@@ -59,6 +59,8 @@ class DepthPairs:
 
 
 class _File(NamedTuple):
+    """A depth map or mask, and what its path names."""
+
     path: Path
     frame: str
     drive: str | None
@@ -67,7 +69,7 @@ class _File(NamedTuple):
 
     @staticmethod
     def parse(path: Path) -> _File:
-        """Return what a path says of its depth map."""
+        """Find frame, drive, camera and product in a path."""
         text = path.absolute().as_posix()
         for layout in _LAYOUTS:
             if match := re.search(layout, text):
@@ -85,11 +87,14 @@ def pair_depth_files(
 ) -> DepthPairs:
     """Pair estimated PNG depth maps with true depth maps and with masks of moving objects.
 
-    Each path is a file, or a folder that is searched with its subfolders. Two files are paired
-    whatever their names. In folders the frames must agree; the drive and the camera too if all
-    paths name them. Files of a known layout exclude others, and in ``truth`` KITTI's
-    ``groundtruth`` maps exclude other maps. ``filled`` pairs densify's filled maps instead of its
-    maps of measured pixels.
+    Two files are paired whatever their names. In folders the frames must agree; the drive and the
+    camera too if all paths name them.
+
+    Args:
+        predicted: File of an estimated map, or folder that is searched with its subfolders. Files
+            of a known layout exclude others.
+        mask: File or folder of masks, None for none.
+        filled: True to pair densify's filled maps instead of its maps of measured pixels.
     """
     estimated = _of_product(_depth_files(predicted, "PREDICTED"), predicted, filled)
     files = _depth_files(truth, "TRUTH")
@@ -141,6 +146,7 @@ def _depth_files(path: Path, argument: str) -> list[_File]:
 
 
 def _last_name(pattern: re.Pattern[str], text: str) -> str | None:
+    """Return the first group of the pattern's last match in a text, None without a match."""
     names = [match[1] for match in pattern.finditer(text)]
     return names[-1] if names else None
 
@@ -152,8 +158,8 @@ def _of_product(files: list[_File], path: Path, filled: bool) -> list[_File]:
         raise InputError(
             f"--filled: {path}: holds no {' or '.join(_FILLED)} maps; leave --filled out"
         )
-    is_densify = filled or any(file.product in _ONLY_DENSIFY for file in files)
-    return chosen if chosen and is_densify else files
+    made_by_densify = filled or any(file.product in _ONLY_DENSIFY for file in files)
+    return chosen if chosen and made_by_densify else files
 
 
 def _match(
@@ -161,13 +167,18 @@ def _match(
 ) -> dict[Path, Path]:
     """Return right -> left path where frames agree, and drive and camera too if all name them."""
     files = (*left, *right)
-    shared = [n for n in ("drive", "camera") if all(getattr(f, n) is not None for f in files)]
+    shared = [
+        name
+        for name in ("drive", "camera")
+        if all(getattr(file, name) is not None for file in files)
+    ]
     left_by_key = _keyed(left, ["frame", *shared], left_path)
     right_by_key = _keyed(right, ["frame", *shared], right_path)
     return {path: left_by_key[key] for key, path in right_by_key.items() if key in left_by_key}
 
 
 def _keyed(files: Sequence[_File], names: Sequence[str], path: Path) -> dict[str, Path]:
+    """Return paths by the text of the named fields; raise InputError if two files have the same."""
     keyed: dict[str, Path] = {}
     for file in files:
         key = " ".join(f"{name} {getattr(file, name)}" for name in names)

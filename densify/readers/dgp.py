@@ -94,10 +94,16 @@ class Dgp(FileSequence):
             path,
             tuple(self._sweeps),
             cameras,
-            {n: {i: d.stamp_ns for i, d in data.items()} for n, data in self._images.items()},
+            {
+                name: {number: datum.stamp_ns for number, datum in data.items()}
+                for name, data in self._images.items()
+            },
             checks.truth_beside(path),
             {number: sweep.path for number, sweep in self._sweeps.items()},
-            {n: {i: d.path for i, d in data.items()} for n, data in self._images.items()},
+            {
+                name: {number: datum.path for number, datum in data.items()}
+                for name, data in self._images.items()
+            },
         )
 
     def T_world_cam(self, camera: str, number: int) -> Float:
@@ -127,10 +133,13 @@ def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
     with described_in(file, "a DGP scene with samples and their data"):
         data = {entry["key"]: entry for entry in content["data"]}
         keys = {key for sample in content["samples"] for key in sample["datum_keys"]}
-        numbered: dict[str, int] = {}
-        for entry in sorted((data[key] for key in keys), key=lambda e: e["id"]["timestamp"]):
-            kind, name = next(iter(entry["datum"])), entry["id"]["name"]
-            number = numbered[name] = numbered.get(name, -1) + 1
+        last_number: dict[str, int] = {}  # last used number, by sensor
+        entries = (data[key] for key in keys)
+        for entry in sorted(entries, key=lambda entry: entry["id"]["timestamp"]):
+            kind = next(iter(entry["datum"]))
+            name = entry["id"]["name"]
+            number = last_number.get(name, -1) + 1
+            last_number[name] = number
             if kind in numbered_of_kind:
                 datum = _datum(file, kind, entry)
                 if isfile(datum.path):

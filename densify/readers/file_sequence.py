@@ -90,7 +90,7 @@ class FileSequence(ABC):
             return path, self._returns(frame)
 
     def sweep_bytes(self) -> dict[int, int]:
-        """Return the size of each sweep's file (bytes) by frame, empty if sweeps share files."""
+        """Return the size (bytes) of each sweep's file, by frame; empty if sweeps share files."""
         return {frame: path.stat().st_size for frame, path in self._files.items()}
 
     def check_first_images(self) -> None:
@@ -99,7 +99,7 @@ class FileSequence(ABC):
             path = next(iter(files.values()))
             size_px = stated_size_px(path)
             if name in self.cameras and size_px is not None:
-                checks.image_size(size_px[::-1], self.cameras[name], path)
+                checks.check_image_size(size_px[::-1], self.cameras[name], path)
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         """Return an existing image, (H,W,3) uint8 RGB."""
@@ -117,12 +117,13 @@ class FileSequence(ABC):
         """Read a sweep and return its valid points, in file order, at their own firing times.
 
         Rows at 0 0 0 (padding) or with a position that is not finite are dropped. Intensities that
-        are not finite become 0.
+        are not finite become 0. Raise InputError without a valid row, or for an impossible number
+        of a scanner.
         """
         path, returns = self._checked_returns(frame)
         x, y, z = returns.points.T  # by columns: reductions over rows of three are far slower
-        valid = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((x != 0) | (y != 0) | (z != 0))
-        row = np.flatnonzero(valid)
+        is_finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
+        row = np.flatnonzero(is_finite & ((x != 0) | (y != 0) | (z != 0)))
         if not len(row):
             untimed = f", {returns.num_untimed} with a time of another sweep"
             raise InputError(
@@ -132,11 +133,13 @@ class FileSequence(ABC):
         intensity, lidar = _rows(returns.intensity, row), _rows(returns.lidar, row)
         if intensity is not None:
             intensity = np.where(np.isfinite(intensity), intensity, 0)
-        num = 256 if returns.scanner_origins is None else len(returns.scanner_origins)
-        if lidar is not None and not 0 <= lidar.min() <= lidar.max() < num:
+        # Numbers of scanners are stored in 8 bits.
+        origins = returns.scanner_origins
+        num_scanners = 256 if origins is None else len(origins)
+        if lidar is not None and not 0 <= lidar.min() <= lidar.max() < num_scanners:
             raise InputError(
                 f"{path}: got points of scanner {lidar.min()} to {lidar.max()}, expected 0 to "
-                f"{num - 1}"
+                f"{num_scanners - 1}"
             )
         return Sweep(
             frame=int(frame),
@@ -175,11 +178,12 @@ class FileSequence(ABC):
             checks.of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
 
     def check_image(self, camera: str, number: int) -> Camera:
-        """Return the camera of an image."""
+        """Return the camera of an image; raise InputError if the image does not exist."""
         calibrated = checks.camera_named(self.cameras, camera, self.where)
         checks.of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
         return calibrated
 
 
 def _rows(column: NDArray[Any] | None, row: Int) -> NDArray[Any] | None:
+    """Return the given rows of a column, None without the column."""
     return None if column is None else column[row]

@@ -49,7 +49,10 @@ Columns = dict[str, NDArray[Any]]
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Return the motion of all points from a folder's flow files: the engine ``npz:FOLDER``."""
+    """Return the motion of all points from the flow files of a folder: the engine ``npz:FOLDER``.
+
+    ``argument`` is the path of the folder; `densify.flow.engines.EngineModule` describes the rest.
+    """
     check_argument(argument)
     step = partial(read_step, Path(argument), scene.stretch)
     return ChainedMotion(scene.stretch, step)
@@ -68,10 +71,12 @@ def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowF
     in the flow file are static.
     """
     columns = _step_columns(folder, stretch, stretch.frames[source], stretch.frames[target])
-    residual, moving = columns["residual_flow"], columns["moving"].astype(bool)
+    residual = columns["residual_flow"]
+    moving = columns["moving"].astype(bool)
     residual[~moving] = 0.0
-    instance, lost = columns["object"].astype(np.int32), np.zeros(len(moving), bool)
-    return FlowField(residual, moving, instance, lost, columns.get("to_reference"))
+    instance = columns["object"].astype(np.int32)
+    no_lost = np.zeros(len(moving), bool)
+    return FlowField(residual, moving, instance, no_lost, columns.get("to_reference"))
 
 
 def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Columns:
@@ -80,7 +85,8 @@ def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Co
     Missing residual_flow, moving, object and valid are added. A point that is missing in the file
     has flow 0 and object -1, and is not valid.
     """
-    path, sweep = folder / f"{frame:06d}_{target:06d}.npz", stretch[frame].sweep
+    path = folder / f"{frame:06d}_{target:06d}.npz"
+    sweep = stretch[frame].sweep
     row = sweep.row
     arrays = load_flow_file(path)
     num_points = len(next(iter(arrays.values())))
@@ -89,30 +95,34 @@ def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Co
             f"{path}: holds {num_points} points, expected one for each row of the sweep's file "
             f"(more than {row.max()}); add their 'row' where some are left out"
         )
-    rows = arrays.get("row", np.arange(num_points))
+
+    # The entry of the flow file for each point of the sweep, -1 for none
+    stored_row = arrays.get("row", np.arange(num_points))
     entry_of_row = np.full(int(row.max(initial=0)) + 1, -1, np.int64)
-    entries = np.flatnonzero(rows < len(entry_of_row))
-    entry_of_row[rows[entries]] = entries
+    entries = np.flatnonzero(stored_row < len(entry_of_row))
+    entry_of_row[stored_row[entries]] = entries
     entry = entry_of_row[row]
-    known = entry >= 0
+    has_entry = entry >= 0
     columns = {}
     for name, array in arrays.items():
         columns[name] = np.zeros((len(row), *array.shape[1:]))
-        columns[name][known] = array[entry[known]]
+        columns[name][has_entry] = array[entry[has_entry]]
+
+    # Missing columns
     if "residual_flow" not in arrays:
         T_source_target = stretch.T_target_source(frame, target)
         arrived = poses.transform(T_source_target, sweep.points + columns["total_flow"])
         residual = arrived - sweep.points - columns.get("to_reference", 0.0)
-        columns["residual_flow"] = np.where(known[:, None], residual, 0.0)
+        columns["residual_flow"] = np.where(has_entry[:, None], residual, 0.0)
     if "moving" not in arrays:
         columns["moving"] = np.linalg.norm(columns["residual_flow"], axis=1) >= MOVES_M
-    columns["object"] = np.where(known, columns.get("object", -1), -1)
-    columns["valid"] = known & columns.get("valid", known).astype(bool)
+    columns["object"] = np.where(has_entry, columns.get("object", -1), -1)
+    columns["valid"] = has_entry & columns.get("valid", has_entry).astype(bool)
     return columns
 
 
 def load_flow_file(path: Path) -> Columns:
-    """Return the arrays of a flow file by name, as stored, after checking shapes and values."""
+    """Return the arrays of a flow file by name, as stored."""
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
     arrays = read_arrays(path, _KNOWN)
@@ -158,7 +168,8 @@ CATEGORIES = dict(
 category is ignored (`av2_metacategories` of the package bucketed-scene-flow-eval)."""
 
 _CLASS_OF = np.array(
-    [0] + [IGNORED if c is None else CLASSES.index(c) for c in CATEGORIES.values()], np.uint8
+    [0] + [IGNORED if name is None else CLASSES.index(name) for name in CATEGORIES.values()],
+    np.uint8,
 )
 _OBJECT = CLASSES.index("OBJECT")
 _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
@@ -175,10 +186,7 @@ class LabelledFlow:
 
 
 def labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
-    """Read the ground-truth flow of a sweep (a frame number) to the next sweep of the stretch.
-
-    ``folder`` holds ``FRAME_NEXT.npz`` or, itself or in its folder ``name``, Argoverse 2 labels.
-    """
+    """Read the ground-truth flow of a sweep to the next sweep of the stretch."""
     if not folder.is_dir():
         raise InputError(f"--truth {folder}: no such folder; expected true flow in it")
     if any(folder.glob("*_*.npz")):
@@ -187,7 +195,9 @@ def labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> Labe
         classes = np.where(columns["object"] >= 0, _OBJECT, 0).astype(np.uint8)
         return LabelledFlow(columns["residual_flow"], classes, columns["valid"])
     label_folder = folder / name if (folder / name).is_dir() else folder
-    files = {int(p.stem): p for p in label_folder.glob("*.feather") if p.stem.isdecimal()}
+    files = {
+        int(path.stem): path for path in label_folder.glob("*.feather") if path.stem.isdecimal()
+    }
     if not files:
         raise InputError(
             f"--truth {folder}: holds no labels of {name}; expected FRAME_NEXT.npz, or "

@@ -53,7 +53,7 @@ class SweepColumns:
     _point_stamps_ns: dict[int, int] = field(default_factory=dict)
 
     def returns(self, frame: int, stamp_ns: int) -> Returns:
-        """Read all rows of a sweep with reference time ``stamp_ns``, in the lidar frame."""
+        """Read all rows of a sweep, in the lidar frame, by its frame number and reference time."""
         path = self.series.paths[frame]
         columns = self._columns(path)
         returns, valid = self.layout.returns(columns, path, stamp_ns)
@@ -70,7 +70,11 @@ class SweepColumns:
         frame, columns = next(iter(self._samples.items()))
         path, settings = self.series.paths[frame], self.settings
         quantities = ("intensity", "time", "lidar")
-        named = {q: getattr(settings, q) for q in quantities if getattr(settings, q)}
+        named = {
+            quantity: getattr(settings, quantity)
+            for quantity in quantities
+            if getattr(settings, quantity)
+        }
         for quantity, name in named.items():
             if name not in columns:
                 raise InputError(
@@ -91,7 +95,11 @@ class SweepColumns:
         )
 
     def stamp_ns(self, frame: int) -> int:
-        """Return a sweep's stamp; without stamps, a time from absolute point times or the rate."""
+        """Return a sweep's stamp (ns).
+
+        Without stamps it is a time of the sweep's points if those are absolute, else the frame
+        number times the period.
+        """
         if self.series.stamps_ns is not None:
             return self.series.stamps_ns[frame]
         times = self._point_clock
@@ -143,7 +151,7 @@ class SweepColumns:
         return round(1e9 / (self.settings.rate_hz or _ASSUMED_HZ))
 
     def fields(self) -> str:
-        """Return the columns in use, and the unused ones with the range of their values."""
+        """Describe the columns in use, and the unused ones with the range of their values."""
         used = {quantity: name for quantity, name in vars(self.layout.fields).items() if name}
         unused = [
             f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
@@ -162,11 +170,14 @@ class SweepColumns:
     def _columns(self, path: Path) -> Columns:
         """Read a file's numeric columns, (N,) each, with the other (N,) arrays of an .npz file."""
         table = read_table(path, self.settings.columns)
-        beside = {n: a for n, a in table.beside.items() if a.shape == (len(table),)}
+        beside = {
+            name: array for name, array in table.beside.items() if array.shape == (len(table),)
+        }
         columns = {**table.columns, **beside}
-        return {name: c for name, c in columns.items() if c.dtype.kind in "fiu"}
+        return {name: column for name, column in columns.items() if column.dtype.kind in "fiu"}
 
     def _lidar(self, path: Path, columns: Columns, valid: Bool) -> NDArray[np.uint8] | None:
+        """Return the (N,) scanner numbers, 0 for invalid rows; None without a column of them."""
         name = self.layout.fields.lidar
         if not name:
             return None
@@ -312,11 +323,13 @@ def _find_sweeps(folder: Path, files: str) -> list[Path]:
         existing(folder, files, "sweeps: {files: ...}", is_folder=True)
     below = files_below(folder / files, SUFFIXES, 0 if files else _SEARCH_DEPTH)
     numbered = {
-        name: [path for path in paths if NamedFile.of(path)[1:] != (None, None)]
-        for name, paths in below.items()
+        name: [path for path in paths if _is_numbered(path)] for name, paths in below.items()
     }
     for suffix in SUFFIXES:
-        groups = {n: [p for p in ps if p.suffix.lower() == suffix] for n, ps in numbered.items()}
+        groups = {
+            name: [path for path in paths if path.suffix.lower() == suffix]
+            for name, paths in numbered.items()
+        }
         groups = {name: paths for name, paths in groups.items() if paths}
         if len(groups) > 1:
             raise InputError(
@@ -331,7 +344,14 @@ def _find_sweeps(folder: Path, files: str) -> list[Path]:
     )
 
 
+def _is_numbered(path: Path) -> bool:
+    """Return True if the name of a file has a number or a time."""
+    named_file = NamedFile.of(path)
+    return named_file.number is not None or named_file.stamp_ns is not None
+
+
 def _find_images(folder: Path, name: str, config: CameraFiles) -> Series:
+    """Return the images of a camera in the order of time; raise InputError without any."""
     below = files_below(folder / config.files, _IMAGE_SUFFIXES, 0)
     if not below:
         key = f"cameras: {{{name}: {{files: {config.files}}}}}"

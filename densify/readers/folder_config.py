@@ -38,23 +38,27 @@ class Kind(NamedTuple):
 
 
 def _require(is_right: Any, value: Any) -> Any:
+    """Return the value; raise ValueError if it is not right."""
     if not is_right:
         raise ValueError
     return value
 
 
 def _array(value: Any, *shape: int) -> Float:
+    """Return finite numbers of a shape."""
     array = np.array(value, dtype=np.float64).reshape(shape)
     return _require(np.isfinite(array).all(), array)
 
 
 def _above_0(value: Any) -> float:
+    """Return a number above 0."""
     number = float(_array(value))  # text too: YAML 1.1 reads 1e-3 as text
     return _require(number > 0, number)
 
 
 def _names(value: Any) -> tuple[str, ...]:
-    is_list = isinstance(value, list) and value and all(isinstance(v, str) for v in value)
+    """Return a list of one or more names."""
+    is_list = isinstance(value, list) and value and all(isinstance(name, str) for name in value)
     return tuple(_require(is_list, value))
 
 
@@ -65,6 +69,7 @@ def _axes(value: Any) -> Float:
 
 
 def _intrinsics(value: Any) -> Float:
+    """Return the (3,3) camera matrix of fx fy cx cy or of nine numbers."""
     numbers = _array(value, -1)
     if len(numbers) == 4:
         fx, fy, cx, cy = numbers
@@ -75,12 +80,14 @@ def _intrinsics(value: Any) -> Float:
 
 
 def _size_px(value: Any) -> tuple[int, int]:
+    """Return width and height as whole numbers of pixels."""
     width, height = _array(value, 2).tolist()
     is_whole = min(width, height) >= 1 and not (width % 1 or height % 1)
     return _require(is_whole, (int(width), int(height)))
 
 
 def _one_of(choices: Collection[str]) -> Kind:
+    """Return the kind of values that are one of these names."""
     return Kind({name: name for name in choices}.__getitem__, f"one of {', '.join(choices)}")
 
 

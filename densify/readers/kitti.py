@@ -63,7 +63,7 @@ KITTI_TRIGGER_LATENCY_NS = 10_500_000
 """Lag of KITTI's recorded image stamps behind the exposure, which the scanner triggers as it faces
 forward. Drives 0002 and 0013 of 2011_09_26 record 10.50 ms (image_02) and 9.96 ms (image_03)."""
 
-_NUM_ROUNDS = 3  # the azimuth changes by degrees at most
+_NUM_ROUNDS = 3  # rounds of the fixed-point iteration, in which the azimuth changes by few degrees
 _SMALLEST_IMAGE_PX = (1224, 370)  # of the tracking data set
 _T_CAM_UPRIGHT = np.array(  # from x right, y forward, z up
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -94,6 +94,7 @@ def open_recording(path: Path, scene: str | None) -> Drive:
 
 
 def _scene(reader: str, path: Path, scene: str | None, names: list[str]) -> str:
+    """Return the name of the requested or the only scene; raise InputError if not clear."""
     none = (
         "no KITTI recording; expected velodyne_points/ (a raw drive), data_3d_raw/ (KITTI-360), "
         "velodyne/0000/ (tracking), or sequences/ or velodyne/ (odometry)"
@@ -114,7 +115,10 @@ class Drive(FileSequence):
         files = checks.numbered_files(sweeps, ".bin")
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
-        numbered = {n: checks.numbered_files(p, ".png", ".jpg", ".jpeg") for n, p in images.items()}
+        numbered = {
+            camera: checks.numbered_files(folder, ".png", ".jpg", ".jpeg")
+            for camera, folder in images.items()
+        }
         numbered = {camera: numbers for camera, numbers in numbered.items() if numbers}
         super().__init__(name, where, tuple(files), files=files, images=numbered)
         self._stamps = stamps
@@ -135,8 +139,11 @@ class Drive(FileSequence):
         return Returns(points, intensity, turned_ns(points, self._stamps.period_ns))
 
     def _first_sizes_px(self) -> dict[str, tuple[int, int]]:
-        """Return the size of the first image of each camera."""
-        return {name: image_size_px(min(f.values())) for name, f in self._image_files.items()}
+        """Return width and height (px) of the first image of each camera."""
+        return {
+            camera: image_size_px(min(files.values()))
+            for camera, files in self._image_files.items()
+        }
 
 
 class KittiRaw(Drive):
@@ -148,24 +155,35 @@ class KittiRaw(Drive):
     """
 
     def __init__(self, path: Path | str) -> None:
-        drive, cameras = Path(path), _raw_cameras(Path(path))
-        files = (drive / f"velodyne_points/timestamps{n}.txt" for n in ("", "_start", "_end"))
-        stamps, self._start, self._end = (read_stamps(p, required=False) for p in files)
+        drive = Path(path)
+        cameras = _raw_cameras(drive)
+        # Stamps of the sweeps, or the middle of each revolution
+        files = (drive / f"velodyne_points/timestamps{end}.txt" for end in ("", "_start", "_end"))
+        stamps, self._start, self._end = (read_stamps(file, required=False) for file in files)
         recorded = (stamps, self._start, self._end)
         self._missing = [file.path.name for file in recorded if not file.by_frame]
         if self._missing == [stamps.path.name]:
-            starts, ends = self._start.by_frame, self._end.by_frame
-            middle = {f: (starts[f] + ends[f]) // 2 for f in starts if f in ends}
-            stamps = Stamps(stamps.path, middle)
+            start_ns, end_ns = self._start.by_frame, self._end.by_frame
+            middle_ns = {
+                frame: (start_ns[frame] + end_ns[frame]) // 2
+                for frame in start_ns
+                if frame in end_ns
+            }
+            stamps = Stamps(stamps.path, middle_ns)
         images = {name: drive / name / "data" for name in cameras}
         sweeps = drive / "velodyne_points" / "data"
         super().__init__(drive.resolve().name, drive, sweeps, stamps, images)
-        self.cameras, self.truth = cameras, checks.truth_beside(drive)
+        self.cameras = cameras
+        self.truth = checks.truth_beside(drive)
+        # Exposures of the images; those without a stamp keep the stamp of the sweep.
         for name, numbers in self._image_files.items():
-            lagging = read_stamps(drive / name / "timestamps.txt", required=False)
-            exposed_ns = {f: ns - KITTI_TRIGGER_LATENCY_NS for f, ns in lagging.by_frame.items()}
+            recorded_ns = read_stamps(drive / name / "timestamps.txt", required=False)
+            exposed_ns = {
+                frame: stamp_ns - KITTI_TRIGGER_LATENCY_NS
+                for frame, stamp_ns in recorded_ns.by_frame.items()
+            }
             exposed_ns = {**self._exposed_ns[name], **exposed_ns}
-            self._exposed_ns[name] = Stamps(lagging.path, exposed_ns).of(numbers)
+            self._exposed_ns[name] = Stamps(recorded_ns.path, exposed_ns).of(numbers)
         self._oxts = checks.numbered_files(drive / "oxts" / "data", ".txt")
 
     def gaps(self) -> list[str]:
@@ -194,7 +212,7 @@ class KittiRaw(Drive):
 
     def _pose(self, frame: int) -> Float:
         """Return the (4,4) T_world_lidar, between oxts records if they have stamps."""
-        # The frame's record is up to 20 ms away from the sweep, 0.3 m at 15 m/s.
+        # The frame's own record is up to 20 ms away from the sweep, which is 0.3 m at 15 m/s.
         if not self._oxts:
             return super()._pose(frame)
         checks.of_frame(self._oxts, frame, "oxts record", self.where)
@@ -350,10 +368,10 @@ class KittiTracking(Drive):
         return T_first_imu(first, record) @ poses.inverse(self._calibration.motion("Tr_imu_velo"))
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return the labelled boxes of a sweep in the lidar frame, None without labels.
+        """Return the labelled boxes of a sweep in the lidar frame; None without a file of labels.
 
         Objects are labelled only in view of image_02; without images its smallest size is assumed.
-        A box is where the object was when the scanner faced it, at the box's ``offset_ns``.
+        A box is at the position of its object when the scanner faced it, at ``offset_ns``.
         """
         self.check_frame(frame)
         path = self.where / "label_02" / self._scene_file
@@ -362,7 +380,8 @@ class KittiTracking(Drive):
         numbers, is_area = read_labels(path)
         # Columns: 0 frame, 1 track, 5 to 8 rectangle in the image, 9 to 15 box
         is_of_frame = numbers[:, 0] == frame
-        labels, areas_px = numbers[is_of_frame & ~is_area], numbers[is_of_frame & is_area, 5:9]
+        labels = numbers[is_of_frame & ~is_area]
+        areas_px = numbers[is_of_frame & is_area, 5:9]
         height_m, width_m, length_m, right, down, forward, turn = labels[:, 9:16].T
         centre_m = np.column_stack([right, forward, height_m / 2 - down])
         T_cam_box = _T_CAM_UPRIGHT @ checks.upright_poses(centre_m, -turn)

@@ -58,13 +58,13 @@ class Stamps:
     by_frame: Mapping[int, int]  # empty without the file: frame k is at k times 100 ms
 
     def at(self, frame: int) -> int:
-        """Return the time of a frame; raise InputError if the file has none of it."""
+        """Return the time (ns) of a frame; raise InputError if the file has no time of it."""
         if not self.by_frame:
             return frame * NOMINAL_PERIOD_NS
         return checks.of_frame(self.by_frame, frame, "stamp", self.path)
 
     def of(self, frames: Mapping[int, Path]) -> dict[int, int]:
-        """Return the times of those frames that have one, such as of existing images."""
+        """Return the times (ns) of those of the given frames that have one, by frame."""
         known = self.by_frame or frames
         return {frame: self.at(frame) for frame in frames if frame in known}
 
@@ -76,9 +76,9 @@ class Stamps:
 
 
 def read_stamps(path: Path, required: bool = True) -> Stamps:
-    """Read the dates (UTC) of a file; lines that are no date are skipped.
+    """Read the dates (UTC) of a file with a line for each frame; lines without a date are skipped.
 
-    A missing file raises InputError, or if not ``required`` has no stamps.
+    ``required`` is True to raise InputError for a missing file; else it has no stamps.
     """
     if not required and not path.exists():
         return Stamps(path, {})
@@ -110,7 +110,10 @@ def parse_oxts(text: str, where: str) -> Float:
 
 
 def T_first_imu(first: Float, record: Float) -> Float:
-    """Return the (4,4) pose of the GPS/IMU unit in its own frame at the drive's first record."""
+    """Return the (4,4) pose of the GPS/IMU unit relative to its pose at the drive's first record.
+
+    Both records are as `parse_oxts` returns them.
+    """
     return poses.inverse(_T_mercator_imu(first, first)) @ _T_mercator_imu(record, first)
 
 
@@ -175,8 +178,9 @@ class Calibration:
         if isinstance(size_px, str):
             width, height = self.numbers(size_px, 2)
             size_px = int(width), int(height)
-        fx_fy_cx_cy, T_cam_rect = P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), np.eye(4)
+        fx_fy_cx_cy = P[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         camera = checks.pinhole(name, size_px, fx_fy_cx_cy, T_rect_lidar, f"{self.path}: {key}")
+        T_cam_rect = np.eye(4)
         T_cam_rect[:3, 3] = np.linalg.solve(camera.K, P[:, 3])
         return replace(camera, T_cam_lidar=T_cam_rect @ T_rect_lidar)
 
@@ -204,7 +208,11 @@ def read_fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
 
 
 def read_labels(path: Path) -> tuple[Float, Bool]:
-    """Return the (n,16) numbers of label lines, no type and score, and an (n,) DontCare mask."""
+    """Read the label lines of a tracking sequence, described in `densify.readers.kitti`.
+
+    Returns:
+        (n,16) numbers of the lines without type and score, and an (n,) mask of DontCare lines.
+    """
     rows, is_area = [], []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()

@@ -61,7 +61,10 @@ def stamp_ns(record: Record) -> int:
 
 
 def pose_of(record: Record, where: str) -> Float:
-    """Return the (4,4) pose of a record with a quaternion w x y z and a translation (m)."""
+    """Return the (4,4) pose in a record of ego_pose, calibrated_sensor or sample_annotation.
+
+    Such a record has a quaternion w x y z and a translation in metres. ``where`` begins messages.
+    """
     return checks.quaternion_pose(record["rotation"], record["translation"], where)
 
 
@@ -72,7 +75,10 @@ def read_table(path: Path) -> dict[str, Record]:
 
 
 def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Record]:
-    """Return the records of a JSON table whose field ``key`` is in ``wanted``, by their tokens."""
+    """Return some records of a JSON table by their tokens, without parsing the others.
+
+    Records are returned if their field ``key`` holds one of the tokens ``wanted``.
+    """
     pattern = re.compile(rb'"%s"\s*:\s*"([^"]*)"' % key.encode())
     names = frozenset(name.encode() for name in wanted)
     records = []
@@ -81,13 +87,14 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
             open_file(_existing(path)) as file,
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
         ):
+            # The records are searched as text: tables have millions of records.
             begin = data[:4096].removeprefix(codecs.BOM_UTF8).lstrip()
             if begin[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
                 raise ValueError("it does not begin with [ or end with ]")
             for match in _RECORD.finditer(data):
                 token = pattern.search(match[0])
                 if token and token[1] in names:
-                    records.append(parse_json(match[0], path))  # tables have millions of records
+                    records.append(parse_json(match[0], path))
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: not a whole JSON table: {reason(error)}; fetch it again"
@@ -119,7 +126,10 @@ class Annotations:
 
     @staticmethod
     def read(tables: Path, scene: str) -> Annotations | None:
-        """Return the boxes of a scene (a token); None if the table is missing or has none of it."""
+        """Read the boxes of a scene; None if the table is missing or has no box of the scene.
+
+        ``tables`` is the folder of the tables, ``scene`` the token of the scene.
+        """
         path = tables / "sample_annotation.json"
         if not path.is_file():
             return None
@@ -141,9 +151,10 @@ class Annotations:
         return Annotations(str(path), key_ns, (*boxes.values(),)) if any(boxes.values()) else None
 
     def at(self, stamp_ns: int, T_lidar_world: Float) -> Boxes | None:
-        """Return the boxes at a time in the lidar frame; None outside the time of the key frames.
+        """Return the boxes at a time, interpolated between key frames, in the lidar frame.
 
-        ``T_lidar_world`` (4,4) maps world coordinates to the lidar frame at that time.
+        None before the first or after the last key frame. ``T_lidar_world`` (4,4) maps world
+        coordinates to the lidar frame at that time.
         """
         if not self.key_ns[0] <= stamp_ns <= self.key_ns[-1]:
             return None
@@ -165,7 +176,9 @@ class Annotations:
         # extrapolated from its nearest motion; it gets no track name, as its position is unknown.
         for first, last in ((before, after), (after, after + 1), (before - 1, before)):
             boxes = [
-                box[instance] for box in self.boxes[max(first, 0) : last + 1] if instance in box
+                boxes_of_key[instance]
+                for boxes_of_key in self.boxes[max(first, 0) : last + 1]
+                if instance in boxes_of_key
             ]
             if 0 <= first < last < len(self.boxes) and len(boxes) == 2:
                 span_ns = self.key_ns[last] - self.key_ns[first]
@@ -277,7 +290,10 @@ class NuScenes(FileSequence):
             root,
             list(sweeps),
             {channel: self._camera(channel, data[0]) for channel, data in self._images.items()},
-            {n: {i: self._images[n][i].stamp_ns for i in files} for n, files in images.items()},
+            {
+                channel: {number: self._images[channel][number].stamp_ns for number in files}
+                for channel, files in images.items()
+            },
             checks.truth_beside(root),
             sweeps,
             images,
@@ -295,7 +311,11 @@ class NuScenes(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the lidar frame; None if not annotated (test split)."""
+        """Return a sweep's boxes in the lidar frame, interpolated between the annotated key frames.
+
+        None if the sweep lies outside the time span of the key frames, or if the scene has no
+        annotations (test split).
+        """
         self.check_frame(frame)
         if self._annotations is None:
             return None
@@ -313,6 +333,7 @@ class NuScenes(FileSequence):
     def _returns(self, frame: int) -> Returns:
         data = read_bytes(self._files[frame])
         rows = np.frombuffer(data, "<f4").reshape(-1, 5).astype(np.float64)  # x y z intensity ring
+        # A new firing begins where the ring number falls.
         column: Int = np.cumsum(np.diff(rows[:, 4], prepend=0.0) < 0, dtype=np.int64)
         offset_ns: Int = (column - column[-1:]) * _COLUMN_NS
         points = self._track.as_fired(rows[:, :3], self._stamps_ns[frame], offset_ns)
@@ -321,4 +342,5 @@ class NuScenes(FileSequence):
 
 
 def _on_disk(data: Mapping[int, Datum]) -> dict[int, Path]:
+    """Return the existing files by number."""
     return {number: datum.path for number, datum in data.items() if isfile(datum.path)}

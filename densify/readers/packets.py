@@ -141,7 +141,10 @@ class Velodyne(FileSequence):
 
 
 def _find_packets(path: Path) -> Int:
-    """Return offset, capture time (ns), azimuth (0.01 deg) and clock (us) of packets, (4,P)."""
+    """Return (4,P) values of the packets with returns, in the order of the file.
+
+    The rows are offset in the file, capture time (ns), azimuth (0.01 deg) and packet clock (us).
+    """
     packets = []
     with open_file(path) as file:
         magic = file.read(24)[:4]
@@ -151,12 +154,13 @@ def _find_packets(path: Path) -> Int:
                 f"becomes one with editcap -F pcap"
             )
         order, unit_ns = _PCAP[magic]
-        record, at = struct.Struct(f"{order}IIII"), 24
+        record = struct.Struct(f"{order}IIII")
+        end = 24  # end of the file header, then of each record
         while len(head := file.read(record.size)) == record.size:
             seconds, fraction, size, _ = record.unpack(head)
-            at += record.size + size
+            end += record.size + size
             if not _PAYLOAD < size <= _PAYLOAD + _MAX_HEADERS:
-                file.seek(at)
+                file.seek(end)
                 continue
             payload = file.read(size)[size - _PAYLOAD :]
             if len(payload) < _PAYLOAD:
@@ -165,7 +169,7 @@ def _find_packets(path: Path) -> Int:
                 azimuth = payload[2] + 256 * payload[3]
                 (clock_us,) = struct.unpack_from("<I", payload, _PAYLOAD - 6)
                 captured_ns = seconds * 10**9 + fraction * unit_ns
-                packets.append((at - _PAYLOAD, captured_ns, azimuth, clock_us))
+                packets.append((end - _PAYLOAD, captured_ns, azimuth, clock_us))
     if not packets:
         raise InputError(
             f"{path}: no Velodyne packets (of {_PAYLOAD} bytes); is it an Ouster's? Then put its "
@@ -196,7 +200,7 @@ def _turns(azimuth: Int) -> list[range]:
     """Return the packet indices of each complete turn, from azimuths (P,) in 0.01 degrees."""
     from_behind = (azimuth - _BEHIND) % 36_000
     first = [0, *(np.flatnonzero(np.diff(from_behind) < -_BEHIND) + 1).tolist(), len(azimuth)]
-    turns = [range(a, b) for a, b in pairwise(first)]
+    turns = [range(begin, end) for begin, end in pairwise(first)]
     usual = np.median([len(turn) for turn in turns[1:-1] or turns])
     ends = {turns[0], turns[-1]}
     return [turn for turn in turns if turn not in ends or len(turn) >= _WHOLE * usual]
@@ -206,6 +210,7 @@ class Ouster(FileSequence):
     """An Ouster capture as a `LidarSequence`, stamped at the first packet of each sweep."""
 
     def __init__(self, path: Path, metadata: Path) -> None:
+        # The decoder's modules
         core, pcap = (
             needed(f"ouster.sdk.{name}", "ouster", "Ouster captures") for name in ("core", "pcap")
         )

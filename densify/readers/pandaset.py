@@ -35,8 +35,8 @@ from densify.readers.recorded_poses import PoseTrack
 
 # The positions of the scanners are not published. These make the rings of the Pandar64 sharpest and
 # the swings of the PandarGT's mirror smoothest. The same vehicle drove all sequences.
-_POSITION_M = np.array([0.777, 0.002, 1.8593])  # of the Pandar64, forward left up
-_AXIS = np.array([-0.0157, 0.00045, 1.0])  # about which it spins, forward left up
+_POSITION_M = np.array([0.777, 0.002, 1.8593])  # position of the Pandar64, forward left up
+_AXIS = np.array([-0.0157, 0.00045, 1.0])  # axis about which it spins, forward left up
 PANDAR_GT_M = np.array([0.580, 0.027, -0.294])
 """(3,) origin of the PandarGT's rays in the Pandar64's frame."""
 
@@ -79,14 +79,17 @@ class PandaSet(FileSequence):
         images, cameras, exposed_ns = {}, {}, {}
         self._T_world_cam: dict[str, Float] = {}
         for folder in sorted(path.glob("camera/*")):
-            files, name = checks.numbered_files(folder, ".jpg", ".png"), folder.name
+            name = folder.name
+            files = checks.numbered_files(folder, ".jpg", ".png")
             if files:
                 images_ns, self._T_world_cam[name] = _stamped_poses(folder, max(files))
-                images[name], exposed_ns[name] = files, {n: int(images_ns[n]) for n in files}
+                images[name] = files
+                exposed_ns[name] = {number: int(images_ns[number]) for number in files}
+                # The mounting of the camera, from the image at which the vehicle moved least
                 steps = np.searchsorted(self._stamps_ns, images_ns[[*files]])
-                calm = [*files][int(np.argmin(step_m[steps]))]
-                T_cam_world = poses.inverse(self._T_world_cam[name][calm])
-                T_cam_lidar = T_cam_world @ self._track.at(exposed_ns[name][calm])
+                number = [*files][int(np.argmin(step_m[steps]))]
+                T_cam_world = poses.inverse(self._T_world_cam[name][number])
+                T_cam_lidar = T_cam_world @ self._track.at(exposed_ns[name][number])
                 cameras[name] = _camera(folder, files[min(files)], T_cam_lidar)
         super().__init__(
             path.resolve().name,

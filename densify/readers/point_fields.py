@@ -37,8 +37,8 @@ _NAMES = {
     "ring": "ring line channel laser_id laser_number laserid beam",
     "lidar": "lidar lidar_id scanner sensor_id scanner_channel",
 }
-_SHORTEST, _LONGEST = 0.08, 4.0  # accepted span of a sweep's times, in periods
-_FEWEST_STEPS = 500  # that the digits of times must distinguish within a sweep
+_SHORTEST, _LONGEST = 0.08, 4.0  # least and greatest accepted span of a sweep's times, in periods
+_FEWEST_STEPS = 500  # least number of times within a sweep that the digits must distinguish
 _NUM_SAMPLED = 5
 _SAME_CLOCK_NS = 2_000_000_000
 _RELATIVE_NS = 3_000_000_000
@@ -60,7 +60,10 @@ class Fields:
 
 
 def find_fields(names: Collection[str]) -> Fields:
-    """Find the field of each quantity by name, in any case; the order of `_NAMES` decides."""
+    """Find the field of each quantity among the names of a cloud's fields, in any case of letters.
+
+    If several names fit, the order of the aliases in `_NAMES` decides.
+    """
     # CloudCompare puts scalar_ before the names of fields.
     lower = {name.lower().removeprefix("scalar_"): name for name in reversed(list(names))}
     field_of_quantity = {
@@ -86,9 +89,14 @@ class PointTimes:
     reference: str
 
     def offset_ns(self, values: NDArray[Any], stamp_ns: int) -> tuple[Int, Bool]:
-        """Convert (N,) times of a sweep's points, in the field's unit, to ns since its stamp.
+        """Convert the times of a sweep's points to ns since its stamp.
 
-        Returns (N,) int64 times, 0 where invalid, and an (N,) mask of the valid times.
+        Args:
+            values: (N,) times in the field's unit.
+            stamp_ns: Stamp of the sweep.
+
+        Returns:
+            (N,) int64 times, 0 where invalid, and an (N,) mask of the valid times.
         """
         times_ns, is_valid = self._times_ns(values, stamp_ns)
         offset_ns = np.zeros(len(values), np.int64)
@@ -139,13 +147,14 @@ def _in_ns(values: NDArray[Any], unit: str) -> tuple[Int, Bool]:
 
 def _extent(times: NDArray[Any]) -> tuple[float, float]:
     """Return the middle of a sweep's times (N,) and half their span, without outlying times."""
-    # Outlying times are farther from the middle of the shortest interval that holds half of the
-    # times than twice the width of this interval.
+    # The shortest interval that holds half of the times: times farther from its middle than twice
+    # its width are outlying.
     times = np.sort(times.astype(np.float64))
     half = len(times) // 2
     width = times[half:] - times[: len(times) - half]
     first = int(np.argmin(width))
-    middle, reach = times[first] + width[first] / 2, 2 * width[first]
+    middle = times[first] + width[first] / 2
+    reach = 2 * width[first]
     inliers = times[np.abs(times - middle) <= reach]
     return float(inliers[0] + inliers[-1]) / 2, float(inliers[-1] - inliers[0]) / 2
 
@@ -153,7 +162,8 @@ def _extent(times: NDArray[Any]) -> tuple[float, float]:
 def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K, Columns]:
     """Read the columns of up to 5 sweeps with points, spread over a recording, by sweep.
 
-    Unreadable sweeps are left out, unless no other has points. ``read`` returns a sweep's columns.
+    ``read`` returns the columns of a sweep. Unreadable sweeps are left out; if no other sweep has
+    points, InputError is raised.
     """
     columns_of_sweep, errors = dict[K, Columns](), list[InputError]()
     for sweep in sweeps[:: max(1, len(sweeps) // _NUM_SAMPLED)][:_NUM_SAMPLED]:
@@ -184,10 +194,13 @@ def find_times(
     period_ns: int,
     stamps_ns: Sequence[int] | None,
 ) -> tuple[PointTimes | None, str]:
-    """Find the unit, epoch, middle and span of the (N,) point times of several sweeps.
+    """Find the unit, epoch, middle and span of point times.
 
-    The middle and the span are medians. ``period_ns`` is the time between consecutive sweeps;
-    ``stamps_ns`` has the stamps of the given sweeps, None without stamps.
+    The middle and the span are medians over the sweeps.
+
+    Args:
+        period_ns: Time between consecutive sweeps.
+        stamps_ns: Stamp of each of these sweeps, None without stamps.
 
     Returns:
         The meaning of the times and its description; or None and the reason of the failure.
@@ -196,7 +209,10 @@ def find_times(
     extents = np.array([_extent(values) for values in finite if len(values)] or [(0.0, 0.0)])
     middle, reach = np.median(extents, axis=0).tolist()
     span = max(float(np.ptp(values)) for values in finite) if any(map(len, finite)) else 0.0
-    dtype, name = sweeps[0].dtype, field.name
+    dtype = sweeps[0].dtype
+    name = field.name
+
+    # Times that cannot be used: too few digits, all equal, or a span of no unit
     if dtype.kind == "f" and np.spacing(dtype.type(abs(middle))) * _FEWEST_STEPS > span > 0:
         return None, (
             f"{name} has too few digits ({np.finfo(dtype).precision}) to tell times: "
@@ -211,23 +227,28 @@ def find_times(
             f"{name} spans {2 * reach:.6g} in a sweep, which in no unit is about the "
             f"{1e-6 * period_ns:.0f} ms from sweep to sweep; name its unit"
         )
-    middles_ns, usual_ns = extents[:, 0] * UNIT_NS[unit], middle * UNIT_NS[unit]
+    middles_ns = extents[:, 0] * UNIT_NS[unit]
+    middle_ns = middle * UNIT_NS[unit]
     reach_ns = reach * UNIT_NS[unit]
+
+    # Absolute times are large or advance from sweep to sweep.
     absolute = field.absolute
     if absolute is None:
-        advance_ns = float(np.median(np.abs(middles_ns - usual_ns)))
-        absolute = abs(usual_ns) > _RELATIVE_NS or advance_ns > period_ns / 2
+        advance_ns = float(np.median(np.abs(middles_ns - middle_ns)))
+        absolute = abs(middle_ns) > _RELATIVE_NS or advance_ns > period_ns / 2
+
+    # The middle of the times since the stamp
     if absolute and stamps_ns is not None:
         stamps_of_timed = [ns for ns, values in zip(stamps_ns, finite, strict=True) if len(values)]
-        usual_ns = float(np.median(middles_ns - np.array(stamps_of_timed, np.float64)))
+        middle_ns = float(np.median(middles_ns - np.array(stamps_of_timed, np.float64)))
     elif absolute:  # the stamps are made of these times
-        usual_ns = {"middle": 0, "end": -1}.get(field.reference, 1) * reach_ns
+        middle_ns = {"middle": 0, "end": -1}.get(field.reference, 1) * reach_ns
     point_times = PointTimes(
         name,
         unit,
         absolute,
-        other_clock=absolute and abs(usual_ns) > _SAME_CLOCK_NS,
-        middle_ns=round(usual_ns),
+        other_clock=absolute and abs(middle_ns) > _SAME_CLOCK_NS,
+        middle_ns=round(middle_ns),
         reach_ns=round(reach_ns) + period_ns,
         reference=field.reference,
     )
@@ -235,9 +256,12 @@ def find_times(
 
 
 def _unit_of(span_in_periods: float) -> str:
-    """Return the unit in which a span, as a share of the period in ns, is a sweep's; "" if none."""
-    shares = {unit: span_in_periods * ns for unit, ns in UNIT_NS.items()}
-    return next((u for u, share in shares.items() if _SHORTEST < share < _LONGEST), "")
+    """Return the unit in which a span is about the span of a sweep; "" if no unit fits.
+
+    ``span_in_periods`` is the span divided by the period in ns.
+    """
+    shares = {unit: span_in_periods * unit_ns for unit, unit_ns in UNIT_NS.items()}
+    return next((unit for unit, share in shares.items() if _SHORTEST < share < _LONGEST), "")
 
 
 def full_scale(intensity: NDArray[Any]) -> float:
@@ -270,11 +294,19 @@ class PointLayout:
         where: Path | str,
         period_ns: int,
         stamps_ns: Sequence[int] | None,
-        named: Mapping[str, str] | None = None,  # known names of fields, as in `Fields`
-        intensity_scale: float = 0.0,  # known divisor of intensities, 0 to find it
-        **times: Any,  # known unit, absolute or reference, as in `TimeField`
+        named: Mapping[str, str] | None = None,
+        intensity_scale: float = 0.0,
+        **times: Any,
     ) -> PointLayout:
-        """Find the layout from the columns of several sweeps; ``where`` begins error messages."""
+        """Find the meaning of the fields from several sweeps of a sensor.
+
+        Args:
+            period_ns: Time between consecutive sweeps.
+            stamps_ns: Stamp of each sweep, None without stamps.
+            named: Quantity -> name of its field, where the user states it.
+            intensity_scale: Divisor of intensities that the user states, 0 to find it.
+            **times: unit, absolute or reference that the user states, as in `TimeField`.
+        """
         fields = Fields(**(vars(find_fields(sweeps[0])) | dict(named or {})))
         missing = [axis for axis in "xyz" if not getattr(fields, axis)]
         if missing:
@@ -310,14 +342,18 @@ class PointLayout:
         valid: Bool = np.logical_and(np.isfinite(points).all(axis=1), points.any(axis=1))
         if self.fields.lidar:
             valid &= np.isfinite(columns[self.fields.lidar])
-        intensity, offset_ns, num_untimed = None, None, 0
+        intensity = None
         if self.fields.intensity:
             intensity = scaled(columns[self.fields.intensity], self.intensity_scale)
+        offset_ns = None
+        num_untimed = 0
         if self.times is not None:
             values = columns[self.times.field][valid]
             if len(values) and (values != values[0]).any():  # else this sweep has no times
+                valid_ns, is_in_sweep = self.times.offset_ns(values, stamp_ns)
                 offset_ns = np.zeros(len(points), np.int64)
-                offset_ns[valid], is_in_sweep = self.times.offset_ns(values, stamp_ns)
-                valid[valid], num_untimed = is_in_sweep, int((~is_in_sweep).sum())
+                offset_ns[valid] = valid_ns
+                valid[valid] = is_in_sweep
+                num_untimed = int((~is_in_sweep).sum())
         points[~valid] = 0
         return Returns(points, intensity, offset_ns, num_untimed=num_untimed), valid

@@ -22,8 +22,8 @@ from densify.readers.decoded_files import read_array, read_arrays, read_las
 Columns = dict[str, NDArray[Any]]
 
 _UNNAMED = ("x", "y", "z", "intensity")  # KITTI's order, which most data sets follow
-_ALIKE = 0.5  # largest median step between rows, as a share of the coordinates
-_FEWEST_ROWS = 20  # for this test
+_ALIKE = 0.5  # largest median step between scanned rows, as a share of the coordinates
+_FEWEST_ROWS = 20  # least number of rows for the test by this step
 _NAME_COLUMNS = (
     "name all of them in densify.yaml beside the sweeps' folder, such as "
     "sweeps: {columns: [x, y, z, intensity, time]}"
@@ -54,9 +54,9 @@ class PointTable:
 
 
 def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
-    """Read all rows of a point file, in file order.
+    """Read all rows of a point file, in file order; raise InputError for other or damaged files.
 
-    ``names`` are those of the columns if the file has none, by default those of `unnamed`.
+    ``names`` gives names to the columns of a file without names, by default those of `unnamed`.
 
     .bin        float32 columns; without ``names``, those of KITTI, nuScenes or Waymo if size and
                 values fit one of them
@@ -86,7 +86,8 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
 
 def unnamed(num_columns: int) -> tuple[str, ...]:
     """Return default column names: x, y, z, intensity, column4, column5 and so on."""
-    return tuple(_UNNAMED[i] if i < len(_UNNAMED) else f"column{i}" for i in range(num_columns))
+    numbered = (f"column{number}" for number in range(len(_UNNAMED), num_columns))
+    return (*_UNNAMED[:num_columns], *numbered)
 
 
 def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Columns:
@@ -110,10 +111,11 @@ def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Col
         raise InputError(
             f"{path}: got {array.shape[1]} columns, expected {len(names)}: {' '.join(names)}"
         )
-    return {name: array[:, i] for i, name in enumerate(names)}
+    return {name: array[:, column] for column, name in enumerate(names)}
 
 
 def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
+    """Read float32 columns of the named columns, or of the known layout that fits."""
     data = read_bytes(path)
     if names is None:
         fitting = [known for num, known in _BIN_LAYOUTS.items() if _fits(data, num)]
@@ -159,12 +161,14 @@ def _are_scanned(points: NDArray[Any]) -> bool:
     # Rows read with a wrong number of columns mix x with y: then points lie far apart.
     with np.errstate(invalid="ignore"):  # wrongly read bytes may be signalling NaN
         finite = np.nan_to_num(points.astype(np.float64), posinf=0, neginf=0)
-    step, size = np.abs(np.diff(finite, axis=0)).sum(axis=1), np.abs(finite).sum(axis=1)
+    step = np.abs(np.diff(finite, axis=0)).sum(axis=1)
+    size = np.abs(finite).sum(axis=1)
     share = step / (size[1:] + size[:-1] + 1e-9)
     return len(finite) < _FEWEST_ROWS or 0 < np.median(share) < _ALIKE
 
 
 def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:
+    """Read a .npy or .npz file."""
     if path.suffix.lower() == ".npy":
         return PointTable(_matrix(read_array(path), names, path))
     arrays = read_arrays(path)
@@ -175,11 +179,17 @@ def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:
     num_points = arrays["x"].shape
     if len(num_points) != 1 or any(arrays[axis].shape != num_points for axis in "yz"):
         raise ValueError("the arrays x, y and z have other shapes than (N,)")
-    fit = {n: a for n, a in arrays.items() if a.shape == num_points and a.dtype.kind in "fiu"}
-    return PointTable(fit, beside={n: a for n, a in arrays.items() if n not in fit})
+    columns = {
+        name: array
+        for name, array in arrays.items()
+        if array.shape == num_points and array.dtype.kind in "fiu"
+    }
+    others = {name: array for name, array in arrays.items() if name not in columns}
+    return PointTable(columns, beside=others)
 
 
 def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
+    """Read a .csv or .txt file."""
     lines = decode_text(read_bytes(path), path).splitlines()
     skip, words, delimiter = _header(lines)
     rows = lines[skip:]
@@ -261,6 +271,7 @@ def _pcd_header(file: Any) -> list[str]:
 
 
 def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
+    """Read a .pcd file."""
     from pypcd4 import PointCloud
 
     file = io.BytesIO(read_bytes(path).removeprefix(codecs.BOM_UTF8))
@@ -288,6 +299,7 @@ def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
+    """Read the vertices of a .ply file."""
     ply = needed("trimesh.exchange.ply", "ply", ".ply files")
     file = io.BytesIO(read_bytes(path).removeprefix(codecs.BOM_UTF8))
     vertex = ply.load_ply(file)["metadata"]["_ply_raw"]["vertex"]
@@ -301,6 +313,7 @@ def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
 
 
 def _read_las(path: Path, names: Sequence[str] | None) -> PointTable:
+    """Read the dimensions of a .las or .laz file."""
     cloud = read_las(path)
     coordinates = {axis: np.asarray(getattr(cloud, axis)) for axis in "xyz"}
     attributes = [n for n in cloud.point_format.dimension_names if n not in ("X", "Y", "Z")]

@@ -44,20 +44,21 @@ class PriorFiles:
 
     @staticmethod
     def open(path: Path, cameras: Sequence[str]) -> PriorFiles:
-        """Find the priors of the given cameras in a folder, or take a single file."""
-        where, example = f"prior {path}", "0000000120.npy, .exr or .png"
+        """Find the prior files of cameras."""
+        where = f"prior {path}"
+        example = "0000000120.npy, .exr or .png"
         if not path.exists():
             raise InputError(f"{where}: no such folder or file; expected DIR/CAMERA/{example}")
-        values = {camera: _in(path / camera) for camera in cameras}
-        sky = {camera: _in(path / "sky" / camera) for camera in cameras}
-        if not any(values.values()) and (flat := _in(path)):
+        values = {camera: _find_numbered(path / camera) for camera in cameras}
+        sky = {camera: _find_numbered(path / "sky" / camera) for camera in cameras}
+        if not any(values.values()) and (flat := _find_numbered(path)):
             if len(cameras) > 1:
                 raise InputError(
                     f"{where}: holds depth images of one camera, and there are "
                     f"{', '.join(cameras)}; choose one with --camera, or put them into "
                     f"{path / 'CAMERA'}"
                 )
-            values, sky = {cameras[0]: flat}, {cameras[0]: _in(path / "sky")}
+            values, sky = {cameras[0]: flat}, {cameras[0]: _find_numbered(path / "sky")}
         if not any(values.values()):
             inside = path / (cameras[0] if cameras else "CAMERA")
             raise InputError(
@@ -67,25 +68,28 @@ class PriorFiles:
             )
         return PriorFiles(path, values, sky)
 
-    def said_of(self, camera: str) -> str:
-        """Return a clause for messages that lists the numbers of a camera's images with a prior."""
+    def describe_available(self, camera: str) -> str:
+        """Return a clause for messages, such as "there are 96-135": a camera's images with priors.
+
+        ``camera`` is its name.
+        """
         return f"there are {format_frames(self.values[camera])}"
 
     def prior(self, camera: Camera, number: int) -> Prior | None:
-        """Return the prior of an image at the camera's size (H,W); None if the image has no prior.
+        """Read the prior of image ``number`` at the camera's size (H,W); None if it has no prior.
 
-        A prior of another size is resized if its aspect ratio agrees to 2 %.
+        A prior of another size is resized if its aspect ratio agrees to 2 %, else InputError.
         """
         path = self.values[camera.name].get(number)
         if path is None:
             return None
-        value = _resized(_value(path), camera, path)
+        value = _resized(_read_values(path), camera, path)
         mask = self.sky[camera.name].get(number)
-        sky = np.zeros(value.shape, bool) if mask is None else _sky(mask, camera)
+        sky = np.zeros(value.shape, bool) if mask is None else _read_sky(mask, camera)
         return Prior(value, sky, str(path))
 
 
-def _in(folder: Path) -> dict[int, Path]:
+def _find_numbered(folder: Path) -> dict[int, Path]:
     """Return the prior files of a folder or its ``data`` subfolder by image number."""
     # A PNG may be only a preview of the .npy.
     folders = (folder, folder / "data")
@@ -93,7 +97,7 @@ def _in(folder: Path) -> dict[int, Path]:
     return next(filter(None, numbered), {})
 
 
-def _value(path: Path) -> Float32:
+def _read_values(path: Path) -> Float32:
     """Read the (H,W) float32 values of a prior; 0 marks pixels without a value."""
     read = {".npy": read_array, ".exr": _read_exr, ".png": _read_png}[path.suffix.lower()]
     image = read(path)
@@ -112,6 +116,7 @@ def _value(path: Path) -> Float32:
 
 
 def _read_exr(path: Path) -> NDArray[Any]:
+    """Read the channel of depth of an EXR file."""
     library = needed("OpenEXR", "exr", "EXR files")
     open_file(path).close()
     try:
@@ -130,6 +135,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
 
 
 def _read_png(path: Path) -> NDArray[Any]:
+    """Read a PNG file of one channel of 16 bits."""
     image = read_image(path, as_stored=True)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise InputError(
@@ -143,11 +149,12 @@ def _resized(value: Float32, camera: Camera, path: Path) -> Float32:
     """Resize values (H,W) to the camera's size; a pixel beside an empty pixel becomes 0 (empty)."""
     if value.shape == (camera.height_px, camera.width_px):
         return value
-    known = _at_size((value > 0).astype(np.float32), camera, path)
-    return np.where(known > 1 - 1e-3, _at_size(value, camera, path), 0).astype(np.float32)
+    # Share of the pixels with a value that a resized pixel is interpolated from
+    share = _at_size((value > 0).astype(np.float32), camera, path)
+    return np.where(share > 1 - 1e-3, _at_size(value, camera, path), 0).astype(np.float32)
 
 
-def _sky(path: Path, camera: Camera) -> Bool:
+def _read_sky(path: Path, camera: Camera) -> Bool:
     """Read a sky mask at the camera's size (H,W), True for sky."""
     mask = read_image(path, as_stored=True)
     mask = mask if mask.ndim == 2 else mask[:, :, :3].max(axis=2)

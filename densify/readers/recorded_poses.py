@@ -47,7 +47,10 @@ class PoseTrack:
             )
 
     def at(self, time_ns: int) -> Float:
-        """Return T_world_ego (4,4) at a time, up to 0.2 s beyond the ends of the path."""
+        """Return T_world_ego (4,4) at a time, interpolated between the nearest poses.
+
+        It is extrapolated up to 0.2 s beyond the ends of the path; farther, InputError is raised.
+        """
         begin, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
         beyond_ns = max(begin - time_ns, time_ns - end)
         if beyond_ns > _MAX_BEYOND_NS:
@@ -55,44 +58,55 @@ class PoseTrack:
                 f"{self.where}: no pose at {time_ns} ns: got poses from {begin} to {end}, "
                 f"{beyond_ns * 1e-9:.2f} s away; expected poses around every sweep and image"
             )
-        i = int(np.clip(np.searchsorted(self.stamp_ns, time_ns) - 1, 0, len(self.stamp_ns) - 2))
-        span_ns = int(self.stamp_ns[i + 1] - self.stamp_ns[i])
-        fraction = (time_ns - int(self.stamp_ns[i])) / span_ns
-        return poses.interpolate(self.T_world_ego[i], self.T_world_ego[i + 1], fraction)
+        # The pose before the time; at the ends, that of the first or the last pair
+        last_pair = len(self.stamp_ns) - 2
+        before = int(np.clip(np.searchsorted(self.stamp_ns, time_ns) - 1, 0, last_pair))
+        after = before + 1
+        span_ns = int(self.stamp_ns[after] - self.stamp_ns[before])
+        fraction = (time_ns - int(self.stamp_ns[before])) / span_ns
+        return poses.interpolate(self.T_world_ego[before], self.T_world_ego[after], fraction)
 
     def as_fired(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
         """Undo ego-motion compensation: return points in the vehicle frame at their firing times.
 
         Many data sets store a sweep as if measured at one time, which smears moving objects and
-        bends rings. ``points`` is (N,3) metres, compensated to the vehicle frame at ``stamp_ns``;
-        padding at 0 0 0 stays. ``offset_ns`` is (N,) firing times since ``stamp_ns``.
+        bends rings.
+
+        Args:
+            points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``; padding at 0 0 0
+                stays.
+            stamp_ns: Time to which the points are compensated.
+            offset_ns: (N,) firing times since ``stamp_ns``.
         """
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
 
     def compensated(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Move (N,3) points as fired to the vehicle frame at ``stamp_ns``; undoes `as_fired`."""
+        """Move (N,3) points from their firing times to ``stamp_ns``; the opposite of `as_fired`."""
         return self._carry(points, stamp_ns, offset_ns, inverse=False)
 
     def taken_back(self, placed: Returns, stamp_ns: int) -> Returns:
-        """Undo that points were moved to the world with the poses of this path.
+        """Return world points that were placed with this path in the vehicle frame, as fired.
 
-        Points of a sweep without times are compensated to its ``stamp_ns``, and the result is too.
+        Points of a sweep without times are in the vehicle frame at ``stamp_ns`` instead.
         """
-        at_stamp = taken_back(placed.points, self.at(stamp_ns))
+        points = taken_back(placed.points, self.at(stamp_ns))
         if placed.offset_ns is not None:
-            at_stamp = self.as_fired(at_stamp, stamp_ns, placed.offset_ns)
-        return replace(placed, points=at_stamp)
+            points = self.as_fired(points, stamp_ns, placed.offset_ns)
+        return replace(placed, points=points)
 
     def _carry(self, points: Float, stamp_ns: int, offset_ns: Int, inverse: bool) -> Float:
+        """Move points from their firing times to ``stamp_ns``, or back if ``inverse``."""
         if not len(points):
             return points
+        # Poses relative to the pose at the stamp, at the ends of the sweep and at stored poses
         T_ref_world = poses.inverse(self.at(stamp_ns))
-        low, high = stamp_ns + int(offset_ns.min()), stamp_ns + int(offset_ns.max())
-        inside = self.stamp_ns[(self.stamp_ns > low) & (self.stamp_ns < high)].tolist()
-        times_ns = [low, *inside, max(high, low + 1)]
-        T_ref_ego = np.stack([T_ref_world @ self.at(t) for t in times_ns])
-        since_ns = np.array([t - stamp_ns for t in times_ns], np.float64)
+        begin_ns, end_ns = stamp_ns + int(offset_ns.min()), stamp_ns + int(offset_ns.max())
+        is_inside = (self.stamp_ns > begin_ns) & (self.stamp_ns < end_ns)
+        times_ns = [begin_ns, *self.stamp_ns[is_inside].tolist(), max(end_ns, begin_ns + 1)]
+        T_ref_ego = np.stack([T_ref_world @ self.at(time_ns) for time_ns in times_ns])
+        since_ns = np.array([time_ns - stamp_ns for time_ns in times_ns], np.float64)
+        # Interpolation between them
         fired_ns, row = np.unique(offset_ns, return_inverse=True)  # many points share a firing time
         turns = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))(fired_ns)[row]
         shifts_m = [np.interp(fired_ns, since_ns, axis) for axis in T_ref_ego[:, :3, 3].T]
@@ -103,7 +117,7 @@ class PoseTrack:
 
 
 def taken_back(placed: Float, T_world_ego: Float) -> Float:
-    """Return points (N,3) of the world in the frame of a pose (4,4). Padding at 0 0 0 stays."""
+    """Return world points (N,3) in the frame of a pose (4,4). Padding at 0 0 0 stays."""
     points = poses.transform(poses.inverse(T_world_ego), placed)
     return np.where(placed.any(axis=1, keepdims=True), points, placed)
 
@@ -124,9 +138,9 @@ class PoseFile:
     ) -> PoseFile | None:
         """Read the poses of a recording; None without any.
 
-        These are the file ``name``, or for "" a file of a usual name, a file with the suffix .pose
-        beside each sweep, or the viewpoints of .pcd files. ``unit`` is that of the times, "" to
-        find it.
+        ``name`` is the pose file; "" searches for a file of a usual name, a file with the suffix
+        .pose beside each sweep, or the viewpoints of .pcd files. ``unit`` is the unit of the times,
+        "" to find it.
         """
         if name:
             return PoseFile.read(existing(folder, name, "poses: {file: ...}"), unit)
@@ -141,7 +155,10 @@ class PoseFile:
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
-        """Read a file with one pose on each line; ``unit`` of the times, "" to find it."""
+        """Read a file with one pose on each line; raise InputError if the lines are no poses.
+
+        ``unit`` is the unit of the times, "" to find it.
+        """
         table = TextTable.read(path, [name for names in _TURNS for name in names])
         columns = [i for names in (*_TURNS, *_POSITIONS) if (i := table.column(names)) is not None]
         width, form, time = len(table.rows[0]), "table with quaternions", None
@@ -192,7 +209,10 @@ class PoseFile:
             return None
 
     def by_frame(self, frames: Sequence[int]) -> dict[int, Float]:
-        """Return the poses by frame: one for each of the ascending ``frames``, or from frame 0."""
+        """Return the (4,4) poses by frame number, for the ascending ``frames`` of a recording.
+
+        The file has a pose for each of the frames, or for each number from 0, else InputError.
+        """
         if self.frames is not None:
             return dict(zip(self.frames, self.T, strict=True))
         if len(self.T) == len(frames):

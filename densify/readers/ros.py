@@ -79,7 +79,11 @@ class Topics(NamedTuple):
 
     @staticmethod
     def choose(bag: Bag, options: str | None) -> Topics:
-        """Choose the topics to read, by the user's options (after ``#``) and the message types."""
+        """Choose the topics to read by the user's options and the message types.
+
+        ``options`` is the text after ``#``, None without. Raise InputError for an unknown topic, or
+        if several topics could be the sweeps.
+        """
         named = dict(parse_qsl(options or "", keep_blank_values=True))
         unknown = [key for key in named if key not in _TYPES]
         if unknown or (options and not named):
@@ -161,7 +165,11 @@ class Transforms:
         tree = Transforms(str(bag.path))
         recorded: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
         for topic in bag.of_type(*TRANSFORMS):
-            transforms = (t for message in bag.messages(topic.name) for t in message.transforms)
+            transforms = (
+                transform
+                for message in bag.messages(topic.name)
+                for transform in message.transforms
+            )
             for transform in transforms:
                 parent, child = _plain(transform.header.frame_id), _plain(transform.child_frame_id)
                 where = f"{bag.path}: {topic.name}: {parent} to {child}"
@@ -182,7 +190,7 @@ class Transforms:
         return tree
 
     def between(self, target: str, source: str) -> Float | None:
-        """Return T_target_source (4,4) along fixed frames; None if no fixed frames join the two."""
+        """Return the constant T_target_source (4,4); None if no fixed frames join the two."""
         T_above_target, T_above_source = self._above(target), self._above(source)
         for ancestor in T_above_source:
             if ancestor in T_above_target:
@@ -190,7 +198,10 @@ class Transforms:
         return None
 
     def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
-        """Return a frame's moving parent and path T_parent_frame in it; None if it is fixed."""
+        """Return the name of a frame's moving parent, and the path T_parent_frame over time.
+
+        None if no frame above it moves.
+        """
         # The nearest moving parent is usually odom, not map, which jumps at loop closures.
         for body, T_body_frame in self._above(frame).items():
             if body in self.moving:
@@ -316,16 +327,23 @@ class RosBag(FileSequence):
             (self._bag.num_unstamped, "headers have no stamp: taken is when they were recorded"),
             (self._bag.num_twice, "messages were recorded twice and are read once"),
         )
-        return [f"{t}: {num[t]} {text}" for num, text in counts for t in self._index if num[t]]
+        return [
+            f"{topic}: {num_by_topic[topic]} {text}"
+            for num_by_topic, text in counts
+            for topic in self._index
+            if num_by_topic[topic]
+        ]
 
     def _returns(self, frame: int) -> Returns:
-        stamp_ns, numbered = self._stamps_ns[frame], list[tuple[int, Returns]]()
+        # The message of the first lidar, and those of other lidars nearest in time
+        stamp_ns = self._stamps_ns[frame]
+        numbered_clouds: list[tuple[int, Returns]] = []
         for number, lidar in enumerate(self._lidars):
             entry = min(lidar.entries, key=lambda entry: abs(entry.stamp_ns - stamp_ns))
             entry = entry if number else lidar.entries[frame]
             if abs(entry.stamp_ns - stamp_ns) <= self._lidars[0].period_ns // 2:
-                numbered.append((number, self._returns_of(lidar, entry, stamp_ns)))
-        clouds = [cloud for _, cloud in numbered]
+                numbered_clouds.append((number, self._returns_of(lidar, entry, stamp_ns)))
+        clouds = [cloud for _, cloud in numbered_clouds]
         offsets_ns = [cloud.offset_ns for cloud in clouds if cloud.offset_ns is not None]
         intensities = [
             np.zeros(len(cloud.points), np.float32) if cloud.intensity is None else cloud.intensity
@@ -336,7 +354,9 @@ class RosBag(FileSequence):
             np.concatenate([cloud.points for cloud in clouds]),
             np.concatenate(intensities),
             np.concatenate(offsets_ns) if len(offsets_ns) == len(clouds) else None,
-            np.concatenate([np.full(len(cloud.points), n, np.uint8) for n, cloud in numbered]),
+            np.concatenate(
+                [np.full(len(cloud.points), number, np.uint8) for number, cloud in numbered_clouds]
+            ),
             origins if len(self._lidars) > 1 else None,
             num_untimed=sum(cloud.num_untimed for cloud in clouds),
         )
@@ -362,7 +382,7 @@ class RosBag(FileSequence):
         topic = self._image_topics[camera.name]
         where = f"{self._bag.path}: {topic}: image {number}"
         rgb = image_rgb(self._bag.message(topic, self._index[topic][number]), where)
-        checks.image_size(rgb.shape, camera, where)
+        checks.check_image_size(rgb.shape, camera, where)
         return rgb
 
     def _pose(self, frame: int) -> Float:
@@ -464,4 +484,4 @@ class RosBag(FileSequence):
                 f"{message.width} x {message.height} px: they are binned already; record it with "
                 f"binning_x and binning_y 0, or leave the camera out of #images="
             )
-        checks.image_size(size, camera, where)
+        checks.check_image_size(size, camera, where)

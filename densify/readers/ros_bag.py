@@ -133,10 +133,10 @@ class Bag:
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Index the messages of the topics by ascending stamp.
+        """Return the index entries of the messages of each topic, by ascending stamp.
 
-        Messages without a stamp are counted. A message that was recorded twice is indexed once and
-        counted.
+        Messages without a stamp are counted in ``num_unstamped``. A message that was recorded twice
+        is indexed once and counted in ``num_twice``.
         """
         entries_of_topic: dict[str, list[Entry]] = {topic: [] for topic in topics}
         num_recorded_at = Counter[tuple[str, int]]()
@@ -287,7 +287,8 @@ def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
         rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
         table = np.array(rows, list(_LIVOX.items()))
         return {name: table[name] for name in _LIVOX}
-    order, layout = ">" if message.is_bigendian else "<", dict[str, tuple[str, int]]()
+    order = ">" if message.is_bigendian else "<"
+    layout: dict[str, tuple[str, int]] = {}  # type and byte offset of each field
     for entry in message.fields:
         if entry.count > 1 or not entry.name or entry.name in layout:
             continue
@@ -298,7 +299,8 @@ def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
                 f"{message.point_step}, expected one of ROS's eight types inside the point"
             )
         layout[entry.name] = (order + kind, entry.offset)
-    formats, offsets = [kind for kind, _ in layout.values()], [at for _, at in layout.values()]
+    formats = [kind for kind, _ in layout.values()]
+    offsets = [offset for _, offset in layout.values()]
     spec: Any = {"names": [*layout], "formats": formats, "offsets": offsets}
     # Some drivers leave the step of an only row at zero.
     step = message.row_step or message.width * message.point_step * (message.height == 1)
@@ -357,8 +359,10 @@ def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
 def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, where: str) -> Camera:
     """Convert a CameraInfo message to a camera, adjusted for binning and region of interest.
 
-    ``T_optical_lidar`` is the (4,4) pose of the lidar in the message's optical frame. Rectified
-    images use P and the rotation R, raw images K and the distortion D.
+    Args:
+        T_optical_lidar: (4,4) pose of the lidar in the message's optical frame.
+        rectified: True for rectified images, which use P and the rotation R; raw images use K and
+            the distortion D.
     """
     matrix = {  # ROS 1 writes K, ROS 2 k
         key: np.asarray(getattr(info, key if hasattr(info, key) else key.upper()), np.float64)
@@ -399,10 +403,12 @@ def _lens(named: str, distortion: tuple[float, ...], where: str) -> tuple[str, t
 def _binned(camera: Camera, info: Any) -> Camera:
     """Adjust a camera to the region of interest and the binning of a CameraInfo."""
     # Binning averages sensor pixels, which moves pixel centres relative to the corner.
-    roi, by = info.roi, np.array([max(1, info.binning_x), max(1, info.binning_y)])
-    size = [roi.width or camera.width_px, roi.height or camera.height_px]
+    region = info.roi
+    binning = np.array([max(1, info.binning_x), max(1, info.binning_y)])
+    size = [region.width or camera.width_px, region.height or camera.height_px]
     K = camera.K.copy()
-    K[:2, 2] -= (roi.x_offset, roi.y_offset)
-    K[:2, 2] = (K[:2, 2] + 0.5) / by - 0.5
-    K[[0, 1], [0, 1]] /= by
-    return replace(camera, K=K, width_px=int(size[0] // by[0]), height_px=int(size[1] // by[1]))
+    K[:2, 2] -= (region.x_offset, region.y_offset)
+    K[:2, 2] = (K[:2, 2] + 0.5) / binning - 0.5
+    K[[0, 1], [0, 1]] /= binning
+    width_px, height_px = (int(size[axis] // binning[axis]) for axis in range(2))
+    return replace(camera, K=K, width_px=width_px, height_px=height_px)

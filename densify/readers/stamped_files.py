@@ -26,9 +26,9 @@ _FILE_COLUMNS = ("filename", "file", "name", "image", "sweep", "path")
 _STAMP_FILES = [f"{n}.{s}" for n in ("timestamps", "times", "stamps") for s in ("txt", "csv")]
 _NO_SWEEPS = ("truth", "labels", "label", "poses", "calib", "calibration")
 _EPOCH_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # the years 2000 to 2099
-_LONGEST_STEP_NS = 3_900_000_000  # between sweeps or images
+_LONGEST_STEP_NS = 3_900_000_000  # longest median time between sweeps or images
 _MOST_NS = 2**63
-_MOST_EQUAL = 1 / 3  # share of the steps
+_MOST_EQUAL = 1 / 3  # greatest share of steps of 0 between stamps
 _SECONDS_AND_NS = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})(?!\d)")
 _MAX_NUMBER_DIGITS = 18  # a longer number is no frame number
 
@@ -103,12 +103,13 @@ class TextTable(NamedTuple):
     def column(self, choices: Collection[str]) -> int | None:
         """Return the index of the first of the names in ``choices`` that is a column, else None."""
         indices = (self.names.index(name) for name in choices if name in self.names)
-        return next((i for i in indices if i < len(self.rows[0])), None)
+        return next((index for index in indices if index < len(self.rows[0])), None)
 
     def times_ns(self, column: int, unit: str) -> tuple[tuple[int, ...], str]:
         """Return the times of a column in nanoseconds, and the unit in the file ("date" for dates).
 
-        Without a ``unit`` ("") the unit of times since 1970 is found; else it is seconds.
+        With "" for ``unit``, the unit of times since 1970 is found by their size; other times are
+        in seconds. Raise InputError for a text that is no time, or for times too far apart.
         """
         times = [words[column] for words in self.rows]
         dates = "-" in times[0][1:] and ":" in times[0]
@@ -156,21 +157,28 @@ class StampFile(NamedTuple):
     def read(path: Path, unit: str = "") -> StampFile:
         """Read a time from each line, alone or among columns: a number of ``unit``, or a date."""
         table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
-        at_time, at_name = table.column(TIME_COLUMNS), table.column(_FILE_COLUMNS)
+        time_column = table.column(TIME_COLUMNS)
+        name_column = table.column(_FILE_COLUMNS)
         words = table.rows[0]
-        if at_time is None and at_name is None:
-            at_name = next((i for i, w in enumerate(words) if Path(w).suffix[1:2].isalpha()), None)
-        if at_time is None:
-            at_time = next((i for i in range(len(words)) if i != at_name), 0)
-        stamps_ns, unit = table.times_ns(at_time, unit)
-        if at_name is None:
-            table.check_digits(stamps_ns, at_time)
+        # Without names of columns, a word with a suffix of letters is the name of a file.
+        if time_column is None and name_column is None:
+            are_files = [Path(word).suffix[1:2].isalpha() for word in words]
+            name_column = are_files.index(True) if any(are_files) else None
+        if time_column is None:
+            time_column = next((column for column in range(len(words)) if column != name_column), 0)
+        stamps_ns, unit = table.times_ns(time_column, unit)
+        if name_column is None:
+            table.check_digits(stamps_ns, time_column)
             return StampFile(path, stamps_ns, unit, None)
-        # Files of several cameras may have one time.
-        return StampFile(path, stamps_ns, unit, tuple(Path(r[at_name]).name for r in table.rows))
+        # Equal times are no error here: files of several cameras may have one time.
+        names = tuple(Path(row[name_column]).name for row in table.rows)
+        return StampFile(path, stamps_ns, unit, names)
 
     def of(self, paths: Mapping[int, Path]) -> dict[int, int]:
-        """Return the stamp of each file by number; a line fits by file name, order or number."""
+        """Return the stamp (ns) of each of the given files, by number.
+
+        Lines belong to files by name, or in order, or by number. Raise InputError if none fits.
+        """
         if self.names is not None:
             by_name = {Path(n).stem: ns for n, ns in zip(self.names, self.stamp_ns, strict=True)}
             missing = [path for path in paths.values() if path.stem not in by_name]
@@ -212,7 +220,7 @@ class NamedFile(NamedTuple):
                 return NamedFile(path, None, None)
         for word in reversed(words):
             epoch = _epoch_unit(word)
-            # ten digits without a fraction are a number with zeros before it, as KITTI's
+            # Ten digits without a fraction are a frame number, as in KITTI's file names.
             if epoch and (epoch != "s" or "." in word) and not word.startswith("0"):
                 return NamedFile(path, None, in_ns(word, epoch))
         digits = [word for word in re.findall(r"\d+", path.stem) if len(word) <= _MAX_NUMBER_DIGITS]
@@ -234,9 +242,12 @@ def in_time(
 ) -> Series:
     """Order files by time and find their stamps; files whose names are times are numbered from 0.
 
-    ``stamps`` is ``names`` if file names are stamps, ``sweeps`` for files without stamps, a stamp
-    file below ``root`` (the recording) or beside the files, or "" to search for one, with
-    ``shared`` in ``root`` too. ``unit`` is the unit of the stamps, "" to detect it.
+    Args:
+        paths: Files.
+        stamps: "names" if file names are stamps, "sweeps" for files without stamps, the name of a
+            stamp file beside the files or below ``root``, or "" to search for one.
+        unit: Unit of the stamps, "" to detect it.
+        shared: True to search in ``root`` too.
     """
     by_names = stamps == "names"
     names = [NamedFile.of(path, unit if by_names else "") for path in paths]
@@ -307,12 +318,17 @@ def files_below(root: Path, suffixes: Sequence[str], depth: int) -> dict[str, li
     """
     files_of_folder = {}
     for folder, subfolders, names in os.walk(root):
-        subfolders[:] = sorted(f for f in subfolders if f[0] != "." and f not in _NO_SWEEPS)
+        # os.walk visits the subfolders that remain in the list.
+        subfolders[:] = sorted(
+            name for name in subfolders if name[0] != "." and name not in _NO_SWEEPS
+        )
         relative = Path(folder).relative_to(root)
         if len(relative.parts) == depth:
             subfolders.clear()
-        fit = [n for n in sorted(names) if n[0] != "." and Path(n).suffix.lower() in suffixes]
-        paths = [Path(folder, name) for name in fit if os.path.isfile(Path(folder, name))]
+        visible = [Path(folder, name) for name in sorted(names) if name[0] != "."]
+        paths = [
+            path for path in visible if path.suffix.lower() in suffixes and os.path.isfile(path)
+        ]
         if paths:
             files_of_folder[relative.as_posix()] = paths
     return files_of_folder

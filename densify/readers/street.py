@@ -42,15 +42,20 @@ class Street:
 
     def __init__(
         self,
-        # street, highway, static (only the ego vehicle moves) or crossing (the ego vehicle stands)
         preset: str = "street",
-        seed: int = 0,  # of the random scene
-        sensor: str = "hdl64",  # a lidar in `densify.street.lidar.SENSORS`
-        hz: int = 10,  # sweeps per second: 5, 10 or 20
-        tilt_deg: float = 0.0,  # pitch of the lidar's mount, nose down; cameras are not tilted
-        cameras: tuple[str, ...] = USUAL,  # in `densify.street.cameras.CAMERAS`
+        seed: int = 0,
+        sensor: str = "hdl64",
+        hz: int = 10,
+        tilt_deg: float = 0.0,
+        cameras: tuple[str, ...] = USUAL,
     ) -> None:
-        """Set up the street; sweeps and images are rendered on demand."""
+        """Set up the street; sweeps and images are rendered on demand.
+
+        Args:
+            preset: "street", "highway", "static" (only the ego vehicle moves) or "crossing" (the
+                ego vehicle stands).
+            tilt_deg: Pitch of the lidar's mount, nose down. Cameras are not tilted.
+        """
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)
         if not (0 <= seed < 10**18 and hz in (5, 10, 20) and abs(tilt_deg) <= 45):
@@ -149,13 +154,17 @@ class Street:
         return kept(self._cache, "bodies", lambda: self._posed, lambda: self.simulator.bodies)
 
     def _render_returns(self, frame: int) -> Returns:
-        return self._kept("sweep", (self._swept, frame), lambda: self.simulator.returns(frame))
+        return self._from_cache(
+            "sweep", (self._swept, frame), lambda: self.simulator.returns(frame)
+        )
 
     def _render_picture(self, camera: str, number: int) -> Picture:
         inputs = (self._pictured, camera, number)
-        return self._kept("image", inputs, lambda: self.simulator.picture(camera, number))
+        return self._from_cache("image", inputs, lambda: self.simulator.picture(camera, number))
 
-    def _kept(self, step: str, inputs: Any, render: Callable[[], T]) -> T:
+    def _from_cache(self, step: str, inputs: Any, render: Callable[[], T]) -> T:
+        """Return a cached result, or render and keep it; ``inputs`` identifies it."""
+
         def rendered() -> T:
             _announce()
             with self._building:

@@ -30,7 +30,7 @@ class WindowFrames(NamedTuple):
 
 
 def runs(frames: Iterable[int]) -> list[range]:
-    """Group ascending frame numbers into ranges of consecutive numbers."""
+    """Return ascending frame numbers as ranges of consecutive numbers."""
     ranges: list[range] = []
     for frame in frames:
         if ranges and frame == ranges[-1].stop:
@@ -74,26 +74,31 @@ class Timeline:
 
     @staticmethod
     def of(sequence: LidarSequence) -> Timeline:
-        """Read the stamps of a recording's sweeps, without points; replace unusable stamps."""
-        frames, unknown = tuple(sequence.frames), {}
+        """Read the stamps of a recording's sweeps, without points.
+
+        Missing stamps and those out of order are interpolated by index.
+        """
+        frames = tuple(sequence.frames)
+        unknown = {}
         stamps_ns = np.zeros(len(frames), np.int64)
         for row, frame in enumerate(frames):
             try:
                 stamps_ns[row] = sequence.stamp_ns(frame)
             except InputError as error:
                 unknown[frame] = str(error)
-        known = np.array([f not in unknown for f in frames], bool)
-        for row in np.flatnonzero(known)[_out_of_order(stamps_ns[known])].tolist():
-            known[row] = False
+        is_known = np.array([frame not in unknown for frame in frames], bool)
+        for row in np.flatnonzero(is_known)[_out_of_order(stamps_ns[is_known])].tolist():
+            is_known[row] = False
             unknown[frames[row]] = (
                 f"the stamp of frame {frames[row]} ({stamps_ns[row]} ns) is not between those of "
                 f"the sweeps before and after it; check the recording's timestamps"
             )
-        if unknown and known.any():
+        if unknown and is_known.any():
             rows = np.arange(len(frames))
-            start_ns = stamps_ns[known][0]
-            since_ns = np.interp(rows, rows[known], (stamps_ns[known] - start_ns).astype(float))
-            stamps_ns = np.where(known, stamps_ns, start_ns + since_ns.astype(np.int64))
+            start_ns = stamps_ns[is_known][0]
+            known_since_ns = (stamps_ns[is_known] - start_ns).astype(float)
+            since_ns = np.interp(rows, rows[is_known], known_since_ns)
+            stamps_ns = np.where(is_known, stamps_ns, start_ns + since_ns.astype(np.int64))
         return Timeline(sequence.name, frames, stamps_ns, unknown)
 
     @cached_property
@@ -127,13 +132,13 @@ class Timeline:
         A series ends where a sweep of the recording is missing from ``frames``, or before a hole in
         time of more than 3.1 median periods.
         """
-        runs: list[list[int]] = []
-        for row in sorted(self.row[f] for f in frames):
-            if runs and runs[-1][-1] == row - 1 and not self._hole_before(row):
-                runs[-1].append(row)
+        series: list[list[int]] = []  # indices of the sweeps
+        for row in sorted(self.row[frame] for frame in frames):
+            if series and series[-1][-1] == row - 1 and not self._hole_before(row):
+                series[-1].append(row)
             else:
-                runs.append([row])
-        return [[self.frames[row] for row in run] for run in runs]
+                series.append([row])
+        return [[self.frames[row] for row in rows] for rows in series]
 
     def before(self, frame: int, num: int) -> list[int]:
         """Return up to ``num`` frames directly before a frame, ascending, up to a hole in time."""
@@ -164,9 +169,13 @@ class Timeline:
     def _side(
         self, key: int, step: int, num: int, left_out: Mapping[int, str]
     ) -> tuple[list[int], str]:
-        """Return up to ``num`` frames beside the key, nearest first, and why there are no more."""
+        """Return up to ``num`` frames beside the key, nearest first, and why there are no more.
+
+        ``step`` is -1 for frames before the key and 1 for frames after it.
+        """
         side: list[int] = []
-        for row in range(self.row[key] + step, self.row[key] + step * (num + 1), step):
+        key_row = self.row[key]
+        for row in range(key_row + step, key_row + step * (num + 1), step):
             previous = self.frames[row - step]
             if not 0 <= row < len(self.frames):
                 return side, f"the recording {'begins' if step < 0 else 'ends'} at frame {previous}"
@@ -181,40 +190,45 @@ class Timeline:
         return side, ""
 
     def _hole_before(self, row: int) -> bool:
+        """Return True if a hole in time lies between a sweep and the sweep before it."""
         gap_ns = int(self.stamp_ns[row] - self.stamp_ns[row - 1])
         return gap_ns > _HOLE_PERIODS * self.period_ns
 
 
 def _out_of_order(stamps_ns: Int) -> list[int]:
-    """Return the stamps outside the longest ascending series, unless they are half of all."""
+    """Return indices of stamps outside the longest ascending series; [] if they are half of all."""
     if np.all(np.diff(stamps_ns) > 0):
         return []
-    best: list[int] = []  # by length: index of the lowest stamp that ends such a series
-    before: list[int] = []
+    # Longest increasing subsequence, by patience sorting
+    end_by_length: list[int] = []  # index of the lowest stamp that ends a series of each length
+    previous: list[int] = []  # index of the stamp before each in its series, -1 for none
     for row, stamp_ns in enumerate(stamps_ns.tolist()):
-        length = bisect_left(best, stamp_ns, key=lambda end: int(stamps_ns[end]))
-        before.append(best[length - 1] if length else -1)
-        if length == len(best) or stamp_ns < stamps_ns[best[length]]:
-            best[length : length + 1] = [row]
-    row, series = best[-1], set[int]()
+        length = bisect_left(end_by_length, stamp_ns, key=lambda end: int(stamps_ns[end]))
+        previous.append(end_by_length[length - 1] if length else -1)
+        if length == len(end_by_length) or stamp_ns < stamps_ns[end_by_length[length]]:
+            end_by_length[length : length + 1] = [row]
+    # Follow the longest series back from its end.
+    series = set[int]()
+    row = end_by_length[-1]
     while row >= 0:
         series.add(row)
-        row = before[row]
-    wrong = [row for row in range(len(stamps_ns)) if row not in series]
-    return wrong if 2 * len(wrong) < len(stamps_ns) else []
+        row = previous[row]
+    outside = [row for row in range(len(stamps_ns)) if row not in series]
+    return outside if 2 * len(outside) < len(stamps_ns) else []
 
 
 def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) -> Sweep:
-    """Read a sweep's returns kept by `in_range`, without times if not ``settings.deskew``."""
+    """Read a sweep and return it after `in_range`, without times if not ``settings.deskew``."""
     sweep = in_range(sequence[frame], settings)
     return sweep if settings.deskew else replace(sweep, offset_ns=None)
 
 
 def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
-    """Remove returns nearer than ``min_range_m`` (the own vehicle) or farther than ``max_range_m``.
+    """Return the sweep without returns that are too near, too far or lone.
 
-    Ranges are measured from the scanner that fired. In snow, rain and dust, returns without
-    neighbours are removed too. The returned copy counts the removed near and lone returns.
+    Returns nearer than ``settings.min_range_m`` (the own vehicle) or farther than ``max_range_m``
+    are removed; ranges are measured from the scanner that fired. In snow, rain and dust, returns
+    without neighbours are removed too. The copy counts the removed near and lone returns.
     """
     origins_m = sweep.scanner_origins
     x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T
@@ -242,7 +256,7 @@ def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list
 def recorded_trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep]) -> Trajectory:
     """Return the recorded poses of the sweeps at their reference times, as a trajectory."""
     return Trajectory(
-        frames=tuple(s.frame for s in sweeps),
-        stamp_ns=np.array([s.stamp_ns for s in sweeps], np.int64),
-        T_world_lidar=np.stack([sequence.T_world_lidar(s.frame) for s in sweeps]),
+        frames=tuple(sweep.frame for sweep in sweeps),
+        stamp_ns=np.array([sweep.stamp_ns for sweep in sweeps], np.int64),
+        T_world_lidar=np.stack([sequence.T_world_lidar(sweep.frame) for sweep in sweeps]),
     )

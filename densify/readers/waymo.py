@@ -74,7 +74,10 @@ class Segment(NamedTuple):
     def read(
         self, component: str, kinds: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Return columns by name without the head; kinds as in `column_files.read_arrow`."""
+        """Read columns of a component; return them by name, without the name of the component.
+
+        ``kinds`` and ``where`` are as in `densify.readers.column_files.read_arrow`.
+        """
         full_kinds = {full_name(component, name): kind for name, kind in kinds.items()}
         path, data_set = self.file(component), ("waymo", "Waymo recordings")
         columns = read_arrow(path, full_kinds, data_set, where)
@@ -98,11 +101,13 @@ class Laser(NamedTuple):
             low, high = self.bounds_rad
             beams = (np.arange(height) + 0.5) / height * (high - low) + low
         T = self.T_vehicle_laser
-        turned_rad = np.arctan2(T[1, 0], T[0, 0])
-        azimuth = ((np.arange(width, 0, -1) - 0.5) / width * 2 - 1) * np.pi - turned_rad
-        rise = beams[::-1, None]
-        x, y = np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise)
-        return np.stack([x, y, np.broadcast_to(np.sin(rise), x.shape)], axis=2)
+        # Azimuths of the pixel centres fall from pi to -pi in the vehicle's frame.
+        mount_rad = np.arctan2(T[1, 0], T[0, 0])
+        azimuth = ((np.arange(width, 0, -1) - 0.5) / width * 2 - 1) * np.pi - mount_rad
+        inclination = beams[::-1, None]  # the first row is the highest beam
+        x = np.cos(azimuth) * np.cos(inclination)
+        y = np.sin(azimuth) * np.cos(inclination)
+        return np.stack([x, y, np.broadcast_to(np.sin(inclination), x.shape)], axis=2)
 
 
 class Image(NamedTuple):
@@ -146,7 +151,10 @@ def read_boxes(segment: Segment) -> dict[int, Boxes]:
 
 
 def read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]:
-    """Return times and poses of images by camera name and frame number; ``starts_us`` is (n,)."""
+    """Return times and poses of images by camera name and frame number.
+
+    ``starts_us`` has the (n,) ``frame_timestamp_micros`` of the frames.
+    """
     keys = ("shutter", "camera_trigger_time", "camera_readout_done_time")
     seconds = ("pose_timestamp", *(f"rolling_shutter_params.{key}" for key in keys))
     kinds = {STAMP: "i", CAMERA: "i", "pose.transform": "l", **dict.fromkeys(seconds, "n")}
@@ -248,7 +256,10 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the vehicle's frame; None if not annotated (test split)."""
+        """Return a sweep's boxes in the vehicle's frame.
+
+        None without a file of boxes (test split), or if the file has no boxes of this sweep.
+        """
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))
 
@@ -275,6 +286,7 @@ class Waymo(FileSequence):
             intensity.append(np.tanh(image[..., 1].ravel()))
             offset_ns.append(self._offset_ns(frame, number, image.shape).ravel())
             lidar.append(np.full(len(in_vehicle), number - 1, np.uint8))
+        # Lidars without a calibration keep the identity.
         T = np.tile(np.eye(4), (len(LASERS), 1, 1))
         for number, laser in self._lasers.items():
             T[number - 1] = laser.T_vehicle_laser

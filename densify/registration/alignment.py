@@ -15,9 +15,13 @@ import small_gicp
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 
-MANY_POINTS, FEW_POINTS = 30_000, 15_000  # of a sweep that makes a surface, and that is aligned
-_GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are even for any order of the rings
-_VOXEL_M, _LEAF_M, _NUM_NEIGHBORS = 0.5, 1.0, 10
+MANY_POINTS = 30_000  # points of a sweep that makes a surface
+FEW_POINTS = 15_000  # points of a sweep that is aligned
+# The multiples of the golden ratio, modulo 1, are spread evenly for any order of the rings.
+_GOLDEN = 0.6180339887498949
+_VOXEL_M = 0.5  # voxel in which a surface keeps one point
+_LEAF_M = 1.0  # voxel of a map
+_NUM_NEIGHBORS = 10  # neighbours that give a normal
 _NORMAL_M = 0.0447  # standard deviation of two surfaces along the normal in generalized ICP
 
 
@@ -51,11 +55,12 @@ class Surface(NamedTuple):
 
     @staticmethod
     def joined(surfaces: Sequence[Surface], T_joined_surface: Float) -> Surface:
-        """Return the surface of n surfaces, each with its pose (n,4,4) in the joint frame."""
-        posed = zip(T_joined_surface, surfaces, strict=True)
-        return Surface.of(
-            np.concatenate([poses.transform(T, s.points.points()[:, :3]) for T, s in posed])
-        )
+        """Return the union of n surfaces, each with its pose (n,4,4) in the common frame."""
+        clouds = [
+            poses.transform(T, surface.points.points()[:, :3])  # without the homogeneous column
+            for T, surface in zip(T_joined_surface, surfaces, strict=True)
+        ]
+        return Surface.of(np.concatenate(clouds))
 
 
 class Alignment(NamedTuple):
@@ -63,8 +68,8 @@ class Alignment(NamedTuple):
 
     T_target_source: Float  # (4,4) pose of the source in the target's frame
     overlap: float  # share of the source's points with a match in the target
-    # (6,6) matrix for a small motion x (rad, m) of the source in its own frame. ``x @ information @
-    # x`` is the mean square distance in m² by which x moves the source off the target's surface.
+    # (6,6) matrix of a quadratic form. For a small motion x (rad, m) of the source in its own
+    # frame, ``x @ information @ x`` is the mean square distance (m²) of the source from the target.
     information: Float
 
 
@@ -83,7 +88,9 @@ def make_map() -> Any:
 
 
 def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> Alignment:
-    """Align a source with a target, by generalized ICP or point to plane.
+    """Align a source with a target, and return the alignment.
+
+    A source `Surface` is aligned by generalized ICP, other points are aligned point to plane.
 
     Args:
         target: A `Surface`, or a map (`make_map`) of surfaces.
@@ -99,6 +106,9 @@ def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> A
         fit = small_gicp.align(target.points, points, target.tree, T_target_source, kind, **options)
     else:
         fit = small_gicp.align(target, points, T_target_source, **options)
-    num, scale_m2 = max(int(fit.num_inliers), 1), _NORMAL_M**2 if is_surface else 1.0
+    # H is a sum over matches, and generalized ICP divides its distances by the deviation.
+    num_matches = max(int(fit.num_inliers), 1)
+    scale_m2 = _NORMAL_M**2 if is_surface else 1.0
+    information = np.asarray(fit.H) * scale_m2 / num_matches
     overlap = fit.num_inliers / max(int(points.size()), 1)
-    return Alignment(np.asarray(fit.T_target_source), overlap, np.asarray(fit.H) * scale_m2 / num)
+    return Alignment(np.asarray(fit.T_target_source), overlap, information)

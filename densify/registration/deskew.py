@@ -21,6 +21,10 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
 
     Points before the reference time move with the velocity from the previous sweep, points after it
     with the velocity to the next sweep. A sweep without point times keeps its points.
+
+    Args:
+        sweeps: Raw sweeps, ascending in time.
+        trajectory: Poses of at least these sweeps.
     """
     registered = []
     for sweep in sweeps:
@@ -34,7 +38,11 @@ def deskew_sweep(
 ) -> RegisteredSweep:
     """Return a deskewed copy of the sweep with its (4,4) pose at the reference time.
 
-    The twists (6,) are the lidar's velocities (rad/s, m/s, lidar frame) before and after that time.
+    Args:
+        sweep: The raw sweep.
+        T_world_lidar: (4,4) its pose.
+        twist_before: (6,) velocity of the lidar before that time, rad/s, m/s, lidar frame.
+        twist_after: (6,) velocity of the lidar after that time.
     """
     points: Float = sweep.points
     if sweep.offset_ns is not None:
@@ -53,30 +61,31 @@ def deskew_points(sweep: Sweep, twist: Float) -> Float:
 def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
     """Return the (6,) velocities (rad/s, m/s) before and after sweep i, in its lidar frame.
 
-    At the first and last sweep both are equal.
+    At the first and last sweep both are equal. For a single sweep both are 0.
     """
     last = len(trajectory.frames) - 1
     if last == 0:
         return np.zeros(6), np.zeros(6)
     T = trajectory.T_world_lidar
 
-    def toward(j: int) -> Float:
-        seconds = (trajectory.stamp_ns[j] - trajectory.stamp_ns[i]) * 1e-9
-        return poses.twist_between(T[i], T[j], seconds)
+    def twist_with(neighbour: int) -> Float:
+        seconds = (trajectory.stamp_ns[neighbour] - trajectory.stamp_ns[i]) * 1e-9
+        return poses.twist_between(T[i], T[neighbour], seconds)
 
-    return toward(i - 1 if i > 0 else 1), toward(i + 1 if i < last else i - 1)
+    return twist_with(i - 1 if i > 0 else 1), twist_with(i + 1 if i < last else i - 1)
 
 
-LEAST_SHARPNESS = 4.0  # of a scanner with distinct rings
+LEAST_SHARPNESS = 4.0  # least sharpness of a scanner with distinct rings
 CLEARLY = 1.25  # least ratio of two sharpnesses that counts as a difference
 LEAST_SPEED_M_S = 1.5  # slower motion does not smear the rings
 COMPENSATED_M = 25.0  # range within which motion during the sweep is visible
 # The HDL-64E of KITTI has two separate blocks of lasers; its rings are sharpest from 0.2 m above.
 _HEIGHTS_M = np.linspace(-0.3, 0.3, 13)
-_NEAR_M = 3.0
-_NUM_POINTS = 20_000
-_WINDOW_CELLS, _LEAST_SHARE = 100, 0.01
-_BIN_RAD = np.deg2rad(0.02)
+_NEAR_M = 3.0  # nearer returns may be of the vehicle
+_NUM_POINTS = 20_000  # greatest number of tested returns
+_WINDOW_CELLS = 100  # cells of a window of elevation
+_LEAST_SHARE = 0.01  # least share of all returns in a window that counts
+_BIN_RAD = np.deg2rad(0.02)  # height of the smallest cell
 
 
 class Rings(NamedTuple):
@@ -101,22 +110,29 @@ class Rings(NamedTuple):
 def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
     """Return how sharply points are concentrated in rings, as seen from an origin; 1 if not at all.
 
-    It is the chance that two returns of a window of elevation share a cell of ``bins`` times 0.02
-    degrees, relative to an even spread. The median over the windows keeps flat ground, which all
-    falls into one window, from dominating. Points (N,3) and ``origin_m`` (3,), the assumed position
-    of the scanner, are in axes with z along the spin axis.
+    Elevations are divided into cells, and cells into windows. Sharpness is the chance that two
+    returns of a window share a cell, relative to an even spread. The median over the windows keeps
+    flat ground, which all falls into one window, from dominating.
+
+    Args:
+        points: (N,3) metres, in axes with z along the spin axis.
+        origin_m: (3,) assumed position of the scanner, in the same axes.
+        bins: Height of a cell, in multiples of 0.02 degrees.
     """
     x, y, z = (points - origin_m).T
     elevation = np.arctan2(z, np.hypot(x, y))
     cell = ((elevation + 0.5 * np.pi) / (bins * _BIN_RAD)).astype(np.int64)
     width = max(8, _WINDOW_CELLS // bins)
-    windows = -(-int(np.pi / (bins * _BIN_RAD) + 1) // width)
-    count = np.bincount(cell, minlength=windows * width).astype(np.float64).reshape(windows, width)
+    num_cells = int(np.pi / (bins * _BIN_RAD) + 1)
+    num_windows = -(-num_cells // width)  # rounded up
+    count = np.bincount(cell, minlength=num_windows * width).astype(np.float64)
+    count = count.reshape(num_windows, width)
     total = count.sum(axis=1)
     dense = total > _LEAST_SHARE * len(points)
     if not dense.any():
         return 1.0
-    return float(np.median((count[dense] ** 2).sum(axis=1) / total[dense] ** 2) * width)
+    chance = (count[dense] ** 2).sum(axis=1) / total[dense] ** 2
+    return float(np.median(chance) * width)
 
 
 def rings_by_motion(
@@ -132,10 +148,10 @@ def rings_by_motion(
         origins_m: Positions (3,) of the scanner to try, in its axes; the sharpest counts.
     """
 
-    def sharpest(moved: Float) -> float:
+    def find_sharpest(moved: Float) -> float:
         return max(sharpness(moved @ R.T, origin_m) for origin_m in origins_m)
 
-    def carried(since_s: Float) -> Float:
+    def move(since_s: Float) -> Float:
         return poses.transform_each(since_s[:, None] * twist, points)
 
     # The time to which the points were compensated is unknown.
@@ -144,13 +160,20 @@ def rings_by_motion(
         "its first point": float(offset_s.min()),
         "its last point": float(offset_s.max()),
     }
-    undone_to = {name: sharpest(carried(at_s - offset_s)) for name, at_s in moments_s.items()}
-    moment = max(undone_to, key=lambda name: undone_to[name])
-    return Rings(sharpest(points), undone_to[moment], sharpest(carried(offset_s)), moment)
+    sharpness_undone = {
+        moment: find_sharpest(move(moment_s - offset_s)) for moment, moment_s in moments_s.items()
+    }
+    sharpest_moment = max(sharpness_undone, key=lambda moment: sharpness_undone[moment])
+    return Rings(
+        as_stored=find_sharpest(points),
+        undone=sharpness_undone[sharpest_moment],
+        done=find_sharpest(move(offset_s)),
+        moment=sharpest_moment,
+    )
 
 
 def sample_rows(sweep: Sweep, far_m: float) -> Int:
-    """Return the rows of at most 20,000 returns of a sweep between 3 m and ``far_m`` away."""
+    """Return the rows of at most 20,000 returns of a sweep, from 3 m to ``far_m`` away."""
     range_m = np.linalg.norm(sweep.points, axis=1)
     rows = np.flatnonzero((range_m > _NEAR_M) & (range_m < far_m))
     return rows[:: len(rows) // _NUM_POINTS + 1]
@@ -168,14 +191,19 @@ def turning_s(points: Float, period_s: float) -> Float:
 def find_compensated(sweep: Sweep, twist: Float, period_s: float) -> Rings | None:
     """Return the rings of a raw sweep that is compensated for motion already, else None.
 
-    ``twist`` (6,) is the lidar's velocity (rad/s, m/s), lidar frame. ``period_s`` is the time of
-    one revolution, used for sweeps without point times.
+    None is also returned if the vehicle is too slow, or if no scanner has distinct rings.
+
+    Args:
+        sweep: The raw sweep.
+        twist: (6,) velocity of the lidar (rad/s, m/s), lidar frame.
+        period_s: Time of one revolution, used for sweeps without point times.
     """
     if np.linalg.norm(twist[3:]) < LEAST_SPEED_M_S:
         return None
     for lidar in np.unique(sweep.lidar).tolist():
         returns = sweep.select(sweep.lidar == lidar)
-        rows, R = sample_rows(returns, COMPENSATED_M), returns.axes(lidar)
+        rows = sample_rows(returns, COMPENSATED_M)
+        R = returns.axes(lidar)
         if not len(rows):
             continue
         if returns.offset_ns is None:

@@ -27,21 +27,23 @@ from densify.registration.odometry import (
 )
 
 MIN_OVERLAP = 0.55
-"""Least share of a sweep's points above the ground that overlap the sweeps of the third of a second
-before. Correct poses gave 0.73 (16 beams, 25 m/s) to 0.98, false poses of a rosette 0.42."""
+"""Least share of a sweep's points above the ground that overlap the preceding third of a second.
+
+Correct poses gave 0.73 (16 beams, 25 m/s) to 0.98, false poses of a rosette 0.42.
+"""
 MIN_NUM_POINTS = 1000  # a sweep with fewer cannot be registered
 _MAX_ACCELERATION_M_S2 = 30.0  # three times the grip of tyres, for noise of the stamps
-_POSE_NOISE_M = 0.5
+_POSE_NOISE_M = 0.5  # error of a pose that is not yet a jump
 _MAX_TURN_RATE_DEG_S = 150.0
-_OVERLAP_POINTS = 2000
-_OVERLAP_M = 0.5
+_OVERLAP_POINTS = 2000  # number of tested points of a sweep
+_OVERLAP_M = 0.5  # distance up to which points overlap
 
 
 class LeftOut(NamedTuple):
     """The reason why a sweep is not used."""
 
     reason: str  # sentence for the user
-    unreadable: bool  # true if the sweep could not be read, False if it could not be registered
+    unreadable: bool  # True if the sweep could not be read, False if it could not be registered
     # True if the sweep's own content prevents registration, as with too few points
     unfit: bool = False
 
@@ -65,22 +67,33 @@ class Registration:
 def find_trajectory(
     sweeps: Sequence[Sweep], settings: RegisterSettings, recorded: Trajectory | None = None
 ) -> Trajectory:
-    """Return the poses of raw sweeps: the recorded ones after a check, or registered ones.
+    """Return the poses of raw sweeps: the recorded poses after a check, or registered ones.
 
-    Each sweep is aligned with the surfaces of earlier sweeps. KISS-ICP predicts the motion of dense
-    sweeps. Implausible poses raise SweepError, whose message names the frame.
+    Each sweep is registered with the surfaces of earlier sweeps. KISS-ICP predicts the motion of
+    dense sweeps.
+
+    Args:
+        sweeps: Raw sweeps, ascending in time.
+        recorded: Recorded poses of these sweeps, None to register them.
+
+    Raises:
+        UnfitSweepError: The stamps do not ascend, or a sweep has too few points to be registered.
+        UnplacedSweepError: A pose is implausible. The message names the frame.
     """
-    frames = tuple(s.frame for s in sweeps)
-    stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
+    frames = tuple(sweep.frame for sweep in sweeps)
+    stamp_ns = np.array([sweep.stamp_ns for sweep in sweeps], np.int64)
     _check_stamps(frames, stamp_ns)
     if recorded is not None:
         check_plausible(recorded, settings)
-        in_world = zip(recorded.T_world_lidar, sweeps, strict=True)
-        check_overlap([poses.transform(T, s.points) for T, s in in_world], recorded, settings)
+        points = [
+            poses.transform(T, sweep.points)
+            for T, sweep in zip(recorded.T_world_lidar, sweeps, strict=True)
+        ]
+        check_overlap(points, recorded, settings)
         return replace(recorded, R_level_lidar=find_upright(sweeps))
     _check_number_of_points(sweeps, settings)
-    # Fewer points would be matched with the scan pattern.
-    is_dense = len(sweeps) > 1 and np.median([len(s) for s in sweeps]) >= MANY_POINTS
+    # KISS-ICP would match sparse sweeps with the scan pattern.
+    is_dense = len(sweeps) > 1 and np.median([len(sweep) for sweep in sweeps]) >= MANY_POINTS
     twists = find_odometry(sweeps, settings) if is_dense else None
     T_world_lidar, points = register_on_surfaces(sweeps, twists)
     trajectory = Trajectory(frames, stamp_ns, T_world_lidar, R_level_lidar=find_upright(sweeps))
@@ -104,37 +117,43 @@ def _check_number_of_points(sweeps: Sequence[Sweep], settings: RegisterSettings)
 
 def _check_stamps(frames: Sequence[int], stamp_ns: Int) -> None:
     """Raise UnfitSweepError where the stamps do not ascend."""
-    for (a, b), step_ns in zip(pairwise(frames), np.diff(stamp_ns), strict=True):
+    for (previous, frame), step_ns in zip(pairwise(frames), np.diff(stamp_ns), strict=True):
         if step_ns <= 0:
             difference = f"{1e-6 * -step_ns:.1f} ms before it" if step_ns else "the same"
             raise UnfitSweepError(
-                f"registration: the stamp of frame {b} is not after that of frame {a}, but "
-                f"{difference}; expected ascending stamps; check the recording's timestamps",
-                b,
+                f"registration: the stamp of frame {frame} is not after that of frame {previous}, "
+                f"but {difference}; expected ascending stamps; check the recording's timestamps",
+                frame,
             )
 
 
 def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
     """Raise UnplacedSweepError if the trajectory has a motion that no vehicle can make."""
-    T, before = trajectory.T_world_lidar, None
+    T = trajectory.T_world_lidar
     if not np.isfinite(T).all():
-        bad = trajectory.frames[int(np.argmin(np.isfinite(T).all((1, 2))))]
-        raise UnplacedSweepError(f"registration: the pose of frame {bad} is not finite", bad)
-    for i, (a, b) in enumerate(pairwise(trajectory.frames), 1):
+        frame = trajectory.frames[int(np.argmin(np.isfinite(T).all((1, 2))))]
+        raise UnplacedSweepError(f"registration: the pose of frame {frame} is not finite", frame)
+    previous_twist = None
+    for i, (previous_frame, frame) in enumerate(pairwise(trajectory.frames), 1):
         twist = poses.twist_to(T, trajectory.stamp_ns, i)
         step_s = float(trajectory.stamp_ns[i] - trajectory.stamp_ns[i - 1]) * 1e-9
-        jump = find_jump(twist, before, step_s)
+        jump = find_jump(twist, previous_twist, step_s)
         if jump:
             raise UnplacedSweepError(
-                f"registration jumps from frame {a} to {b}: {jump}; {_advice(settings)}", b
+                f"registration jumps from frame {previous_frame} to {frame}: {jump}; "
+                f"{_advice(settings)}",
+                frame,
             )
-        before = twist
+        previous_twist = twist
 
 
-def find_jump(twist: Float, before: Float | None, step_s: float) -> str:
-    """Return why a vehicle cannot move at ``twist`` (6,) (rad/s, m/s) for ``step_s``; "" if it can.
+def find_jump(twist: Float, previous_twist: Float | None, step_s: float) -> str:
+    """Return, in words, why no vehicle can move as given; "" if it can.
 
-    ``before`` (6,) is the velocity of the previous step, None if unknown.
+    Args:
+        twist: (6,) velocity of the step (rad/s, m/s).
+        previous_twist: (6,) velocity of the previous step, None if unknown.
+        step_s: Duration of the step.
     """
     slack_m_s = _POSE_NOISE_M / step_s
     speed_m_s, turn_deg_s = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))
@@ -143,7 +162,9 @@ def find_jump(twist: Float, before: Float | None, step_s: float) -> str:
             f"{speed_m_s:.0f} m/s and {turn_deg_s:.0f} deg/s, expected at most "
             f"{MAX_SPEED_M_S:g} m/s and {_MAX_TURN_RATE_DEG_S:.0f} deg/s"
         )
-    change_m_s = 0.0 if before is None else np.linalg.norm(twist[3:] - before[3:])
+    change_m_s = 0.0
+    if previous_twist is not None:
+        change_m_s = float(np.linalg.norm(twist[3:] - previous_twist[3:]))
     if change_m_s > _MAX_ACCELERATION_M_S2 * step_s + slack_m_s:
         return (
             f"the speed changes by {change_m_s:.1f} m/s within {step_s:.2f} s, expected a vehicle's"
@@ -154,23 +175,23 @@ def find_jump(twist: Float, before: Float | None, step_s: float) -> str:
 def check_overlap(
     points: Sequence[Float], trajectory: Trajectory, settings: RegisterSettings
 ) -> None:
-    """Raise UnplacedSweepError if a sweep overlaps too little with the third of a second before it.
+    """Raise UnplacedSweepError if a sweep overlaps too little with the preceding third of a second.
 
     Odometry can continue at constant velocity over sweeps of another place. One earlier sweep is
-    not enough for a scan pattern that does not repeat. Near the start, the following third of a
-    second is tested too. Very sparse sweeps pass. ``points`` are (N,3) of each sweep, world.
+    not enough for a scan pattern that does not repeat. Very sparse sweeps pass.
+
+    Args:
+        points: (N,3) of each sweep, deskewed, metres, world.
+        trajectory: Poses of these sweeps.
     """
     frames, stamp_ns = trajectory.frames, trajectory.stamp_ns
-    above = [above_ground(p) for p in points]
-    trees = [tree_of(p) for p in above]
+    points_above = [above_ground(sweep_points) for sweep_points in points]
+    trees = [tree_of(sweep_points) for sweep_points in points_above]
     for i in range(1, len(points)):
         first = min(int(np.searchsorted(stamp_ns, stamp_ns[i] - FRESH_NS)), i - 1)
-        share = _share_on(above[i], trees[first:i])
+        share = _share_on(points_above[i], trees[first:i])
         if share < MIN_OVERLAP and stamp_ns[i] - stamp_ns[0] < FRESH_NS:
-            end = int(np.searchsorted(stamp_ns, stamp_ns[i] + FRESH_NS))
-            trees_around = trees[first:i] + trees[i + 1 : end]
-            both_ways = _share_on(above[i], trees_around), _share_on(above[i - 1], trees[i:end])
-            share = max(share, min(both_ways))
+            share = max(share, _share_near_start(i, points_above, trees, stamp_ns))
         if share < MIN_OVERLAP:
             raise UnplacedSweepError(
                 f"registration fails from frame {frames[i - 1]} to {frames[i]}: only "
@@ -180,10 +201,23 @@ def check_overlap(
             )
 
 
+def _share_near_start(
+    i: int, points_above: Sequence[Float], trees: Sequence[cKDTree], stamp_ns: Int
+) -> float:
+    """Return the share of matched points at the step to sweep i, with the later sweeps' points."""
+    # Few sweeps precede sweep i, hence those of the following third of a second count too. They
+    # must also hold the points of the sweep before i: otherwise all sweeps from i on could be of
+    # another place, and match each other.
+    end = int(np.searchsorted(stamp_ns, stamp_ns[i] + FRESH_NS))
+    share = _share_on(points_above[i], [*trees[:i], *trees[i + 1 : end]])
+    previous_share = _share_on(points_above[i - 1], trees[i:end])
+    return min(share, previous_share)
+
+
 def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
     """Return the share of (N,3) points within 0.5 m of any tree's points; 1 for few points."""
     if min(len(points), sum(tree.n for tree in trees)) < _OVERLAP_POINTS // 10:
-        return 1.0
+        return 1.0  # too few points to tell
     unmatched = points[:: len(points) // _OVERLAP_POINTS + 1]
     num = len(unmatched)
     for tree in trees:
@@ -193,6 +227,7 @@ def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
 
 
 def _advice(settings: RegisterSettings) -> str:
+    """Return what the user can do about implausible poses."""
     alternative = "kiss-icp" if settings.source == "dataset" else "dataset"
     return (
         f"choose another key or a smaller window, or other poses (register.source={alternative}); "

@@ -17,14 +17,14 @@ _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
 def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
     """Return (M,) True for ghosts, and (M,) True for points that the key sweep cannot judge.
 
-    A ghost is a point of another sweep at a position that the key sweep saw through. All returns of
-    the key sweep in its direction and the eight around, at least six, are farther by more than
-    max(0.5 m, 2 % of its range). Dark paint and glass give no return and hide ghosts.
+    A ghost is a point of another sweep at a position that the key sweep saw through: all returns of
+    the key sweep in the point's cell and the eight cells around it, at least six, are farther by
+    more than max(0.5 m, 2 % of its range). Dark paint and glass give no return and hide ghosts.
     """
     ghost, unjudged = np.zeros((2, len(cloud)), bool)
     rows = np.flatnonzero(_others(cloud, key))
     margins_m = (_GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION)
-    beyond = key_image.num_beyond(
+    beyond = key_image.count_beyond(
         cloud.points[rows], margins_m, _MIN_FILLED, cloud.velocity_m_s[rows]
     )
     ghost[rows] = (beyond >= _MIN_FILLED).any(axis=0)
@@ -33,7 +33,7 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
 
 
 def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
-    """Return the share of `ghosts` among the points of other sweeps of the window."""
+    """Return the share of `ghosts` among the points of the window's other sweeps, None for none."""
     return _mean(ghosts(cloud, key_image, key)[0][_others(cloud, key)])
 
 
@@ -76,4 +76,5 @@ def _rates(ghost: Bool, group: NDArray[np.integer]) -> dict[int, float]:
 
 
 def _mean(values: np.ndarray) -> float | None:
+    """Return the mean, None for no values."""
     return float(np.mean(values)) if len(values) else None

@@ -63,27 +63,35 @@ def depth_errors(
 ) -> DepthErrors:
     """Return the errors of depths over the pixels with ground truth.
 
-    Depths are camera z in metres, 0 none. All arrays are (H,W) maps or (N,) lists of pixels,
-    ``mask`` True at the pixels that count. A depth z is an outlier if its disparity focal_px (fx) ·
-    baseline_m / z is off by more than 3 px *and* by more than 5 % of the true disparity.
+    A depth z is an outlier if its disparity ``focal_px * baseline_m / z`` differs by more than 3 px
+    *and* by more than 5 % from the true disparity.
+
+    Args:
+        predicted_m: (H,W) map or (N,) list of depths, camera z in metres, 0 for none.
+        truth_m: True depths of the same shape.
+        mask: True at the pixels that count, None for all.
+        focal_px: Focal length fx.
+        baseline_m: Stereo baseline.
     """
-    known = truth_m > 0 if mask is None else (truth_m > 0) & mask
-    compared = known & (predicted_m > 0)
-    num_pixels, num_compared = int(known.sum()), int(compared.sum())
-    z, t = predicted_m[compared].astype(float), truth_m[compared].astype(float)
-    off_m = np.abs(z - t)
-    off_per_km = np.abs(1000 / z - 1000 / t)
+    has_truth = truth_m > 0 if mask is None else (truth_m > 0) & mask
+    is_compared = has_truth & (predicted_m > 0)
+    num_pixels = int(has_truth.sum())
+    num_compared = int(is_compared.sum())
+    z = predicted_m[is_compared].astype(float)
+    t = truth_m[is_compared].astype(float)
+    error_m = np.abs(z - t)
+    error_per_km = np.abs(1000 / z - 1000 / t)
     ratio = np.maximum(z / t, t / z)
     return DepthErrors(
         num_pixels=num_pixels,
         num_compared=num_compared,
         coverage=num_compared / num_pixels if num_pixels else None,
-        mae_m=_mean(off_m),
-        rmse_m=_root_mean_square(off_m),
-        imae_per_km=_mean(off_per_km),
-        irmse_per_km=_root_mean_square(off_per_km),
-        abs_rel=_mean(off_m / t),
-        sq_rel=_mean((off_m / t) ** 2),
+        mae_m=_mean(error_m),
+        rmse_m=_root_mean_square(error_m),
+        imae_per_km=_mean(error_per_km),
+        irmse_per_km=_root_mean_square(error_per_km),
+        abs_rel=_mean(error_m / t),
+        sq_rel=_mean((error_m / t) ** 2),
         delta_1=_mean(ratio < _DELTA),
         delta_2=_mean(ratio < _DELTA**2),
         delta_3=_mean(ratio < _DELTA**3),
@@ -97,21 +105,26 @@ def precision_density(
 ) -> list[dict[str, float | None]]:
     """Return density and share of outliers for each least confidence 0, 0.05, … 0.95.
 
-    For ``measured`` and ``filled`` depth, ``density_*`` is the share of pixels that keep a depth,
-    ``outliers_*`` that of outliers among those with a true depth (H,W), metres, 0 none, and
-    ``expected_*`` the share that the confidence of kept pixels promises.
+    Args:
+        truth_m: (H,W) true depth in metres, 0 for none.
+
+    Returns:
+        For each least confidence ``min_confidence``, and for ``measured`` and ``filled`` depth:
+            ``density_*``, share of the pixels that keep a depth; ``outliers_*``, share of outliers
+            among those with a true depth, None for none; ``expected_*``, share of outliers that the
+            confidence of the kept pixels promises.
     """
     curve = []
     for min_confidence in _LEAST_CONFIDENCES:
-        kept = maps.confidence >= min_confidence
+        is_kept = maps.confidence >= min_confidence
         point: dict[str, float | None] = {"min_confidence": min_confidence}
         for name, depth_m in (("measured", maps.depth_m), ("filled", maps.filled_m)):
-            predicted_m = np.where(kept, depth_m, np.float32(0))
+            predicted_m = np.where(is_kept, depth_m, np.float32(0))
             errors = depth_errors(predicted_m, truth_m, focal_px=camera.focal_px)
             point[f"density_{name}"] = image_density(predicted_m)
             point[f"outliers_{name}"] = errors.outliers
-            of_kept = maps.confidence[predicted_m > 0]
-            point[f"expected_{name}"] = _mean(outlier_probability(of_kept))
+            kept_confidence = maps.confidence[predicted_m > 0]
+            point[f"expected_{name}"] = _mean(outlier_probability(kept_confidence))
         curve.append(point)
     return curve
 
@@ -125,6 +138,8 @@ def errors_by_part(
     baseline_m: float = KITTI_BASELINE_M,
 ) -> dict[str, DepthErrors]:
     """Return `depth_errors` of parts of the pixels (H,W), by name of the part.
+
+    The arguments are as in `depth_errors`; ``moving`` is True at pixels of moving objects.
 
     The parts are ``all`` pixels, ranges of true depth (``0-10 m`` … ``over 80 m``), `depth_edges`
     (``edge``), other pixels (``not edge``) and, given a mask, ``moving`` and ``static`` pixels.
@@ -146,10 +161,15 @@ def errors_by_part(
 
 
 def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_BASELINE_M) -> Bool:
-    """Return (H,W) True at pixels of the true depth (m, 0 none) close to a depth discontinuity.
+    """Return (H,W) True at pixels with a true depth close to a depth discontinuity.
 
-    Within 3 px of such a pixel there is a true depth that would be an outlier here. Level ground is
-    no discontinuity: for a camera 1.65 m above it, disparity grows by 0.54/1.65 px per row.
+    Within 3 px of such a pixel, another true depth would be an outlier at this pixel. Level ground
+    is no discontinuity: for a camera 1.65 m above it, disparity grows by 0.54/1.65 px per row.
+
+    Args:
+        truth_m: (H,W) true depth in metres, 0 for none.
+        focal_px: Focal length, which gives disparity with the baseline.
+        baseline_m: Stereo baseline.
     """
     known = truth_m > 0
     disparity_px = np.zeros(truth_m.shape)
@@ -203,8 +223,8 @@ def scores_by_motion(
 def outlier_probability(confidence: Float | Float32) -> Float:
     """Return the probability that a pixel is an outlier by KITTI's rule.
 
-    It is ``10 ** (-5 * confidence)``. Of a confidence PNG with pixel values v above 0, the
-    confidence is ``(v - 1) / 254``.
+    It is ``10 ** (-5 * confidence)``. A pixel value v above 0 of a confidence PNG means the
+    confidence ``(v - 1) / 254``.
 
     Args:
         confidence: Confidence of 0 to 1, of any shape.
@@ -229,14 +249,17 @@ def is_outlier_depth(
 
 
 def _is_outlier(disparity_px: Float, true_px: Float) -> Bool:
-    off_px = np.abs(disparity_px - true_px)
-    outlier: Bool = (off_px > OUTLIER_PX) & (off_px > OUTLIER_FRACTION * true_px)
+    """Return (N,) True where a disparity is an outlier by KITTI's rule."""
+    error_px = np.abs(disparity_px - true_px)
+    outlier: Bool = (error_px > OUTLIER_PX) & (error_px > OUTLIER_FRACTION * true_px)
     return outlier
 
 
 def _mean(values: np.ndarray) -> float | None:
+    """Return the mean, None for no values."""
     return float(np.mean(values)) if len(values) else None
 
 
 def _root_mean_square(values: Float) -> float | None:
+    """Return the root mean square, None for no values."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else None

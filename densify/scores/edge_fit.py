@@ -22,18 +22,20 @@ from densify.geometry import poses
 from densify.geometry.cameras import image_points
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep
 
-_NEAREST_M, _FARTHEST_M, _MOST_RANGE_M = 3.0, 50.0, 100.0  # of both surfaces, and of the far one
-_EDGE_M, _EDGE_SHARE = 0.6, 0.08
+_NEAREST_M, _MOST_RANGE_M = 3.0, 100.0  # least and greatest range of both surfaces at an edge
+_FARTHEST_M = 50.0  # greatest range of the near surface
+_EDGE_M, _EDGE_SHARE = 0.6, 0.08  # least step of range at an edge, in metres and as a share
 _ROW_RAD = np.deg2rad(0.1)  # finer than any scanner's rings
 _APART_RAD = np.deg2rad(1.5)  # greatest angle between neighbouring returns at an edge
 _FOCAL_PX = 700.0  # focal length to which images are resized
-_NOISE_PX, _BLUR_PX, _AROUND_PX = 0.8, 2.0, 25.0
+_NOISE_PX, _BLUR_PX, _AROUND_PX = 0.8, 2.0, 25.0  # blurs: of noise, of edges, of their surroundings
 _MOST_STRENGTH = 4.0
-_REACH, _STEP = (2.7, 2.7, 2.0, 0.2), (0.3, 0.3, 1.0, 0.05)  # degrees and seconds of the grid
+# Half extent and step of the grid of offsets: degrees (pitch, yaw, roll) and seconds
+_REACH, _STEP = (2.7, 2.7, 2.0, 0.2), (0.3, 0.3, 1.0, 0.05)
 _BLURRED = np.array([0.15, 0.15, 0.3, 0.015])  # an offset that moves edges by the blur
 _NUM_ON_GRID, _NUM_STARTS, _NUM_HALVINGS = 4000, 4, 4
-_CLEARLY = 2.0  # standard errors
-_AS_HIGH = 0.8  # of the height of the best score above the median
+_CLEARLY = 2.0  # standard errors by which a clearly better score exceeds another
+_AS_HIGH = 0.8  # share of the best score's height above the median, for scores of similar height
 
 
 class Silhouettes(NamedTuple):
@@ -96,33 +98,45 @@ def depth_edges(points: Float) -> Silhouettes:
     """
     x, y, z = points.T
     range_m = np.linalg.norm(points, axis=1)
-    azimuth, elevation = np.arctan2(y, x), np.arcsin(z / range_m)
+    azimuth = np.arctan2(y, x)
+    elevation = np.arcsin(z / range_m)
     edge_points, is_level = [], []
-    step_rad = _ROW_RAD
-    for far_is_level, along, across in ((False, azimuth, elevation), (True, elevation, azimuth)):
-        line = np.floor(across / step_rad)
-        order = np.lexsort((along, line))
-        gap = np.diff(along[order])
-        joined = (np.diff(line[order]) == 0) & (gap < _APART_RAD)
-        row = 1 + np.flatnonzero(joined[:-1] & joined[1:])
-        before, at, after = order[row - 1], order[row], order[row + 1]
+    step_rad = _ROW_RAD  # width of a line
+    # Lines of equal elevation, then lines of equal azimuth
+    for far_is_level, position, line_rad in (
+        (False, azimuth, elevation),
+        (True, elevation, azimuth),
+    ):
+        # Triples of neighbouring returns on a line
+        line = np.floor(line_rad / step_rad)
+        order = np.lexsort((position, line))
+        gap = np.diff(position[order])
+        is_joined = (np.diff(line[order]) == 0) & (gap < _APART_RAD)
+        row = 1 + np.flatnonzero(is_joined[:-1] & is_joined[1:])
+        before, middle, after = order[row - 1], order[row], order[row + 1]
+
+        # The middle return is at an edge if it is nearer than the line through both neighbours.
         share = gap[row - 1] / np.maximum(gap[row - 1] + gap[row], 1e-12)
-        straight = (1 - share) / range_m[before] + share / range_m[after]
-        beside = np.where(range_m[before] > range_m[after], before, after)
-        deeper_m = np.maximum(_EDGE_M, _EDGE_SHARE * range_m[at])
-        is_edge = (range_m[beside] - range_m[at] > deeper_m) & (range_m[at] < _FARTHEST_M)
-        is_edge &= 1 - straight * range_m[at] > _EDGE_SHARE
-        at, beside = at[is_edge], beside[is_edge]
-        ray = points[at] / range_m[at, None] + points[beside] / range_m[beside, None]
-        edge_points.append(ray * (range_m[at] / np.linalg.norm(ray, axis=1))[:, None])
-        is_level.append(np.full(len(at), far_is_level))
-        if joined.any():
-            step_rad = max(step_rad, float(np.median(gap[joined])))
+        straight_inverse = (1 - share) / range_m[before] + share / range_m[after]
+        far = np.where(range_m[before] > range_m[after], before, after)
+        deeper_m = np.maximum(_EDGE_M, _EDGE_SHARE * range_m[middle])
+        is_edge = (range_m[far] - range_m[middle] > deeper_m) & (range_m[middle] < _FARTHEST_M)
+        is_edge &= 1 - straight_inverse * range_m[middle] > _EDGE_SHARE
+        near, far = middle[is_edge], far[is_edge]
+        ray = points[near] / range_m[near, None] + points[far] / range_m[far, None]
+        edge_points.append(ray * (range_m[near] / np.linalg.norm(ray, axis=1))[:, None])
+        is_level.append(np.full(len(near), far_is_level))
+        # The columns of a sparse scanner are as wide as the gaps within its rings.
+        if is_joined.any():
+            step_rad = max(step_rad, float(np.median(gap[is_joined])))
     return Silhouettes(np.concatenate(edge_points), np.concatenate(is_level))
 
 
 def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, float]:
-    """Return `View.strength` and `View.scale` of an (H,W,3) RGB image."""
+    """Return `View.strength` and `View.scale` of an (H,W,3) RGB image.
+
+    ``focal_px`` is the focal length of the image.
+    """
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     scale = _FOCAL_PX / focal_px
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -130,10 +144,12 @@ def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, flo
     smooth = cv2.GaussianBlur(resized, (0, 0), _NOISE_PX)
     edges = []
     for order in ((1, 0), (0, 1)):
-        change = np.abs(cv2.Sobel(smooth, cv2.CV_32F, *order))
-        around = cv2.GaussianBlur(change, (0, 0), _AROUND_PX) + _MOST_STRENGTH
-        change = cv2.GaussianBlur(np.minimum(change / around, _MOST_STRENGTH), (0, 0), _BLUR_PX)
-        edges.append(change - change.mean())
+        gradient = np.abs(cv2.Sobel(smooth, cv2.CV_32F, *order))
+        # Strength relative to the surroundings, limited and blurred
+        surroundings = cv2.GaussianBlur(gradient, (0, 0), _AROUND_PX) + _MOST_STRENGTH
+        strength = np.minimum(gradient / surroundings, _MOST_STRENGTH)
+        strength = cv2.GaussianBlur(strength, (0, 0), _BLUR_PX)
+        edges.append(strength - strength.mean())
     return np.stack(edges), smooth.shape[1] / image.shape[1]
 
 
@@ -150,48 +166,59 @@ def score(camera: Camera, views: Sequence[View]) -> tuple[float, int]:
 
 
 def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -> bool:
-    """Return True if an (H,W,3) RGB image clearly does not lie where the depth discontinuities are.
+    """Return True if an image is clearly turned against the depth discontinuities of a sweep.
 
-    ``camera`` has its pose at the exposure, ``silhouettes`` are of the sweep nearest in time. The
-    image is off if a turn of up to 2.7 degrees scores better than the best within 0.3 degrees, by
-    two standard errors of the sum of their differences at the discontinuities, and if that turn
-    stands out: the best of many turns is better by chance too where discontinuities are few.
+    It is if a turn of up to 2.7 degrees scores better than the best turn within 0.3 degrees, by two
+    standard errors of the sum of their differences at the discontinuities, and if that turn stands
+    out: where discontinuities are few, the best of many turns is better by chance too.
+
+    ``camera`` has its pose at the exposure of the (H,W,3) RGB image. ``silhouettes`` are of the
+    sweep nearest in time.
     """
     view = View(silhouettes, *image_edges(image, camera.focal_px), np.zeros(6), 0.0)
-    lines, turns = _Lines.of(camera, view, np.zeros(4)), _turns(np.zeros(1), np.zeros(1))
-    scores, is_small = lines.scores(turns), (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
+    lines = _Lines.of(camera, view, np.zeros(4))
+    turns = _turns(np.zeros(1), np.zeros(1))
+    scores = lines.scores(turns)
+    # Half a step beyond the first step of the grid: turns within 0.3 degrees
+    is_small = (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
     small, large = (turns[mask][np.argmax(scores[mask])] for mask in (is_small, ~is_small))
-    better = np.diff(lines.strengths(np.stack([small, large])), axis=0)
-    rival = scores[_is_beside(turns, large)].max()
+    gain = np.diff(lines.strengths(np.stack([small, large])), axis=0)
+    rival_score = scores[_is_beside(turns, large)].max()
     median = np.median(scores)
-    stands_out = rival - median < _AS_HIGH * (scores[~is_small].max() - median)
-    return bool(stands_out and better.sum() > _CLEARLY * np.sqrt((better**2).sum()))
+    stands_out = rival_score - median < _AS_HIGH * (scores[~is_small].max() - median)
+    return bool(stands_out and gain.sum() > _CLEARLY * np.sqrt((gain**2).sum()))
 
 
 def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
-    """Return the best fit of a camera to two or more views, with delay 0 unless ``with_clock``.
+    """Return the best-fitting offset of a camera to two or more views.
 
-    Of the local maxima that fit equally well, it is the one that changes the fewest parameters.
+    The delay is fitted only ``with_clock``, else it is 0. Among local maxima that fit equally well,
+    the one that changes the fewest parameters is chosen.
     """
     free = np.array([True, True, True, with_clock])
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
     grid = _turns(_steps(2), np.zeros(1))
     if with_clock:
         grid = np.concatenate([grid, _turns(np.zeros(1), _steps(3))])
+    # Scores on a grid of offsets, at every n-th discontinuity to save time
     thin = sum(len(line.uv) for line in lines) // _NUM_ON_GRID + 1
     on_grid = np.sum([line.scores(grid, thin) for line in lines], axis=0)
     usual = float(np.median(on_grid)) * thin
+
+    # The best of the local maxima near some starts, and the best score far from it
     starts = _starts(grid, on_grid, free)
-    best, rivals, are_equal = _simplest(
-        lines, [_climbed(lines, start, free) for start in starts], usual
-    )
-    beside = _is_beside(grid, best)
-    rival = grid[beside][np.argmax(on_grid[beside])]
+    maxima = [_climbed(lines, start, free) for start in starts]
+    best, others, are_equal = _simplest(lines, maxima, usual)
+    is_beside = _is_beside(grid, best)
+    rival = grid[is_beside][np.argmax(on_grid[is_beside])]
     rival_score = _sum(lines, rival)
+
+    # Projections are linear in the offset; they are linearised again at the best offset.
     lines = [_Lines.of(camera, view, best) for view in views]
-    more = _climbed(lines, np.zeros(4), free)
-    error, height = _error(lines, more, free), _sum(lines, more)
-    return Fit(best + more, error, height, rival_score, usual, rivals, are_equal)
+    correction = _climbed(lines, np.zeros(4), free)
+    error = _error(lines, correction, free)
+    best_score = _sum(lines, correction)
+    return Fit(best + correction, error, best_score, rival_score, usual, others, are_equal)
 
 
 def _starts(grid: Float, on_grid: Float, free: Bool) -> list[Float]:
@@ -237,6 +264,7 @@ def num_changed(offsets: Float) -> Any:
 
 
 def _steps(axis: int) -> Float:
+    """Return the values of a parameter on the grid; half a step keeps the last value."""
     return np.arange(-_REACH[axis], _REACH[axis] + _STEP[axis] / 2, _STEP[axis])
 
 
@@ -272,6 +300,7 @@ class _Lines(NamedTuple):
             ends = [project(sign * step * np.eye(4)[axis])[0] for sign in (1, -1)]
             slope[:, :, axis] = (ends[0] - ends[1]) / (2 * step)
         known = np.isfinite(slope).all(axis=(1, 2))
+        # The centre of the first pixel is at 0, so resizing shifts by half a pixel.
         return _Lines(
             (uv[known] + 0.5) * view.scale - 0.5,
             slope[known] * view.scale,
@@ -294,6 +323,7 @@ class _Lines(NamedTuple):
 
 
 def _sum(lines: Sequence[_Lines], offset: Float) -> float:
+    """Return the score of an offset (4,) over all views."""
     return float(sum(line.scores(offset[None])[0] for line in lines))
 
 
@@ -328,7 +358,7 @@ def _error(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
     total = scores.sum(axis=0)
     curvature = np.diag(total[1 : num + 1] + total[num + 1 : 2 * num + 1] - 2 * total[0])
     for row, (i, j) in enumerate(pairs):
-        # scores at the corners ++, +-, -+ and -- of the axes i and j
+        # Scores at the corners ++, +-, -+ and -- of the axes i and j
         pp, pm, mp, mm = total[2 * num + 1 + 4 * row :][:4]
         curvature[i, j] = curvature[j, i] = 0.25 * (pp - pm - mp + mm)
     error = np.zeros(4)

@@ -31,7 +31,7 @@ def end_point_errors(estimated: Float, true: Float) -> Float:
 
 
 def end_point_error(estimated: Float, true: Float, mask: Bool | None = None) -> float:
-    """Return the mean end-point error in metres, over ``mask`` (N,) if given."""
+    """Return the mean end-point error in metres of (N,3) flows, over ``mask`` (N,) if given."""
     error_m = end_point_errors(estimated, true)
     return mean_of(error_m if mask is None else error_m[mask])
 
@@ -98,8 +98,10 @@ def challenge_scores(
     three_way["mean_m"] = sum(three_way.values()) / len(three_way)
     bucket = np.digitize(length_m, _EDGES_M) - 1
     bucketed = {
-        CLASSES[k]: _bucketed(*(x[class_number == k] for x in (error_m, length_m, bucket)))
-        for k in np.unique(class_number)
+        CLASSES[number]: _bucketed(
+            *(column[class_number == number] for column in (error_m, length_m, bucket))
+        )
+        for number in np.unique(class_number)
     }
     columns = {name: [row[name] for row in bucketed.values()] for name in ("static_m", "dynamic")}
     means = {name: mean_of(_finite(column)) for name, column in columns.items()}
@@ -112,12 +114,16 @@ def challenge_scores(
 
 def _bucketed(error_m: Float, length_m: Float, bucket: NDArray[np.intp]) -> dict[str, float]:
     """Return the two scores of one class with points."""
-    errors, lengths = (np.bincount(bucket, x, len(_EDGES_M))[1:] for x in (error_m, length_m))
+    # Sums over the points of each bucket but the first
+    errors, lengths = (
+        np.bincount(bucket, values, len(_EDGES_M))[1:] for values in (error_m, length_m)
+    )
     filled = lengths > 0
     quotients = errors[filled] / lengths[filled]
     return {"static_m": mean_of(error_m[bucket == 0]), "dynamic": mean_of(quotients)}
 
 
 def _finite(values: list[float]) -> Float:
+    """Return the finite values."""
     array = np.array(values, np.float64)
     return array[np.isfinite(array)]

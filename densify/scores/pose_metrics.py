@@ -18,17 +18,24 @@ _OFF_M, _OFF_PER_M, _OFF_DEG = 0.03, 0.01, 0.3
 def window_pose_errors(
     stretch: Stretch, key: int, T_world_lidar: Callable[[int], Float]
 ) -> tuple[float, float]:
-    """Return the error of a window's poses relative to the key sweep's: metres, degrees.
+    """Return the errors of a window's poses relative to the key sweep's pose.
 
-    Both are root mean squares over the sweeps. ``T_world_lidar`` returns a frame's true pose.
+    ``T_world_lidar`` returns the true (4,4) pose of a frame.
+
+    Returns:
+        Root mean squares over the sweeps of the translation error (m) and of the rotation error
+            (degrees).
     """
     T_key_world = poses.inverse(T_world_lidar(key))
     true = T_key_world @ np.stack([T_world_lidar(frame) for frame in stretch.frames])
     estimated = np.stack([stretch.T_target_source(key, frame) for frame in stretch.frames])
-    off = poses.inverse(true) @ estimated
-    squared_m2, squared_rad2 = (off[:, :3, 3] ** 2, poses.log(off)[:, :3] ** 2)
-    off_m, off_rad = (np.sqrt(x.sum(axis=1).mean()) for x in (squared_m2, squared_rad2))
-    return float(off_m), float(np.rad2deg(off_rad))
+    T_error = poses.inverse(true) @ estimated
+    squared_m2 = T_error[:, :3, 3] ** 2
+    squared_rad2 = poses.log(T_error)[:, :3] ** 2
+    error_m, error_rad = (
+        np.sqrt(squared.sum(axis=1).mean()) for squared in (squared_m2, squared_rad2)
+    )
+    return float(error_m), float(np.rad2deg(error_rad))
 
 
 class RecordedError(NamedTuple):
@@ -41,24 +48,37 @@ class RecordedError(NamedTuple):
 
     @staticmethod
     def of(recorded: Sequence[Float], odometry: Sequence[Float]) -> RecordedError:
-        """Compare the motions (4,4), one or more, from the first to the last sweep of a stretch."""
+        """Compare recorded motions with odometry.
+
+        Both are one or more (4,4) motions, each from the first to the last sweep of a stretch.
+        """
         T_recorded, T_odometry = np.stack(recorded), np.stack(odometry)
-        apart = poses.log(poses.inverse(T_recorded) @ T_odometry)
+        difference = poses.log(poses.inverse(T_recorded) @ T_odometry)
         way_m = np.linalg.norm(T_odometry[:, :3, 3], axis=1)
-        off_rad, off_m = (np.linalg.norm(x, axis=1) for x in np.hsplit(apart, 2))
-        off_deg = float(np.rad2deg(np.median(off_rad)))
-        cost = max(float(np.median(off_m / (_OFF_M + _OFF_PER_M * way_m))), off_deg / _OFF_DEG)
-        return RecordedError(float(np.median(off_m)), off_deg, cost, float(way_m.max()))
+        error_rad, error_m = (np.linalg.norm(half, axis=1) for half in np.hsplit(difference, 2))
+        error_deg = float(np.rad2deg(np.median(error_rad)))
+        cost_m = float(np.median(error_m / (_OFF_M + _OFF_PER_M * way_m)))
+        cost = max(cost_m, error_deg / _OFF_DEG)
+        return RecordedError(float(np.median(error_m)), error_deg, cost, float(way_m.max()))
 
 
 def main_error(
     recorded: Sequence[Float], odometry: Sequence[Float], duration_s: float
 ) -> tuple[str, str]:
-    """Return the main error of motions over ``duration_s``, scale or drift, and its correction."""
+    """Describe the main error of recorded motions, scale or drift, and its correction.
+
+    Args:
+        odometry: The same motions by odometry.
+        duration_s: Duration of a motion.
+
+    Returns:
+        A clause about the error, and a clause about the correction, "" if there is none.
+    """
     recorded_m, odometry_m = (
         np.array([T[:3, 3] for T in motions]) for motions in (recorded, odometry)
     )
     off_m, way_m = (recorded_m - odometry_m).mean(axis=0), odometry_m.mean(axis=0)
+    # Errors in different directions have no common cause.
     if np.linalg.norm(off_m) < 0.5 * np.linalg.norm(recorded_m - odometry_m, axis=1).mean():
         mistake = "; no usual mistake explains it (another frame than the points', another clock,"
         return f"{mistake} or noise)", ""

@@ -20,23 +20,27 @@ from densify.street.motion import Driving, poses_at
 from densify.street.world import PASSES, STOPS, Hits, Optics, Rays, World
 
 _TABLES = read_table("cameras")
-_FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # axes of cameras
+# Rotations from lidar axes to the axes of cameras that look forward and to the left
+_FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 _LEFT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _MAX_DEPTH_M = 120.0
-_GAMMA = 2.2  # of the display
-_OFF_SURFACE_M = 0.015  # from a surface to the origin of its ray to the sun
-_NUM_OCTAVES, _OCTAVE_SHIFT = 3, 7  # of the noise of clouds
-_GRAIN = 0.4  # share of grains beside blotches
-_DARKEST, _CONTRAST = 0.82, 0.36  # of the brightness of bricks
+_GAMMA = 2.2  # gamma of the display
+_OFF_SURFACE_M = 0.015  # distance from a surface to the origin of its ray to the sun
+_NUM_OCTAVES, _OCTAVE_SHIFT = 3, 7  # octaves of the noise of clouds, and the shift between them
+_GRAIN = 0.4  # share of the grains in a texture; blotches have the rest
+_DARKEST, _CONTRAST = 0.82, 0.36  # brightness of the darkest brick, and range of brightness
 
 
 def _pose(R_cam_lidar: Float, lidar_m: Float) -> Float:
+    """Return the (4,4) pose of a lidar at the position ``lidar_m`` of the camera's frame."""
     T_cam_lidar = np.eye(4)
-    T_cam_lidar[:3, :3], T_cam_lidar[:3, 3] = R_cam_lidar, lidar_m
+    T_cam_lidar[:3, :3] = R_cam_lidar
+    T_cam_lidar[:3, 3] = lidar_m
     return T_cam_lidar
 
 
 def _intrinsics(focal_px: float, u: float, v: float) -> Float:
+    """Return the (3,3) camera matrix for a focal length and a principal point in pixels."""
     return np.array([[focal_px, 0, u], [0, focal_px, v], [0, 0, 1.0]])
 
 
@@ -49,7 +53,8 @@ T_RECTIFIED_LIDAR = _pose(
 def _pinhole(name: str, row: Any) -> Camera:
     """Return a pinhole camera with a share of KITTI's resolution."""
     share = 1 / getattr(row, "one_in", 1)
-    u, v = ((c + 0.5) * share - 0.5 for c in _RECTIFIED.centre_px)
+    # The centre of the first pixel is at 0, and its outer corner at -0.5.
+    u, v = ((coordinate + 0.5) * share - 0.5 for coordinate in _RECTIFIED.centre_px)
     K = _intrinsics(_RECTIFIED.focal_px * share, u, v)
     T_cam_lidar = T_RECTIFIED_LIDAR.copy()
     T_cam_lidar[0, 3] -= row.right_m
@@ -59,6 +64,7 @@ def _pinhole(name: str, row: Any) -> Camera:
 
 
 def _fisheye(row: Any) -> Camera:
+    """Return the fisheye camera, which looks to the left, with its centre in the middle."""
     u, v = ((size - 1) / 2 for size in row.size_px)
     K, T_cam_lidar = _intrinsics(row.focal_px, u, v), _pose(_LEFT, row.lidar_m)
     width_px, height_px = row.size_px
@@ -70,13 +76,13 @@ def _fisheye(row: Any) -> Camera:
 
 CAMERAS = {name: _pinhole(name, row) for name, row in vars(_TABLES.pinhole).items()}
 CAMERAS["fisheye"] = _fisheye(_FISHEYE)
-"""The cameras, beside a level mount."""
+"""The cameras by name; their poses are relative to a lidar on a level mount."""
 
 EXPOSURES: dict[str, Any] = {**vars(_TABLES.pinhole), "fisheye": _FISHEYE}
 """The rows of cameras.yaml that tell when a camera exposes."""
 
 USUAL = ("image_02", "image_03")
-"""Those that are there unless others are asked for."""
+"""Names of the cameras that a recording has by default."""
 
 
 def T_level_lidar(tilt_deg: float) -> Float:
@@ -87,7 +93,11 @@ def T_level_lidar(tilt_deg: float) -> Float:
 def cameras_beside(tilt_deg: float, names: tuple[str, ...] = USUAL) -> dict[str, Camera]:
     """Return the cameras, which do not tilt, with poses relative to the tilted lidar."""
     T = T_level_lidar(tilt_deg)
-    return {n: replace(CAMERAS[n], T_cam_lidar=CAMERAS[n].T_cam_lidar @ T) for n in names}
+    cameras = {name: CAMERAS[name] for name in names}
+    return {
+        name: replace(camera, T_cam_lidar=camera.T_cam_lidar @ T)
+        for name, camera in cameras.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -102,40 +112,51 @@ class Picture:
 
 
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
-    """Render the picture of a camera, each row at its own time, the middle one at ``time_s``.
+    """Render the picture of a camera with a rolling shutter: each row at its own time.
 
-    ``camera``'s pose is relative to a level lidar, ``time_s`` in seconds since frame 0.
+    The camera's pose is relative to a lidar on a level mount of the vehicle ``ego``. ``time_s`` is
+    the exposure time of the middle row, in seconds since frame 0.
     """
     h, w = camera.height_px, camera.width_px
     v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)
     ray = rays(camera, np.column_stack([u, v]))
-    seen = np.flatnonzero(np.isfinite(ray[:, 0]))
-    ray = ray[seen]
-    cast = _in_world(ego, camera, ray, time_s, v[seen] - (h - 1) / 2)
+    # Pixels outside the view of the lens have no ray and stay black.
+    in_view = np.flatnonzero(np.isfinite(ray[:, 0]))
+    ray = ray[in_view]
+    cast = _in_world(ego, camera, ray, time_s, v[in_view] - (h - 1) / 2)
     hits = world.cast(cast, lambda met: np.full(len(met.ray), STOPS))
     colour = _colours(world, cast, hits)
-    is_glass = world.triangles.material[hits.triangle] == Material.GLASS
-    glass = np.flatnonzero((hits.triangle >= 0) & is_glass)
-    if len(glass):
-        through, shares = Rays(*(column[glass] for column in cast)), _TABLES.light.glass
-        behind = _colours(world, through, world.cast(through, through_glass(world)))
-        colour[glass] = shares.mirrors * _sky(through.direction) + shares.passes * behind
+    _shine_through_glass(colour, world, cast, hits)
+
     depth_m = hits.range_m * ray[:, 2] if camera.measure == "z" else hits.range_m
-    solid = np.isfinite(depth_m) & (depth_m <= _MAX_DEPTH_M)
-    image, depth = np.zeros((h * w, 3), np.uint8), np.zeros(h * w, np.float32)
+    is_near = np.isfinite(depth_m) & (depth_m <= _MAX_DEPTH_M)
+    image = np.zeros((h * w, 3), np.uint8)
+    image[in_view] = np.rint(255 * np.clip(colour, 0, 1) ** (1 / _GAMMA)).astype(np.uint8)
+    depth = np.zeros(h * w, np.float32)
+    depth[in_view] = np.where(is_near, depth_m, 0.0)
     body = np.full(h * w, -1, np.int32)
-    image[seen] = np.rint(255 * np.clip(colour, 0, 1) ** (1 / _GAMMA)).astype(np.uint8)
-    depth[seen] = np.where(solid, depth_m, 0.0)
-    body[seen] = np.where(hits.triangle >= 0, world.triangles.body[hits.triangle], -1)
+    body[in_view] = np.where(hits.triangle >= 0, world.triangles.body[hits.triangle], -1)
     return Picture(image.reshape(h, w, 3), depth.reshape(h, w), body.reshape(h, w))
 
 
 def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Float) -> Rays:
-    """Return rays in the world frame, each at the exposure time of its row below the middle."""
+    """Return rays in the world frame at the exposure of their rows, counted from the middle row."""
     time = time_s + row * camera.row_time_s
-    poses, T_ego_cam = poses_at(ego, time), T_ego_lidar() @ inverse(camera.T_cam_lidar)
+    poses = poses_at(ego, time)
+    T_ego_cam = T_ego_lidar() @ inverse(camera.T_cam_lidar)
     origin = poses.apply(np.broadcast_to(T_ego_cam[:3, 3], ray.shape))
     return Rays(origin, poses.turn(ray @ T_ego_cam[:3, :3].T), time)
+
+
+def _shine_through_glass(colour: Float, world: World, cast: Rays, hits: Hits) -> None:
+    """Replace the (N,3) colours of glass by the mirrored sky and the surface behind the glass."""
+    is_glass = world.triangles.material[hits.triangle] == Material.GLASS
+    rows = np.flatnonzero((hits.triangle >= 0) & is_glass)
+    if len(rows):
+        through = Rays(*(column[rows] for column in cast))
+        behind = _colours(world, through, world.cast(through, through_glass(world)))
+        shares = _TABLES.light.glass
+        colour[rows] = shares.mirrors * _sky(through.direction) + shares.passes * behind
 
 
 def through_glass(world: World) -> Optics:
@@ -146,14 +167,21 @@ def through_glass(world: World) -> Optics:
 
 def _colours(world: World, rays: Rays, hits: Hits) -> Float:
     """Return (N,3) linear RGB of the ray hits: sun with shadows, sky light and haze."""
-    light, is_hit = _TABLES.light, hits.triangle >= 0
+    light = _TABLES.light
+    is_hit = hits.triangle >= 0
     colour = np.empty(rays.direction.shape)
     colour[~is_hit] = _sky(rays.direction[~is_hit])
     rows = np.flatnonzero(is_hit)
-    triangle, direction, normal = hits.triangle[rows], rays.direction[rows], hits.normal[rows]
-    material, range_m = world.triangles.material[triangle], hits.range_m[rows, None]
+    triangle = hits.triangle[rows]
+    material = world.triangles.material[triangle]
+    direction = rays.direction[rows]
+    range_m = hits.range_m[rows, None]
+    # Normals are turned towards the camera.
+    normal = hits.normal[rows]
     facing = np.einsum("ni,ni->n", normal, direction)
     normal = np.where(facing[:, None] > 0, -normal, normal)
+
+    # Light that the surface scatters
     point = rays.origin[rows] + direction * range_m + _OFF_SURFACE_M * normal
     sunlight = _sunlight(world, Rays(point, normal, rays.time_s[rows]), material)
     sun = light.sun.strength * sunlight[:, None] * np.array(light.sun.colour)
@@ -161,6 +189,8 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
     ambient = ambient * np.array(light.ambient.colour)
     painted = np.clip(_painted(world, triangle, hits.barycentric[rows]), 0, 1) ** _GAMMA
     reflected = painted * (sun + ambient)
+
+    # Mirrored sky on glossy surfaces, then haze over the distance
     shiny = np.flatnonzero(GLOSS[material])
     direction, normal = direction[shiny], normal[shiny]
     mirrored = direction - 2 * np.einsum("ni,ni->n", direction, normal)[:, None] * normal
@@ -171,7 +201,7 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
 
 
 def _sunlight(world: World, surface: Rays, material: Int) -> Float:
-    """Return (N,) shares of sunlight at points with normals as directions, 0 in a shadow."""
+    """Return (N,) shares of sunlight, 0 in a shadow; ``surface`` has points and their normals."""
     light = _TABLES.light
     sun = np.array(light.towards_sun) / np.linalg.norm(light.towards_sun)
     cosine = surface.direction @ sun
@@ -196,15 +226,16 @@ def _sky(direction: Float) -> Float:
     octaves = [_smooth_noise(flat + _OCTAVE_SHIFT * i, 0.5**i) / 2**i for i in range(_NUM_OCTAVES)]
     density = sum(octaves) / sum(0.5**i for i in range(_NUM_OCTAVES))
     cover = np.clip((density - cloud.begins) * cloud.contrast, 0, cloud.most)[:, None]
-    cover = cover * np.clip(up * cloud.fade, 0, 1)
+    cover = cover * np.clip(up * cloud.fade, 0, 1)  # clouds fade out towards the horizon
     return blue * (1 - cover) + cloud.brightness * cover
 
 
 def _painted(world: World, triangle: Int, barycentric: Float32) -> Float:
     """Return the (N,3) colours of points on triangles: material, tint and texture."""
-    uv, material = world.triangles.uv[triangle], world.triangles.material[triangle]
-    a, b = barycentric.astype(np.float64).T[:, :, None]
-    position = uv[:, 0] * (1 - a - b) + uv[:, 1] * a + uv[:, 2] * b
+    uv = world.triangles.uv[triangle]
+    material = world.triangles.material[triangle]
+    weight_1, weight_2 = barycentric.astype(np.float64).T[:, :, None]
+    position = uv[:, 0] * (1 - weight_1 - weight_2) + uv[:, 1] * weight_1 + uv[:, 2] * weight_2
     brightness = np.ones(len(material))
     for name, texture in vars(_TABLES.textures).items():
         rows = np.flatnonzero(material == Material[name])
@@ -215,20 +246,22 @@ def _painted(world: World, triangle: Int, barycentric: Float32) -> Float:
 
 
 def _grains(uv: Float, texture: Any) -> Float:
-    """Return the (N,) brightness, around 1, of grains and blotches at (N,2) metres."""
+    """Return the (N,) brightness, around 1, of grains and blotches at (N,2) positions in metres."""
     grain = noise(*np.floor(uv.T / texture.grain_m).astype(np.int64))
     mix = _GRAIN * grain + (1 - _GRAIN) * _smooth_noise(uv, texture.blotch_m)
     return 1 + texture.contrast * (2 * mix - 1)
 
 
 def _bricks(uv: Float, texture: Any) -> Float:
-    """Return the (N,) brightness, around 1, of bricks in courses at (N,2) metres."""
+    """Return the (N,) brightness, around 1, of bricks in courses at (N,2) positions in metres."""
     length_m, height_m = texture.brick_m
     row = np.floor(uv[:, 1] / height_m)
-    along = uv[:, 0] / length_m + 0.5 * (row % 2)
-    column = np.floor(along)
-    beside_m, above_m = (along - column) * length_m, uv[:, 1] - row * height_m
-    is_joint = (beside_m < texture.joint_m) | (above_m < texture.joint_m)
+    # Every second course is shifted by half a brick.
+    in_bricks = uv[:, 0] / length_m + 0.5 * (row % 2)
+    column = np.floor(in_bricks)
+    from_left_m = (in_bricks - column) * length_m
+    from_bottom_m = uv[:, 1] - row * height_m
+    is_joint = (from_left_m < texture.joint_m) | (from_bottom_m < texture.joint_m)
     brick = noise(column.astype(np.int64), row.astype(np.int64))
     return np.where(is_joint, texture.joint, _DARKEST + _CONTRAST * brick)
 
@@ -237,8 +270,10 @@ def _smooth_noise(uv: Float, cell_m: float) -> Float:
     """Return (N,) numbers in [0, 1) at (N,2) positions, smooth over cells of ``cell_m``."""
     x, y = uv.T / cell_m
     i, j = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    # Positions within the cell, with slope 0 at its sides (smoothstep)
     x, y = x - i, y - j
     x, y = x * x * (3 - 2 * x), y * y * (3 - 2 * y)
+    # Bilinear interpolation between the random numbers of the cell's corners
     low, high = noise(i, j), noise(i, j + 1)
     low += (noise(i + 1, j) - low) * x
     high += (noise(i + 1, j + 1) - high) * x

@@ -16,14 +16,16 @@ from densify.street.mesh import Material, Mesh
 from densify.street.motion import Curve, Terrain
 
 Spans = Sequence[Sequence[float]]
-_CORNER_RADIUS_M = 9.0  # of the kerb where two roads meet
-_SAMPLE_M, _NUM_STEPS = 2.0, 3  # between points of a road, and steps from there to the foot
-_COARSE_M, _FAR_M = 8.0, 200.0  # cells of the ground far from roads, and their distance beyond it
-_BORDER_M = 4.0  # of the grid beyond the margin of the roads
-_OVERLAP_M = 1.5 * _COARSE_M  # of the fine and the coarse ground
-_SUNK_M = -1.0  # height of the coarse ground below the fine one
-_BELOW_KERB_M = -0.05  # height of the coarse ground beside the fine one over the raised ground
-_LINE_M, _DASH_M, _DASH_EVERY_M = 0.12, 3.0, 9.0  # width of lane markings, dashes, their distance
+_CORNER_RADIUS_M = 9.0  # radius of the kerb where two roads meet
+_SAMPLE_M = 2.0  # distance between the sampled points of a road
+_NUM_STEPS = 3  # Newton steps from the nearest sample to the foot of the perpendicular
+_COARSE_M = 8.0  # size of the cells of the coarse ground
+_FAR_M = 200.0  # width of the coarse ground outside the fine ground
+_BORDER_M = 4.0  # width of the fine grid outside the margin of the roads
+_OVERLAP_M = 1.5 * _COARSE_M  # width of the overlap of fine and coarse ground
+_SUNK_M = -1.0  # height of the coarse ground under the fine ground, relative to the terrain
+_BELOW_KERB_M = -0.05  # height of the coarse ground elsewhere, relative to the raised ground
+_LINE_M, _DASH_M, _DASH_EVERY_M = 0.12, 3.0, 9.0  # width of lines, length and period of dashes
 _PAINT_M = 0.006  # height of paint over the road
 
 
@@ -37,6 +39,7 @@ class Road:
 
     @cached_property
     def _samples(self) -> tuple[Float, cKDTree]:
+        """The arc lengths of points of the centreline, and a tree of the points."""
         stations = np.arange(0.0, self.curve.length_m, _SAMPLE_M)
         return stations, cKDTree(self.curve(stations))
 
@@ -49,8 +52,9 @@ class Road:
             away = xy - foot
             station = station + np.einsum("ni,ni->n", away, tangent)
         offset = away[:, 1] * tangent[:, 0] - away[:, 0] * tangent[:, 1]  # to the left
-        across = np.maximum(offset - self.left_m, -self.right_m - offset)
-        return np.maximum(across, np.maximum(-station, station - self.curve.length_m))
+        to_side_m = np.maximum(offset - self.left_m, -self.right_m - offset)
+        to_end_m = np.maximum(-station, station - self.curve.length_m)
+        return np.maximum(to_side_m, to_end_m)
 
 
 @dataclass(frozen=True)
@@ -64,11 +68,13 @@ class Ground:
 
     def distance(self, xy: Float) -> Float:
         """Return (N,) signed metres to the kerb, negative on the carriageway."""
+        # Union of the strips with rounded inner corners, as signed distance fields are joined
         distance = self.roads[0].distance(xy)
+        radius_m = _CORNER_RADIUS_M
         for road in self.roads[1:]:
-            crossed, r = road.distance(xy), _CORNER_RADIUS_M
-            distance = np.maximum(r, np.minimum(distance, crossed)) - np.hypot(
-                np.maximum(r - distance, 0), np.maximum(r - crossed, 0)
+            to_road = road.distance(xy)
+            distance = np.maximum(radius_m, np.minimum(distance, to_road)) - np.hypot(
+                np.maximum(radius_m - distance, 0), np.maximum(radius_m - to_road, 0)
             )
         return distance
 
@@ -77,8 +83,11 @@ class Ground:
         return self.terrain.height(xy) + self.kerb_m * (self.distance(xy) > 0)
 
     def mesh(self, margin_m: float, cell_m: float) -> Mesh:
-        """Return triangles fine up to ``margin_m`` from roads, coarse beyond."""
-        centre = np.concatenate([r.curve(r.curve.knots_m) for r in self.roads])
+        """Return the mesh of the ground: cells of ``cell_m`` near roads, 8 m elsewhere.
+
+        ``margin_m`` is the greatest distance of fine cells from a road.
+        """
+        centre = np.concatenate([road.curve(road.curve.knots_m) for road in self.roads])
         low = centre.min(axis=0) - margin_m - _BORDER_M
         high = centre.max(axis=0) + margin_m + _BORDER_M
         corners, quads = _grid(low, high, cell_m)
@@ -91,22 +100,26 @@ class Ground:
     def _fine(self, xy: Float, distance: Float, triangles: Float) -> Mesh:
         """Return triangles cut at the edge of the carriageway, and the upright kerb."""
         # Triangles are cut along the zero line of the signed distance to the kerb.
-        on_road = distance[triangles] < 0
-        num_on_road = on_road.sum(axis=1)
-        is_road, is_beside = (xy[triangles[num_on_road == num]] for num in (3, 0))
-        meshes = [self._flat(is_road, False), self._flat(is_beside, True)]
+        is_on_road = distance[triangles] < 0
+        num_on_road = is_on_road.sum(axis=1)
+        road_corners, beside_corners = (xy[triangles[num_on_road == num]] for num in (3, 0))
+        meshes = [self._flat(road_corners, False), self._flat(beside_corners, True)]
         edges: list[Float] = []  # (K,2,2), the road on the left
+        # A triangle across the kerb has one lone corner a, on the road or beside it.
         for lone_is_road in (True, False):
-            mixed = num_on_road == (1 if lone_is_road else 2)
-            corner = triangles[mixed]
-            lone = np.argmax(on_road[mixed] == lone_is_road, axis=1)
+            is_mixed = num_on_road == (1 if lone_is_road else 2)
+            corner = triangles[is_mixed]
+            lone = np.argmax(is_on_road[is_mixed] == lone_is_road, axis=1)
+            # Corners in cyclic order, the lone corner first
             corner = np.take_along_axis(corner, (lone[:, None] + np.arange(3)) % 3, axis=1)
             a, b, c = (xy[corner[:, i]] for i in range(3))
-            da, db, dc = (distance[corner[:, i]][:, None] for i in range(3))
-            ab, ac = a + (b - a) * da / (da - db), a + (c - a) * da / (da - dc)
-            pair = [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
+            to_kerb_a, to_kerb_b, to_kerb_c = (distance[corner[:, i]][:, None] for i in range(3))
+            # Points of the kerb on the sides a-b and a-c
+            ab = a + (b - a) * to_kerb_a / (to_kerb_a - to_kerb_b)
+            ac = a + (c - a) * to_kerb_a / (to_kerb_a - to_kerb_c)
+            quad_halves = [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
             meshes.append(self._flat(np.stack([a, ab, ac], axis=1), not lone_is_road))
-            meshes.append(self._flat(np.concatenate(pair), lone_is_road))
+            meshes.append(self._flat(np.concatenate(quad_halves), lone_is_road))
             edges.append(np.stack([ab, ac] if lone_is_road else [ac, ab], axis=1))
         if self.kerb_m > 0:
             meshes.append(self._upright(np.concatenate(edges)))
@@ -114,44 +127,46 @@ class Ground:
 
     def _flat(self, corners: Float, is_beside: bool) -> Mesh:
         """Return the mesh of (K,3,2) triangles of the road or beside it."""
-        flat = corners.reshape(-1, 2)
-        k = len(corners)
-        material = np.full(k, Material.ASPHALT, np.int16)
+        xy = corners.reshape(-1, 2)
+        num = len(corners)
+        material = np.full(num, Material.ASPHALT, np.int16)
         if is_beside:
             is_paved = self.distance(corners.mean(axis=1)) < self.pavement_m
             material[:] = np.where(is_paved, Material.PAVING, Material.GRASS)
         return Mesh(
-            vertices=np.column_stack([flat, self.terrain.height(flat) + self.kerb_m * is_beside]),
-            triangles=np.arange(3 * k).reshape(k, 3),
-            uv=flat,
+            vertices=np.column_stack([xy, self.terrain.height(xy) + self.kerb_m * is_beside]),
+            triangles=np.arange(3 * num).reshape(num, 3),
+            uv=xy,
             material=material,
-            tint=np.ones((k, 3)),
-            instance=np.full(k, -1, np.int32),
+            tint=np.ones((num, 3)),
+            instance=np.full(num, -1, np.int32),
         )
 
     def _upright(self, edges: Float) -> Mesh:
         """Return the faces of the kerb above (K,2,2) lines on the ground."""
-        z = self.terrain.height(edges.reshape(-1, 2)).reshape(-1, 2, 1)
-        low = np.concatenate([edges, z], axis=2)
-        high = low + [0.0, 0.0, self.kerb_m]
-        corners = np.stack([low[:, 1], low[:, 0], high[:, 0], high[:, 1]], axis=1)
+        height_m = self.terrain.height(edges.reshape(-1, 2)).reshape(-1, 2, 1)
+        bottom = np.concatenate([edges, height_m], axis=2)
+        top = bottom + [0.0, 0.0, self.kerb_m]
+        corners = np.stack([bottom[:, 1], bottom[:, 0], top[:, 0], top[:, 1]], axis=1)
         return Mesh.quads(corners, Material.KERB)
 
     def _coarse(self, low: Float, high: Float, margin_m: float) -> Mesh:
         """Return large quads, sunk where fine triangles cover them."""
         corners, quads = _grid(low - _FAR_M, high + _FAR_M, _COARSE_M)
-        covered = self.distance(corners) < margin_m - _OVERLAP_M
-        beside_m = self.kerb_m + _BELOW_KERB_M
-        z = self.terrain.height(corners) + np.where(covered, _SUNK_M, beside_m)
+        is_covered = self.distance(corners) < margin_m - _OVERLAP_M
+        uncovered_m = self.kerb_m + _BELOW_KERB_M
+        z = self.terrain.height(corners) + np.where(is_covered, _SUNK_M, uncovered_m)
         return Mesh.quads(np.column_stack([corners, z])[quads], Material.GRASS)
 
 
 def _grid(low: Float, high: Float, cell_m: float) -> tuple[Float, Float]:
     """Return the corners (N,2) of a regular grid and its cells (M,4), anticlockwise."""
-    nx, ny = (int(np.ceil(v)) + 1 for v in (high - low) / cell_m)
-    x, y = np.meshgrid(low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny))
-    i = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
-    return np.column_stack([x.ravel(), y.ravel()]), np.stack([i, i + 1, i + nx + 1, i + nx], axis=1)
+    num_x, num_y = (int(np.ceil(num_cells)) + 1 for num_cells in (high - low) / cell_m)
+    x, y = np.meshgrid(low[0] + cell_m * np.arange(num_x), low[1] + cell_m * np.arange(num_y))
+    corners = np.column_stack([x.ravel(), y.ravel()])
+    first = (np.arange(num_y - 1)[:, None] * num_x + np.arange(num_x - 1)).ravel()
+    above = first + num_x
+    return corners, np.stack([first, first + 1, above + 1, above], axis=1)
 
 
 @dataclass(frozen=True)
@@ -164,7 +179,7 @@ class Side:
     end_m: float
 
     def at(self, station_m: float, beyond_kerb_m: float) -> Float:
-        """Return the (2,) point ``beyond_kerb_m`` outside the kerb, abreast of the station."""
+        """Return the (2,) point beside a station, ``beyond_kerb_m`` outside the kerb."""
         station = np.array([station_m])
         edge_m = self.road.left_m if self.side > 0 else self.road.right_m
         normal = self.road.curve.normal(station)[0] * self.side
@@ -172,8 +187,9 @@ class Side:
         return point
 
     def heading(self, station_m: float) -> float:
-        """Return the heading with which the +y axis of a mesh points away from the road."""
-        return float(np.arctan2(*-self.forward(station_m)[::-1]))
+        """Return the heading (rad) at which the +y axis of a mesh points away from the road."""
+        forward = self.forward(station_m)
+        return float(np.arctan2(-forward[1], -forward[0]))
 
     def forward(self, station_m: float) -> Float:
         """Return the (2,) direction of the traffic on this side. Traffic keeps to the right."""
@@ -182,7 +198,10 @@ class Side:
 
 
 def mark_road(ground: Ground, road: Road, row: Any, spans: Spans) -> Mesh:
-    """Paint the lines of a row of ``markings`` in scenes.yaml, only within the spans."""
+    """Return the painted lines of a row of ``markings`` in scenes.yaml.
+
+    ``spans`` are the intervals of arc length (m) along the road that have lines.
+    """
     dashes = [
         (station, station + _DASH_M)
         for begin, end in spans
@@ -191,7 +210,12 @@ def mark_road(ground: Ground, road: Road, row: Any, spans: Spans) -> Mesh:
     lines: list[tuple[float, Spans]] = [(offset_m, dashes) for offset_m in row.dashed]
     lines += [(offset_m, spans) for offset_m in row.solid]
     width_m = getattr(row, "width_m", _LINE_M)
-    return Mesh.join([_strip(ground, road.curve, m, width_m, where) for m, where in lines])
+    return Mesh.join(
+        [
+            _strip(ground, road.curve, offset_m, width_m, painted_spans)
+            for offset_m, painted_spans in lines
+        ]
+    )
 
 
 def _strip(ground: Ground, curve: Curve, offset_m: float, width_m: float, spans: Spans) -> Mesh:
@@ -201,7 +225,9 @@ def _strip(ground: Ground, curve: Curve, offset_m: float, width_m: float, spans:
         stations = np.linspace(begin, end, max(2, int(end - begin) + 1))  # a metre apart
         middle, normal = curve(stations), curve.normal(stations)
         sides = (middle + normal * (offset_m + shift) for shift in (-width_m / 2, width_m / 2))
-        right, left = (np.column_stack([s, ground.terrain.height(s) + _PAINT_M]) for s in sides)
+        right, left = (
+            np.column_stack([side, ground.terrain.height(side) + _PAINT_M]) for side in sides
+        )
         corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)
         meshes.append(Mesh.quads(corners, Material.PAINT))
     return Mesh.join(meshes)

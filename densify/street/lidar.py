@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Simulate sweeps of the lidars in lidars.yaml: every pulse, and what comes back from it.
 
-A scan pattern has two methods. ``num_pulses(period_s)`` is the number of pulses in a sweep.
-``directions(number, share, time_s)`` are (N,3) unit vectors in the axes of the scanner, of pulses
-by their (N,) index from 0, firing time minus the reference time in periods, -0.5 to 0.5, and firing
-time in seconds since frame 0.
+A scan pattern has two methods. ``num_pulses(period_s)`` returns the number of pulses in a sweep.
+``directions(number, share, time_s)`` returns (N,3) unit vectors in the axes of the scanner. Its
+arguments describe N pulses: index from 0; firing time minus the reference time in periods, -0.5 to
+0.5; and firing time in seconds since frame 0.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from densify.street.motion import Driving, poses_at
 from densify.street.world import ABSORBED, PASSES, STOPS, Hits, Meeting, Optics, Rays, World
 
 _TABLES = read_table("lidars")
-_ROUNDING = 1e-6  # of a number of pulses
-_WIDENING = 1.5  # exponent of growing steps
+_ROUNDING = 1e-6  # added to a number of pulses before it is cut to an integer
+_WIDENING = 1.5  # exponent of the growing steps between elevations
 _S_PER_NS = 1e-9
 
 # Scan patterns
@@ -38,7 +38,8 @@ _S_PER_NS = 1e-9
 class Spinning:
     """A pattern that spins once a sweep, clockwise from above, forward at the reference time."""
 
-    # Beams in firing order, never two at once: every pulse has an azimuth of its own
+    # Elevations of the beams in firing order. Beams fire one after another, so every pulse has its
+    # own azimuth.
     elevation_deg: tuple[float, ...]
     # Firings per second of each beam. A revolution at 20 Hz has half the columns of a revolution at
     # 10 Hz.
@@ -50,7 +51,7 @@ class Spinning:
         return int(self.columns_per_s * period_s + _ROUNDING) * len(self.elevation_deg)
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
-        """Return the unit vectors of pulses."""
+        """Return the (N,3) unit vectors of pulses; the module describes the arguments."""
         azimuth = -2 * np.pi * (share + self.phase)
         beam = number % len(self.elevation_deg)
         return _pointing(azimuth, np.radians(self.elevation_deg)[beam])
@@ -63,6 +64,7 @@ class _Steady:
     pulses_per_s: int
 
     def num_pulses(self, period_s: float) -> int:
+        """Return the number of pulses in a sweep."""
         return int(self.pulses_per_s * period_s + _ROUNDING)
 
 
@@ -76,9 +78,9 @@ class Raster(_Steady):
     lines_per_s: int  # swings of the fast mirror per second, counting each direction
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
-        """Return the unit vectors of pulses."""
+        """Return the (N,3) unit vectors of pulses; the module describes the arguments."""
         line = number * (self.lines_per_s / self.pulses_per_s)
-        swing = 1 - np.abs(line % 2 - 1)  # 0 to 1 and back
+        swing = 1 - np.abs(line % 2 - 1)  # from 0 to 1 in one line, back to 0 in the next
         azimuth = np.radians(self.width_deg) * (0.5 - swing)
         return _pointing(azimuth, np.radians(self.height_deg) * -share)
 
@@ -93,17 +95,18 @@ class Rosette(_Steady):
     turns_per_s: tuple[float, float]
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
-        """Return the unit vectors of pulses."""
+        """Return the (N,3) unit vectors of pulses; the module describes the arguments."""
         first, second = (np.pi * rate * time_s for rate in self.turns_per_s)
-        off_axis = np.radians(self.width_deg / 2) * np.cos(first - second)
-        roll, flat = first + second, np.sin(off_axis)
-        return np.stack([np.cos(off_axis), flat * np.cos(roll), flat * np.sin(roll)], axis=1)
+        axis_angle = np.radians(self.width_deg / 2) * np.cos(first - second)
+        roll = first + second
+        sine = np.sin(axis_angle)
+        return np.stack([np.cos(axis_angle), sine * np.cos(roll), sine * np.sin(roll)], axis=1)
 
 
 def _pointing(azimuth: Float, elevation: Float) -> Float:
     """Return (N,3) unit vectors from (N,) azimuths and (N,) elevations in rad."""
-    flat = np.cos(elevation)
-    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
+    cosine = np.cos(elevation)
+    return np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
 # Sensors
@@ -127,7 +130,7 @@ class Sensor:
     scanners: tuple[Scanner, ...]
 
     def each(self, field: str) -> Float:
-        """Return the values of a field for all S scanners, (S,) or (S,3)."""
+        """Return the values of the named field of all S scanners, (S,) or (S,3)."""
         return np.array([getattr(scanner, field) for scanner in self.scanners], np.float64)
 
     @property
@@ -144,7 +147,7 @@ class Sensor:
 
 
 def _elevations_deg(row: Any) -> Float:
-    """Return the elevations of a row of ``elevation_deg``."""
+    """Return the elevations (degrees) that a row of ``elevation_deg`` in lidars.yaml describes."""
     if hasattr(row, "values"):
         return np.array(row.values)
     steps = np.arange(1, row.num + 1)
@@ -160,7 +163,7 @@ def _elevations_deg(row: Any) -> Float:
 
 
 def _scanner(row: Any) -> Scanner:
-    """Return the scanner of a row of ``sensors``."""
+    """Return the scanner that a row of ``sensors`` in lidars.yaml describes."""
     columns = vars(row).copy()
     if "spinning" in columns:
         spinning = vars(columns.pop("spinning")).copy()
@@ -188,7 +191,12 @@ class Firings:
 
 
 def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
-    """Return all pulses of the sweep that lasts ``period_ns`` around ``time_s``, evenly in time."""
+    """Return all pulses of one sweep, evenly spaced in time.
+
+    Args:
+        time_s: Reference time in the middle of the sweep, seconds since frame 0.
+        period_ns: Duration of the sweep.
+    """
     pulses = []
     for index, scanner in enumerate(sensor.scanners):
         num = scanner.pattern.num_pulses(period_ns * _S_PER_NS)
@@ -203,60 +211,79 @@ def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
     return Firings(direction[order], offset_ns[order], lidar[order])
 
 
-# Rays that pass a surface, or are lost
+# Rays that pass a surface or are absorbed
 
 _VEHICLES = [Material[name] for name in vars(_TABLES.vehicles.lost_percent)]
+# True for materials that let some rays pass or absorb them
 _IS_LEAKY = np.isin(np.arange(len(Material)), (*_VEHICLES, Material.LEAF))
-# (part, brightness, incidence) shares of rays
+# Shares of rays without a return and of passing rays, by vehicle part, brightness and incidence
 _LOST, _PASSES = (
     0.01 * np.array([[*vars(paints).values()] for paints in vars(percent).values()])
     for percent in (_TABLES.vehicles.lost_percent, _TABLES.vehicles.passes_percent)
 )
 _PATCH_M = 0.7  # size of a patch that loses its rays together: a car window, half a door
-_DARK = 0.1  # reflectance
-_LEAF_PASSES = 0.45  # share of rays
+_DARK = 0.1  # reflectance below which a surface counts as dark
+_LEAF_PASSES = 0.45  # share of the rays that pass a leaf
 _GOLDEN = 0.6180339887498949  # its multiples are spread evenly modulo 1
 _LARGE_PRIME = 1_000_003  # keeps hashed cells apart
-_RARE = 1e-9  # least probability of a level
+_RARE = 1e-9  # least probability that is converted to a normal quantile
 
 
 def laser(world: World, luck: Float) -> Optics:
-    """Return the optics of lidar, by a random number of each ray in [0, 1)."""
+    """Return the optics of lidar."""
     surfaces = world.triangles
 
     def optics(met: Meeting) -> Int:
         outcome = np.full(len(met.ray), STOPS)
         rows = np.flatnonzero(_IS_LEAKY[surfaces.material[met.triangle]])
-        material, instance = (c[met.triangle[rows]] for c in (surfaces.material, surfaces.instance))
-        inside = (instance >= 0) & (instance == met.passed[rows])
-        drawn = (luck[met.ray[rows]] + met.layer * _GOLDEN) % 1.0
-        outcome[rows[(material == Material.LEAF) & (drawn < _LEAF_PASSES)]] = PASSES
-        outcome[rows[(material == Material.GLASS) & inside]] = PASSES
-        outside = (material != Material.LEAF) & ~inside
-        rows, material, instance = rows[outside], material[outside], instance[outside]
-        vehicle_part = np.argmax(material[:, None] == np.array(_VEHICLES), axis=1)
-        tint = surfaces.mean_tint[met.triangle[rows]]
-        brightness = np.digitize(tint, _TABLES.vehicles.brightness)
-        cosine = np.clip(np.abs(met.facing[rows]), 0.0, 1.0)
-        incidence_deg = np.degrees(np.arccos(cosine))
-        lost, passes = (
-            _between(table[vehicle_part, brightness], incidence_deg) for table in (_LOST, _PASSES)
+        material, instance = (
+            column[met.triangle[rows]] for column in (surfaces.material, surfaces.instance)
         )
-        threshold = patches(
-            met.positions(rows), world.seed + 3 * instance.astype(np.int64) + vehicle_part
-        )
-        outcome[rows[threshold > 1 - passes]] = PASSES
-        outcome[rows[threshold < lost]] = ABSORBED
+        # A ray that passed a surface of the same object before is inside it.
+        is_inside = (instance >= 0) & (instance == met.passed[rows])
+        # Each layer draws anew: multiples of the golden ratio are spread evenly.
+        draw = (luck[met.ray[rows]] + met.layer * _GOLDEN) % 1.0
+        outcome[rows[(material == Material.LEAF) & (draw < _LEAF_PASSES)]] = PASSES
+        outcome[rows[(material == Material.GLASS) & is_inside]] = PASSES
+        is_shell = (material != Material.LEAF) & ~is_inside
+        _decide_at_shell(outcome, world, met, rows[is_shell])
         return outcome
 
     return optics
 
 
+def _decide_at_shell(outcome: Int, world: World, met: Meeting, rows: Int) -> None:
+    """Enter PASSES and ABSORBED for the rays (indices in ``met``) at the outside of vehicles."""
+    surfaces = world.triangles
+    material, instance = (
+        column[met.triangle[rows]] for column in (surfaces.material, surfaces.instance)
+    )
+    vehicle_part = np.argmax(material[:, None] == np.array(_VEHICLES), axis=1)
+    tint = surfaces.mean_tint[met.triangle[rows]]
+    brightness = np.digitize(tint, _TABLES.vehicles.brightness)
+    cosine = np.clip(np.abs(met.facing[rows]), 0.0, 1.0)
+    incidence_deg = np.degrees(np.arccos(cosine))
+    absorbed_share, passing_share = (
+        _between(table[vehicle_part, brightness], incidence_deg) for table in (_LOST, _PASSES)
+    )
+    # Whole patches of a surface pass or absorb rays. Each part of an object has its own patches.
+    owner = world.seed + 3 * instance.astype(np.int64) + vehicle_part
+    draw = patches(met.positions(rows), owner)
+    outcome[rows[draw > 1 - passing_share]] = PASSES
+    outcome[rows[draw < absorbed_share]] = ABSORBED
+
+
 def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
-    """Return the (N,) share of pulses without a return, besides pulses that vehicles absorb."""
+    """Return the (N,) shares of pulses without a return, besides pulses that vehicles absorb.
+
+    Args:
+        tint: (N,) factors on their reflectivity.
+        range_m: (N,) ranges in metres.
+    """
     table = _TABLES.lost_elsewhere
     ground, dark, bright = (
-        np.interp(range_m, table.range_m, lost) for lost in (table.ground, table.dark, table.bright)
+        np.interp(range_m, table.range_m, shares)
+        for shares in (table.ground, table.dark, table.bright)
     )
     is_vehicle = np.isin(material, _VEHICLES)
     is_dark = (REFLECTIVITY[material] * tint < _DARK) & ~is_vehicle
@@ -264,33 +291,43 @@ def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
 
 
 def patches(position: Float, owner: Int) -> Float:
-    """Return (N,) uniform numbers, 0 to 1, smooth over the surface of each ``owner`` (object)."""
+    """Return (N,) random numbers, uniform from 0 to 1, that vary smoothly over a surface.
+
+    Args:
+        position: (N,3) positions on the surfaces in metres.
+        owner: (N,) numbers of the objects; each object has its own random numbers.
+    """
+    # Normal random numbers at the corners of a grid of cells are interpolated.
     cell = np.floor(position / _PATCH_M)
     share = position / _PATCH_M - cell
-    share = share * share * (3 - 2 * share)
+    share = share * share * (3 - 2 * share)  # smoothstep: slope 0 at the sides of a cell
     i, j, k = cell.astype(np.int64).T
-    across_key, up_key = i + _LARGE_PRIME * owner, j + _LARGE_PRIME * k
-    hashed = noise(across_key, up_key)
+    xo_key = i + _LARGE_PRIME * owner
+    yz_key = j + _LARGE_PRIME * k
+    hashed = noise(xo_key, yz_key)
+    # The corners of each cell are drawn once.
     _, first, cell_of = np.unique(hashed, return_index=True, return_inverse=True)
     corners = [
-        noise(across_key[first] + x, up_key[first] + y + _LARGE_PRIME * z)
+        noise(xo_key[first] + x, yz_key[first] + y + _LARGE_PRIME * z)
         for x, y, z in product((0, 1), repeat=3)
     ]
     normal = ndtri(np.clip(corners, _RARE, 1 - _RARE)).T.take(cell_of, axis=0).T
-    for axis_share in share.T:  # halves the corners, axis by axis
+    for axis_share in share.T:  # each axis halves the number of corners
         low, high = np.split(normal, 2)
         normal = low + axis_share * (high - low)
-    spread = np.prod(share**2 + (1 - share) ** 2, axis=1)
-    smooth: Float = ndtr(normal[0] / np.sqrt(spread))
+    # Interpolation lowers the variance; the division restores it.
+    variance = np.prod(share**2 + (1 - share) ** 2, axis=1)
+    smooth: Float = ndtr(normal[0] / np.sqrt(variance))
     return smooth
 
 
 def _between(rows: Float, incidence_deg: Float) -> Float:
-    """Return (N,) values of (N,5) table rows at (N,) degrees, interpolated."""
+    """Return the (N,) values of (N,5) table rows, interpolated at (N,) degrees of incidence."""
     columns_deg = _TABLES.vehicles.incidence_deg
     column = np.interp(incidence_deg, columns_deg, np.arange(len(columns_deg)))
-    low, n = np.minimum(column.astype(int), len(columns_deg) - 2), np.arange(len(column))
-    return rows[n, low] + (column - low) * (rows[n, low + 1] - rows[n, low])
+    low = np.minimum(column.astype(int), len(columns_deg) - 2)  # there is a column after it
+    row = np.arange(len(column))
+    return rows[row, low] + (column - low) * (rows[row, low + 1] - rows[row, low])
 
 
 # Echoes
@@ -298,10 +335,10 @@ def _between(rows: Float, incidence_deg: Float) -> Float:
 LIDAR_HEIGHT_M = 1.73
 _MIN_RANGE_M = 1.0
 _SPOT_RAD = 1.05e-3  # half the spot of a beam, along each axis
-_SPOT = np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # its rays, left and up
+_SPOT = np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # rays of the spot, left and up
 _FLAT_M = 0.10  # distance to the plane of the central echo from which a spot is at an edge
-_EDGE_HEARD = 0.85  # share of echoes at edges
-_MERGE_M = 2.0  # echoes closer than this can melt into one
+_EDGE_HEARD = 0.85  # share of the echoes at edges that the receiver detects
+_MERGE_M = 2.0  # echoes closer than this can merge into one
 _MELT_PROBABILITY = 0.2
 # Brightness of an echo: least share by tint, least share at grazing incidence, relative noise
 _UNTINTED, _GRAZING, _NOISE = 0.6, 0.35, 0.05
@@ -337,10 +374,16 @@ class Mount(NamedTuple):
 
 
 def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) -> Returns:
-    """Simulate one sweep around ``time_s``, seconds since frame 0."""
-    sensor, T = mount.sensor, T_ego_lidar(mount.tilt_deg)
+    """Simulate one sweep of a mounted sensor; ``rng`` always draws in the same order.
+
+    ``time_s`` is the reference time in the middle of the sweep, in seconds since frame 0.
+    """
+    sensor = mount.sensor
+    T = T_ego_lidar(mount.tilt_deg)
     fired = firings(sensor, time_s, mount.period_ns)
     n = len(fired.offset_ns)
+
+    # Five rays for each pulse, in the world frame
     times = at_offsets(time_s, fired.offset_ns)
     ego_poses = poses_at(mount.ego, times)
     origin_m = sensor.origins_m[fired.lidar]
@@ -348,17 +391,27 @@ def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) ->
     spot = _spot(fired.direction) @ (ego_poses.rotation @ T[:3, :3]).transpose(0, 2, 1)
     luck = rng.random((len(_SPOT), n)).T
     rays = Rays(origin.repeat(len(_SPOT), axis=0), spot.reshape(-1, 3), times.repeat(len(_SPOT)))
-    echoes = world.cast(rays, laser(world, luck.ravel()), len(_SPOT), 2 * _SPOT_RAD)
-    range_m, ray, is_edge = _echo(echoes, spot, rng)
-    triangle, normal = echoes.triangle[ray], echoes.normal.take(ray, axis=0)
-    material, tint = world.triangles.material[triangle], world.triangles.mean_tint[triangle]
-    heard = (1 - share_lost(material, tint, range_m)) * np.where(is_edge, _EDGE_HEARD, 1.0)
-    keep = np.isfinite(range_m) & (rng.random(n) < heard)
+    hits = world.cast(rays, laser(world, luck.ravel()), len(_SPOT), 2 * _SPOT_RAD)
+
+    # One echo for each pulse, and whether the receiver detects it
+    echoes = _strongest_echoes(hits, spot, rng)
+    range_m = echoes.range_m
+    triangle = hits.triangle[echoes.ray]
+    normal = hits.normal.take(echoes.ray, axis=0)
+    material = world.triangles.material[triangle]
+    tint = world.triangles.mean_tint[triangle]
+    probability = 1 - share_lost(material, tint, range_m)
+    probability = probability * np.where(echoes.is_edge, _EDGE_HEARD, 1.0)
+    keep = np.isfinite(range_m) & (rng.random(n) < probability)
+
+    # Noise of the range, and points in the lidar frame
     range_m = np.where(keep, range_m, 0.0)
     range_m += sensor.each("range_sigma_m")[fired.lidar] * rng.normal(size=n)
     keep &= (range_m > _MIN_RANGE_M) & (range_m < sensor.each("max_range_m")[fired.lidar])
     points = fired.direction * range_m[:, None]
-    np.add(points, origin_m, out=points, where=origin_m != 0)  # a coordinate of -0.0 stays one
+    np.add(points, origin_m, out=points, where=origin_m != 0)  # a coordinate of -0.0 stays -0.0
+
+    # Brightness
     reflectivity = REFLECTIVITY[material] * (_UNTINTED + (1 - _UNTINTED) * tint)
     cosine = np.abs(np.einsum("ni,ni->n", normal, spot[:, 0]))
     brightness = reflectivity * (_GRAZING + (1 - _GRAZING) * cosine)
@@ -388,25 +441,40 @@ def _spot(direction: Float) -> Float:
     return np.stack([direction, *(ray / lengths(ray) for ray in rays)], axis=1)
 
 
-def _echo(echoes: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Int, Bool]:
-    """Return (N,) ranges (m) of laser spots, rays that count, and True for spots at an edge."""
+class _Echoes(NamedTuple):
+    """The strongest echoes of N laser spots."""
+
+    range_m: Float  # (N,) ranges, inf without a hit
+    ray: Int  # (N,) index of the ray whose surface counts
+    is_edge: Bool  # (N,) True for spots at an edge
+
+
+def _strongest_echoes(hits: Hits, spot: Float, rng: np.random.Generator) -> _Echoes:
+    """Return the strongest echo of each laser spot, from the hits of its (N,5,3) rays."""
     # On one plane the centre ray counts. At an edge each ray is equally likely to be the strongest
     # echo. Two echoes close together sometimes merge into one at a range in between.
     n, num = spot.shape[:2]
-    range_m = echoes.range_m.reshape(n, num)
-    slant = np.einsum("ni,nsi->ns", echoes.normal[::num], spot)
+    range_m = hits.range_m.reshape(n, num)
+
+    # A spot is at an edge if a ray does not end in the plane of the centre ray's surface.
+    slant = np.einsum("ni,nsi->ns", hits.normal[::num], spot)
     with np.errstate(divide="ignore", invalid="ignore"):  # a ray without a hit has infinite range
-        off_plane = np.abs(range_m - (range_m * slant)[:, :1] / slant)
+        plane_distance = np.abs(range_m - (range_m * slant)[:, :1] / slant)
     is_hit = np.isfinite(range_m)
-    is_flat = off_plane < _FLAT_M
+    is_flat = plane_distance < _FLAT_M
     is_edge = np.logical_or.reduce([*is_hit.T]) & ~np.logical_and.reduce([*is_flat.T])
-    # any of the rays with a hit, all equally likely
+
+    # One of the rays with a hit is chosen at random; a second ray may merge with it.
     edges = np.flatnonzero(is_edge)
-    pick = np.argmax(rng.random((num, n))[:, edges] * is_hit[edges].T, axis=0)
-    chosen, partner = range_m[edges, pick], range_m[edges, rng.integers(num, size=(n,))[edges]]
-    merged = np.isfinite(partner) & (rng.random((n,))[edges] < _MELT_PROBABILITY)
-    merged[merged] = np.abs(partner[merged] - chosen[merged]) < _MERGE_M
-    chosen[merged] = (chosen[merged] + partner[merged]) / 2
-    range_m, ray = range_m[:, 0].copy(), np.arange(0, n * num, num)
-    range_m[edges], ray[edges] = chosen, edges * num + pick
-    return range_m, ray, is_edge
+    choice = np.argmax(rng.random((num, n))[:, edges] * is_hit[edges].T, axis=0)
+    chosen_m = range_m[edges, choice]
+    partner_m = range_m[edges, rng.integers(num, size=(n,))[edges]]
+    merges = np.isfinite(partner_m) & (rng.random((n,))[edges] < _MELT_PROBABILITY)
+    merges[merges] = np.abs(partner_m[merges] - chosen_m[merges]) < _MERGE_M
+    chosen_m[merges] = (chosen_m[merges] + partner_m[merges]) / 2
+
+    echo_m = range_m[:, 0].copy()
+    echo_m[edges] = chosen_m
+    ray = np.arange(0, n * num, num)  # centre rays
+    ray[edges] = edges * num + choice
+    return _Echoes(echo_m, ray, is_edge)

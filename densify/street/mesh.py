@@ -18,8 +18,9 @@ Tint = Sequence[float]
 Point = Sequence[float]
 WHITE: Tint = (1.0, 1.0, 1.0)
 _TINY = 1e-9
-_UPRIGHT = 0.9  # z of a unit vector that is not level enough to be crossed with z
-_LEAF_SIZES, _LEAF_TINTS = (0.35, 0.65), (0.65, 1.35)  # half sizes and tints of leaves vary
+_UPRIGHT = 0.9  # least z of a unit vector that is too steep for a cross product with the z axis
+# Ranges of the random factors on the half size and on the tint of a leaf
+_LEAF_SIZES, _LEAF_TINTS = (0.35, 0.65), (0.65, 1.35)
 
 
 class Material(IntEnum):
@@ -70,38 +71,48 @@ class Mesh:
     @staticmethod
     def join(meshes: Sequence[Mesh]) -> Mesh:
         """Return the union of several meshes."""
-        meshes = [m for m in meshes if len(m.triangles)]
-        starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
+        meshes = [mesh for mesh in meshes if len(mesh.triangles)]
         columns = {
-            f.name: np.concatenate([getattr(m, f.name) for m in meshes]) for f in fields(Mesh)
+            field.name: np.concatenate([getattr(mesh, field.name) for mesh in meshes])
+            for field in fields(Mesh)
         }
-        columns["triangles"] += np.repeat(starts[:-1], [len(m.triangles) for m in meshes])[:, None]
+        # Vertex indices count from the first vertex of their mesh in the union.
+        first_vertex = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])[:-1]
+        num_triangles = [len(mesh.triangles) for mesh in meshes]
+        columns["triangles"] += np.repeat(first_vertex, num_triangles)[:, None]
         return Mesh(**columns)
 
     @staticmethod
     def quads(corners: Float, material: Material, tint: Tint | Float = WHITE) -> Mesh:
-        """Return a mesh of (K,4,3) quads in order around. Texture x runs along their first side."""
-        k = len(corners)
-        side, away = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
-        along = side / np.maximum(lengths(side), _TINY)
-        up = away - np.einsum("ki,ki->k", away, along)[:, None] * along
-        axes = np.stack([along, up / np.maximum(lengths(up), _TINY)], axis=1)
+        """Return a mesh of K quads, two triangles each. Texture x runs along the first side.
+
+        Args:
+            corners: (K,4,3) corners in metres, in order around each quad.
+            tint: (3,) factors on its colour, or (K,3) for each quad.
+        """
+        num = len(corners)
+        first_side = corners[:, 1] - corners[:, 0]
+        last_side = corners[:, 3] - corners[:, 0]
+        # Two perpendicular axes in the plane of each quad are the axes of its texture.
+        x_axis = first_side / np.maximum(lengths(first_side), _TINY)
+        y_axis = last_side - np.einsum("ki,ki->k", last_side, x_axis)[:, None] * x_axis
+        axes = np.stack([x_axis, y_axis / np.maximum(lengths(y_axis), _TINY)], axis=1)
         halves = np.array([0, 1, 2, 0, 2, 3])  # corners of the two triangles of a quad
         return Mesh(
-            corners.reshape(-1, 3),
-            (np.arange(0, 4 * k, 4)[:, None] + halves).reshape(-1, 3),
-            np.einsum("kci,kai->kca", corners, axes).reshape(-1, 2),
-            np.full(2 * k, material, np.int16),
-            np.repeat(np.broadcast_to(tint, (k, 3)), 2, axis=0),
-            np.full(2 * k, -1, np.int32),
+            vertices=corners.reshape(-1, 3),
+            triangles=(np.arange(0, 4 * num, 4)[:, None] + halves).reshape(-1, 3),
+            uv=np.einsum("kci,kai->kca", corners, axes).reshape(-1, 2),
+            material=np.full(2 * num, material, np.int16),
+            tint=np.repeat(np.broadcast_to(tint, (num, 3)), 2, axis=0),
+            instance=np.full(2 * num, -1, np.int32),
         )
 
     def moved(self, offset: Point) -> Mesh:
-        """Return the mesh moved by a (3,) offset."""
+        """Return the mesh moved by a (3,) offset in metres."""
         return replace(self, vertices=self.vertices + offset)
 
     def posed(self, T_a_mesh: Float) -> Mesh:
-        """Return the mesh moved by a (4,4) rigid motion."""
+        """Return the mesh in frame a, for the (4,4) pose of the mesh in that frame."""
         return replace(self, vertices=self.vertices @ T_a_mesh[:3, :3].T + T_a_mesh[:3, 3])
 
     def of_instance(self, instance: int) -> Mesh:
@@ -115,8 +126,9 @@ class Mesh:
 
 
 def box(low: Point | Float, high: Point | Float, material: Material, tint: Tint = WHITE) -> Mesh:
-    """Return an upright box between two corners, or K boxes between (K,3) corners."""
-    is_high = np.array(  # x, y, z of the corners of each side
+    """Return an upright box between two corners (3,) in metres; (K,3) corners make K boxes."""
+    # For each corner of each side: 1 where x, y, z are those of the highest corner of the box
+    is_high = np.array(
         [
             [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)],
             [(1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)],
@@ -135,14 +147,18 @@ def box(low: Point | Float, high: Point | Float, material: Material, tint: Tint 
 def frustum(
     low: Point, high: Point, material: Material, tint: Tint = WHITE, taper: Point = (1.0, 1.0)
 ) -> Mesh:
-    """Return a box whose top is scaled by ``taper`` in x and y about its own centre."""
-    a, b = np.asarray(low, float), np.asarray(high, float)
-    middle, half = (a + b)[:2] / 2, (b - a)[:2] / 2
+    """Return a box whose top is scaled by ``taper`` in x and y about its own centre.
+
+    ``low`` and ``high`` are opposite corners (3,) of the box before the scaling, in metres.
+    """
+    lowest, highest = np.asarray(low, float), np.asarray(high, float)
+    middle = (lowest + highest)[:2] / 2
+    half = (highest - lowest)[:2] / 2
     ring = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
-    bottom = np.column_stack([middle + ring * half, np.full(4, a[2])])
-    top = np.column_stack([middle + ring * half * taper, np.full(4, b[2])])
-    after = [1, 2, 3, 0]
-    sides = np.stack([bottom, bottom[after], top[after], top], axis=1)
+    bottom = np.column_stack([middle + ring * half, np.full(4, lowest[2])])
+    top = np.column_stack([middle + ring * half * taper, np.full(4, highest[2])])
+    next_corner = [1, 2, 3, 0]
+    sides = np.stack([bottom, bottom[next_corner], top[next_corner], top], axis=1)
     caps = np.stack([bottom[::-1], top])
     return Mesh.quads(np.concatenate([sides, caps]), material, tint)
 
@@ -158,17 +174,20 @@ def tube(
     """Return a closed cylinder or cone between two points, with one radius or one at each end."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     start_radius_m, end_radius_m = np.broadcast_to(radius_m, 2)
+    # Two unit vectors u and v span the plane of the rings.
     axis = (b - a) / np.linalg.norm(b - a)
     is_upright = abs(axis[2]) >= _UPRIGHT
     u = across(np.array([1.0, 0.0, 0.0] if is_upright else [0.0, 0.0, 1.0]), axis)
     u /= np.linalg.norm(u)
     v = across(axis, u)
     angle = 2 * np.pi * np.arange(num_sides)[:, None] / num_sides
-    ring, after = np.cos(angle) * u + np.sin(angle) * v, np.roll(np.arange(num_sides), -1)
-    low, high = a + start_radius_m * ring, b + end_radius_m * ring
-    around = (low, low[after], high[after], high)
-    caps = ((a, low[after], low, a), (b, high, high[after], b))
-    quads = [np.stack(np.broadcast_arrays(*quad), axis=1) for quad in (around, *caps)]
+    ring = np.cos(angle) * u + np.sin(angle) * v
+    start_ring, end_ring = a + start_radius_m * ring, b + end_radius_m * ring
+    next_corner = np.roll(np.arange(num_sides), -1)
+    next_start, next_end = start_ring[next_corner], end_ring[next_corner]
+    side = (start_ring, next_start, next_end, end_ring)
+    caps = ((a, next_start, start_ring, a), (b, end_ring, next_end, b))
+    quads = [np.stack(np.broadcast_arrays(*quad), axis=1) for quad in (side, *caps)]
     return Mesh.quads(np.concatenate(quads), material, tint)
 
 
@@ -177,23 +196,32 @@ def ball(centre: Point, radius_m: Point, material: Material, tint: Tint = WHITE)
     latitude, longitude = np.meshgrid(
         np.linspace(-np.pi / 2, np.pi / 2, 6 + 1), np.linspace(0, 2 * np.pi, 10 + 1), indexing="ij"
     )
-    flat = np.cos(latitude)
-    p = np.stack([flat * np.cos(longitude), flat * np.sin(longitude), np.sin(latitude)], axis=2)
-    p = p * np.asarray(radius_m) + np.asarray(centre)
+    level = np.cos(latitude)
+    unit = np.stack(
+        [level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)], axis=2
+    )
+    p = unit * np.asarray(radius_m) + np.asarray(centre)  # (ring, sector, 3)
     corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
     return Mesh.quads(corners.reshape(-1, 4, 3), material, tint)
 
 
 def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint = WHITE) -> Mesh:
-    """Return a square leaf (a bunch of leaves) at each of (K,3) centres, turned at random."""
-    k = len(centres)
-    u = rng.normal(size=(k, 3))
+    """Return square leaves, turned at random; each square stands for a bunch of leaves.
+
+    Args:
+        centres: (K,3) centres of the squares in metres.
+        size_m: Mean side of a square.
+        tint: Mean factors on the colour of the material.
+    """
+    num = len(centres)
+    # Unit vectors along the sides of each square
+    u = rng.normal(size=(num, 3))
     u /= lengths(u)
-    v = across(u, rng.normal(size=(k, 3)))
+    v = across(u, rng.normal(size=(num, 3)))
     v /= lengths(v)
-    half = (size_m * rng.uniform(*_LEAF_SIZES, k))[:, None]
+    half = (size_m * rng.uniform(*_LEAF_SIZES, num))[:, None]
     corners = [centres + half * (i * u + j * v) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    tints = np.asarray(tint) * rng.uniform(*_LEAF_TINTS, (k, 1))
+    tints = np.asarray(tint) * rng.uniform(*_LEAF_TINTS, (num, 1))
     return Mesh.quads(np.stack(corners, axis=1), Material.LEAF, tints)
 
 

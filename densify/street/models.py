@@ -52,56 +52,68 @@ class Actor:
 
 
 @lru_cache(_CACHED_MODELS)
-def model(name: str, **named: Any) -> Mesh:
-    """Return a model of models.yaml; ``named`` are the lengths, colours and materials it names."""
-    return Mesh.join([_solid(solid, named) for solid in getattr(_SHAPES, name)])
+def model(name: str, **parameters: Any) -> Mesh:
+    """Return a model of models.yaml, joined from its solids.
+
+    ``parameters`` gives a value (a length, a colour or a material) to each name that the rows of
+    the model use.
+    """
+    return Mesh.join([_solid(solid, parameters) for solid in getattr(_SHAPES, name)])
 
 
-def panel(name: str, length_m: float, **named: Any) -> Mesh:
-    """Return a piece of a fence, wall or rail, this long along x."""
-    return model(name, left=-length_m / 2, right=length_m / 2, **named)
+def panel(name: str, length_m: float, **parameters: Any) -> Mesh:
+    """Return a piece of a fence, wall or rail with this length along x, centred at the origin."""
+    return model(name, left=-length_m / 2, right=length_m / 2, **parameters)
 
 
-def _solid(row: Any, named: dict[str, Any]) -> Mesh:
-    fields = {name: resolve(value, named) for name, value in vars(row).items()}
+def _solid(row: Any, parameters: dict[str, Any]) -> Mesh:
+    """Return the solid that a row of models.yaml describes, once or at several offsets."""
+    fields = {name: resolve(value, parameters) for name, value in vars(row).items()}
     material = fields["material"]
     fields["material"] = material if isinstance(material, Material) else Material[material]
-    make, offsets = _SOLIDS[fields.pop("solid")], fields.pop("at", None)
+    make = _SOLIDS[fields.pop("solid")]
+    offsets = fields.pop("at", None)
     if "spaced" in fields:
-        offsets = _spaced(fields.pop("spaced"), named)
+        offsets = _repeated_offsets(fields.pop("spaced"), parameters)
     if offsets is None:
         return make(**fields)
-    if make is box:  # many at once
+    if make is box:  # `box` makes many boxes at once
         return box(**fields | {end: np.add(fields[end], offsets) for end in ("low", "high")})
     return Mesh.join([make(**fields).moved(offset) for offset in offsets])
 
 
-def _spaced(row: Any, named: dict[str, Any]) -> Float:
+def _repeated_offsets(row: Any, parameters: dict[str, Any]) -> Float:
     """Return the (N,3) offsets of solids that repeat along an axis."""
-    steps = np.arange(resolve(row.first, named), resolve(row.end, named), row.step_m)
-    gap_m = resolve(getattr(row, "from_middle_m", 0.0), named)
+    steps = np.arange(resolve(row.first, parameters), resolve(row.end, parameters), row.step_m)
+    gap_m = resolve(getattr(row, "from_middle_m", 0.0), parameters)
     offsets = np.zeros((np.count_nonzero(np.abs(steps) >= gap_m), 3))
     offsets[:, "xyz".index(row.axis)] = steps[np.abs(steps) >= gap_m]
     return offsets
 
 
-def resolve(value: Any, named: Mapping[str, Any]) -> Any:
-    """Return a value of a table with names replaced, and [name, number] by their sum."""
+def resolve(value: Any, parameters: Mapping[str, Any]) -> Any:
+    """Return a value of a table in which names are replaced by the values of parameters.
+
+    A pair [name, number] is replaced by the sum of the parameter and the number. Other lists are
+    resolved item by item, and unknown names stay.
+    """
     if isinstance(value, str):
-        return named.get(value, value)
+        return parameters.get(value, value)
     if not isinstance(value, list):
         return value
     if len(value) == 2 and isinstance(value[0], str):
         name, beyond_m = value
-        return named[name] + beyond_m
-    return [resolve(item, named) for item in value]
+        return parameters[name] + beyond_m
+    return [resolve(item, parameters) for item in value]
 
 
-def _any_paint(rng: np.random.Generator) -> Tint:
+def _random_paint(rng: np.random.Generator) -> Tint:
+    """Return the colour of one of the paints."""
     return tuple(_SHAPES.paints[int(rng.integers(len(_SHAPES.paints)))])
 
 
-def _any_cloth(rng: np.random.Generator) -> Tint:
+def _random_cloth(rng: np.random.Generator) -> Tint:
+    """Return a random colour of cloth."""
     cloth = _SHAPES.cloth
     return colorsys.hsv_to_rgb(
         rng.random(), rng.uniform(*cloth.saturation), rng.uniform(*cloth.value)
@@ -126,6 +138,7 @@ def _sheet(left: Any, material: Material, tint: Tint = WHITE) -> Mesh:
 
 
 def _quads(corners: Any, material: Material, tint: Tint = WHITE) -> Mesh:
+    """Return quads from lists of corners."""
     return Mesh.quads(np.array(corners, float), material, tint)
 
 
@@ -138,8 +151,8 @@ _SOLIDS: dict[str, Callable[..., Mesh]] = {
 
 
 def parked_car(instance: int, rng: np.random.Generator) -> Mesh:
-    """Return a car of any paint and shape."""
-    return car_mesh(_any_paint(rng), rng).of_instance(instance)
+    """Return a car of random paint and shape, with this object number."""
+    return car_mesh(_random_paint(rng), rng).of_instance(instance)
 
 
 def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
@@ -149,29 +162,30 @@ def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
     front = shape.front_m + rng.uniform(*shape.longer_m)
     rear = shape.rear_m - rng.uniform(*shape.longer_m)
     roof = shape.roof_m + rng.uniform(*shape.estate_higher_m) * (style == "estate")
-    named = {"front": front, "rear": rear, "roof": roof, "paint": paint, "belt": shape.belt_m}
-    named |= {"wide": shape.half_width_m, "narrow": shape.roof_half_width_m}
-    named |= {"cowl": shape.cowl_m, "screen": shape.screen_m}
-    named["deck"] = rear + getattr(shape.deck_ahead_of_rear_m, style)
-    named["rear_roof"] = rear + getattr(shape.rear_roof_ahead_of_rear_m, style)
+    parameters = {"front": front, "rear": rear, "roof": roof, "paint": paint, "belt": shape.belt_m}
+    parameters |= {"wide": shape.half_width_m, "narrow": shape.roof_half_width_m}
+    parameters |= {"cowl": shape.cowl_m, "screen": shape.screen_m}
+    parameters["deck"] = rear + getattr(shape.deck_ahead_of_rear_m, style)
+    parameters["rear_roof"] = rear + getattr(shape.rear_roof_ahead_of_rear_m, style)
+    # Pillars behind and before the doors, at the lower and the upper line of the windows
     door_rear, door_front = shape.door_pillar_m
     for height, begin, end in (("low", "deck", "cowl"), ("high", "rear_roof", "screen")):
-        behind_m, ahead_m = door_rear - named[begin], named[end] - door_front
-        named[f"{height}_rear_pillar"] = named[begin] + shape.rear_pillar_share * behind_m
-        named[f"{height}_front_pillar"] = named[end] - shape.front_pillar_share * ahead_m
+        behind_m, ahead_m = door_rear - parameters[begin], parameters[end] - door_front
+        parameters[f"{height}_rear_pillar"] = parameters[begin] + shape.rear_pillar_share * behind_m
+        parameters[f"{height}_front_pillar"] = parameters[end] - shape.front_pillar_share * ahead_m
     lights = model("car_lights", front=front, rear=rear)
-    return Mesh.join([model("car_body", **named), model("car_inside"), lights])
+    return Mesh.join([model("car_body", **parameters), model("car_inside"), lights])
 
 
 def car(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a driving car."""
-    return Actor("car", (Body(car_mesh(_any_paint(rng), rng), motion, instance),))
+    return Actor("car", (Body(car_mesh(_random_paint(rng), rng), motion, instance),))
 
 
 def truck(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a 16 m articulated truck. The trailer follows the tractor through turns."""
-    cab = model("truck_cab", paint=_any_paint(rng))
-    load = model("truck_load", tarpaulin=_any_cloth(rng))
+    cab = model("truck_cab", paint=_random_paint(rng))
+    load = model("truck_load", tarpaulin=_random_cloth(rng))
     towed = Towed(motion, _SHAPES.truck.kingpin_m, WHEELBASE_M["trailer"], *SPAN_S)
     return Actor("truck", (Body(cab, motion, instance), Body(load, towed, instance)), num_solid=2)
 
@@ -180,36 +194,40 @@ def walker(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a pedestrian: a trunk with two legs and two arms that swing in step."""
     shape = _SHAPES.walker
     hip_m = shape.hip_m + rng.uniform(*shape.taller_m)
-    named = {"hip": hip_m, "foot": -(hip_m - shape.leg_shorter_than_hip_m)}
-    named |= {"cloth": _any_cloth(rng), "trousers": _any_cloth(rng)}
-    named["hair"] = tuple(channel * rng.random() for channel in shape.darkest_hair)
-    trunk = Body(model("walker_trunk", **named), motion, instance)
-    return Actor("walker", (trunk, *_limbs(shape, named, motion, instance)))
+    parameters = {"hip": hip_m, "foot": -(hip_m - shape.leg_shorter_than_hip_m)}
+    parameters |= {"cloth": _random_cloth(rng), "trousers": _random_cloth(rng)}
+    parameters["hair"] = tuple(channel * rng.random() for channel in shape.darkest_hair)
+    trunk = Body(model("walker_trunk", **parameters), motion, instance)
+    return Actor("walker", (trunk, *_limbs(shape, parameters, motion, instance)))
 
 
 def cyclist(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a bicycle with a rider whose legs pedal."""
     shape = _SHAPES.cyclist
     names = ("paint", "cloth", "helmet", "left_cloth", "right_cloth")
-    named = {name: _any_cloth(rng) for name in names}
-    wheels = [tube for x in shape.wheel.x_m for tube in _spoked_wheel(shape.wheel, x)]
-    frame = Mesh.join([*wheels, model("bicycle_and_rider", **named)])
+    parameters = {name: _random_cloth(rng) for name in names}
+    wheels = [part for x_m in shape.wheel.x_m for part in _spoked_wheel(shape.wheel, x_m)]
+    frame = Mesh.join([*wheels, model("bicycle_and_rider", **parameters)])
     trunk = Body(frame, motion, instance)
-    return Actor("cyclist", (trunk, *_limbs(shape, named, motion, instance)))
+    return Actor("cyclist", (trunk, *_limbs(shape, parameters, motion, instance)))
 
 
-def _limbs(shape: Any, named: dict[str, Any], motion: Driving, instance: int) -> Iterator[Body]:
+def _limbs(
+    shape: Any, parameters: dict[str, Any], motion: Driving, instance: int
+) -> Iterator[Body]:
     """Yield the limbs of a walker or cyclist."""
     for row in shape.limbs:
-        hinge_m, phase = resolve(row.hinge_m, named), 2 * np.pi * row.phase
+        hinge_m, phase = resolve(row.hinge_m, parameters), 2 * np.pi * row.phase
         limb = Limb(motion, hinge_m, row.swing_rad, shape.stride_m, phase)
-        yield Body(model(row.model, **named), limb, instance)
+        yield Body(model(row.model, **parameters), limb, instance)
 
 
-def _spoked_wheel(row: Any, x: float) -> list[Mesh]:
+def _spoked_wheel(row: Any, x_m: float) -> list[Mesh]:
+    """Return the tubes of a wheel at a position along x: its tyre, and spokes across the hub."""
     angle = np.linspace(0, 2 * np.pi, row.num_sides + 1)
     circle = row.radius_m * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
-    rim, half = circle + (x, 0, row.hub_m), row.num_sides // 2
+    rim = circle + (x_m, 0, row.hub_m)
+    half = row.num_sides // 2  # the opposite corner of the rim
     spokes = [(rim[i], rim[i + half]) for i in range(0, half, 2)]
     tubes = [(row.tyre_m, Material.RUBBER, ends) for ends in pairwise(rim)]
     tubes += [(row.spoke_m, Material.METAL, ends) for ends in spokes]
@@ -232,48 +250,55 @@ def house(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
     tint = tuple(rng.uniform(darkest, brightest, 3).tolist())
     right, rear = width_m / 2, depth_m / 2
     ridge = height + rng.uniform(*shape.ridge_share) * depth_m
-    named = {"height": height, "ridge": ridge, "wall": wall, "tint": tint}
-    named |= {"left": -right, "right": right, "front": -rear, "rear": rear}
-    named["chimney"] = float(rng.uniform(*shape.chimney_share)) * right
+    parameters = {"height": height, "ridge": ridge, "wall": wall, "tint": tint}
+    parameters |= {"left": -right, "right": right, "front": -rear, "rear": rear}
+    parameters["chimney"] = float(rng.uniform(*shape.chimney_share)) * right
     windows = [
-        model("house_windows", **named, sill=shape.sill_m + shape.storey_m * storey,
+        model("house_windows", **parameters, sill=shape.sill_m + shape.storey_m * storey,
               beside_door=shape.beside_door_m if storey == 0 else 0.0)
         for storey in range(storeys)
     ]  # fmt: skip
-    return Mesh.join([model("house_shell", **named), *windows, model("house_details", **named)])
+    return Mesh.join(
+        [model("house_shell", **parameters), *windows, model("house_details", **parameters)]
+    )
 
 
 def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
-    """Return the mesh of a tree, and the mesh of its trunk."""
+    """Return the mesh of a tree, and the mesh of its foot, which vehicles must not touch."""
     shape = _SHAPES.tree
     height, spread = rng.uniform(*shape.height_m), rng.uniform(*shape.radius_m)
-    crown = max(shape.crown_from_m, shape.crown_share * height)
-    thick = shape.trunk_radius.per_m * height + shape.trunk_radius.base_m
+    crown_z = max(shape.crown_from_m, shape.crown_share * height)
+    radius_m = shape.trunk_radius.per_m * height + shape.trunk_radius.base_m
     top = (rng.uniform(*shape.top_m), rng.uniform(*shape.top_m), height * shape.top_share)
     root = (0, 0, shape.root_m)
-    trunk = tube(root, top, (thick, thick * shape.trunk_radius.top_share), Material.BARK)
+    trunk = tube(root, top, (radius_m, radius_m * shape.trunk_radius.top_share), Material.BARK)
     meshes = [trunk]
+
+    # Branches start at the trunk, between the crown's lower end and its upper part.
     for _ in range(shape.num_branches):
         angle = rng.uniform(0, 2 * np.pi)
-        z = rng.uniform(crown, height * shape.branch_to_share)
+        z = rng.uniform(crown_z, height * shape.branch_to_share)
         reach = spread * rng.uniform(*shape.branch_reach)
         tip = (reach * np.cos(angle), reach * np.sin(angle), z + reach * shape.branch_rise)
         start = (top[0] * z / top[2], top[1] * z / top[2], z)
         meshes.append(
             tube(start, tip, shape.branch_radius_m, Material.BARK, num_sides=shape.branch_sides)
         )
-    count = int(shape.leaves_per_m * spread)
-    away = rng.normal(size=(count, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    away *= rng.uniform(shape.leaf_from, 1.0, (count, 1)) ** 0.5
+
+    # Leaves fill the outer part of a lumpy ellipsoid.
+    num_leaves = int(shape.leaves_per_m * spread)
+    direction = rng.normal(size=(num_leaves, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction *= rng.uniform(shape.leaf_from, 1.0, (num_leaves, 1)) ** 0.5
     lump = shape.lump
-    wave = np.sin(lump.per_x * away[:, :1] + rng.uniform(*lump.phase))
-    lumps = 1 + lump.depth * wave * np.cos(lump.per_y * away[:, 1:2])
-    middle = [top[0], top[1], (crown + height) / 2 + shape.crown_up_m]
-    radii = [spread, spread, (height - crown) / 2 + shape.crown_taller_m]
+    wave = np.sin(lump.per_x * direction[:, :1] + rng.uniform(*lump.phase))
+    lumps = 1 + lump.depth * wave * np.cos(lump.per_y * direction[:, 1:2])
+    middle = [top[0], top[1], (crown_z + height) / 2 + shape.crown_up_m]
+    radii = [spread, spread, (height - crown_z) / 2 + shape.crown_taller_m]
     green = tuple(rng.uniform(*channel) for channel in shape.tint)
-    meshes.append(leaves(middle + away * lumps * radii, shape.leaf_m, rng, green))
-    foot_radius_m = max(thick, shape.foot.radius_m)
+    meshes.append(leaves(middle + direction * lumps * radii, shape.leaf_m, rng, green))
+
+    foot_radius_m = max(radius_m, shape.foot.radius_m)
     foot = tube(root, (0, 0, shape.foot.height_m), foot_radius_m, Material.BARK)
     return Mesh.join(meshes), foot
 
@@ -282,11 +307,12 @@ def hedge(rng: np.random.Generator, height_m: float, length_m: float) -> Mesh:
     """Return a hedge along x: dense leaves outside, a few twigs inside."""
     shape = _SHAPES.hedge
     half = np.array([length_m / 2, shape.half_depth_m, height_m / 2])
-    count = int(shape.leaves_per_m2 * length_m * height_m)
-    centres = rng.uniform(-1, 1, (count, 3))
-    face = rng.integers(0, 3, count)
-    is_outer = rng.random(count) < shape.outer_share
-    side = np.sign(centres[np.arange(count), face])
+    num_leaves = int(shape.leaves_per_m2 * length_m * height_m)
+    centres = rng.uniform(-1, 1, (num_leaves, 3))
+    face = rng.integers(0, 3, num_leaves)
+    is_outer = rng.random(num_leaves) < shape.outer_share
+    # Outer leaves are moved to one of the faces of the box.
+    side = np.sign(centres[np.arange(num_leaves), face])
     outermost = rng.uniform(shape.outer_from, 1.0, is_outer.sum())
     centres[is_outer, face[is_outer]] = side[is_outer] * outermost
     foliage = leaves(centres * half + [0, 0, height_m / 2], shape.leaf_m, rng, shape.tint)

@@ -14,10 +14,12 @@ from scipy.spatial.transform import Rotation
 from densify.geometry.types import Bool, Float, Int
 from densify.street.mesh import Mesh, across, lengths
 
-DURATION_S = 16  # of every scene
-STEP_M, _FINE_M = 0.5, 0.05  # between the points of a curve, and steps of integration
-_TOW_S = 0.01  # between the positions of a trailer
-_WAVE_M, _WAVE_SHARE = np.array([95.0, 150.0, 240.0]), np.array([0.25, 0.35, 0.4])  # of hills
+DURATION_S = 16  # duration of every scene
+STEP_M = 0.5  # distance between the points of a curve
+_FINE_M = 0.05  # step of the integration of a curve
+_TOW_S = 0.01  # time between the computed positions of a trailer
+# Lengths of the waves of the terrain, and their shares of the greatest slope
+_WAVE_M, _WAVE_SHARE = np.array([95.0, 150.0, 240.0]), np.array([0.25, 0.35, 0.4])
 
 
 class Curve:
@@ -25,6 +27,7 @@ class Curve:
 
     def __init__(self, xy: Float) -> None:
         """Build the curve through (N,2) points in metres, neighbours about half a metre apart."""
+        # The sum of the chords is the arc length.
         chord_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
         self.length_m = float(chord_m[-1])
         self.knots_m: Float = chord_m
@@ -59,16 +62,23 @@ class Curve:
     def bending(
         length_m: float, curvature: Callable[[Float], Float], origin_m: float = 0.0
     ) -> Curve:
-        """Return a curve by curvature (1/m, left positive), through the origin along +x."""
+        """Return the curve with a given curvature that passes the origin in the direction +x.
+
+        Args:
+            length_m: Length of the curve.
+            curvature: Function from (N,) arc lengths to (N,) curvatures in 1/m, left positive.
+            origin_m: Arc length at which the curve passes the origin.
+        """
         step = _FINE_M
         station = np.arange(0.0, length_m + step, step)
         heading = np.concatenate([[0.0], np.cumsum(curvature(station[:-1] + step / 2) * step)])
         middle = (heading[1:] + heading[:-1]) / 2
         steps = step * np.stack([np.cos(middle), np.sin(middle)], axis=1)
         xy = np.concatenate([[[0.0, 0.0]], np.cumsum(steps, axis=0)])
-        start = round(origin_m / step)  # at this arc length it passes the origin
-        c, s = np.cos(heading[start]), np.sin(heading[start])
-        xy = (xy - xy[start]) @ np.array([[c, -s], [s, c]])
+        # Move and turn the curve until its point at ``origin_m`` is the origin.
+        start = round(origin_m / step)
+        cosine, sine = np.cos(heading[start]), np.sin(heading[start])
+        xy = (xy - xy[start]) @ np.array([[cosine, -sine], [sine, cosine]])
         return Curve(xy[:: round(STEP_M / step)])
 
 
@@ -97,20 +107,34 @@ def polyline(corners: Sequence[Float | tuple[float, float]], radius_m: float) ->
     """Return (N,2) points, half a metre apart, along straight lines with rounded corners."""
     pieces = [np.asarray(corners[0], float)[None]]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
-        a, b, c = (np.asarray(p, float) for p in (before, corner, after))
-        u, v = (a - b) / np.linalg.norm(a - b), (c - b) / np.linalg.norm(c - b)
-        half = np.arccos(np.clip(u @ v, -1, 1)) / 2
-        centre = b + (u + v) / np.linalg.norm(u + v) * radius_m / np.sin(half)
-        begin, end = b + u * radius_m / np.tan(half), b + v * radius_m / np.tan(half)
-        start, stop = (np.arctan2(*(p - centre)[::-1]) for p in (begin, end))
-        sweep = (stop - start + np.pi) % (2 * np.pi) - np.pi
-        angle = start + np.linspace(0, sweep, max(2, int(abs(sweep) * radius_m / STEP_M)))
-        pieces.append(centre + radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        pieces.append(_rounded_corner(before, corner, after, radius_m))
     pieces.append(np.asarray(corners[-1], float)[None])
-    rough = np.concatenate(pieces)
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rough, axis=0), axis=1))])
+
+    # Resample the points at equal steps.
+    xy = np.concatenate(pieces)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
     even = np.linspace(0, length[-1], int(length[-1] / STEP_M) + 1)
-    return np.stack([np.interp(even, length, rough[:, i]) for i in range(2)], axis=1)
+    return np.stack([np.interp(even, length, xy[:, axis]) for axis in range(2)], axis=1)
+
+
+def _rounded_corner(
+    before: Float | tuple[float, float],
+    corner: Float | tuple[float, float],
+    after: Float | tuple[float, float],
+    radius_m: float,
+) -> Float:
+    """Return points (N,2) of the arc that touches both lines at the middle of three corners."""
+    a, b, c = (np.asarray(point, float) for point in (before, corner, after))
+    u = (a - b) / np.linalg.norm(a - b)
+    v = (c - b) / np.linalg.norm(c - b)
+    half = np.arccos(np.clip(u @ v, -1, 1)) / 2  # half the angle between the lines
+    centre = b + (u + v) / np.linalg.norm(u + v) * radius_m / np.sin(half)
+    begin = b + u * radius_m / np.tan(half)
+    end = b + v * radius_m / np.tan(half)
+    begin_angle, end_angle = (np.arctan2(*(point - centre)[::-1]) for point in (begin, end))
+    turn = (end_angle - begin_angle + np.pi) % (2 * np.pi) - np.pi
+    angle = begin_angle + np.linspace(0, turn, max(2, int(abs(turn) * radius_m / STEP_M)))
+    return centre + radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 class Speed:
@@ -122,13 +146,17 @@ class Speed:
         self._travelled = np.concatenate([[0.0], np.cumsum(steps)])
 
     def distance(self, times_s: Float) -> Float:
-        """Return (N,) metres travelled since the first knot, negative before it."""
-        i = np.clip(np.searchsorted(self._t, times_s, side="right") - 1, 0, len(self._t) - 1)
-        after = np.minimum(i + 1, len(self._t) - 1)
-        span = np.where(after > i, self._t[after] - self._t[i], 1.0)
-        slope = np.where(times_s < self._t[0], 0.0, (self._v[after] - self._v[i]) / span)
-        dt = times_s - self._t[i]
-        travelled: Float = self._travelled[i] + self._v[i] * dt + slope * dt**2 / 2
+        """Return (N,) metres travelled since the first knot at (N,) seconds, negative before it."""
+        last = len(self._t) - 1
+        before = np.clip(np.searchsorted(self._t, times_s, side="right") - 1, 0, last)
+        after = np.minimum(before + 1, last)
+        # Constant acceleration between two knots, 0 before the first and after the last
+        span = np.where(after > before, self._t[after] - self._t[before], 1.0)
+        acceleration = np.where(
+            times_s < self._t[0], 0.0, (self._v[after] - self._v[before]) / span
+        )
+        dt = times_s - self._t[before]
+        travelled: Float = self._travelled[before] + self._v[before] * dt + acceleration * dt**2 / 2
         return travelled
 
 
@@ -142,7 +170,10 @@ class Terrain:
 
     @staticmethod
     def hilly(rng: np.random.Generator, max_slope: float, scale_m: float = 1.0) -> Terrain:
-        """Return three waves in random directions, nowhere steeper than ``max_slope``."""
+        """Return a terrain of three waves in random directions, nowhere steeper than ``max_slope``.
+
+        ``scale_m`` is a factor on the lengths of the waves.
+        """
         length_m = _WAVE_M * scale_m
         angle = rng.uniform(0, 2 * np.pi, 3)
         wave = (2 * np.pi / length_m)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -161,21 +192,21 @@ class Terrain:
 
 
 class Poses(NamedTuple):
-    """N poses ``T_world_body``."""
+    """N poses ``T_world_body`` of bodies in the world."""
 
     rotation: Float  # (N,3,3) rotation matrices
     position: Float  # (N,3) metres
 
     def apply(self, points: Float) -> Float:
-        """Return (N,3) body-frame points in the world, row by row."""
+        """Return (N,3) points of the body frames in world coordinates, each by its own pose."""
         return self.turn(points) + self.position
 
     def undo(self, points: Float) -> Float:
-        """Return (N,3) world points in the body frames, row by row."""
+        """Return (N,3) world points in body coordinates, each by its own pose."""
         return np.einsum("nji,nj->ni", self.rotation, points - self.position)
 
     def turn(self, directions: Float) -> Float:
-        """Return (N,3) body-frame directions in world axes."""
+        """Return (N,3) directions of the body frames in world axes, each by its own pose."""
         return np.einsum("nij,nj->ni", self.rotation, directions)
 
     def rows(self, rows: Int) -> Poses:
@@ -185,7 +216,8 @@ class Poses(NamedTuple):
     def matrix(self, row: int = 0) -> Float:
         """Return the (4,4) matrix ``T_world_body`` of one pose."""
         T_world_body = np.eye(4)
-        T_world_body[:3, :3], T_world_body[:3, 3] = self.rotation[row], self.position[row]
+        T_world_body[:3, :3] = self.rotation[row]
+        T_world_body[:3, 3] = self.position[row]
         return T_world_body
 
 
@@ -204,14 +236,15 @@ class Trajectory(Protocol):
 
 
 def poses_at(trajectory: Trajectory, times_s: Float) -> Poses:
-    """Return N poses at (N,) seconds. Poses for equal times in a row are computed once."""
-    new = np.diff(times_s, prepend=np.nan) != 0
-    if new.all():
+    """Return N poses at (N,) seconds since frame 0; consecutive equal times are computed once."""
+    is_new = np.diff(times_s, prepend=np.nan) != 0
+    if is_new.all():
         return trajectory.poses(times_s)
-    poses = trajectory.poses(times_s[new])
+    poses = trajectory.poses(times_s[is_new])
     if len(poses.position) == 1:
-        return Poses(*(np.broadcast_to(c, (len(new), *c.shape[1:])) for c in poses))
-    return poses.rows(np.cumsum(new) - 1)
+        columns = (np.broadcast_to(column, (len(is_new), *column.shape[1:])) for column in poses)
+        return Poses(*columns)
+    return poses.rows(np.cumsum(is_new) - 1)
 
 
 class Still:
@@ -254,12 +287,20 @@ class Driving:
 def on_ground(
     terrain: Terrain, rear: Float, front: Float, lift_m: Float, upright: bool = False
 ) -> Poses:
-    """Return the N poses of bodies that touch the ground at (N,2) rear and front points."""
-    a = np.column_stack([rear, terrain.height(rear) + lift_m])
-    b = np.column_stack([front, terrain.height(front) + lift_m])
-    middle = (a + b) / 2
+    """Return the N poses of bodies that stand on the ground, or above it.
+
+    Args:
+        rear: (N,2) rear points of contact, world.
+        front: (N,2) front points of contact, world.
+        lift_m: (N,) heights of both points above the ground.
+        upright: True to stay vertical on slopes.
+    """
+    rear_xyz = np.column_stack([rear, terrain.height(rear) + lift_m])
+    front_xyz = np.column_stack([front, terrain.height(front) + lift_m])
+    middle = (rear_xyz + front_xyz) / 2
     slope = terrain.slope(middle[:, :2]) * (not upright)
-    forward = (b - a) * (1.0, 1.0, not upright)
+    forward = (front_xyz - rear_xyz) * (1.0, 1.0, not upright)
+    # The axis to the left is perpendicular to the direction of travel and to the ground's normal.
     x = forward / lengths(forward)
     y = across(np.column_stack([-slope, np.ones(len(slope))]), x)
     y /= lengths(y)
@@ -272,18 +313,26 @@ class Towed:
     def __init__(
         self, tractor: Driving, kingpin_m: float, wheelbase_m: float, first_s: float, last_s: float
     ) -> None:
-        """Build the trailer; the kingpin is ``kingpin_m`` along the x axis of the tractor."""
-        self._tractor, self._kingpin_m = tractor, kingpin_m
+        """Compute the path of the axle.
+
+        Args:
+            kingpin_m: Position of the kingpin on the x axis of the tractor.
+            wheelbase_m: Distance from the kingpin to the axle of the trailer.
+        """
+        self._tractor = tractor
+        self._kingpin_m = kingpin_m
         times = np.arange(first_s, last_s, _TOW_S)
         pin = self._pin(times)
         axle = np.empty_like(pin)
+        # The trailer starts straight behind the tractor. In each step the axle keeps its distance.
         axle[0] = pin[0] - wheelbase_m * (pin[1] - pin[0]) / np.linalg.norm(pin[1] - pin[0])
-        for i in range(1, len(times)):
-            away = axle[i - 1] - pin[i]
-            axle[i] = pin[i] + wheelbase_m * away / np.linalg.norm(away)
+        for step in range(1, len(times)):
+            pin_to_axle = axle[step - 1] - pin[step]
+            axle[step] = pin[step] + wheelbase_m * pin_to_axle / np.linalg.norm(pin_to_axle)
         self._axle = CubicSpline(times, axle)
 
     def _pin(self, times_s: Float) -> Float:
+        """Return the (N,2) positions of the kingpin in the world at (N,) seconds."""
         tractor = self._tractor.poses(times_s)
         return (tractor.position + tractor.rotation[:, :, 0] * self._kingpin_m)[:, :2]
 
@@ -323,7 +372,10 @@ class Rectangles(NamedTuple):
 
     @staticmethod
     def of(mesh: Mesh, poses: Poses, slack_m: float = 0.0) -> Rectangles:
-        """Return the N footprints of a mesh at N poses: its bounds from above, plus ``slack_m``."""
+        """Return the N footprints of a mesh at N poses: its bounds from above, with a margin.
+
+        ``slack_m`` is the width of the margin on each side.
+        """
         low, high = mesh.bounds
         n = len(poses.position)
         middle = np.append((low + high)[:2] / 2, 0.0)
@@ -335,7 +387,7 @@ class Rectangles(NamedTuple):
     @staticmethod
     def joined(groups: Sequence[Rectangles]) -> Rectangles:
         """Return all rectangles, concatenated along the first axis."""
-        return Rectangles(*(np.concatenate(c) for c in zip(*groups, strict=True)))
+        return Rectangles(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
 
     def rows(self, rows: Int | None) -> Rectangles:
         """Return the rectangles with these indices along the first axis, None for a new axis."""
@@ -344,15 +396,16 @@ class Rectangles(NamedTuple):
 
 def overlap(a: Rectangles, b: Rectangles) -> Bool:
     """Return (...) True for pairs of rectangles that touch; leading shapes are broadcast."""
-    # Two rectangles are apart if a side of either of them separates the two (separating axes).
-    away = b.centre - a.centre
-    apart = np.zeros(away.shape[:-1], bool)
-    for p, q in ((a, b), (b, a)):
-        for side, axis in enumerate((p.forward, left_of(p.forward))):
-            reach = p.half_m[..., side] + q.half_m[..., 0] * np.abs(_dot(axis, q.forward))
-            reach = reach + q.half_m[..., 1] * np.abs(_dot(axis, left_of(q.forward)))
-            apart |= np.abs(_dot(axis, away)) > reach
-    return ~apart
+    # Two rectangles are apart if the direction of a side separates them (separating axes): along
+    # it, their centres are farther apart than the sum of their half extents.
+    between = b.centre - a.centre
+    is_apart = np.zeros(between.shape[:-1], bool)
+    for one, other in ((a, b), (b, a)):
+        for side, axis in enumerate((one.forward, left_of(one.forward))):
+            reach = one.half_m[..., side] + other.half_m[..., 0] * np.abs(_dot(axis, other.forward))
+            reach = reach + other.half_m[..., 1] * np.abs(_dot(axis, left_of(other.forward)))
+            is_apart |= np.abs(_dot(axis, between)) > reach
+    return ~is_apart
 
 
 def _dot(a: Float, b: Float) -> Float:

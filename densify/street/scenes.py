@@ -22,17 +22,18 @@ from densify.street.motion import Curve, Driving, Lane, Rectangles, Speed, left_
 from densify.street.world import Body, World
 
 _TABLES = read_table("scenes")
-FIRST_PARKED = 1000  # instances of parked cars count from here
-_NUM_SEEDS = 2**31  # of the random properties of surfaces
-_TRIES = 40  # of an actor that collides
+FIRST_PARKED = 1000  # object number of the first parked car
+_NUM_SEEDS = 2**31  # number of possible seeds of the random properties of surfaces
+_TRIES = 40  # most random draws of an actor that collides
 _TOUCH_M = 25.0  # greatest distance of the centres of two objects that touch
 _ROAD_END_M = 20.0  # no object is nearer to the end of a road
-_CLEAR_M = 0.3  # between static objects
-# Width of the margin around an actor's outline: limbs reach beyond the outline of a trunk.
+_CLEAR_M = 0.3  # least distance between static objects
+# Widths of the margin around an actor's outline: limbs reach beyond the outline of a trunk.
 _ACTOR_MARGIN_M, _LIMBS_MARGIN_M, _EGO_MARGIN_M = 0.1, 0.3, 0.2
 _OUTLINE_STEP_S = 0.1
-_KERB_RAMP_M = 0.25  # over which a pedestrian steps on the kerb
-_CONVOY, _CONVOY_VARIES = range(-9, 7), 0.2
+_KERB_RAMP_M = 0.25  # distance over which a pedestrian steps on the kerb
+_CONVOY = range(-9, 7)  # numbers of the vehicles of a convoy, 0 at its station
+_CONVOY_VARIES = 0.2  # share by which the gaps of a convoy vary
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,11 @@ class Scene:
 
 
 def build(preset: str, rng: np.random.Generator) -> Scene:
-    """Return a scene; ``preset`` is a key of `PRESETS`."""
-    has_traffic, table = preset != "static", PRESETS[preset]
+    """Build a scene at random; ``preset`` is a key of `PRESETS`."""
+    table = PRESETS[preset]
+    has_traffic = preset != "static"
+
+    # Roads, ground and static objects
     curves, stations = _LAYOUTS[preset](table, rng)
     roads = {name: Road(curves[name], **vars(sides)) for name, sides in vars(table.roads).items()}
     terrain = motion.Terrain.hilly(rng, table.ground.max_slope, getattr(table.ground, "scale", 1.0))
@@ -63,6 +67,8 @@ def build(preset: str, rng: np.random.Generator) -> Scene:
     for row in table.markings:
         spans = resolve(row.spans, stations)
         meshes.append(mark_road(ground, roads[row.road], row, spans))
+
+    # The ego vehicle; "here" is its station on the main road at the meeting time.
     ego_lane = getattr(table.lanes, table.ego.lane)
     lane = Lane(curves[ego_lane.road], ego_lane.offset_m)
     ego = Driving(
@@ -72,6 +78,7 @@ def build(preset: str, rng: np.random.Generator) -> Scene:
     if "here" not in stations:
         ego_m = ego.station(np.array([_TABLES.meeting_s]))[0]
         stations["here"] = float(np.interp(ego_m, lane.curve.knots_m, curves["main"].knots_m))
+
     traffic = Traffic(ego, scenery, vars(table.lanes), curves)
     for row in table.traffic if has_traffic else ():
         traffic.add_row(Journey(**vars(row)), stations)
@@ -86,23 +93,27 @@ def build(preset: str, rng: np.random.Generator) -> Scene:
 
 
 def _lay_street(table: Any, rng: np.random.Generator) -> tuple[dict[str, Curve], dict[str, float]]:
-    """Return a main road with two bends, a side road, and the path of the turning truck."""
+    """Return the curves of main road, side road and turning truck by name, and the stations."""
     left, right, wiggle = table.left_bend, table.right_bend, table.wiggle
     left_curvature = 1 / (left.radius_m * _vary(rng, left.vary))
     right_curvature = _vary(rng, right.vary) / right.radius_m
     wiggle_curvature = _vary(rng, wiggle.vary) / wiggle.radius_m
     phase = rng.uniform(0, 2 * np.pi)
 
-    def share(ahead: Float, bend: Any) -> Float:
+    def share_of_bend(ahead: Float, bend: Any) -> Float:
+        """Return 1 within a bend and 0 outside, with a ramp at its ends."""
         ramps = np.minimum(ahead - bend.begin_m, bend.end_m - ahead) / table.ramp_m
         return np.clip(ramps, 0, 1)
 
     def curvature(station: Float) -> Float:
-        ahead = station - table.start_m
+        ahead = station - table.start_m  # distance ahead of the ego vehicle's start
+        left_share = share_of_bend(ahead, left)
+        right_share = share_of_bend(ahead, right)
+        bends = left_curvature * left_share - right_curvature * right_share
+        # Before and after both bends the road wiggles.
         outside = np.maximum(wiggle.before_m - ahead, ahead - wiggle.after_m) / wiggle.ramp_m
-        bends = left_curvature * share(ahead, left) - right_curvature * share(ahead, right)
-        strongest = np.clip(outside, 0, 1) * wiggle_curvature
-        return bends + strongest * np.sin(station / wiggle.wave_m + phase)
+        amplitude = np.clip(outside, 0, 1) * wiggle_curvature
+        return bends + amplitude * np.sin(station / wiggle.wave_m + phase)
 
     main = Curve.bending(table.length_m, curvature, table.start_m)
     mouth = np.array([table.stations.mouth])
@@ -113,16 +124,19 @@ def _lay_street(table: Any, rng: np.random.Generator) -> tuple[dict[str, Curve],
 
 
 def _turn(table: Any, main: Curve, side: Curve) -> tuple[Curve, float]:
-    """Return the path from the oncoming lane into the side road, and where it begins to turn."""
+    """Return the path from the oncoming lane into the side road, and the station of its turn."""
     shape = table.turn
     oncoming = Lane(main, table.lanes.oncoming.offset_m, forward=False).curve
     xy = oncoming(np.arange(0.0, oncoming.length_m, motion.STEP_M))
-    origin, out = side(np.zeros(1))[0], side.tangent(np.zeros(1))[0]
-    along = -left_of(out)  # direction of the ego vehicle
-    is_near = np.abs(xy - origin).sum(axis=1) < shape.search_m
-    straight = xy[is_near & ((xy - origin) @ along > shape.straight_to_m)]
-    corner = origin + along + out * float((straight[-1] - origin) @ out)
-    bend = motion.polyline([straight[-1], corner, corner + shape.beyond_m * out], shape.radius_m)
+    mouth = side(np.zeros(1))[0]
+    side_direction = side.tangent(np.zeros(1))[0]
+    ego_direction = -left_of(side_direction)
+    # The path follows the oncoming lane up to the mouth of the side road, then rounds a corner.
+    is_near = np.abs(xy - mouth).sum(axis=1) < shape.search_m
+    straight = xy[is_near & ((xy - mouth) @ ego_direction > shape.straight_to_m)]
+    corner = mouth + ego_direction + side_direction * float((straight[-1] - mouth) @ side_direction)
+    end = corner + shape.beyond_m * side_direction
+    bend = motion.polyline([straight[-1], corner, end], shape.radius_m)
     curve = Curve(np.concatenate([straight[:-1], bend]))
     straight_m, arc_m = shape.beyond_m - shape.radius_m, shape.radius_m * np.pi / 2
     return curve, curve.length_m - straight_m - arc_m
@@ -131,7 +145,7 @@ def _turn(table: Any, main: Curve, side: Curve) -> tuple[Curve, float]:
 def _lay_crossing(
     table: Any, rng: np.random.Generator
 ) -> tuple[dict[str, Curve], dict[str, float]]:
-    """Return the straight roads and paths of the crossroads."""
+    """Return the curves of the crossroads (straight roads and turning paths), and the stations."""
     curves = {
         name: Curve(motion.polyline(path.corners, getattr(path, "radius_m", 0.0)))
         for name, path in vars(table.paths).items()
@@ -140,7 +154,7 @@ def _lay_crossing(
 
 
 def _lay_highway(table: Any, rng: np.random.Generator) -> tuple[dict[str, Curve], dict[str, float]]:
-    """Return a road of gentle bends in turn."""
+    """Return a main road whose gentle bends alternate, and the stations."""
     wiggle = table.wiggle
     bend, phase = _vary(rng, wiggle.vary) / wiggle.radius_m, rng.uniform(0, 2 * np.pi)
 
@@ -170,35 +184,49 @@ class Scenery:
         self._num_parked = 0
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
-        """Place a mesh on the ground; ``solid`` or all of it is tested for collisions."""
+        """Place a mesh on the ground.
+
+        Args:
+            xy: (2,) position, world.
+            heading: Rotation about z in rad.
+            solid: Part of the mesh that traffic must not touch; None for all of it.
+        """
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
         self._stand(mesh, upright((*xy, z), heading), solid or mesh)
 
     def _stand(self, mesh: Mesh, pose: motion.Poses, solid: Mesh) -> None:
+        """Add a mesh at its pose, and the footprint of its solid part."""
         self.meshes.append(mesh.posed(pose.matrix()))
         self.footprints.append(Rectangles.of(solid, pose))
 
     def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
-        """Return True if the mesh is clear of the carriageway and of all other objects."""
+        """Return True if the mesh is clear of the carriageway and of all other objects.
+
+        ``kerb_gap_m`` is the least distance from the kerb; `put` describes the other arguments.
+        """
         outline = Rectangles.of(mesh, upright((*xy, 0.0), heading), _CLEAR_M)
         if self.footprints:
             self.footprints = [Rectangles.joined(self.footprints)]
             if motion.overlap(self.footprints[0], outline).any():
                 return False
         forward = outline.forward[0]
+        # The outline is tested at its centre, its corners and the middles of its sides.
         grid = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)], float)
-        around = outline.centre + grid * outline.half_m[0] @ [forward, left_of(forward)]
-        return float(self.ground.distance(around).min()) >= kerb_gap_m
+        tested = outline.centre + grid * outline.half_m[0] @ [forward, left_of(forward)]
+        return float(self.ground.distance(tested).min()) >= kerb_gap_m
 
     def put_if_free(
         self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float, solid: Mesh | None = None
     ) -> None:
-        """Place the mesh if its position is free, else leave it out."""
+        """Place the mesh if `is_free` of its solid part is True, else leave it out."""
         if self.is_free(solid or mesh, xy, heading, kerb_gap_m):
             self.put(mesh, xy, heading, solid)
 
     def park(self, xy: Float, forward: Float) -> None:
-        """Place a parked car, tilted with the slope like a driving car."""
+        """Place a parked car of random shape, tilted with the slope like a driving car.
+
+        ``xy`` is its (2,) position and ``forward`` its (2,) unit direction, world.
+        """
         mesh = models.parked_car(FIRST_PARKED + self._num_parked, self.rng)
         self._num_parked += 1
         half = forward * WHEELBASE_M["car"] / 2
@@ -210,13 +238,20 @@ class Scenery:
     def row(
         self, make: Callable[[float], Mesh], start: Float, end: Float, kerb_gap_m: float
     ) -> None:
-        """Put panels of a fence, wall or hedge from start to end, each at its own height."""
+        """Place the panels of a fence, wall or hedge in a line, each on the ground below it.
+
+        Args:
+            make: Function that returns a panel of a given length (m).
+            start: (2,) begin of the line, world.
+            end: (2,) end of the line.
+            kerb_gap_m: Panels nearer to the kerb are left out.
+        """
         length = float(np.linalg.norm(end - start))
-        count = max(1, round(length / _TABLES.plots.panel_m))
+        num_panels = max(1, round(length / _TABLES.plots.panel_m))
         heading = float(np.arctan2(*(end - start)[::-1]))
-        middles = start + (end - start) * (np.arange(count)[:, None] + 0.5) / count
+        middles = start + (end - start) * (np.arange(num_panels)[:, None] + 0.5) / num_panels
         for middle in middles[self.ground.distance(middles) > kerb_gap_m]:
-            self.put(make(length / count), middle, heading)
+            self.put(make(length / num_panels), middle, heading)
 
 
 def _line_with_plots(
@@ -255,12 +290,13 @@ def _build_houses(scenery: Scenery, side: Side) -> None:
         )
         if is_built:
             scenery.put(home, centre, heading)
+        # A plot without a house always has a tree.
         if rng.random() < (table.tree.share if is_built else 1.0):
-            shoot, foot = models.tree(rng)
+            tree, foot = models.tree(rng)
             inset_m = table.tree.from_ends_m
-            along = station + rng.uniform(inset_m, width - inset_m)
-            xy = side.at(along, boundary + rng.uniform(*table.tree.behind_boundary_m))
-            scenery.put_if_free(shoot, xy, 0.0, pavement_m, foot)
+            tree_station = station + rng.uniform(inset_m, width - inset_m)
+            xy = side.at(tree_station, boundary + rng.uniform(*table.tree.behind_boundary_m))
+            scenery.put_if_free(tree, xy, 0.0, pavement_m, foot)
         _close_off(scenery, side, (station, station + width), boundary, has_gate=is_built)
         station += width
 
@@ -268,12 +304,14 @@ def _build_houses(scenery: Scenery, side: Side) -> None:
 def _close_off(
     scenery: Scenery, side: Side, span: tuple[float, float], beyond_m: float, has_gate: bool
 ) -> None:
-    """Enclose a plot by a boundary of a random kind."""
+    """Enclose a plot by a boundary of a random kind, with a gap in the middle for a gate."""
     rng, table = scenery.rng, _TABLES.plots
-    chosen = int(rng.integers(len(table.boundaries)))
+    choice = int(rng.integers(len(table.boundaries)))
     light = float(rng.uniform(*table.paint))
-    height_m = [float(rng.uniform(*row.height_m)) for row in table.boundaries][chosen]
-    row, make = table.boundaries[chosen], partial(models.hedge, rng, height_m)
+    # A height is drawn for every kind, so the number of random draws does not depend on the kind.
+    height_m = [float(rng.uniform(*row.height_m)) for row in table.boundaries][choice]
+    row = table.boundaries[choice]
+    make = partial(models.hedge, rng, height_m)
     if row.kind == "wall":
         make = partial(panel, "wall", height=height_m, material=Material[row.material])
     elif row.kind == "picket_fence":
@@ -285,13 +323,13 @@ def _close_off(
     begin, end = span
     middle, half_m = (begin + end) / 2, table.gate_half_m
     spans = [(begin, middle - half_m), (middle + half_m, end)] if has_gate else [span]
-    for a, b in spans:
-        start, stop = side.at(a, beyond_m), side.at(b, beyond_m)
+    for first_station, last_station in spans:
+        start, stop = side.at(first_station, beyond_m), side.at(last_station, beyond_m)
         scenery.row(make, start, stop, beyond_m - table.fence_clear_m)
 
 
-def _any(kind: str, rng: np.random.Generator) -> tuple[Mesh, Mesh | None]:
-    """Return an object for the kerb, and its outline for collisions; None for all of it."""
+def _make_furniture(kind: str, rng: np.random.Generator) -> tuple[Mesh, Mesh | None]:
+    """Return an object for the kerb, and its part that is tested for collisions, None for all."""
     if kind == "tree":
         return models.tree(rng)
     return (models.sign_post(rng) if kind == "sign_post" else model(kind)), None
@@ -307,7 +345,7 @@ def _furnish(scenery: Scenery, side: Side, spacing_m: float, has_trees: bool) ->
                 continue
             if hasattr(row, "share") and rng.random() >= row.share:
                 continue
-            mesh, solid = _any(row.kind, rng)
+            mesh, solid = _make_furniture(row.kind, rng)
             ahead_m = row.ahead_m if hasattr(row, "ahead_m") else row.ahead_share * spacing_m
             heading = 0.0 if row.kind == "tree" else side.heading(station)
             if row.kind == "sign_post" and side.side > 0:
@@ -326,7 +364,7 @@ def _park_cars(
         is_taken = rng.random() < share
         xy = side.at(station, table.beyond_kerb_m + rng.uniform(*table.vary_m))
         gap_m = table.from_gap_m
-        is_kept_free = any(a - gap_m < station < b + gap_m for a, b in keep_free)
+        is_kept_free = any(begin - gap_m < station < end + gap_m for begin, end in keep_free)
         is_at_kerb = float(scenery.ground.distance(xy[None])[0]) > table.on_edge_m
         if is_taken and not is_kept_free and is_at_kerb:
             scenery.park(xy, side.forward(station))
@@ -338,12 +376,14 @@ def _line_motorway(scenery: Scenery, road: Road, end_m: float) -> None:
     rng, table = scenery.rng, _TABLES.motorway
     left, right = (Side(road, side, 0.0, end_m) for side in (1, -1))
     rail, barrier = (panel(name, table.panel_m) for name in ("guard_rail", "noise_barrier"))
-    panels = np.arange(table.begin_m, end_m, table.panel_m)
+    panel_stations = np.arange(table.begin_m, end_m, table.panel_m)
+    # Rails outside the road and beside its median
     median_m = -road.left_m + table.rails_beside_median_m
-    for station in panels:
+    for station in panel_stations:
         for beyond_m in (table.rails_beyond_edge_m, median_m):
             for side in (left, right):
                 scenery.put(rail, side.at(station, beyond_m), side.heading(station))
+    # Lamps in the median, signs beside the road
     for station in np.arange(table.lamps.begin_m, end_m, table.lamps.every_m):
         lamp_xy = left.at(station, -road.left_m)
         scenery.put(model("lamp_post"), lamp_xy, left.heading(station))
@@ -351,16 +391,17 @@ def _line_motorway(scenery: Scenery, road: Road, end_m: float) -> None:
             sign_m = float(station * _vary(rng, table.signs.vary))
             sign_xy = side.at(sign_m, table.signs.beyond_edge_m)
             scenery.put(models.sign_post(rng), sign_xy, side.heading(sign_m))
+    # The noise barrier on the left; elsewhere trees and bushes
     begin_m, stop_m = rng.uniform(*table.barrier.begin_m), rng.uniform(*table.barrier.end_m)
     for side in (left, right):
-        for station in panels:
+        for station in panel_stations:
             heading = side.heading(station)
             if side is left and begin_m < station < stop_m:
                 scenery.put(barrier, side.at(station, table.barrier.beyond_edge_m), heading)
             elif rng.random() < table.tree.share:
-                shoot, foot = models.tree(rng)
+                tree, foot = models.tree(rng)
                 beyond_m = rng.uniform(*table.tree.beyond_edge_m)
-                scenery.put(shoot, side.at(station, beyond_m), solid=foot)
+                scenery.put(tree, side.at(station, beyond_m), solid=foot)
             elif rng.random() < table.bush.share:
                 height_m = float(rng.uniform(*table.bush.height_m))
                 bush = models.hedge(rng, height_m, rng.uniform(*table.bush.length_m))
@@ -373,36 +414,46 @@ def _line_motorway(scenery: Scenery, road: Road, end_m: float) -> None:
 
 @dataclass(frozen=True)
 class Journey:
-    """A row of ``traffic`` in scenes.yaml."""
+    """The path and speed of an actor or a convoy: a row of ``traffic`` in scenes.yaml."""
 
-    kind: str  # "car", "truck", "cyclist" or "walker"
-    lane: str
-    station: Any  # where the actor is at the meeting time, as in `resolve`
-    slack_m: float = 2.0  # greatest random difference from there
-    knots: Sequence[tuple[float, float]] = ()  # seconds and metres per second
-    m_s: Any = 0.0  # constant speed instead of knots, or the range of speeds to try
-    vary: float = 0.0  # the speed varies by this share
-    vary_m_s: float = 0.0  # the speed varies by this in each try
-    gap_m: float | None = None  # distance between the vehicles of a convoy
+    kind: str  # kind of the actor: "car", "truck", "cyclist" or "walker"
+    lane: str  # name of its lane
+    # Position at the meeting time: arc length (m) along the road, the name of a station, or a pair
+    # [name, metres ahead], as `densify.street.models.resolve` reads it
+    station: Any
+    slack_m: float = 2.0  # greatest random distance from the station
+    knots: Sequence[tuple[float, float]] = ()  # knots (s, m/s) of the speed over time
+    # Without knots: constant speed in m/s, or a range [lowest, highest] from which each try draws
+    m_s: Any = 0.0
+    vary: float = 0.0  # share by which the constant speed varies at random
+    vary_m_s: float = 0.0  # m/s by which the constant speed varies in each try
+    gap_m: float | None = None  # distance between the vehicles of a convoy, None for a single actor
 
 
 class Traffic:
-    """Collector of actors that never collide with each other or with static objects."""
+    """Collector of ``actors`` that collide neither with each other nor with static objects."""
 
     def __init__(
         self, ego: Driving, scenery: Scenery, lanes: Mapping[str, Any], curves: Mapping[str, Curve]
     ) -> None:
+        """Start without actors.
+
+        Args:
+            lanes: Rows of ``lanes`` in scenes.yaml, by name.
+            curves: Curves of the roads, by name.
+        """
         self.actors: list[Actor] = []
-        self._ground, self._rng, self._lanes, self._curves = (
-            scenery.ground, scenery.rng, lanes, curves,
-        )  # fmt: skip
+        self._ground = scenery.ground
+        self._rng = scenery.rng
+        self._lanes = lanes
+        self._curves = curves
         self._times = np.arange(*SPAN_S, _OUTLINE_STEP_S)
-        self._standing = Rectangles.joined(scenery.footprints)
+        self._static = Rectangles.joined(scenery.footprints)
         outline = Rectangles.of(model("ego_vehicle"), ego.poses(self._times), _EGO_MARGIN_M)
         self._moving = outline.rows(None)
 
     def add_row(self, journey: Journey, stations: Mapping[str, float]) -> None:
-        """Add the actor or the convoy of a row of scenes.yaml."""
+        """Add the actor or the convoy of a journey; ``stations`` are arc lengths (m) by name."""
         station = resolve(journey.station, stations)
         if journey.gap_m is None:
             self._add(partial(self._draw, journey, station, self._speed(journey)))
@@ -432,17 +483,19 @@ class Traffic:
             ]
             if not any(self._touches(outline) for outline in outlines):
                 self.actors.append(actor)
-                new = [outline.rows(None) for outline in outlines]
-                self._moving = Rectangles.joined([self._moving, *new])
+                actor_outlines = [outline.rows(None) for outline in outlines]
+                self._moving = Rectangles.joined([self._moving, *actor_outlines])
                 return
 
     def _touches(self, outline: Rectangles) -> bool:
         """Return True if an outline, by time, overlaps a static object or an actor."""
         if motion.overlap(outline, self._moving).any():
             return True
-        x, y = (self._standing.centre[:, i] - outline.centre[:, i, None] for i in (0, 1))
-        time, standing = np.nonzero(x * x + y * y < _TOUCH_M**2)
-        return bool(motion.overlap(outline.rows(time), self._standing.rows(standing)).any())
+        # Only static objects near the outline at some time are compared.
+        x, y = (self._static.centre[:, axis] - outline.centre[:, axis, None] for axis in (0, 1))
+        time_row, static_row = np.nonzero(x * x + y * y < _TOUCH_M**2)
+        near = self._static.rows(static_row)
+        return bool(motion.overlap(outline.rows(time_row), near).any())
 
     def _draw(self, journey: Journey, station: float, speed: Speed | None) -> Actor:
         """Draw an actor beside a station of the road at the meeting time."""
@@ -453,6 +506,7 @@ class Traffic:
         arc_m = lane.at(station + rng.uniform(-journey.slack_m, journey.slack_m))
 
         def lift(arc_m: Float) -> Float:
+            """Return the (N,) heights above the terrain at (N,) arc lengths: 0 to the kerb's."""
             beyond_m = ground.distance(lane.curve(arc_m))
             return ground.kerb_m * np.clip(beyond_m / _KERB_RAMP_M, 0, 1)
 

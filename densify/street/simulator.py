@@ -35,7 +35,12 @@ class Bodies:
     moving: Bool  # (F,B) bool, True if the body's object moves around that time
 
     def place(self, frame: int, body: NDArray[np.int32], points: Float) -> Float:
-        """Return (N,3) world positions, at a frame's stamp, of points in body frames."""
+        """Return the (N,3) world positions of points at a frame's reference time.
+
+        Args:
+            body: (N,) index of the body of each point.
+            points: (N,3) metres, each in the frame of its body.
+        """
         T_world_body = self.T_world_body[frame][body]
         placed: Float = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points)
         return placed + T_world_body[:, :3, 3]
@@ -43,19 +48,28 @@ class Bodies:
     def sweep(
         self, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], points: Float
     ) -> SweepTruth:
-        """Return the ground truth of a sweep; ``body`` and ``points`` are as in `place`."""
+        """Return the ground truth of a sweep with N points.
+
+        ``instance`` has the (N,) object numbers of the points; `place` describes the other
+        arguments.
+        """
         T_world_lidar = self.T_world_lidar[frame]
-        away = self.place(frame, body, points) - T_world_lidar[:3, 3]
+        from_lidar = self.place(frame, body, points) - T_world_lidar[:3, 3]
         return SweepTruth(
-            T_world_lidar, away @ T_world_lidar[:3, :3], instance, self.moving[frame][body]
+            T_world_lidar, from_lidar @ T_world_lidar[:3, :3], instance, self.moving[frame][body]
         )
 
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
     ) -> Float:
-        """Return (N,3) true scene flow, as in `densify.geometry.types.Truth.displacement`."""
+        """Return the (N,3) true scene flow of points from a frame to the frame ``target``.
+
+        It is in metres in the lidar frame of ``frame``, ego-motion removed. `place` describes the
+        other arguments.
+        """
         self.check(target)
-        after, before = (self.place(f, body, points) for f in (target, frame))
+        after = self.place(target, body, points)
+        before = self.place(frame, body, points)
         return (after - before) @ self.T_world_lidar[frame][:3, :3]
 
     def check(self, frame: int) -> None:
@@ -67,7 +81,7 @@ class Bodies:
             )
 
 
-VERSION = 6  # raise it whenever the same frame would come out differently
+VERSION = 6  # must grow with every change of the simulated data
 _NS_PER_S = 1_000_000_000
 EPOCH_NS = 1_781_258_400_000_000_000  # 2026-06-12 10:00:00 UTC, frame 0
 _MOVING_M, _MOVING_S = 0.05, 0.5  # an object moves if it goes this far in this time
@@ -105,26 +119,27 @@ class Simulator:
         return build_scene(self.preset, self.seed)
 
     def returns(self, frame: int) -> Returns:
-        """Return the sweep of a frame."""
+        """Simulate the sweep of a frame."""
         rng = np.random.default_rng([self.seed, 1, frame])
         time_s = seconds(self.stamp_ns(frame))
         mount = Mount(self.scene.ego, self.sensor, self.period_ns, self.tilt_deg)
         return scan(self.scene.world, mount, time_s, rng)
 
     def image_stamps_ns(self, camera: str) -> dict[int, int]:
-        """Return image number -> exposure time of the middle row, for a camera."""
+        """Return the exposure time (ns) of the middle row of each image of a camera, by number."""
         exposure = EXPOSURES[camera]
         period_ns = getattr(exposure, "period_ns", self.period_ns)
         first_ns = EPOCH_NS + exposure.delay_ns
-        return {n: first_ns + n * period_ns for n in range(DURATION_S * _NS_PER_S // period_ns)}
+        num_images = DURATION_S * _NS_PER_S // period_ns
+        return {number: first_ns + number * period_ns for number in range(num_images)}
 
     def picture(self, camera: str, number: int) -> Picture:
-        """Return the image of a camera with this number."""
+        """Render the image of a camera with this image number."""
         time_s = seconds(self.image_stamps_ns(camera)[number])
         return expose(self.scene.world, self.scene.ego, CAMERAS[camera], time_s)
 
     def T_world_lidar_at(self, time_ns: int) -> Float:
-        """Return the (4,4) pose of the lidar frame at any time."""
+        """Return the (4,4) pose of the lidar frame in the world at an absolute time."""
         T_world_ego = self.scene.ego.poses(np.array([seconds(time_ns)])).matrix()
         return T_world_ego @ T_ego_lidar(self.tilt_deg)
 
@@ -134,7 +149,10 @@ class Simulator:
         return self.bodies_at([self.stamp_ns(frame) for frame in range(self.num_frames)])
 
     def bodies_at(self, stamps_ns: Sequence[int], indices: Sequence[int] | None = None) -> Bodies:
-        """Return the poses of bodies (``indices``, whole objects; None for all) at these times."""
+        """Return the poses of bodies at these absolute times.
+
+        ``indices`` selects bodies; it must hold all bodies of an object or none. None selects all.
+        """
         times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
         if indices is not None:
@@ -152,7 +170,7 @@ class Simulator:
 
     def in_bodies(self, frame: int, returns: Returns) -> Float:
         """Return the (N,3) measured points, each in the frame of the body it was measured on."""
-        # To the world and from there to the body by the poses at the point's firing time.
+        # Poses at the firing time of each point take it to the world, and from there to its body.
         times = at_offsets(seconds(self.stamp_ns(frame)), returns.offset_ns)
         points = transform(T_ego_lidar(self.tilt_deg), returns.points.astype(np.float64))
         points = self.scene.ego.poses(times).apply(points)
@@ -164,7 +182,7 @@ class Simulator:
 
 
 def seconds(time_ns: int) -> float:
-    """Return an absolute time in ns as seconds since frame 0, the unit inside this package."""
+    """Return an absolute time (ns) as seconds since frame 0, the unit inside `densify.street`."""
     return (time_ns - EPOCH_NS) * 1e-9
 
 
@@ -172,12 +190,16 @@ def _moving(bodies: Sequence[Body], times_s: Float) -> Bool:
     """Return (F,B) True if the body is part of an object that moves around that time."""
 
     def positions(shift_s: float) -> Float:
-        return np.stack([b.trajectory.poses(times_s + shift_s).position for b in bodies], axis=1)
+        columns = [body.trajectory.poses(times_s + shift_s).position for body in bodies]
+        return np.stack(columns, axis=1)
 
-    now, shifts_s = positions(0.0), _MOVING_S * np.array([-1, -0.5, 0.5, 1])
+    now = positions(0.0)
+    shifts_s = _MOVING_S * np.array([-1, -0.5, 0.5, 1])
     moved_m = [np.linalg.norm(positions(shift_s) - now, axis=2) for shift_s in shifts_s]
     moving: Bool = np.max(moved_m, axis=0) >= _MOVING_M
+    # An object moves if one of its bodies moves.
     instance = np.array([body.instance for body in bodies])
-    for one in np.unique(instance[instance >= 0]):
-        moving[:, instance == one] = moving[:, instance == one].any(axis=1, keepdims=True)
+    for number in np.unique(instance[instance >= 0]):
+        is_part = instance == number
+        moving[:, is_part] = moving[:, is_part].any(axis=1, keepdims=True)
     return moving

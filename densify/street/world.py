@@ -15,9 +15,10 @@ from densify.geometry.types import Bool, Float, Float32, Int
 from densify.street.mesh import Mesh, across, lengths
 from densify.street.motion import Poses, Trajectory, poses_at
 
-_STEP_M = 2e-3  # from a surface that a ray passes to its next origin
+_STEP_M = 2e-3  # distance from a surface that a ray passes to its next origin
 _MAX_LAYERS = 8  # most layers of glass and leaves that one ray passes
-_STEP_S, _SLACK_M = 0.05, 0.1  # between positions that bound a body, and beyond them
+_STEP_S = 0.05  # time between the sampled positions of a body
+_SLACK_M = 0.1  # addition to the radius of the ball around these positions
 _BLOCK = 16  # consecutive rays that are tested together
 _TINY = 1e-9
 _FLAT_M2 = 1e-7  # twice the area of a triangle that is left out
@@ -65,7 +66,10 @@ class Meeting(NamedTuple):
     passed: NDArray[np.int32]
 
     def positions(self, rows: Int) -> Float:
-        """Return the positions of some of the rays, (R,3) in the frame of the body."""
+        """Return the (R,3) positions at which some of the rays meet it, in the body's frame.
+
+        ``rows`` are (R,) indices into the K rays.
+        """
         return self.origin[rows] + self.distance_m[rows, None] * self.direction[rows]
 
 
@@ -75,17 +79,22 @@ Optics = Callable[[Meeting], Int]
 
 
 class Triangles:
-    """The triangles of all bodies in a row, except those of no area. Arrays are by triangle."""
+    """The triangles of all bodies in order, except those of no area. Arrays are by triangle."""
 
     def __init__(self, bodies: Sequence[Body]) -> None:
-        meshes = [b.mesh.of_instance(b.instance) if b.instance >= 0 else b.mesh for b in bodies]
+        """Join the meshes of the bodies and build an Embree scene for each."""
+        meshes = [
+            body.mesh.of_instance(body.instance) if body.instance >= 0 else body.mesh
+            for body in bodies
+        ]
         mesh = Mesh.join(meshes)
+        # Embree computes in single precision; the planes are those of its rounded corners.
         single = mesh.vertices.astype(np.float32).take(mesh.triangles, axis=0)
         corners = single.astype(np.float64)
         normal = across(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = lengths(normal)
         keep = np.flatnonzero(length[:, 0] > _FLAT_M2)
-        counts = [len(m.triangles) for m in meshes]
+        counts = [len(body_mesh.triangles) for body_mesh in meshes]
         self.body = np.repeat(np.arange(len(meshes), dtype=np.int32), counts)[keep]
         # Index of the first triangle of each body
         self.first: Int = np.searchsorted(self.body, np.arange(len(meshes) + 1))
@@ -96,19 +105,28 @@ class Triangles:
         self.instance = mesh.instance[keep]
         self.corner: Float = corners[:, 0].take(keep, axis=0)
         self.normal: Float = normal.take(keep, axis=0) / length.take(keep, axis=0)
-        each = np.split(single.take(keep, axis=0), self.first[1:-1])
+        corners_by_body = np.split(single.take(keep, axis=0), self.first[1:-1])
         # Embree scene of each body, in single precision
-        self.scenes = [_raycasting_scene(corners) for corners in each]
+        self.scenes = [_raycasting_scene(body_corners) for body_corners in corners_by_body]
 
     def first_hit(
         self, spans: Iterable[tuple[int, int]], origin: Float, direction: Float
     ) -> tuple[Int, Int, Float]:
-        """Return the rays that hit their body, the first triangle that each hits, and u, v there.
+        """Return the first triangle that each ray hits on its own body.
 
-        ``spans`` has body and end of its rays, ascending. Rays (N,3) are in the frames of bodies.
+        Args:
+            spans: Index of each body and end of its rays, ascending: a span begins where the
+                previous one ends.
+            origin: (N,3) origins, each in the frame of its body.
+            direction: (N,3) unit vectors, each in the frame of its body.
+
+        Returns:
+            Indices (K,) of the rays with a hit, their (K,) triangles, and (K,2) u and v there.
         """
-        start, ray = origin.astype(np.float32), direction.astype(np.float32)
-        met, triangle, barycentric, begin = [], [], [], 0
+        start = origin.astype(np.float32)
+        ray = direction.astype(np.float32)
+        met, triangle, barycentric = [], [], []
+        begin = 0
         for index, end in spans:
             if end > begin:
                 traced = self.scenes[index].run(
@@ -138,15 +156,19 @@ class World:
     def cast(self, rays: Rays, optics: Optics, num_together: int = 1, spread: float = 0.0) -> Hits:
         """Return the first surface at which each ray ends, by the decisions of ``optics``.
 
-        ``num_together`` consecutive rays share origin and time, within ``spread`` rad of the first.
+        Args:
+            rays: N rays in the world.
+            num_together: Number of consecutive rays that share origin and time.
+            spread: Greatest angle (rad) between the first of them and another.
         """
+        # The static world first; then the moving bodies in front of its surfaces
         every = np.arange(len(rays.time_s))
         best = self._cast_bodies([(0, len(every))], rays.origin, rays.direction, every, optics)
         groups = Rays(*(column[::num_together] for column in rays))
         farthest_m = np.maximum.reduce([*best.range_m.reshape(-1, num_together).T])
         candidates = [
-            (index, rows, poses_at(self.bodies[index].trajectory, groups.time_s[rows]))
-            for index, rows in self._near(groups, farthest_m, spread)
+            _Candidate(index, rows, poses_at(self.bodies[index].trajectory, groups.time_s[rows]))
+            for index, rows in self._find_near_rays(groups, farthest_m, spread)
         ]
         if candidates:
             self._add_moving(best, rays, candidates, optics, num_together)
@@ -157,31 +179,37 @@ class World:
         self,
         best: Hits,
         rays: Rays,
-        candidates: Sequence[tuple[int, Int, Poses]],
+        candidates: Sequence[_Candidate],
         optics: Optics,
         num: int,
     ) -> None:
         """Enter the hits of moving bodies that are nearer than those in ``best``."""
-        # candidates: index of each body, groups of num rays that may hit it, its poses then.
-        poses = [pose for _, _, pose in candidates]
-        groups = np.concatenate([rows for _, rows, _ in candidates])
-        ends = num * np.cumsum([len(rows) for _, rows, _ in candidates])
-        spans = [(index, end) for (index, _, _), end in zip(candidates, ends.tolist(), strict=True)]
-        at = Poses(*(np.concatenate(column) for column in zip(*poses, strict=True)))
+        # All rays that may hit a body, body by body, in the frame of their body
+        groups = np.concatenate([candidate.groups for candidate in candidates])
+        ends = num * np.cumsum([len(candidate.groups) for candidate in candidates])
+        bodies = [candidate.body for candidate in candidates]
+        spans = list(zip(bodies, ends.tolist(), strict=True))
+        all_poses = [candidate.poses for candidate in candidates]
+        poses = Poses(*(np.concatenate(columns) for columns in zip(*all_poses, strict=True)))
         rows = (groups[:, None] * num + np.arange(num)).ravel()
-        origin = at.undo(rays.origin.take(groups * num, axis=0)).repeat(num, axis=0)
-        direction = rays.direction.take(rows, axis=0).reshape(-1, num, 3) @ at.rotation
+        origin = poses.undo(rays.origin.take(groups * num, axis=0)).repeat(num, axis=0)
+        direction = rays.direction.take(rows, axis=0).reshape(-1, num, 3) @ poses.rotation
         hits = self._cast_bodies(spans, origin, direction.reshape(-1, 3), rows, optics)
+
+        # The bodies in turn: a ray may hit several of them.
         begin = 0
-        for pose, (_, end) in zip(poses, spans, strict=True):
-            new = np.flatnonzero(hits.range_m[begin:end] < best.range_m[rows[begin:end]])
-            hits.normal[begin + new] = pose.rows(new // num).turn(hits.normal[begin + new])
-            new += begin
+        for body_poses, (_, end) in zip(all_poses, spans, strict=True):
+            nearer = np.flatnonzero(hits.range_m[begin:end] < best.range_m[rows[begin:end]])
+            normal = hits.normal[begin + nearer]
+            hits.normal[begin + nearer] = body_poses.rows(nearer // num).turn(normal)
+            nearer += begin
             for name in Hits._fields:
-                getattr(best, name)[rows[new]] = getattr(hits, name)[new]
+                getattr(best, name)[rows[nearer]] = getattr(hits, name)[nearer]
             begin = end
 
-    def _near(self, rays: Rays, farthest_m: Float, spread: float) -> Iterator[tuple[int, Int]]:
+    def _find_near_rays(
+        self, rays: Rays, farthest_m: Float, spread: float
+    ) -> Iterator[tuple[int, Int]]:
         """Yield the index of each body but the first, and indices of rays that may hit it."""
         # These rays intersect a ball around the positions of the body at all of their times, before
         # their static surface. Blocks of consecutive rays are tested before each ray.
@@ -190,26 +218,29 @@ class World:
         first = np.arange(0, len(rays.time_s), _BLOCK)
         count = np.diff(np.append(first, len(rays.time_s)))
         origin, direction = (
-            np.add.reduceat(c, first) / count[:, None] for c in (rays.origin, rays.direction)
+            np.add.reduceat(column, first) / count[:, None]
+            for column in (rays.origin, rays.direction)
         )
         direction /= np.maximum(lengths(direction), _TINY)
-        around_m, around = (
-            np.maximum.reduceat(lengths(c - np.repeat(middle, count, axis=0))[:, 0], first)
-            for c, middle in ((rays.origin, origin), (rays.direction, direction))
+        # Greatest differences within each block from its mean origin and direction
+        block_radius_m, block_spread = (
+            np.maximum.reduceat(lengths(column - np.repeat(mean, count, axis=0))[:, 0], first)
+            for column, mean in ((rays.origin, origin), (rays.direction, direction))
         )
-        blocks = origin, direction, np.maximum.reduceat(farthest_m, first)
+        blocks = _Segments(origin, direction, np.maximum.reduceat(farthest_m, first))
         for index, (centre, radius_m) in enumerate(self._balls(rays.time_s), start=1):
-            wide = _meets_ball(blocks, centre, radius_m + around_m, spread + around)
-            rows = (np.flatnonzero(wide)[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
-            rows = rows[: np.searchsorted(rows, len(rays.time_s))]
-            each = rays.origin[rows], rays.direction[rows], farthest_m[rows]
-            rows = rows[_meets_ball(each, centre, radius_m, spread)]
+            is_near = _meets_ball(blocks, centre, radius_m + block_radius_m, spread + block_spread)
+            rows = (np.flatnonzero(is_near)[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
+            rows = rows[: np.searchsorted(rows, len(rays.time_s))]  # the last block may be smaller
+            segments = _Segments(rays.origin[rows], rays.direction[rows], farthest_m[rows])
+            rows = rows[_meets_ball(segments, centre, radius_m, spread)]
             if len(rows):
                 yield index, rows
 
     def _balls(self, times_s: Float) -> Iterator[tuple[Float, float]]:
         """Yield centre (3,) and radius of a ball around each moving body at all of these times."""
         begin_s, end_s = times_s.min(), times_s.max()
+        # Both ends are sampled, and steps are shorter than _STEP_S.
         sampled_s = np.linspace(begin_s, end_s, int((end_s - begin_s) / _STEP_S) + 2)
         for body in self.bodies[1:]:
             middles = np.tile(np.mean(body.mesh.bounds, axis=0), (len(sampled_s), 1))
@@ -228,47 +259,76 @@ class World:
     ) -> Hits:
         """Return the hits of rays, each with one body and in the frame of that body."""
         # Distances are to the plane of the triangle, in double precision, also for absorbed rays.
-        surfaces, n = self.triangles, len(origin)
+        surfaces = self.triangles
+        n = len(origin)
         hits = Hits(
             np.full(n, np.inf), np.full(n, -1), np.zeros((n, 2), np.float32), np.zeros(n, bool),
             np.zeros((n, 3)),
         )  # fmt: skip
-        rows, start, ray, passed = np.arange(n), origin, direction, np.full(n, -1, np.int32)
+        # The rays that still travel: indices, origins behind the last surface, directions, and the
+        # object of that surface
+        rows = np.arange(n)
+        start, ray = origin, direction
+        passed = np.full(n, -1, np.int32)
         for layer in range(_MAX_LAYERS):
             ends = np.searchsorted(rows, [end for _, end in spans]).tolist()
-            left = zip((index for index, _ in spans), ends, strict=True)
-            met, triangle, barycentric = surfaces.first_hit(left, start, ray)
+            spans_left = zip((index for index, _ in spans), ends, strict=True)
+            met, triangle, barycentric = surfaces.first_hit(spans_left, start, ray)
             if not len(met):
                 break
             rows, passed, ray = rows[met], passed[met], ray.take(met, axis=0)
-            begin, normal = origin.take(rows, axis=0), surfaces.normal.take(triangle, axis=0)
+            ray_origin = origin.take(rows, axis=0)
+            normal = surfaces.normal.take(triangle, axis=0)
             corner = surfaces.corner.take(triangle, axis=0)
             facing = np.einsum("ni,ni->n", ray, normal)
-            distance_m = np.einsum("ni,ni->n", corner - begin, normal) / facing
-            meeting = Meeting(number[rows], triangle, layer, begin, ray, distance_m, facing, passed)
+            distance_m = np.einsum("ni,ni->n", corner - ray_origin, normal) / facing
+            meeting = Meeting(
+                number[rows], triangle, layer, ray_origin, ray, distance_m, facing, passed
+            )
             outcome = optics(meeting)
-            hits.range_m[rows], hits.triangle[rows] = distance_m, triangle
-            hits.barycentric[rows], hits.absorbed[rows] = barycentric, outcome == ABSORBED
+            hits.range_m[rows] = distance_m
+            hits.triangle[rows] = triangle
+            hits.barycentric[rows] = barycentric
+            hits.absorbed[rows] = outcome == ABSORBED
             hits.normal[rows] = normal
-            on = np.flatnonzero(outcome == PASSES)
-            rows, ray, passed = rows[on], ray[on], surfaces.instance[triangle[on]]
-            hits.range_m[rows], hits.triangle[rows] = np.inf, -1
-            start = begin[on] + (distance_m[on] + _STEP_M)[:, None] * ray
+
+            # Rays that pass go on behind the surface, without a hit so far.
+            passing = np.flatnonzero(outcome == PASSES)
+            rows, ray = rows[passing], ray[passing]
+            passed = surfaces.instance[triangle[passing]]
+            hits.range_m[rows] = np.inf
+            hits.triangle[rows] = -1
+            start = ray_origin[passing] + (distance_m[passing] + _STEP_M)[:, None] * ray
         return hits
 
 
+class _Candidate(NamedTuple):
+    """A moving body with the groups of rays that may hit it."""
+
+    body: int  # index of the body
+    groups: Int  # (G,) indices of the groups
+    poses: Poses  # G poses of the body at the times of the groups
+
+
+class _Segments(NamedTuple):
+    """N rays up to a distance."""
+
+    origin: Float  # (N,3)
+    direction: Float  # (N,3) unit vectors
+    length_m: Float  # (N,)
+
+
 def _meets_ball(
-    rays: tuple[Float, Float, Float], centre: Float, radius_m: Float | float, spread: Float | float
+    rays: _Segments, centre: Float, radius_m: Float | float, spread: Float | float
 ) -> Bool:
-    """Return (N,) True for rays (origins, unit vectors, lengths) that meet a ball."""
-    # spread is the greatest difference of a ray's true direction from its unit vector.
-    origin, direction, farthest_m = rays
-    away = centre - origin
-    along = np.einsum("ni,ni->n", away, direction)
-    square = np.einsum("ni,ni->n", away, away)
-    reach_m = radius_m + spread * (np.sqrt(square) + radius_m)
-    meets: Bool = square - along * along < reach_m * reach_m
-    return meets & (along > -reach_m) & (along - reach_m < farthest_m)
+    """Return (N,) True for rays that meet a ball, by the greatest angle from their direction."""
+    to_centre = centre - rays.origin
+    along_m = np.einsum("ni,ni->n", to_centre, rays.direction)
+    squared_m2 = np.einsum("ni,ni->n", to_centre, to_centre)
+    # Up to the far side of the ball, the true ray deviates by at most the spread times the range.
+    reach_m = radius_m + spread * (np.sqrt(squared_m2) + radius_m)
+    meets: Bool = squared_m2 - along_m * along_m < reach_m * reach_m
+    return meets & (along_m > -reach_m) & (along_m - reach_m < rays.length_m)
 
 
 @cache

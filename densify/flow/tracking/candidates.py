@@ -23,9 +23,10 @@ from densify.geometry.nearest import close_to_seeds, link
 from densify.geometry.types import Bool, Float, Int, Stretch
 
 LINK_M = 0.6  # candidates closer to each other are one cluster
-_NEAR_M, MIN_SEED_SHARE = 0.4, 0.4
-_RING_GAP_M = 0.35
-_STRIP = 32
+_NEAR_M = 0.4  # greatest distance from a seed to a candidate
+MIN_SEED_SHARE = 0.4  # least share of seeds around a seed, and in a cluster that starts a track
+_RING_GAP_M = 0.35  # greatest distance between rings that are linked
+_STRIP = 32  # number of consecutive points in a strip
 
 T = TypeVar("T", bound=np.generic)
 
@@ -38,7 +39,7 @@ class Strips:
         begins = np.arange(0, len(points), _STRIP)
         self._low = np.ascontiguousarray(np.minimum.reduceat(points, begins).T)
         self._high = np.ascontiguousarray(np.maximum.reduceat(points, begins).T)
-        padded = np.full((len(begins) * _STRIP, 3), np.inf)  # the padding is in no box
+        padded = np.full((len(begins) * _STRIP, 3), np.inf)  # infinite points are in no box
         padded[: len(points)] = points
         strips = padded.reshape(len(begins), _STRIP, 3)
         self._strips = np.ascontiguousarray(strips.transpose(0, 2, 1))
@@ -56,7 +57,7 @@ class Strips:
 class Candidates:
     """The C points above the ground of one sweep, and which may move: see `Obstacles`."""
 
-    # None of them depends on the world's origin.
+    # The fields have the meaning of those of `Obstacles`. They do not depend on the world's origin.
     row: Int
     seed: Bool
     cluster: Int
@@ -114,16 +115,22 @@ class Batch:
     @staticmethod
     def of(sweeps: Sequence[int], obstacles: Sequence[Obstacles], clock: Clock) -> Batch:
         """Build a batch from sweep indices, with the obstacles and clock of the whole stretch."""
-        of_sweeps = [obstacles[j] for j in sweeps]
+        parts = [obstacles[j] for j in sweeps]
         first_ns, last_ns = clock.time_ns[[sweeps[0], sweeps[-1]]].tolist()
-        begins = np.cumsum([0] + [len(c.points) for c in of_sweeps[:-1]]).tolist()
-        middle_ns, half_s = (first_ns + last_ns) // 2, (last_ns - first_ns) * 0.5e-9
-        return Batch(tuple(sweeps), middle_ns, half_s, _merged(of_sweeps), tuple(begins))
+        begins = np.cumsum([0] + [len(part.points) for part in parts[:-1]]).tolist()
+        return Batch(
+            sweeps=tuple(sweeps),
+            time_ns=(first_ns + last_ns) // 2,
+            half_s=(last_ns - first_ns) * 0.5e-9,
+            obstacles=_merge(parts),
+            begins=tuple(begins),
+        )
 
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
         """Concatenate the arrays of this batch's sweeps, in the order of ``obstacles``.
 
-        columns: For every sweep of the stretch, an array with a value for each obstacle.
+        Args:
+            columns: For every sweep of the stretch, an array with a value for each obstacle.
         """
         return np.concatenate([columns[j] for j in self.sweeps])
 
@@ -137,27 +144,34 @@ class Batch:
         return {j: sweep_rows - begin for j, sweep_rows, begin in sweeps if len(sweep_rows)}
 
 
-def _merged(sweeps: Sequence[Obstacles]) -> Obstacles:
+def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
     """Concatenate the obstacles of sweeps; clusters within `LINK_M` of each other become one."""
     if len(sweeps) == 1:
         return sweeps[0]
-    first = np.cumsum([0] + [c.num_clusters for c in sweeps]).tolist()
+    # Labels of the sweeps' clusters are made unique.
+    first_labels = np.cumsum([0] + [sweep.num_clusters for sweep in sweeps]).tolist()
+    num_labels = first_labels[-1]
     label = np.concatenate(
-        [np.where(c.candidate, c.cluster + k, -1) for c, k in zip(sweeps, first[:-1], strict=True)]
+        [
+            np.where(sweep.candidate, sweep.cluster + first_label, -1)
+            for sweep, first_label in zip(sweeps, first_labels[:-1], strict=True)
+        ]
     )
-    points = np.concatenate([c.points for c in sweeps])
+    # A graph joins each candidate's cluster in its sweep with its group among all sweeps. The
+    # components of this graph are the merged clusters.
+    points = np.concatenate([sweep.points for sweep in sweeps])
     candidate = np.flatnonzero(label >= 0)
     num_groups, group = link(points[candidate], LINK_M)
-    num = first[-1] + num_groups
-    edges = label[candidate], first[-1] + group
-    graph = coo_array((np.ones(len(candidate), bool), edges), shape=(num, num))
+    num_nodes = num_labels + num_groups
+    edges = label[candidate], num_labels + group
+    graph = coo_array((np.ones(len(candidate), bool), edges), shape=(num_nodes, num_nodes))
     num_clusters, cluster = connected_components(graph, directed=False)
     label[candidate] = cluster[label[candidate]]
     return Obstacles(
-        row=np.concatenate([c.row for c in sweeps]),
+        row=np.concatenate([sweep.row for sweep in sweeps]),
         points=points,
-        time_s=np.concatenate([c.time_s for c in sweeps]),
-        seed=np.concatenate([c.seed for c in sweeps]),
+        time_s=np.concatenate([sweep.time_s for sweep in sweeps]),
+        seed=np.concatenate([sweep.seed for sweep in sweeps]),
         cluster=label,
         num_clusters=int(num_clusters),
     )
@@ -169,37 +183,41 @@ def find_candidates(
     """Return the points above the ground of each sweep, and which of them may move.
 
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
-    because usually only a part of a moving object's points is seen through. ``among`` are the
-    indices of the sweeps to work on, None for all.
+    because usually only a part of a moving object's points is seen through.
+
+    Args:
+        among: Indices of the sweeps to work on, None for all.
     """
 
-    def of_sweep(i: int) -> Candidates:
+    def find_in_sweep(i: int) -> Candidates:
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         above = np.flatnonzero(ground.above(points) >= ABOVE_GROUND_M)
-        points = points[above]
+        points_above = points[above]
         seed = np.zeros(len(above), bool)
         for j in space.others(i):
             unmarked = np.flatnonzero(~seed)
-            seed[unmarked] = space.seen_through(points[unmarked], j)
+            seed[unmarked] = space.seen_through(points_above[unmarked], j)
         gap_m = space.sensors.gap_m(registered.sweep.points[above], registered.sweep.lidar[above])
-        squeezed = closer_rings(points - registered.T_world_lidar[:3, 3], gap_m)
-        num_clusters, cluster = cluster_around(squeezed, seed)
+        compressed = closer_rings(points_above - registered.T_world_lidar[:3, 3], gap_m)
+        num_clusters, cluster = cluster_around(compressed, seed)
         return Candidates(above, seed, cluster, num_clusters)
 
     with ThreadPoolExecutor(num_threads()) as pool:
-        return tuple(pool.map(of_sweep, range(len(stretch.sweeps)) if among is None else among))
+        sweeps = range(len(stretch.sweeps)) if among is None else among
+        return tuple(pool.map(find_in_sweep, sweeps))
 
 
 def closer_rings(points: Float, gap_m: Float) -> Float:
     """Return the (N,3) points with heights compressed where rings are too far apart to be linked.
 
-    ``points`` are relative to the scanner, z up, so that level surfaces stay level. ``gap_m`` (N,)
-    is the distance between neighbouring rings at each point.
+    Args:
+        points: (N,3) metres, z up, relative to the scanner: level surfaces then stay level.
+        gap_m: (N,) distance between neighbouring rings at each point.
     """
-    squeezed = points.copy()
-    squeezed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
-    return squeezed
+    compressed = points.copy()
+    compressed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
+    return compressed
 
 
 def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
@@ -211,10 +229,16 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Link seeds and points (N,3) within 0.4 m of seeds into clusters.
+    """Link seeds and points within 0.4 m of seeds into clusters.
 
-    Seeds with few other seeds around them, as in a hedge, do not count. Return the number of
-    clusters, and (N,) labels, -1 for points in no cluster.
+    Seeds with few other seeds around them, as in a hedge, do not count.
+
+    Args:
+        points: (N,3) metres.
+        seed: (N,) True for seeds.
+
+    Returns:
+        The number of clusters, and (N,) labels, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
     rows = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, MIN_SEED_SHARE))

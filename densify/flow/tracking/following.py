@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ MAX_SPEED_M_S = 38.0
 _NEAR_S, _AROUND_S = 0.1, 0.5  # times to the nearest and the farthest batches that vote
 STEP_M = 0.2  # side of a voxel
 _MOST_VOXELS = 1 << 28  # of a sweep, a byte each: 250 m x 250 m x 34 m
-FEW_POINTS, _MANY_POINTS = 60, 600
+FEW_POINTS, _MANY_POINTS = 60, 600  # points of a cluster in the first vote, and in later votes
 _FINE_M_S = 0.2  # velocity step of the last vote
 
 
@@ -47,16 +48,19 @@ class DistanceField:
         """Build the field of N candidates from points (N,3, world) and firing times (N,)."""
         if not len(points):
             return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3), None, time_s)
+        # The margin of the grid is wider than the reach of a candidate.
         inside = points[bulk(points, STEP_M, _MOST_VOXELS)]
         low = inside.min(0) - 2 * LINK_M
         shape = tuple(np.ceil((inside.max(0) + 2 * LINK_M - low) / STEP_M).astype(int) + 1)
         nearness = np.zeros(shape, np.uint8)
-        n = int(np.ceil(LINK_M / STEP_M))
-        span = np.arange(-n, n + 1)
+        # Voxels around a candidate, and their nearness
+        reach = int(np.ceil(LINK_M / STEP_M))
+        span = np.arange(-reach, reach + 1)
         offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), -1).reshape(-1, 3)
-        far = np.linalg.norm(offsets, axis=1) * STEP_M / LINK_M
-        values = (255 - np.round(255 * far[far < 1])).astype(np.uint8)
-        _spread(inside, low, STEP_M, offsets[far < 1], values, nearness)
+        distance = np.linalg.norm(offsets, axis=1) * STEP_M / LINK_M  # in units of the reach
+        is_reached = distance < 1
+        values = (255 - np.round(255 * distance[is_reached])).astype(np.uint8)
+        _spread(inside, low, STEP_M, offsets[is_reached], values, nearness)
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_to(self, nearness: Bytes, group: Group, velocities: Float) -> None:
@@ -67,10 +71,12 @@ class DistanceField:
         """
         if self.tree is None:
             return
-        _, row = nearest(self.tree, group.middle[None])  # the firing time depends on the position
-        moved = group.middle + (self.time_s[row] - group.middle_s) * velocities
-        _, row = nearest(self.tree, moved)
-        elapsed_s = self.time_s[row] - group.middle_s
+        # The firing time depends on the position, and the position on the time. Each is taken from
+        # the nearest candidate, first at the group's old position, then at the moved position.
+        _, old_neighbour = nearest(self.tree, group.middle[None])
+        moved = group.middle + (self.time_s[old_neighbour] - group.middle_s) * velocities
+        _, moved_neighbour = nearest(self.tree, moved)
+        elapsed_s = self.time_s[moved_neighbour] - group.middle_s
         _look_up.over_rows(
             len(velocities),
             group.points,
@@ -102,54 +108,64 @@ class Group:
     def thinned(self, max_points: int) -> Group:
         """Return the group with at most ``max_points`` points, evenly chosen."""
         step = len(self.points) // max_points + 1
-        points, late_s = (np.ascontiguousarray(a[::step]) for a in (self.points, self.late_s))
+        points = np.ascontiguousarray(self.points[::step])
+        late_s = np.ascontiguousarray(self.late_s[::step])
         return Group(points, late_s, self.middle_s, self.middle)
 
 
 def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
     """Return the horizontal velocity (3,) of a cluster, m/s, that the neighbouring sweeps support.
 
-    At this velocity the group of batch n comes nearest to candidates of other batches. First the
-    batches about 0.1 and 0.2 s before and after are compared, in coarse steps of velocity. A flat
-    side shows its speed only at its ends, which move by less than a voxel in this short time.
-    Therefore batches up to 0.5 s away are compared too, in fine steps. ``fields`` holds, for each
-    batch, the distance fields of its sweeps.
+    At this velocity the group comes nearest to candidates of other batches. First the batches about
+    0.1 and 0.2 s before and after are compared, in coarse steps of velocity. A flat side shows its
+    speed only at its ends, which move by less than a voxel in this short time. Therefore batches up
+    to 0.5 s away are compared too, in fine steps.
+
+    Args:
+        group: The cluster's points in batch n.
+        fields: For each batch, the distance fields of its sweeps.
+        clock: Times of the batches.
     """
     near_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
-    coarse_m_s = 2 * STEP_M / near_s
+    far_s = max(_AROUND_S / 2, near_s)
     near_fields = [fields[m] for m in _batches_around(n, near_s, clock)]
-    all_fields = near_fields + [
-        fields[m] for m in _batches_around(n, max(_AROUND_S / 2, near_s), clock)
-    ]
-    rough_m_s = _best(
-        group.thinned(FEW_POINTS), near_fields, _grid(int(MAX_SPEED_M_S / coarse_m_s)) * coarse_m_s
-    )
-    group = group.thinned(_MANY_POINTS)
-    finer_m_s = _best(group, near_fields, rough_m_s + _grid(6) * coarse_m_s / 3)
+    all_fields = near_fields + [fields[m] for m in _batches_around(n, far_s, clock)]
+    # Coarse steps of two voxels, over all velocities
+    few_points = group.thinned(FEW_POINTS)
+    coarse_m_s = 2 * STEP_M / near_s
+    coarse_grid = _grid(int(MAX_SPEED_M_S / coarse_m_s)) * coarse_m_s
+    rough_m_s = _best_velocity(few_points, near_fields, coarse_grid)
+    # A third of the coarse step, up to two coarse steps to each side
+    many_points = group.thinned(_MANY_POINTS)
+    finer_m_s = _best_velocity(many_points, near_fields, rough_m_s + _grid(6) * coarse_m_s / 3)
+    # Steps of about 0.2 m/s, up to the last step to each side
     num = max(1, round(coarse_m_s / 3 / _FINE_M_S))
-    return _best(group, all_fields, finer_m_s + _grid(num) * coarse_m_s / 3 / num)
+    return _best_velocity(many_points, all_fields, finer_m_s + _grid(num) * coarse_m_s / 3 / num)
 
 
 def _batches_around(n: int, step_s: float, clock: Clock) -> list[int]:
     """Return the existing batches one and two steps of ``step_s`` before and after batch n."""
-    asked = [clock.at(n, later_s) for later_s in (-2 * step_s, -step_s, step_s, 2 * step_s)]
-    return sorted({m for m in asked if m is not None})
+    batches = [clock.at(n, later_s) for later_s in (-2 * step_s, -step_s, step_s, 2 * step_s)]
+    return sorted({m for m in batches if m is not None})
 
 
-def _best(group: Group, around: Sequence[Sequence[DistanceField]], velocities: Float) -> Float:
+def _best_velocity(
+    group: Group, fields: Sequence[Sequence[DistanceField]], velocities: Float
+) -> Float:
     """Return the velocity (3,) among (V,3) that brings the group nearest to candidates."""
     cost = np.zeros(len(velocities))
-    for batch in around:
+    for batch_fields in fields:
         nearness = np.zeros((len(velocities), len(group.points)), np.uint8)
-        for field in batch:
+        for field in batch_fields:
             field.raise_to(nearness, group, velocities)
         cost += 1 - nearness.mean(axis=1) / 255
+    # Of equal velocities the slowest is best.
     return np.asarray(velocities[np.argmin(cost + 1e-3 * np.linalg.norm(velocities, axis=1))])
 
 
-def _grid(n: int) -> Float:
-    """Return all (V,3) horizontal steps with whole x and y from -n to n."""
-    span = np.arange(-n, n + 1.0)
+def _grid(num: int) -> Float:
+    """Return all (V,3) horizontal steps with whole x and y from -num to num."""
+    span = np.arange(-num, num + 1.0)
     x, y = np.meshgrid(span, span, indexing="ij")
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
 
@@ -166,8 +182,8 @@ def _spread(
             int((points[i, 2] - low[2]) / step),
         )
         for k in range(len(offsets)):
-            at = x + offsets[k, 0], y + offsets[k, 1], z + offsets[k, 2]
-            grid[at] = max(grid[at], values[k])
+            voxel = x + offsets[k, 0], y + offsets[k, 1], z + offsets[k, 2]
+            grid[voxel] = max(grid[voxel], values[k])
 
 
 @Kernel
@@ -196,7 +212,7 @@ def _look_up(
 
 
 MIN_POINTS = 8  # to start a track
-_NEARER_END = 0.7  # nearer than `_AROUND_S` to an end, a start is worth this share per 0.1 s
+_NEARER_END = 0.7  # factor of a start's worth for each 0.1 s that an end is nearer than 0.5 s
 FIT_M = 0.3
 """Greatest distance of a point from the object that claims it."""
 _SHARE_UNSEEN = 0.5  # least share of the object's usual number of points
@@ -221,31 +237,49 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
         nearer_s = max(0.0, _AROUND_S - clock.from_end_s(n))
         return float(len(members) * _NEARER_END ** (nearer_s / _NEAR_S))
 
-    for n, c in enumerate(batches):
-        size = np.bincount(c.cluster[c.candidate], minlength=c.num_clusters)
-        seeds = np.bincount(c.cluster[c.candidate & c.seed], minlength=c.num_clusters)
-        good = np.flatnonzero((size >= MIN_POINTS) & (seeds >= MIN_SEED_SHARE * size))
-        starts += [(n, np.flatnonzero(c.cluster == k)) for k in good]
+    for n, obstacles in enumerate(batches):
+        cluster, candidate = obstacles.cluster, obstacles.candidate
+        size = np.bincount(cluster[candidate], minlength=obstacles.num_clusters)
+        num_seeds = np.bincount(
+            cluster[candidate & obstacles.seed], minlength=obstacles.num_clusters
+        )
+        may_start = (size >= MIN_POINTS) & (num_seeds >= MIN_SEED_SHARE * size)
+        starts += [(n, np.flatnonzero(cluster == k)) for k in np.flatnonzero(may_start)]
     return sorted(starts, key=worth, reverse=True)
 
 
 def velocities_beside(
     batch: Batch, members: Int, objects: Sequence[MovingObject]
 ) -> Iterator[Float]:
-    """Yield the velocity (3,), m/s, of each object within 1 m of a cluster, as of a tow car.
+    """Yield the velocity (3,), m/s, of each object within 1 m of a cluster.
 
-    The measurements alone hardly show how fast a long side slides along itself. ``members`` are the
-    cluster's rows of the batch's obstacles.
+    A trailer has the velocity of the car that tows it. The measurements alone hardly show how fast
+    a long flat side moves along itself.
+
+    Args:
+        members: Rows of the cluster in the batch's obstacles.
+        objects: Confirmed objects.
     """
     points = batch.obstacles.points[members]
-    tree, middle = tree_of(points), points.mean(0, keepdims=True)
+    tree = tree_of(points)
+    middle = points.mean(0, keepdims=True)
     for moving_object in objects:
-        track, at_s = moving_object.track, moving_object.track.seen_at(batch.time_ns)
-        if (
-            moving_object.may_be_near(points, at_s, BESIDE_M)
-            and is_near(tree, track.place(moving_object.shape.points, at_s), BESIDE_M).any()
-        ):
+        track = moving_object.track
+        at_s = track.seen_at(batch.time_ns)
+        if not moving_object.may_be_near(points, at_s, BESIDE_M):
+            continue
+        object_points = track.place(moving_object.shape.points, at_s)
+        if is_near(tree, object_points, BESIDE_M).any():
             yield track.velocity_m_s(middle, at_s)[0]
+
+
+class _Sighting(NamedTuple):
+    """The points of an object found in one batch."""
+
+    state: Float  # (4,) state of the object
+    seen_s: float  # mean firing time of the points
+    rows: Int  # (K,) rows of the batch's obstacles
+    points: Float  # (K,3) positions at ``seen_s``, world
 
 
 @dataclass(frozen=True)
@@ -260,57 +294,73 @@ class Follower:
     def follow(self, members: Int, start: int, velocity: Float) -> Track:
         """Track a cluster forwards, then backwards; the model is made of all points found so far.
 
-        ``members`` are rows of the obstacles of batch ``start``; ``velocity`` (3,) is m/s, world.
+        Args:
+            members: Rows of the cluster in the obstacles of batch ``start``.
+            start: Batch index of the cluster.
+            velocity: (3,) m/s, world, at which the track starts.
         """
-        obstacles, rate = self.batches[start].obstacles, np.append(velocity, 0.0)
-        seen_s = float(obstacles.time_s[members].mean())
-        points = _at_once(obstacles, members, rate, seen_s)
+        batch = self.batches[start]
+        rate = np.append(velocity, 0.0)  # of the state, without a turn
+        seen_s = float(batch.obstacles.time_s[members].mean())
+        points = _at_once(batch.obstacles, members, rate, seen_s)
         track = Track(points.mean(0))
-        track.add(start, self.batches[start], np.zeros(4), seen_s, members)
+        track.add(start, batch, np.zeros(4), seen_s, members)
         model = Model(points)
         for direction in (1, -1):
-            last, n = start, start + direction
-            while 0 <= n < len(self.batches) and (
-                abs(n - last) <= 1 + _MISSES_ALLOWED or self.clock.near(n, last, MISSED_S)
-            ):
-                alignment = self._find(model, track, rate, n)
-                if alignment is not None:
+            last = start  # latest batch in which the object was found
+            n = start + direction
+            while 0 <= n < len(self.batches) and self._may_continue(last, n):
+                sighting = self._find(model, track, rate, n)
+                if sighting is not None:
                     last = n
-                    state, seen_s, rows, points = alignment
-                    track.add(n, self.batches[n], state, seen_s, rows)
-                    model.add(undo(state, points, track.centre))
+                    track.add(n, self.batches[n], sighting.state, sighting.seen_s, sighting.rows)
+                    model.add(undo(sighting.state, sighting.points, track.centre))
                 n += direction
         return track
 
-    def _find(
-        self, model: Model, track: Track, rate: Float, n: int
-    ) -> tuple[Float, float, Int, Float] | None:
-        """Align the candidates of batch n with the object so far; None if too few points fit."""
-        batch, num_recent = self.batches[n], self.clock.num_in(_RECENT_S)
-        obstacles, centre = batch.obstacles, track.centre
-        rough_state, rough_rate, _ = _predict(track, rate, num_recent, track.seen_at(batch.time_ns))
-        expected = apply(rough_state, model.points, centre)
-        slack_m = GATES_M[0] + batch.half_s * np.abs(rough_rate[:3])
-        inside = obstacles.strips.rows_inside(expected.min(0) - slack_m, expected.max(0) + slack_m)
+    def _may_continue(self, last: int, n: int) -> bool:
+        """Return True if a track last observed in batch ``last`` may still reach batch n."""
+        return abs(n - last) <= 1 + _MISSES_ALLOWED or self.clock.near(n, last, MISSED_S)
+
+    def _find(self, model: Model, track: Track, rate: Float, n: int) -> _Sighting | None:
+        """Align the obstacles of batch n with the object so far; None if too few points fit."""
+        centre = track.centre
+        batch = self.batches[n]
+        obstacles = batch.obstacles
+        num_recent = self.clock.num_in(_RECENT_S)
+
+        # Free obstacles at the expected position, at any time of the batch
+        expected_s = track.seen_at(batch.time_ns)
+        expected = _predict(track, rate, num_recent, expected_s)
+        expected_points = apply(expected.state, model.points, centre)
+        slack_m = GATES_M[0] + batch.half_s * np.abs(expected.rate[:3])
+        low, high = expected_points.min(0) - slack_m, expected_points.max(0) + slack_m
+        inside = obstacles.strips.rows_inside(low, high)
         inside = inside[batch.gather(self.free)[inside]]
-        rows, min_num_rows = inside[obstacles.cluster[inside] >= 0], float(MIN_FIT)
-        if len(rows) < MIN_FIT:  # no sweep saw through the object, but it may be there
+        rows = inside[obstacles.cluster[inside] >= 0]
+        min_num_rows = float(MIN_FIT)
+        if len(rows) < MIN_FIT:
+            # No sweep saw through the object here, hence it has no candidates. Other obstacles are
+            # the object if they are nearly as many as usual.
             usual_num = float(np.median([track.num_points(m) for m in track.observations]))
-            rows, min_num_rows = inside, max(MIN_FIT, _SHARE_UNSEEN * usual_num)
+            rows = inside
+            min_num_rows = max(MIN_FIT, _SHARE_UNSEEN * usual_num)
         if len(rows) < min_num_rows:
             return None
+
+        # Alignment, at the mean firing time
         seen_s = float(obstacles.time_s[rows].mean())
-        predicted, rate, std = _predict(track, rate, num_recent, seen_s)
-        predicted[2] = track.rise_m(self.ground, predicted)
-        target = _at_once(obstacles, rows, rate, seen_s)
-        state = model.align(target, centre, predicted, std)
+        predicted = _predict(track, rate, num_recent, seen_s)
+        predicted.state[2] = track.rise_m(self.ground, predicted.state)
+        points = _at_once(obstacles, rows, predicted.rate, seen_s)
+        state = model.align(points, centre, predicted.state, predicted.std)
         if state is None:
             return None
         state[2] = track.rise_m(self.ground, state)
-        fit = model.covers(undo(state, target, centre), FIT_M)
-        if fit.sum() < min_num_rows:
+        fits = model.covers(undo(state, points, centre), FIT_M)
+        if fits.sum() < min_num_rows:
             return None
-        return state, seen_s, rows[fit], target[fit]  # the (K,3) points at seen_s, world
+        return _Sighting(state, seen_s, rows[fits], points[fits])
 
 
 def _at_once(obstacles: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
@@ -319,26 +369,41 @@ def _at_once(obstacles: Obstacles, rows: Int, rate: Float, time_s: float) -> Flo
     return obstacles.points[rows] + late_s[:, None] * rate[:3]
 
 
-def _predict(track: Track, rate: Float, num: int, time_s: float) -> tuple[Float, Float, Float]:
-    """Predict state (4,), rate (4,), and (3,) x, y, yaw std at constant speed and turn rate."""
+class _Prediction(NamedTuple):
+    """The expected motion of an object at one time."""
+
+    state: Float  # (4,) state of the object
+    rate: Float  # (4,) derivative of the state per second
+    std: Float  # (3,) standard deviation of x, y (m) and yaw (rad)
+
+
+def _predict(track: Track, given_rate: Float, num: int, time_s: float) -> _Prediction:
+    """Predict an object's state from the ``num`` nearest ones, at constant speed and turn rate."""
     # The velocity turns with the object (Schubert, Richter, Wanielik, "Comparison and Evaluation of
     # Advanced Motion Models for Vehicle Tracking", FUSION 2008).
     nearest_first = sorted(
-        track.observations.items(), key=lambda s: (abs(s[1].seen_s - time_s), s[0])
+        track.observations.items(), key=lambda item: (abs(item[1].seen_s - time_s), item[0])
     )
-    known = dict(nearest_first[:num])
-    states = np.stack([seen.state for seen in known.values()])
-    t = np.array([seen.seen_s for seen in known.values()])
-    ahead_s, middle_s = time_s - t[0], t.mean()
-    if len(t) > 1:
-        t -= middle_s
-        given_s2 = np.full(4, _GIVEN_S2 * (next(iter(track.observations)) in known))
-        given_s2[3] = 0  # it has no turn rate
-        rate = (t @ states + given_s2 * rate) / (t @ t + given_s2)
+    recent = dict(nearest_first[:num])
+    states = np.stack([observation.state for observation in recent.values()])
+    times_s = np.array([observation.seen_s for observation in recent.values()])
+    ahead_s = time_s - times_s[0]
+    middle_s = times_s.mean()
+    rate = given_rate
+    if len(times_s) > 1:
+        # A line through the states. The given velocity counts as long as the first observation is
+        # among the recent ones. It has no turn rate.
+        centred_s = times_s - middle_s
+        first_batch = next(iter(track.observations))
+        given_s2 = np.full(4, _GIVEN_S2 * (first_batch in recent))
+        given_s2[3] = 0
+        rate = (centred_s @ states + given_s2 * given_rate) / (centred_s @ centred_s + given_s2)
         rate[3] *= _TURNS_ON
     std = PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
+    # The line's rate is that of its middle. Between the nearest state and ``time_s``, the mean rate
+    # is that of the middle between them.
     mean_rate = _turned(rate, time_s - 0.5 * ahead_s - middle_s)
-    return states[0] + mean_rate * ahead_s, _turned(rate, time_s - middle_s), std
+    return _Prediction(states[0] + mean_rate * ahead_s, _turned(rate, time_s - middle_s), std)
 
 
 def _turned(rate: Float, later_s: float) -> Float:

@@ -50,36 +50,51 @@ class Path:
 
     @staticmethod
     def fit(times_s: Float, states: Float, weights: Float) -> Path:
-        """Fit a path to states (m,d) at ascending times (m,), as stiff as the states allow.
+        """Fit a path to states, as stiff as the states allow.
 
         A softer path is taken only if its leave-one-out error, in closed form, is at least 20 %
-        lower. ``weights`` (m,) may have any scale.
+        lower. It needs at least 8 states and 0.65 s. Fewer than 5 states, or less than 0.35 s, give
+        a path of almost constant velocity.
+
+        Args:
+            times_s: (m,) ascending times, s.
+            states: (m,d) coordinates at these times, first x and y in metres.
+            weights: (m,) weights of the states, of any scale.
         """
+        num_states = len(times_s)
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
-        num_spans = max(1, round((end_s - begin_s) / _KNOT_S))
-        width_s = (end_s - begin_s) / num_spans
+        duration_s = end_s - begin_s
+        num_spans = max(1, round(duration_s / _KNOT_S))
+        width_s = duration_s / num_spans
         knots: Float = begin_s + width_s * np.arange(-_DEGREE, num_spans + _DEGREE + 1.0)
         last_s = min(end_s, knots[-_DEGREE - 1])  # rounding may put the last knot before the end
         inside = np.clip(times_s, begin_s, np.nextafter(last_s, begin_s))
         B = BSpline.design_matrix(inside, knots, _DEGREE).toarray()
-        num_states, duration_s = len(times_s), end_s - begin_s
-        accelerates = num_states >= MIN_STATES and duration_s >= MIN_SPAN_S
-        D = np.diff(np.eye(B.shape[1]), 3 if accelerates else 2, axis=0)
+        # D: differences of the coefficients, whose squares are penalised
+        may_accelerate = num_states >= MIN_STATES and duration_s >= MIN_SPAN_S
+        D = np.diff(np.eye(B.shape[1]), 3 if may_accelerate else 2, axis=0)
         W = weights / weights.mean()
-        least_error_m, coefficients, residual_m = np.inf, np.zeros(0), np.inf
-        jerks = num_states >= _JERK_STATES and duration_s >= _JERK_S
-        for stiffness in _STIFFNESSES if jerks else _STIFFNESSES[:1]:
-            solve = np.linalg.solve(B.T @ (W[:, None] * B) + stiffness * D.T @ D, B.T * W)
-            leverage = np.einsum("ij,ji->i", B, solve)
-            fitted = solve @ states
-            missed_m = np.linalg.norm((states - B @ fitted)[:, :2], axis=1)
-            left_out_m = missed_m / np.maximum(1 - leverage, 1e-3)
+        may_jerk = num_states >= _JERK_STATES and duration_s >= _JERK_S
+        stiffnesses = _STIFFNESSES if may_jerk else _STIFFNESSES[:1]
+
+        least_error_m = residual_m = np.inf
+        coefficients = np.zeros(0)
+        for stiffness in stiffnesses:
+            # Linear map from the states to the coefficients of the penalised fit
+            fit_matrix = np.linalg.solve(B.T @ (W[:, None] * B) + stiffness * D.T @ D, B.T * W)
+            trial = fit_matrix @ states
+            leverage = np.einsum("ij,ji->i", B, fit_matrix)
+            deviation_m = np.linalg.norm((states - B @ trial)[:, :2], axis=1)
+            left_out_m = deviation_m / np.maximum(1 - leverage, 1e-3)
             error_m = float(np.sqrt(np.average(left_out_m**2, weights=W)))
             if error_m < _WORTH_SOFTENING * least_error_m:
+                # The leverages sum to the number of fitted parameters. Half a degree of freedom
+                # remains at least.
                 freedom = max(num_states - leverage.sum() - 0.5, 0.5)
-                mean_square = float(np.average(missed_m**2, weights=W))
+                mean_square = float(np.average(deviation_m**2, weights=W))
                 residual_m = float(np.sqrt(mean_square * num_states / freedom))
-                least_error_m, coefficients = error_m, fitted
+                least_error_m = error_m
+                coefficients = trial
         return Path(knots, coefficients, begin_s, end_s, residual_m)
 
     @cached_property
@@ -89,10 +104,15 @@ class Path:
         width_s = (self.end_s - self.begin_s) / num_spans
         controls = np.stack([self.coefficients[k : k + num_spans] for k in range(_DEGREE + 1)])
         cubic = np.einsum("pk,knd->pnd", _CUBIC, controls)
+        # Rows are powers 3 to 0 of the time since the piece began, in units of a span.
+        linear, constant = 2, 3
         first, last = np.zeros((2, _DEGREE + 1, 1, cubic.shape[2]))
-        first[2:] = cubic[2:, :1]
-        first[3] -= first[2]
-        last[3], last[2] = cubic[:, -1:].sum(axis=0), np.arange(3.0, -1.0, -1) @ cubic[:, -1]
+        # The first piece begins one span before the path, and ends with its value and slope.
+        first[linear] = cubic[linear, :1]
+        first[constant] = cubic[constant, :1] - first[linear]
+        # The last piece begins with the value and the slope at the end of the path.
+        last[constant] = cubic[:, -1:].sum(axis=0)
+        last[linear] = np.arange(3.0, -1.0, -1) @ cubic[:, -1]
         powers = width_s ** -np.arange(_DEGREE, -1.0, -1)
         pieces = np.concatenate([first, cubic, last], axis=1) * powers[:, None, None]
         return PPoly(pieces, self.begin_s + width_s * np.arange(-1.0, num_spans + 2))
@@ -112,16 +132,17 @@ class Path:
         return float(np.linalg.norm((self(self.end_s) - self(self.begin_s))[:2]))
 
 
-_NEAR_M, _NEAR_GAPS = 0.2, 0.5
+_NEAR_M, _NEAR_GAPS = 0.2, 0.5  # least neighbour distance, and its share of the ring gap
 _MANY_POINTS = 100  # more points do not locate an object better
-BESIDE_M = 1.0  # from a towing vehicle to what it tows, and from an object to the road
-_OUTLINE_M = 0.05
+BESIDE_M = 1.0  # from a towing vehicle to its trailer, and from an object to the road
+_OUTLINE_M = 0.05  # distance outside an outline that still counts as inside
 LONG_M = 3.0
 """Objects shorter than this may bend, and need not move where they point."""
 LANE_M = 15.0
 """Distance ahead of and behind an object within which its parts are searched."""
-_SIDE_M = 0.1
+_SIDE_M = 0.1  # margin of a lane
 _QUARTERS_RAD = np.arange(4) * np.pi / 2
+# Search for the sides: number of points, step of the angle, bins of the histograms
 _SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
 
 
@@ -162,7 +183,14 @@ class Track:
     path: Path = field(init=False)
 
     def add(self, n: int, batch: Batch, state: Float, seen_s: float, rows: Int) -> None:
-        """Add the observation in batch n: state (4,), mean firing time, ascending obstacle rows."""
+        """Add the observation in one batch.
+
+        Args:
+            n: Index of the batch.
+            state: (4,) state of the object.
+            seen_s: Mean firing time of the points.
+            rows: Ascending rows of the points in the batch's obstacles.
+        """
         rows_by_sweep = batch.split(rows)
         self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(rows_by_sweep))
         self.claimed |= rows_by_sweep
@@ -214,7 +242,7 @@ class Track:
         """Return the indices, in the batch's obstacles, of the object's points."""
         sweeps = zip(batch.sweeps, batch.begins, strict=True)
         rows = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
-        return np.concatenate([np.zeros(0, np.int64), *rows])  # all may have been taken away
+        return np.concatenate([np.zeros(0, np.int64), *rows])  # there may be none
 
     def num_points(self, n: int) -> int:
         """Return the number of the object's points in batch index n."""
@@ -230,7 +258,8 @@ class Track:
 
     def rise_m(self, ground: HeightMap, state: Float) -> float:
         """Return how much higher (m) the ground is below a state (4,) than at first."""
-        # The median with 1 m to both sides: the road below an object may never be observed.
+        # The median of three lines, in the middle and 1 m to both sides: the road below an object
+        # may never be observed.
         ahead = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
         start = self.centre[:2] + np.outer([-BESIDE_M, 0.0, BESIDE_M], [-ahead[1], ahead[0]])
         start_m, end_m = ground.under(np.concatenate([start, start + state[:2]])).reshape(2, -1)
@@ -238,10 +267,11 @@ class Track:
 
     def seen_at(self, time_ns: int) -> float:
         """Estimate when (s) the sweep with reference time ``time_ns`` measures the object."""
-        # Both count from the first sweep. The delay is that of the observation nearest in time.
-        nearest = min(
+        # Both times count from the first sweep. The delay from the reference time to the firing
+        # time is that of the observation nearest in time.
+        _, nearest = min(
             self.observations.items(), key=lambda item: (abs(item[1].time_ns - time_ns), item[0])
-        )[1]
+        )
         return time_ns * 1e-9 + nearest.seen_s - nearest.time_ns * 1e-9
 
 
@@ -287,15 +317,18 @@ class Shape:
         points = self.points[:: len(self.points) // _SOME_POINTS + 1, :2]
         points = points - points.mean(axis=0)
         reach_m = float(np.linalg.norm(points, axis=1).max())
-        num = int(2 * reach_m / _BIN_M) + 2
+        num_bins = int(2 * reach_m / _BIN_M) + 2  # rounded up, and one bin for the end itself
         angles = np.deg2rad(np.arange(0.0, 90.0, _ANGLE_DEG))
         score = np.zeros(len(angles))
-        for turned in (angles, angles + np.pi / 2):
-            across = np.outer(np.cos(turned), points[:, 0]) + np.outer(np.sin(turned), points[:, 1])
-            bin_number = ((across + reach_m) / _BIN_M).astype(np.int64)
-            bin_number += num * np.arange(len(angles))[:, None]
-            counts = np.bincount(bin_number.ravel(), minlength=num * len(angles))
-            score += (counts.reshape(-1, num) ** 2).sum(axis=1)
+        for axis_rad in (angles, angles + np.pi / 2):
+            x_m = np.outer(np.cos(axis_rad), points[:, 0])
+            y_m = np.outer(np.sin(axis_rad), points[:, 1])
+            along_m = x_m + y_m  # (angles, points) coordinates along the axis
+            bin_number = ((along_m + reach_m) / _BIN_M).astype(np.int64)
+            # Each angle has bins of its own. One count gives the histograms of all angles.
+            bin_number += num_bins * np.arange(len(angles))[:, None]
+            counts = np.bincount(bin_number.ravel(), minlength=num_bins * len(angles))
+            score += (counts.reshape(-1, num_bins) ** 2).sum(axis=1)
         return float(angles[np.argmax(score)])
 
 
@@ -310,9 +343,9 @@ class MovingObject(NamedTuple):
 
         Points are measured at one time, or at (N,) times.
         """
-        at_s, rim = float(np.mean(time_s)), self.shape.rim
+        at_s = float(np.mean(time_s))
         travel_m = float(np.ptp(time_s) * np.linalg.norm(self.track.path.rate(at_s)[:2]))
-        rim = self.track.place(rim, at_s)
+        rim = self.track.place(self.shape.rim, at_s)
         apart_m = np.maximum(points.min(0) - rim.max(0), rim.min(0) - points.max(0))
         return bool((apart_m <= within_m + travel_m).all())
 
@@ -322,22 +355,28 @@ class MovingObject(NamedTuple):
         An object longer than 3 m points along the side closest to its velocity, because a turning
         trailer does not move where it points. Other objects point along their velocity.
         """
-        ahead = self.track.path.rate(at_s)[:2]
-        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
+        velocity_m_s = self.track.path.rate(at_s)[:2]
+        direction = velocity_m_s / max(float(np.linalg.norm(velocity_m_s)), 1e-6)
         rim = self.track.place(self.shape.rim, at_s)[:, :2]
         if np.linalg.norm(np.ptp(rim, axis=0)) < LONG_M:
-            return ahead
-        sides_rad = self.shape.side_rad + float(self.track.path(at_s)[3]) + _QUARTERS_RAD
+            return direction
+        yaw_rad = float(self.track.path(at_s)[3])
+        sides_rad = self.shape.side_rad + yaw_rad + _QUARTERS_RAD
         sides = np.stack([np.cos(sides_rad), np.sin(sides_rad)], axis=1)
-        side: Float = sides[np.argmax(sides @ ahead)]
-        return side if np.ptp(rim @ side) >= LONG_M else ahead
+        side: Float = sides[np.argmax(sides @ direction)]
+        return side if np.ptp(rim @ side) >= LONG_M else direction
 
     def lane(self, at_s: float) -> Lane:
         """Return the space ahead of and behind the object at a time (s), see `Lane`."""
         ahead = self.heading(at_s)
         rim = self.track.place(self.shape.rim, at_s)
-        aside = rim[:, :2] @ [-ahead[1], ahead[0]]
-        return Lane(ahead, aside.min() - _SIDE_M, aside.max() + _SIDE_M, rim[:, 2].max() + _SIDE_M)
+        aside_m = rim[:, :2] @ [-ahead[1], ahead[0]]
+        return Lane(
+            ahead=ahead,
+            right_m=aside_m.min() - _SIDE_M,
+            left_m=aside_m.max() + _SIDE_M,
+            top_m=rim[:, 2].max() + _SIDE_M,
+        )
 
 
 class Lane(NamedTuple):
@@ -351,6 +390,6 @@ class Lane(NamedTuple):
 
     def holds(self, points: Float, slack_m: float = 0.0) -> Bool:
         """Return (N,) True for points (N,3, world) inside the lane or within ``slack_m`` of it."""
-        aside = points[:, :2] @ [-self.ahead[1], self.ahead[0]]
-        inside: Bool = (aside > self.right_m - slack_m) & (aside < self.left_m + slack_m)
+        aside_m = points[:, :2] @ [-self.ahead[1], self.ahead[0]]
+        inside: Bool = (aside_m > self.right_m - slack_m) & (aside_m < self.left_m + slack_m)
         return inside & (points[:, 2] < self.top_m + slack_m)

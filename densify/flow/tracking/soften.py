@@ -25,15 +25,16 @@ from densify.geometry.types import Float, Int
 _ALPHAS = tuple(np.geomspace(100.0, 0.5, 7).tolist())  # from stiff to soft
 _REACHES_M = np.geomspace(0.5, 0.25, len(_ALPHAS))  # targets farther away do not pull
 _BLURS_M = np.geomspace(0.2, 0.08, len(_ALPHAS))
-_NODE_M = 0.07  # one node per voxel, so that dense regions are not stiffer than sparse regions
-_NUM_NEIGHBORS, _LINK_M = 6, 0.5
-_NUM_BLURRED = 8
+# One node per voxel: otherwise dense regions would be stiffer than sparse regions.
+_NODE_M = 0.07
+_NUM_NEIGHBORS, _LINK_M = 6, 0.5  # neighbours in the graph of nodes, and their greatest distance
+_NUM_BLURRED = 8  # neighbours that are averaged by a blur
 _ANCHOR, _ANCHOR_M = 2.0, 0.02  # weight of the rigid position, and distance at which it fades
-_MAX_PRODUCTS, _RESIDUAL_DROP = 30, 0.02
-_NUM_LOOKED_UP = 3
-_MIN_POINTS = 20
-# On eight streets parts of vehicles gained up to 0.045 of the squared distance, walkers within
-# 20 m mostly 0.06 to 0.4.
+_MAX_PRODUCTS, _RESIDUAL_DROP = 30, 0.02  # limits of the linear solver
+_NUM_INTERPOLATED = 3  # points that a value is interpolated from
+_MIN_POINTS = 20  # least median number of points of a snapshot
+# A softer object must lower the squared distance by this share, and in this share of snapshots. On
+# eight streets parts of vehicles gained up to 0.045, walkers within 20 m mostly 0.06 to 0.4.
 _MIN_GAIN, _MIN_SHARE_BETTER = 0.05, 0.75
 
 
@@ -62,91 +63,100 @@ class Softened:
     held_out_m: dict[float, float]
 
     def velocity_m_s(self, i: int) -> Float:
-        """Return (n,3) velocities of snapshot i beyond the rigid motion, object's frame."""
+        """Return (n,3) velocities of snapshot i relative to the rigid motion, object's frame."""
         # The mean of the velocities to the next and from the previous snapshot
-        velocities = [np.zeros_like(self.snapshots[i].points)]
-        for j, moved in ((i + 1, self.to_next[i]), (i - 1, self.to_previous[i])):
+        velocities = []
+        for j, displacement in ((i + 1, self.to_next[i]), (i - 1, self.to_previous[i])):
             if 0 <= j < len(self.snapshots):
-                velocities.append(moved / (self.snapshots[j].time_s - self.snapshots[i].time_s))
-        return np.asarray(np.mean(velocities[1:] or velocities, axis=0))
+                duration_s = self.snapshots[j].time_s - self.snapshots[i].time_s
+                velocities.append(displacement / duration_s)
+        if not velocities:
+            return np.zeros_like(self.snapshots[i].points)
+        return np.asarray(np.mean(velocities, axis=0))
 
     def carry(self, i: int, j: int) -> Float:
         """Return the (n,3) points of snapshot i at the time of snapshot j, object's frame."""
-        # At each snapshot in between, a point continues like nearby points that came the same way.
-        points, step = self.snapshots[i].points, 1 if j > i else -1
+        points = self.snapshots[i].points
         if i == j or np.isinf(self.alpha):
             return points
-        forward, backward = self.to_next, self.to_previous
-        if step < 0:
-            forward, backward = backward, forward
-        moved = forward[i]
+        if j > i:
+            step, onward, back = 1, self.to_next, self.to_previous
+        else:
+            step, onward, back = -1, self.to_previous, self.to_next
+        # At each snapshot in between, a point continues like the nearby points of that snapshot
+        # which arrived by a similar displacement.
+        displacement = onward[i]
         for k in range(i + step, j, step):
-            points = points + moved
-            moved = _look_up(points, moved, self.snapshots[k].points, -backward[k], forward[k])
-        return points + moved
+            points = points + displacement
+            snapshot_points = self.snapshots[k].points
+            displacement = _interpolate(points, displacement, snapshot_points, -back[k], onward[k])
+        return points + displacement
 
 
 def soften(snapshots: Sequence[Snapshot]) -> Softened:
-    """Estimate the bending of one object from its snapshots, by ascending time.
+    """Estimate how one object bends, from its snapshots by ascending time.
 
-    Every second snapshot is left out, and predicted from the bending between its neighbours. The
+    Every second snapshot is held out, and predicted from the bending between its neighbours. The
     softest stiffness is taken that predicts clearly better than the rigid object, in most
-    snapshots. Otherwise the object stays rigid. Objects longer than 3 m, with fewer than 5
-    snapshots, less than 0.35 s, or a median of fewer than 20 points per snapshot always stay rigid.
+    snapshots. Otherwise the object stays rigid. Objects longer than 3 m always stay rigid, as do
+    objects with fewer than 5 snapshots, within less than 0.35 s, or with a median of fewer than 20
+    points per snapshot.
     """
     snapshots = tuple(snapshots)
-    zero = tuple(np.zeros_like(p.points) for p in snapshots)
+    zero = tuple(np.zeros_like(snapshot.points) for snapshot in snapshots)
     if not _may_bend(snapshots):
         return Softened(snapshots, zero, zero, np.inf, {})
-    squared = _held_out(snapshots)
-    rms_m = np.sqrt(squared.mean(axis=0)).tolist()
+    squared_m2 = _held_out_errors(snapshots)
+    rms_m = np.sqrt(squared_m2.mean(axis=0)).tolist()
     held_out_m = dict(zip((np.inf, *_ALPHAS), rms_m, strict=True))
-    clearly = squared.mean(axis=0) < (1 - _MIN_GAIN) * squared[:, 0].mean()
-    mostly = (squared < squared[:, :1]).mean(axis=0) >= _MIN_SHARE_BETTER
-    confirmed = np.flatnonzero(clearly & mostly)
+    rigid_m2 = squared_m2[:, 0]
+    is_clearly_better = squared_m2.mean(axis=0) < (1 - _MIN_GAIN) * rigid_m2.mean()
+    is_mostly_better = (squared_m2 < squared_m2[:, :1]).mean(axis=0) >= _MIN_SHARE_BETTER
+    confirmed = np.flatnonzero(is_clearly_better & is_mostly_better)
     if not len(confirmed):
         return Softened(snapshots, zero, zero, np.inf, held_out_m)
-    softest = int(confirmed[-1]) - 1
+    softest = int(confirmed[-1]) - 1  # column 0 is the rigid object
     bending = _Bending(snapshots)
     for k in range(softest + 1):
-        bending.bring_beyond()
+        bending.fill_targets()
         bending.refine(k)
-    return Softened(
-        snapshots, *_averaged(snapshots, *bending.at_points()), _ALPHAS[softest], held_out_m
-    )
+    to_next, to_previous = _average_both_ways(snapshots, *bending.at_points())
+    return Softened(snapshots, to_next, to_previous, _ALPHAS[softest], held_out_m)
 
 
 def _may_bend(snapshots: tuple[Snapshot, ...]) -> bool:
     """Return True if the object is shorter than 3 m and was observed often enough."""
     if len(snapshots) < MIN_STATES or snapshots[-1].time_s - snapshots[0].time_s < MIN_SPAN_S:
         return False
-    if np.median([len(p.points) for p in snapshots]) < _MIN_POINTS:
+    if np.median([len(snapshot.points) for snapshot in snapshots]) < _MIN_POINTS:
         return False
-    lengths_m = [np.linalg.norm(np.ptp(p.points, axis=0)) for p in snapshots]
+    lengths_m = [np.linalg.norm(np.ptp(snapshot.points, axis=0)) for snapshot in snapshots]
     return bool(np.median(lengths_m) < LONG_M)
 
 
-def _held_out(snapshots: tuple[Snapshot, ...]) -> Float:
+def _held_out_errors(snapshots: tuple[Snapshot, ...]) -> Float:
     """Return the mean squared distance (m²) of each held-out snapshot from its prediction."""
-    # errors[i, k]: snapshot i + 1 at alpha k - 1; k = 0 is rigid
-    errors = np.zeros((len(snapshots) - 2, 1 + len(_ALPHAS)))
+    # Row i belongs to snapshot i + 1: the first and the last snapshot cannot be predicted. Column 0
+    # is the rigid object, column k has alpha k - 1.
+    squared_m2 = np.zeros((len(snapshots) - 2, 1 + len(_ALPHAS)))
     for first in (0, 1):
-        kept, left_out = snapshots[first::2], snapshots[first + 1 :: 2]
-        bending = _Bending(kept)
+        used = snapshots[first::2]
+        held_out = snapshots[first + 1 :: 2]
+        bending = _Bending(used)
         for k in range(1 + len(_ALPHAS)):
-            if k:
+            if k > 0:
                 bending.refine(k - 1)
-            for n in range(len(kept) - 1):
-                predicted = bending.between(n, left_out[n].time_s)
-                errors[first + 2 * n, k] = _squared_distance(left_out[n].points, predicted)
-    return errors
+            for n in range(len(used) - 1):
+                predicted = bending.between(n, held_out[n].time_s)
+                squared_m2[first + 2 * n, k] = _mean_squared_m2(held_out[n].points, predicted)
+    return squared_m2
 
 
-def _squared_distance(a: Float, b: Float) -> float:
+def _mean_squared_m2(points: Float, predicted: Float) -> float:
     """Return the mean squared, capped distance (m²) of nearest points, both ways."""
-    a_to_b_m = np.minimum(nearest(tree_of(b), a)[0], FIT_M)
-    b_to_a_m = np.minimum(nearest(tree_of(a), b)[0], FIT_M)
-    return float((a_to_b_m**2).mean() + (b_to_a_m**2).mean()) / 2
+    to_predicted_m = np.minimum(nearest(tree_of(predicted), points)[0], FIT_M)
+    to_points_m = np.minimum(nearest(tree_of(points), predicted)[0], FIT_M)
+    return float((to_predicted_m**2).mean() + (to_points_m**2).mean()) / 2
 
 
 class _Bending:
@@ -154,99 +164,139 @@ class _Bending:
 
     def __init__(self, snapshots: tuple[Snapshot, ...]) -> None:
         self._snapshots = snapshots
-        self._nodes = [p.points[_one_per_voxel(p.points)] for p in snapshots]
-        n = len(snapshots)
-        # A hop leads to the next or the previous snapshot. The nodes of all hops lie side by side.
-        self._hops = [(i, i + 1) for i in range(n - 1)] + [(i, i - 1) for i in range(1, n)]
-        everything = np.concatenate(self._nodes)
-        self._apart_m = float(np.ptp(everything, axis=0).max()) + 10.0
-        self._start = np.cumsum([0] + [len(self._nodes[a]) for a, _ in self._hops])
+        self._nodes = [snapshot.points[_one_per_voxel(snapshot.points)] for snapshot in snapshots]
+        # A hop (a, b) leads from snapshot a to the next or the previous snapshot b.
+        num = len(snapshots)
+        self._hops = [(i, i + 1) for i in range(num - 1)] + [(i, i - 1) for i in range(1, num)]
+        # The nodes of all hops lie side by side, 10 m apart, and are solved at once.
+        extent_m = float(np.ptp(np.concatenate(self._nodes), axis=0).max())
+        self._shift_m = extent_m + 10.0
+        # First node of each hop, and the number of all nodes
+        self._begins = np.cumsum([0] + [len(self._nodes[a]) for a, _ in self._hops])
         self._source = self._side_by_side([self._nodes[a] for a, _ in self._hops])
         self._laplacian = _laplacian(self._source)
-        self._around = nearest_k(tree_of(self._source), self._source, _NUM_BLURRED)[1]
-        self._steady = self._steadiness()
-        self._flow = np.zeros_like(self._source)  # (nodes, 3) beyond the rigid motion
+        self._neighbours = nearest_k(tree_of(self._source), self._source, _NUM_BLURRED)[1]
+        self._velocity_penalty = self._velocity_change()
+        self._flow = np.zeros_like(self._source)  # (nodes, 3) relative to the rigid motion
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
 
     def refine(self, k: int) -> None:
-        """Find all targets again and solve for the flow, in place; alpha k = 0 is the stiffest."""
-        # Minimise, for fixed targets t: Σ w |f - t|² + Σ a |f|² + steady + alpha tr(Fᵀ L F).
+        """Match all nodes again, and solve for the flow, in place; alpha k = 0 is the stiffest."""
+        # Minimise, for fixed target flows t:
+        # Σ w |f - t|² + Σ a |f|² + velocity penalty + alpha tr(Fᵀ L F)
         # The anchor a holds a node until it clearly left the rigid position (Geman, McClure 1987).
+        target_flow, weight = self._match(k)
+        anchor = _ANCHOR / (1 + (self._flow**2).sum(axis=1) / _ANCHOR_M**2) ** 2
+        smoothness = _ALPHAS[k] * self._laplacian
+        matrix = diags_array(weight + anchor) + self._velocity_penalty + smoothness
+        self._solve(matrix, weight[:, None] * target_flow)
+
+    def _match(self, k: int) -> tuple[Float, Float]:
+        """Return the flow of each node (nodes, 3) to its target, and the (nodes,) weights."""
         moved = self._source + self._flow
         neighbours = nearest_k(tree_of(self._target), moved, _NUM_BLURRED)[1]
-        target_mean, distance_m = _blurred(self._target, neighbours, moved, _BLURS_M[k])
-        source_mean, _ = _blurred(moved, self._around, moved, _BLURS_M[k])
+        target_mean, distance_m = _blur(self._target, neighbours, moved, _BLURS_M[k])
+        source_mean, _ = _blur(moved, self._neighbours, moved, _BLURS_M[k])
         weight = np.clip(1 - (distance_m / _REACHES_M[k]) ** 2, 0, 1) ** 2  # Tukey
-        anchor = _ANCHOR / (1 + (self._flow**2).sum(axis=1) / _ANCHOR_M**2) ** 2
-        pull = weight[:, None] * (self._flow + target_mean - source_mean)
-        matrix = diags_array(weight + anchor) + self._steady + _ALPHAS[k] * self._laplacian
+        return self._flow + target_mean - source_mean, weight
+
+    def _solve(self, matrix: csr_array, right_side: Float) -> None:
+        """Solve for the flow, in place, by conjugate gradients with a Jacobi preconditioner."""
         jacobi = diags_array(1 / (matrix.diagonal() + 1e-9))
         for axis in range(3):
-            start, rhs = self._flow[:, axis], pull[:, axis]
-            enough = _RESIDUAL_DROP * float(np.linalg.norm(rhs - matrix @ start))
+            start = self._flow[:, axis]
+            residual = right_side[:, axis] - matrix @ start
+            # Matches are provisional: a full solution is not needed.
+            tolerance = _RESIDUAL_DROP * float(np.linalg.norm(residual))
             self._flow[:, axis], _ = cg(
-                matrix, rhs, start, rtol=0.0, atol=enough, maxiter=_MAX_PRODUCTS, M=jacobi
+                matrix,
+                right_side[:, axis],
+                start,
+                rtol=0.0,
+                atol=tolerance,
+                maxiter=_MAX_PRODUCTS,
+                M=jacobi,
             )
 
-    def bring_beyond(self) -> None:
-        """Fill holes in the target of each hop from a to b by the snapshot beyond b, moved to b."""
+    def fill_targets(self) -> None:
+        """Fill holes in the target of each hop (a, b) by the snapshot after b, moved to b."""
         flows = self._by_hop()
         targets = []
         for a, b in self._hops:
-            beyond = 2 * b - a
-            brought = [self._nodes[beyond] + flows[beyond, b]] if (beyond, b) in flows else []
-            targets.append(np.concatenate([self._nodes[b], *brought]))
+            clouds = [self._nodes[b]]
+            after = 2 * b - a  # the snapshot that follows in the direction of the hop
+            if (after, b) in flows:
+                clouds.append(self._nodes[after] + flows[after, b])
+            targets.append(np.concatenate(clouds))
         self._target = self._side_by_side(targets)
 
     def between(self, i: int, time_s: float) -> Float:
         """Return the (N,3) nodes of snapshots i and i + 1, both moved to a time between them."""
         flows = self._by_hop()
-        start_s, end_s = self._snapshots[i].time_s, self._snapshots[i + 1].time_s
-        share = (time_s - start_s) / (end_s - start_s)
-        forth = self._nodes[i] + share * flows[i, i + 1]
-        return np.concatenate([forth, self._nodes[i + 1] + (1 - share) * flows[i + 1, i]])
+        begin_s = self._snapshots[i].time_s
+        end_s = self._snapshots[i + 1].time_s
+        share = (time_s - begin_s) / (end_s - begin_s)
+        earlier = self._nodes[i] + share * flows[i, i + 1]
+        later = self._nodes[i + 1] + (1 - share) * flows[i + 1, i]
+        return np.concatenate([earlier, later])
 
     def at_points(self) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
         """Return the flow (n,3) of each snapshot's points to the next and the previous one."""
-        to_next = [np.zeros_like(p.points) for p in self._snapshots]
-        to_previous = [np.zeros_like(p.points) for p in self._snapshots]
+        to_next = [np.zeros_like(snapshot.points) for snapshot in self._snapshots]
+        to_previous = [np.zeros_like(snapshot.points) for snapshot in self._snapshots]
         for (a, b), flow in self._by_hop().items():
-            nodes, points = self._nodes[a], self._snapshots[a].points
-            moved = _look_up(points, np.zeros_like(points), nodes, np.zeros_like(nodes), flow)
-            (to_next if b > a else to_previous)[a] = moved
+            nodes = self._nodes[a]
+            points = self._snapshots[a].points
+            # by position alone: all last displacements are given as 0
+            no_points_moved = np.zeros_like(points)
+            no_nodes_moved = np.zeros_like(nodes)
+            point_flow = _interpolate(points, no_points_moved, nodes, no_nodes_moved, flow)
+            if b > a:
+                to_next[a] = point_flow
+            else:
+                to_previous[a] = point_flow
         return tuple(to_next), tuple(to_previous)
 
     def _by_hop(self) -> dict[tuple[int, int], Float]:
-        return dict(zip(self._hops, np.split(self._flow, self._start[1:-1]), strict=True))
+        """Return the flow (n,3) of the nodes of each hop."""
+        return dict(zip(self._hops, np.split(self._flow, self._begins[1:-1]), strict=True))
 
     def _side_by_side(self, clouds: Sequence[Float]) -> Float:
-        return np.concatenate([c + [k * self._apart_m, 0.0, 0.0] for k, c in enumerate(clouds)])
+        """Return the clouds (n,3) of all hops, each shifted to its own place along x."""
+        return np.concatenate(
+            [cloud + [k * self._shift_m, 0.0, 0.0] for k, cloud in enumerate(clouds)]
+        )
 
-    def _steadiness(self) -> csr_array:
+    def _velocity_change(self) -> csr_array:
         """Return the (nodes, nodes) matrix of ``|f_next / dt_next + f_before / dt_before|²``."""
         # f: displacements to the next and the previous snapshot; the sum is 0 at constant velocity
         number = {hop: k for k, hop in enumerate(self._hops)}
-        times_s = [p.time_s for p in self._snapshots]
+        times_s = [snapshot.time_s for snapshot in self._snapshots]
+        # The node that leads from the same point to the other side; without one, the node itself
         opposite = np.arange(len(self._source))
-        diagonal, crossed = np.zeros((2, len(self._source)))
+        diagonal, coupling = np.zeros((2, len(self._source)))
         for (a, b), k in number.items():
             opposite_hop = number.get((a, 2 * a - b))
             if opposite_hop is None:
                 continue
-            rows = slice(self._start[k], self._start[k + 1])
-            opposite[rows] = np.arange(self._start[opposite_hop], self._start[opposite_hop + 1])
-            u, v = 1 / abs(times_s[b] - times_s[a]), 1 / abs(times_s[2 * a - b] - times_s[a])
-            scale = 2 / (u * u + v * v)  # a weight of 1 for equal times
-            diagonal[rows], crossed[rows] = scale * u * u, scale * u * v
+            rows = slice(self._begins[k], self._begins[k + 1])
+            opposite[rows] = np.arange(self._begins[opposite_hop], self._begins[opposite_hop + 1])
+            rate = 1 / abs(times_s[b] - times_s[a])
+            opposite_rate = 1 / abs(times_s[2 * a - b] - times_s[a])
+            # a weight of 1 for equal times
+            scale = 2 / (rate * rate + opposite_rate * opposite_rate)
+            diagonal[rows] = scale * rate * rate
+            coupling[rows] = scale * rate * opposite_rate
         row = np.arange(len(opposite))
-        coupling = coo_array((crossed, (row, opposite)), shape=(len(row), len(row)))
-        return csr_array(diags_array(diagonal) + coupling)
+        mixed = coo_array((coupling, (row, opposite)), shape=(len(row), len(row)))
+        return csr_array(diags_array(diagonal) + mixed)
 
 
 def _laplacian(points: Float) -> csr_array:
     """Return the (n,n) Laplacian ``(D - W) / mean(D)`` of the neighbour graph of points (n,3)."""
     # W[i, j] = exp(-|p_i - p_j|² / 1 m²) where either is among the 6 nearest of the other
     n = len(points)
+    # + 1: each point is its own nearest point
     distance_m, neighbours = nearest_k(tree_of(points), points, _NUM_NEIGHBORS + 1)
     row, rank = np.nonzero(distance_m <= _LINK_M)
     weights = coo_array(
@@ -257,18 +307,19 @@ def _laplacian(points: Float) -> csr_array:
     return csr_array((diags_array(degree) - weights) / degree.mean())
 
 
-def _averaged(
+def _average_both_ways(
     snapshots: tuple[Snapshot, ...], to_next: tuple[Float, ...], to_previous: tuple[Float, ...]
 ) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-    """Average each flow with the reversed flow back from the snapshot where its points arrive."""
+    """Return both flows, each averaged with the reversed flow of the points where it arrives."""
 
-    def mean(a: int, b: int, flow: Float, reverse: Float) -> Float:
+    def average(a: int, b: int, flow: Float, reverse: Float) -> Float:
         arrived = snapshots[a].points + flow
-        return (flow + _look_up(arrived, flow, snapshots[b].points, -reverse, -reverse)) / 2
+        reversed_flow = _interpolate(arrived, flow, snapshots[b].points, -reverse, -reverse)
+        return (flow + reversed_flow) / 2
 
     last = len(snapshots) - 1
-    forth = [mean(i, i + 1, to_next[i], to_previous[i + 1]) for i in range(last)]
-    back = [mean(i + 1, i, to_previous[i + 1], to_next[i]) for i in range(last)]
+    forth = [average(i, i + 1, to_next[i], to_previous[i + 1]) for i in range(last)]
+    back = [average(i + 1, i, to_previous[i + 1], to_next[i]) for i in range(last)]
     return (*forth, to_next[last]), (to_previous[0], *back)
 
 
@@ -278,24 +329,29 @@ def _one_per_voxel(points: Float) -> Int:
     return np.sort(np.unique(voxel, axis=0, return_index=True)[1]).astype(np.int64)
 
 
-def _blurred(points: Float, neighbours: Int, at: Float, blur_m: float) -> tuple[Float, Float]:
-    """Return (N,3) Gaussian means of ``points[near[i]]`` around ``at[i]``, nearest distances."""
-    around = points[neighbours]
-    away = around - at[:, None]
-    squared = np.einsum("nki,nki->nk", away, away)
-    nearest = squared.min(axis=1)
-    weight = np.exp((nearest[:, None] - squared) / (2 * blur_m**2))
+def _blur(points: Float, neighbours: Int, positions: Float, blur_m: float) -> tuple[Float, Float]:
+    """Return, at (N,3) positions, the Gaussian mean of neighbours (N,k) and nearest distance."""
+    neighbour_points = points[neighbours]
+    offset = neighbour_points - positions[:, None]
+    squared = np.einsum("nki,nki->nk", offset, offset)
+    least_squared = squared.min(axis=1)
+    weight = np.exp((least_squared[:, None] - squared) / (2 * blur_m**2))
     weight /= weight.sum(axis=1, keepdims=True)
-    return np.einsum("nk,nki->ni", weight, around), np.sqrt(nearest)
+    return np.einsum("nk,nki->ni", weight, neighbour_points), np.sqrt(least_squared)
 
 
-def _look_up(
-    points: Float, moved: Float, known_points: Float, known_moved: Float, values: Float
+def _interpolate(
+    points: Float,
+    displacement: Float,
+    sample_points: Float,
+    sample_displacement: Float,
+    values: Float,
 ) -> Float:
-    """Interpolate values (M,3) of known points with similar position and last displacement."""
-    known, queries = np.hstack([known_points, known_moved]), np.hstack([points, moved])
-    neighbours = nearest_k(tree_of(known), queries, _NUM_LOOKED_UP)[1]
-    distance_m = np.linalg.norm(known[neighbours] - queries[:, None], axis=2)
+    """Return (N,3) values at points from (M,3) samples of similar position and displacement."""
+    samples = np.hstack([sample_points, sample_displacement])
+    queries = np.hstack([points, displacement])
+    neighbours = nearest_k(tree_of(samples), queries, _NUM_INTERPOLATED)[1]
+    distance_m = np.linalg.norm(samples[neighbours] - queries[:, None], axis=2)
     weight = 1 / (distance_m + 1e-3) ** 2
     weight /= weight.sum(axis=1, keepdims=True)
     return np.einsum("nk,nki->ni", weight, values[neighbours])

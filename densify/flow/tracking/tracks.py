@@ -28,8 +28,8 @@ from densify.flow.tracking.following import (
     velocities_beside,
     vote,
 )
-from densify.flow.tracking.likelihood import NUM_ASKED, Judge, Verdict, judge
-from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track
+from densify.flow.tracking.likelihood import NUM_ASKED, RecordEvidence, Verdict, judge
+from densify.flow.tracking.objects import LANE_M, Lane, MovingObject, Shape, Track
 from densify.free_space.ground import HeightMap
 from densify.free_space.seen_through import FreeSpace
 from densify.free_space.sensor import Sensors
@@ -38,10 +38,10 @@ from densify.geometry.clock import Clock
 from densify.geometry.nearest import link
 from densify.geometry.types import Bool, Float, Int
 
-_NEAR_S = 0.3
-_REFINED_STD = PREDICTION_STD / 2  # of the smooth motion
-_AS_WHOLE = 0.9  # share of the known track's points that a better track must keep
-_GAPS_IN_LINE_M = (1.5, 4.0)
+_NEAR_S = 0.3  # time to the sweeps that test a motion
+_REFINED_STD = PREDICTION_STD / 2  # standard deviation of the smooth motion
+_KEPT_SHARE = 0.9  # share of the first track's points that a restarted track must keep
+_GAPS_IN_LINE_M = (1.5, 4.0)  # least and greatest gap that is linked along the heading
 _ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of a single ring or column, in steps
 
 
@@ -50,15 +50,17 @@ def find_tracks(
     space: FreeSpace,
     ground: HeightMap,
     velocities_m_s: Sequence[Float] | None = None,
-    judged: Judge | None = None,
+    record: RecordEvidence | None = None,
 ) -> list[Track]:
     """Return the confirmed tracks of all moving objects in the stretch (consecutive sweeps).
 
-    ``velocities_m_s`` are, for each sweep, (C,3) of its obstacles, world frame, at which clusters
-    start. None lets the neighbouring sweeps vote. ``judged`` is called with each track that was
-    tried, and its evidence.
+    Args:
+        obstacles: Points above the ground of each sweep of the stretch.
+        velocities_m_s: For each sweep, (C,3) velocities of its obstacles, world frame, at which
+            tracks start. None lets the neighbouring sweeps vote.
+        record: Called with each track that was tried, and its evidence.
     """
-    return _Search(obstacles, space, ground, velocities_m_s, judged).tracks()
+    return _Search(obstacles, space, ground, velocities_m_s, record).find_tracks()
 
 
 class _Trial(NamedTuple):
@@ -86,37 +88,45 @@ class _Search:
         space: FreeSpace,
         ground: HeightMap,
         velocities_m_s: Sequence[Float] | None,
-        judged: Judge | None,
+        record: RecordEvidence | None,
     ) -> None:
-        self._obstacles, self._space, self._ground = obstacles, space, ground
-        self._judged = judged
+        self._obstacles = obstacles
+        self._space = space
+        self._ground = ground
+        self._record = record
         self._velocities_m_s = velocities_m_s
         self.batches = [Batch.of(sweeps, obstacles, space.clock) for sweeps in space.batches]
         self.clock = Clock(np.array([batch.time_ns for batch in self.batches]))
-        self._free, self._objects = self._all_points(), list[MovingObject]()
+        # For each sweep (C,) True for obstacles that no track has claimed
+        self._free = self._all_obstacles()
+        self._objects = list[MovingObject]()
         self._follower = Follower(self.batches, self._free, ground, self.clock)
         self._fields: list[list[DistanceField]] = []
         if velocities_m_s is None:
-            of_sweeps = [
-                DistanceField.of(c.points[c.candidate], c.time_s[c.candidate]) for c in obstacles
+            sweep_fields = [
+                DistanceField.of(sweep.points[sweep.candidate], sweep.time_s[sweep.candidate])
+                for sweep in obstacles
             ]
-            self._fields = [[of_sweeps[j] for j in batch.sweeps] for batch in self.batches]
+            self._fields = [[sweep_fields[j] for j in batch.sweeps] for batch in self.batches]
 
-    def _all_points(self) -> list[Bool]:
-        return [np.ones(len(c.points), bool) for c in self._obstacles]
+    def _all_obstacles(self) -> list[Bool]:
+        """Return, for each sweep, a mask (C,) of all obstacles."""
+        return [np.ones(len(sweep.points), bool) for sweep in self._obstacles]
 
-    def tracks(self) -> list[Track]:
+    def find_tracks(self) -> list[Track]:
         """Return the confirmed tracks; tracks from the best starting clusters come first."""
-        untried = self._all_points()
+        untried = self._all_obstacles()
         for n, cluster in find_starts([batch.obstacles for batch in self.batches], self.clock):
             batch = self.batches[n]
-            untaken = batch.gather(self._free)[cluster] & batch.gather(untried)[cluster]
-            members = cluster[untaken]
+            is_open = batch.gather(self._free)[cluster] & batch.gather(untried)[cluster]
+            members = cluster[is_open]
             if len(members) < MIN_POINTS:
                 continue
-            beside = velocities_beside(self.batches[n], members, self._objects)
-            velocities = [self._velocity_of(members, n), *beside]
-            velocities = [v for v in velocities if self._may_move(members, n, v)]
+            velocities = [
+                velocity
+                for velocity in self._starting_velocities(members, n)
+                if self._may_move(members, n, velocity)
+            ]
             if not velocities:
                 continue
             track, verdict = self._track_of(members, n, velocities)
@@ -135,7 +145,13 @@ class _Search:
             self._free[j][rows] = False
         self._objects.append(MovingObject(track, self._shape_of(track)))
 
+    def _starting_velocities(self, members: Int, n: int) -> list[Float]:
+        """Return velocities (3,), m/s, at which batch n's obstacles ``members`` may move."""
+        beside = velocities_beside(self.batches[n], members, self._objects)
+        return [self._velocity_of(members, n), *beside]
+
     def _shape_of(self, track: Track) -> Shape:
+        """Return the shape of all points that a track has claimed."""
         return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
 
     def _velocity_of(self, members: Int, n: int) -> Float:
@@ -148,19 +164,22 @@ class _Search:
 
     def _may_move(self, members: Int, n: int, velocity: Float) -> bool:
         """Return True if other sweeps see less often through ``members`` once they are moved."""
-        obstacles, rows = self.batches[n].obstacles, members[:: len(members) // NUM_ASKED + 1]
-        points, time_s = obstacles.points[rows], obstacles.time_s[rows]
+        obstacles = self.batches[n].obstacles
+        rows = members[:: len(members) // NUM_ASKED + 1]
+        points = obstacles.points[rows]
+        time_s = obstacles.time_s[rows]
         velocity_m_s = np.repeat([velocity, np.zeros(3)], len(rows), axis=0)
-        num_seen_through = np.zeros(2, np.int64)  # moved, static
+        num_moved = num_static = 0  # violations
         for m, batch in enumerate(self.batches):
             if m != n and self.clock.near(m, n, _NEAR_S):
                 j = batch.sweeps[0]
                 moved = points + (self._space.clock.time_s[j] - time_s)[:, None] * velocity
-                asked = np.concatenate([moved, points])
-                seen_through = self._space.seen_through(asked, j, velocity_m_s)
-                num_seen_through += seen_through.reshape(2, -1).sum(axis=1)
-        # without any evidence they may move
-        return bool(num_seen_through[0] < num_seen_through[1] or not num_seen_through.any())
+                positions = np.concatenate([moved, points])
+                is_violated = self._space.seen_through(positions, j, velocity_m_s)
+                num_moved += int(is_violated[: len(rows)].sum())
+                num_static += int(is_violated[len(rows) :].sum())
+        # Without any evidence they may move.
+        return num_moved < num_static or num_moved == num_static == 0
 
     def _track_of(self, members: Int, n: int, velocities: Sequence[Float]) -> _Trial:
         """Return the most likely track of ``members`` of batch n's obstacles."""
@@ -168,15 +187,21 @@ class _Search:
         for velocity in velocities[1:]:
             if best.leaves_much_unexplained:
                 best = best.or_better(self._follow(members, n, velocity))
-        if not (best.verdict.moves and best.leaves_much_unexplained):
-            return best
-        # At its ends more may be in view than one side that slides along itself.
-        track = best.track
+        if best.verdict.moves and best.leaves_much_unexplained:
+            return self._restart_from_ends(best, n)
+        return best
+
+    def _restart_from_ends(self, trial: _Trial, n: int) -> _Trial:
+        """Return the most likely of a track and its restarts from the first and last batch."""
+        # A track that started at batch n from one flat side may have a wrong speed along that side.
+        # In the first or the last batch, another side may be in view.
+        best = trial
+        track = trial.track
         for end in sorted({min(track.observations), max(track.observations)} - {n}):
             rows = track.rows_in(self.batches[end])
             if len(rows) >= MIN_POINTS:
                 restarted = self._follow(rows, end, self._velocity_of(rows, end))
-                if restarted.track.total_points() >= _AS_WHOLE * track.total_points():
+                if restarted.track.total_points() >= _KEPT_SHARE * track.total_points():
                     best = best.or_better(restarted)
         return best
 
@@ -185,7 +210,7 @@ class _Search:
         track = self._follower.follow(members, n, velocity)
         if len(track.observations) > 1:
             track.smooth()
-        verdict = judge(track, self._obstacles, self._space, self._objects, self._judged)
+        verdict = judge(track, self._obstacles, self._space, self._objects, self._record)
         return _Trial(track, verdict)
 
     def _gather(self, track: Track) -> None:
@@ -200,37 +225,46 @@ class _Search:
     def _claim_in_line(self, track: Track) -> None:
         """Claim free clusters of single rings or columns ahead of and behind the object."""
         # On a roof, or on a side that recedes from the scanner, they are too far apart to link.
-        # Tracked alone, such a cluster would stay where the rays are.
-        space, shape = self._space, self._shape_of(track)
+        # Tracked alone, the cluster would seem static, because the rays are static.
+        space = self._space
+        shape = self._shape_of(track)
         at_s = next(iter(track.observations.values())).seen_s
         lane = MovingObject(track, shape).lane(at_s)
+        rows_in_line = dict[int, Int]()  # by sweep index
         # (N,3) points of the object, then those in line of each sweep, all at one time
-        rows_in_line, clouds = dict[int, Int](), [track.place(shape.points, at_s)]
+        clouds = [track.place(shape.points, at_s)]
         for j in track.claimed:
-            obstacles, T_lidar_world = self._obstacles[j], space.T_lidar_world[j]
-            rows = self._unclaimed_around(track, shape, j, LANE_M)
-            rows = rows[_few_rays(obstacles, rows, T_lidar_world, space.sensors)]
-            rows = rows[lane.holds(track.place(track.in_object(obstacles, rows), at_s))]
-            rows_in_line[j] = rows = self._without_violations(track, j, rows)
-            clouds.append(track.place(track.in_object(obstacles, rows), at_s))
+            rows = self._rows_in_line(track, shape, j, lane, at_s)
+            rows_in_line[j] = rows
+            clouds.append(track.place(track.in_object(self._obstacles[j], rows), at_s))
+
         T_lidar_world = space.T_lidar_world[next(iter(track.claimed))]
         columns_m = columns_apart_m(track.centre, lane.ahead, T_lidar_world, space.sensors)
         gap_m = float(np.clip(NUM_COLUMNS * columns_m, *_GAPS_IN_LINE_M))
-        # Shortened along the heading, gaps up to ``gap_m`` are linked.
+        # The points are compressed along the heading, until gaps up to ``gap_m`` are linked.
         points = np.concatenate(clouds)
         points[:, :2] -= (1 - LINK_M / gap_m) * (points[:, :2] @ lane.ahead)[:, None] * lane.ahead
         _, group = link(points, LINK_M)
         is_linked = np.isin(group, group[: len(shape.points)])
         ends = np.cumsum([len(cloud) for cloud in clouds])
-        in_sweeps = np.split(is_linked, ends)[1:-1]
-        for (j, rows), is_linked in zip(rows_in_line.items(), in_sweeps, strict=True):
-            track.claimed[j] = np.concatenate([track.claimed[j], rows[is_linked]])
+        linked_in_sweeps = np.split(is_linked, ends)[1:-1]  # the first part is the object itself
+        for (j, rows), linked in zip(rows_in_line.items(), linked_in_sweeps, strict=True):
+            track.claimed[j] = np.concatenate([track.claimed[j], rows[linked]])
 
-    def _unclaimed_around(self, track: Track, shape: Shape, j: int, around_m: float) -> Int:
-        """Return the rows of sweep j's obstacles, free candidates, in the box around the object."""
+    def _rows_in_line(self, track: Track, shape: Shape, j: int, lane: Lane, at_s: float) -> Int:
+        """Return the rows of sweep j's free clusters of few rays in the lane of an object."""
+        obstacles = self._obstacles[j]
+        rows = self._unclaimed_around(track, shape, j, LANE_M)
+        T_lidar_world = self._space.T_lidar_world[j]
+        rows = rows[_is_of_few_rays(obstacles, rows, T_lidar_world, self._space.sensors)]
+        rows = rows[lane.holds(track.place(track.in_object(obstacles, rows), at_s))]
+        return self._without_violations(track, j, rows)
+
+    def _unclaimed_around(self, track: Track, shape: Shape, j: int, room_m: float) -> Int:
+        """Return the rows of sweep j's free candidates up to ``room_m`` from an object's box."""
         obstacles = self._obstacles[j]
         rim = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
-        rows = obstacles.strips.rows_inside(rim.min(0) - around_m, rim.max(0) + around_m)
+        rows = obstacles.strips.rows_inside(rim.min(0) - room_m, rim.max(0) + room_m)
         rows = rows[self._free[j][rows] & (obstacles.cluster[rows] >= 0)]
         return np.setdiff1d(rows, track.claimed[j], assume_unique=True)
 
@@ -243,48 +277,55 @@ class _Search:
         return rows
 
 
-def _few_rays(obstacles: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors) -> Bool:
+def _is_of_few_rays(
+    obstacles: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors
+) -> Bool:
     """Return (N,) True for ``rows`` whose cluster is hit by a single ring or column."""
     if not len(rows):
         return np.zeros(0, bool)
-    clusters, of_row = np.unique(obstacles.cluster[rows], return_inverse=True)
+    clusters, cluster_of_row = np.unique(obstacles.cluster[rows], return_inverse=True)
     members = np.flatnonzero(np.isin(obstacles.cluster, clusters))
     label = obstacles.cluster[members]
     in_lidar = poses.transform(T_lidar_world, obstacles.points[members])
 
     def spread(values: Float) -> Float:
-        lowest, highest = (f(values, label, clusters) for f in (ndimage.minimum, ndimage.maximum))
+        lowest = ndimage.minimum(values, label, clusters)
+        highest = ndimage.maximum(values, label, clusters)
         return np.asarray(highest) - np.asarray(lowest)
 
     range_m = np.linalg.norm(in_lidar, axis=1)
     ring_rad = ndimage.minimum(sensors.finest_gap_m(in_lidar) / range_m, label, clusters)
     column_rad = min(model.azimuth_step_rad for model in sensors.models.values())
+    # Azimuths relative to the mean direction, which keeps them away from the jump at 180 degrees
     x, y = in_lidar[:, :2].mean(axis=0)
     azimuth_rad = np.arctan2(in_lidar[:, :2] @ [-y, x], in_lidar[:, :2] @ [x, y])
     is_single = spread(np.arcsin(in_lidar[:, 2] / range_m)) < _ONE_RING * np.asarray(ring_rad)
     is_single |= spread(azimuth_rad) < _ONE_COLUMN * column_rad
-    return np.asarray(is_single[of_row.ravel()])
+    return np.asarray(is_single[cluster_of_row.ravel()])
 
 
 def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> None:
     """Align every observation again, in place; keep the result if the motion is smoother."""
     # Followed batch by batch, an object drifts when its other side comes into view. Therefore even
     # batches are aligned with the points of the odd batches, and the other way round.
-    sweeps: tuple[list[int], list[int]] = [], []
-    for n, seen in sorted(track.observations.items()):
-        sweeps[n % 2].extend(seen.sweeps)
-    points = [track.points_in(obstacles, half) for half in sweeps]
-    if not all(map(len, points)):
+    sweeps: tuple[list[int], list[int]] = [], []  # of the even batches, of the odd batches
+    for n, observation in sorted(track.observations.items()):
+        sweeps[n % 2].extend(observation.sweeps)
+    clouds = [track.points_in(obstacles, half) for half in sweeps]
+    if not all(map(len, clouds)):
         return
-    models = [Model(x) for x in points]
-    unrefined = dict(track.observations), track.path  # poses and path before
-    for n, seen in track.observations.items():
-        target = track.place(track.points_in(obstacles, seen.sweeps), seen.seen_s)
-        predicted = track.path(seen.seen_s)
+    models = [Model(cloud) for cloud in clouds]
+    previous_observations = dict(track.observations)
+    previous_path = track.path
+    for n, observation in track.observations.items():
+        points = track.points_in(obstacles, observation.sweeps)
+        target = track.place(points, observation.seen_s)
+        predicted = track.path(observation.seen_s)
         state = models[1 - n % 2].align(target, track.centre, predicted, _REFINED_STD)
         if state is not None:
             state[2] = track.rise_m(ground, state)
-            track.observations[n] = replace(seen, state=state)
+            track.observations[n] = replace(observation, state=state)
     track.smooth()
-    if track.path.residual_m > unrefined[1].residual_m:
-        track.observations, track.path = unrefined
+    if track.path.residual_m > previous_path.residual_m:
+        track.observations = previous_observations
+        track.path = previous_path

@@ -86,7 +86,8 @@ class Trajectory:
 
     def part(self, frames: Sequence[int], origin: int) -> Trajectory:
         """Return the poses of some frames in the levelled lidar frame of the sweep ``origin``."""
-        rows, T_new_lidar = [self.frames.index(f) for f in frames], np.eye(4)
+        rows = [self.frames.index(frame) for frame in frames]
+        T_new_lidar = np.eye(4)
         T_new_lidar[:3, :3] = self.R_level_lidar
         T_new_old = T_new_lidar @ inverse(self.T_world_lidar[self.frames.index(origin)])
         T_new = T_new_old @ self.T_world_lidar[rows]
@@ -117,10 +118,17 @@ class RegisteredSweep:
     @staticmethod
     def without_points(trajectory: Trajectory, frame: int) -> RegisteredSweep:
         """Return the pose and time of a frame of the trajectory as a sweep without points."""
-        i, lidar, row = trajectory.frames.index(frame), np.zeros(0, np.uint8), np.zeros(0, np.int64)
-        points, intensity = np.zeros((0, 3)), np.zeros(0, np.float32)
-        sweep = Sweep(frame, int(trajectory.stamp_ns[i]), points, intensity, None, lidar, row)
-        return RegisteredSweep(sweep, trajectory.T_world_lidar[i], np.zeros(6), np.zeros(6))
+        index = trajectory.frames.index(frame)
+        sweep = Sweep(
+            frame=frame,
+            stamp_ns=int(trajectory.stamp_ns[index]),
+            points=np.zeros((0, 3)),
+            intensity=np.zeros(0, np.float32),
+            offset_ns=None,
+            lidar=np.zeros(0, np.uint8),
+            row=np.zeros(0, np.int64),
+        )
+        return RegisteredSweep(sweep, trajectory.T_world_lidar[index], np.zeros(6), np.zeros(6))
 
 
 @dataclass(frozen=True)
@@ -132,7 +140,7 @@ class Stretch:
     @property
     def frames(self) -> tuple[int, ...]:
         """Frame numbers of the sweeps."""
-        return tuple(s.frame for s in self.sweeps)
+        return tuple(registered.frame for registered in self.sweeps)
 
     def __getitem__(self, frame: int) -> RegisteredSweep:
         return self.sweeps[self.frames.index(frame)]
@@ -179,7 +187,8 @@ class FlowField:
     @staticmethod
     def zero(num_points: int) -> FlowField:
         """Return the flow of ``num_points`` points that are all static."""
-        displacement, instance = np.zeros((num_points, 3)), np.full(num_points, -1, np.int32)
+        displacement = np.zeros((num_points, 3))
+        instance = np.full(num_points, -1, np.int32)
         moving, lost = np.zeros((2, num_points), bool)
         return FlowField(displacement, moving, instance, lost)
 
@@ -206,11 +215,12 @@ class StretchFlow:
 
         The key sweep itself has the flow to a neighbour.
         """
-        before = [f for f in stretch.frames if f <= key]
-        after = [f for f in reversed(stretch.frames) if f >= key]
-        hops = [*pairwise(before), *pairwise(after)]
+        up_to_key = [frame for frame in stretch.frames if frame <= key]
+        down_to_key = [frame for frame in reversed(stretch.frames) if frame >= key]
+        hops = [*pairwise(up_to_key), *pairwise(down_to_key)]
         if len(stretch.frames) > 1:
-            hops.append((key, after[-2] if len(after) > 1 else before[-2]))
+            neighbour = down_to_key[-2] if len(down_to_key) > 1 else up_to_key[-2]
+            hops.append((key, neighbour))
         return StretchFlow(stretch, {hop: motion.flow(*hop) for hop in hops})
 
 
@@ -333,7 +343,8 @@ class LidarSequence(Protocol):
 
 def in_one_line(sequence: LidarSequence) -> str:
     """Return what a recording holds, for its ``repr``."""
-    frames, cameras = sequence.frames, ", ".join(sequence.cameras) or "none"
+    frames = sequence.frames
+    cameras = ", ".join(sequence.cameras) or "none"
     span = f" from {frames[0]} to {frames[-1]}" if len(frames) else ""
     return f"<{sequence.name}: {len(frames)} sweeps{span}; cameras: {cameras}>"
 

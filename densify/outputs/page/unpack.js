@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: MIT
-// The other half of densify/report/pack.py: base64, deflate, bytes by significance, differences.
+// Unpack what densify/outputs/report_page.py packs: base64, deflate, bytes by significance,
+// differences.
 
 const page = JSON.parse(document.getElementById("page-data").textContent);
 
