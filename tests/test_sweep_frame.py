@@ -53,6 +53,12 @@ def test_the_way_of_the_scanner_in_a_map(street, placed, up_m):
     assert is_still(np.stack([np.eye(4)] * 2)) and not is_still(T)
 
 
+def test_a_rosette_at_rest_is_in_its_own_frame():
+    """Its few returns are hardly occluded from anywhere."""
+    resting = Street("crossing", 307, "rosette", cameras=())
+    assert way_in_map(resting[40], resting[55]) == 0
+
+
 def test_sweeps_at_their_poses_are_placed(street, placed):
     sweeps, T = placed
     T_far = np.stack([T_world_map() @ t for t in T])

@@ -49,11 +49,8 @@ class HeightMap:
     def of(clouds: Sequence[Float]) -> HeightMap:
         """Return the ground height under clouds of (N,3) points, z up, at least one point in all.
 
-        The ground of a cell is the median, over the clouds, of a cloud's lowest point after its
-        second lowest and its lowest 2 %, because these may be mirror images from below the road. A
-        cell far below the median of its surroundings is repaired. A limit on the slope then removes
-        cars and walls, and narrow humps are removed. The points near the resulting lower hull are
-        averaged.
+        The ground of a cell is the median over the clouds of the lowest points, without mirror
+        images from below the road. A limit on the slope removes cars and walls.
         """
         clouds = _drop_far_points(clouds)
         low_m, shape = _grid_around(clouds)
@@ -77,10 +74,7 @@ class HeightMap:
         return HeightMap(_average_heights(hull, clouds, cells), low_m, CELL_M)
 
     def under(self, points: Float) -> Float:
-        """Return (N,) ground heights in metres at points (N,2) or (N,3).
-
-        Points beyond the grid take the height of its nearest edge.
-        """
+        """Return (N,) ground heights, metres, at points (N,2 or 3); beyond the grid its edge's."""
         # Heights are those of the middles of cells, half a cell from the corner.
         x, y = ((points[:, axis] - self.low_m[axis]) / self.cell_m - 0.5 for axis in (0, 1))
         ground_m: Float = ndimage.map_coordinates(self.heights_m, (x, y), order=1, mode="nearest")
@@ -92,10 +86,7 @@ class HeightMap:
         return height_m
 
     def below(self, points: Float, T_world_lidar: Float) -> Bool:
-        """Return (N,) True for points (N,3, lidar frame) clearly below the ground: mirror images.
-
-        Only points within 30 m of the lidar are judged, where the ground is measured densely.
-        """
+        """Return (N,) True for points (N,3, lidar frame) within 30 m clearly below the ground."""
         rows = np.flatnonzero(np.hypot(points[:, 0], points[:, 1]) < _DENSE_M)
         is_below = np.zeros(len(points), bool)
         is_below[rows] = self.above(poses.transform(T_world_lidar, points[rows])) < -_BELOW_M
@@ -193,9 +184,8 @@ def _limit_slope(heights: Float, rise_m: float) -> Float:
 def find_upright(sweeps: Sequence[Sweep]) -> Float:
     """Return the (3,3) rotation ``R_level_lidar`` from the lidar frame to level axes, z up.
 
-    RANSAC (Fischler, Bolles, 1981) finds the ground plane: most points are on it, few below it, and
-    the lidar is above it. The lidar is upside down if this holds only after turning it over.
-    Without a ground plane the result is the identity. Slopes below 0.075 are not levelled.
+    RANSAC (Fischler, Bolles, 1981) finds the ground plane: most points are on it, few below it.
+    Without one the result is the identity. Slopes below 0.075 are not levelled.
     """
     stride = sum(map(len, sweeps)) // _NUM_POINTS + 1
     points = np.concatenate([sweep.points[::stride] for sweep in sweeps])

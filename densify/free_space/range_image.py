@@ -2,13 +2,10 @@
 """Build range images: the measurements of a sweep by direction, and its free space.
 
 A range image is in the scanner's frame at the firing time of each ray, where the rays form a
-regular grid. Its rows are the scanner's rings, its columns the azimuth steps, both measured in the
-returns (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for free space).
-
-A scanner that does not fire in order of azimuth (solid state, rosettes) faces a cell at several
-times. The cell keeps their middle and their spread, which widens the margin. The density of such
-rays varies. Therefore several images are made, each with cells twice as large, and each is used
-where enough of its cells are filled.
+regular grid of rings and azimuth steps (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for
+free space). A scanner that does not fire in order of azimuth (solid state, rosettes) faces a cell
+at several times, whose spread widens the margin. Several images with ever larger cells are used
+where enough of their cells are filled.
 """
 
 from __future__ import annotations
@@ -82,13 +79,10 @@ class RangeImage:
 
     @staticmethod
     def of(registered: RegisteredSweep, num_together: int = 1, by_ring: bool = False) -> RangeImage:
-        """Return the range images of a deskewed sweep.
+        """Return the range images of a deskewed sweep, for sums over ``num_together`` sweeps.
 
-        Args:
-            num_together: Number of sweeps whose counts are added up. The columns are finer by this
-                factor.
-            by_ring: True also uses single rings: dense rings for far points, where an error of
-                registration is smaller than their spacing, and isolated rings at their rays.
+        The columns are finer by this number. ``by_ring`` also uses single rings: dense rings for
+        far points, and isolated rings at their rays.
         """
         scanners: list[ScannerImage] = []
         for lidar in np.unique(registered.sweep.lidar).tolist():
@@ -103,19 +97,12 @@ class RangeImage:
         min_filled: int = MIN_FILLED,
         velocity_m_s: Float | Float32 | None = None,
     ) -> Bool:
-        """Return (N,) True where the space at points (N,3) is certainly free.
+        """Return (N,) True where the space at points (N,3), metres, lidar frame, is certainly free.
 
-        At least ``min_filled`` of the 3 x 3 cells around a point's direction must hold a return.
-        Every return in them must be farther than the point by more than ``max(margin_m,
-        margin_fraction * range)``. A larger margin tolerates errors of registration, but misses
-        moving objects close to a background.
-
-        Args:
-            points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
-            margin_m: Least distance in metres of a return beyond the point.
-            margin_fraction: Least distance of a return beyond the point, as a share of its range.
-            min_filled: Least number of filled cells.
-            velocity_m_s: (N,3) lidar frame, without ego-motion; None for static points.
+        At least ``min_filled`` of the 3 x 3 cells around a point's direction must hold a return,
+        and all their returns be farther than the point by more than ``max(margin_m, margin_fraction
+        * range)``. A larger margin tolerates errors of registration, but misses movers close to a
+        background. ``velocity_m_s`` is (N,3), lidar frame, without ego-motion; None if static.
         """
         margins = margin_m, margin_fraction
         num_beyond = self.count_beyond(points, margins, min_filled, velocity_m_s)
@@ -130,13 +117,8 @@ class RangeImage:
     ) -> NDArray[np.int16]:
         """Return the (S,N) number of filled cells around each of N points in each of S images.
 
-        The 3 x 3 cells around a point's direction are counted. There are three cases:
-
-        - The count is 0 if fewer than ``min_filled`` cells are filled.
-        - It is the number of filled cells if all their returns are beyond the point.
-        - It is far below 0 if any of these returns is not beyond the point.
-
-        The counts of several sweeps may be added.
+        Among the 3 x 3 cells around a point, it is 0 if fewer than ``min_filled`` are filled, far
+        below 0 if any of their returns is not beyond the point. Counts of sweeps may be added.
 
         Args:
             points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
@@ -389,10 +371,7 @@ def _speed_of(point, velocity, twist):  # type: ignore[no-untyped-def]
 
 @inlined
 def _find_cells(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column):  # type: ignore[no-untyped-def]
-    """Fill the position, time, row and column at which the scanner faced each of ``size`` points.
-
-    The position ``x``, ``y``, ``z`` is in the scanner's frame at ``time_s``.
-    """
+    """Fill position (scanner's frame), time, row and column at which the scanner faced points."""
     # The time gives the position, the position gives the cell, and the cell gives the time. Two
     # rounds from the position at the reference time converge; the third finds the last cell.
     num_columns, by_azimuth = image.nearest_m.shape[1], len(image.offset_s) == 1
@@ -419,18 +398,7 @@ def _find_cells(points, velocity, start, size, image, x, y, z, time_s, elevation
 
 @Kernel
 def _count_beyond(begin, end, points, velocity, image, margins, min_filled, num_beyond):  # type: ignore[no-untyped-def]
-    """Add to ``num_beyond`` (N,) int16 the number of filled cells beyond each point.
-
-    The filled cells among the 3 x 3 cells around a point count if they are at least ``min_filled``.
-    If any of their returns is not beyond the point, `_HIDES` is subtracted instead. All other
-    arrays are float32.
-
-    Args:
-        points: (N,3) positions in metres, lidar frame at the reference time.
-        velocity: (N,3) velocities in m/s, or (1,3) for all points.
-        image: Range image, `ScannerImage`.
-        margins: (2,) least distance of a return beyond a point: metres and share of the range.
-    """
+    """Add to ``num_beyond`` (N,) the number of filled cells beyond each point, or -`_HIDES`."""
     by_azimuth = len(image.offset_s) == 1
     settled_s = np.float32(image.settled_s)
     x, y, z, time_s, elevation = np.empty((5, BLOCK), np.float32)

@@ -34,6 +34,8 @@ _MAX_MOVES = 20  # greatest number of moves with one step
 # Returns occluded from the scanner's position are fewer than this share of those occluded from any
 # other position.
 _LESS = 0.8
+# Up to this share of returns seems occluded from the scanner itself: silhouettes split beams.
+_AT_SILHOUETTES = 0.01
 _APART_M = 1.0  # least distance between the scanner's positions that shows its motion
 _FLOOR_M = 30.0  # greatest distance of returns that show the floor
 _LOWEST_M, _ROOF_M = 0.5, 1.8  # heights above the floor: lowest scanner, scanner on a car's roof
@@ -215,8 +217,10 @@ def share_behind(points: Float, origin: Float) -> float:
 def _find_scanner(points: Float, start: Float) -> Float:
     """Return the (3,) position, level with ``start`` (3,), from which a sweep was measured."""
     # A descent in steps of 4 m to 0.5 m. A position counts only if clearly fewer returns are
-    # occluded there than at the start.
+    # occluded there than at the start, and more than silhouettes explain.
     start_share = share_behind(points, start)
+    if start_share < _AT_SILHOUETTES:
+        return start
     best_position = start
     lowest_share = start_share
     for step_m in _STEP_M * 0.5 ** np.arange(_NUM_STEPS):

@@ -97,7 +97,7 @@ def move_to_scanner(x, y, z, size, origin, R):  # type: ignore[no-untyped-def]
 def aim(begin, end, points, offset_s, origin, axes, twists, rays):  # type: ignore[no-untyped-def]
     """Fill ``rays`` (3,N) with azimuth and elevation (rad) and range (m) of a scanner's points.
 
-    Each deskewed point is moved to the scanner's frame at its firing time. All arrays are float32.
+    Each point is moved to the scanner's frame at its firing time. All arrays are float32.
 
     Args:
         points: (N,3) positions in metres, lidar frame at the reference time.
@@ -132,10 +132,7 @@ class AimedRays(NamedTuple):
 
 
 def aim_rays(registered: RegisteredSweep, lidar: int) -> AimedRays:
-    """Return the rays of the scanner with index ``lidar`` in a deskewed sweep.
-
-    Deskewing is undone: each ray is as it left the scanner at its own firing time.
-    """
+    """Return the rays of scanner number ``lidar``, each as it left at its own firing time."""
     sweep = registered.sweep
     rows = np.flatnonzero(sweep.lidar == lidar)
     offset_s = np.zeros(len(rows), np.float32)
@@ -155,10 +152,7 @@ def aim_rays(registered: RegisteredSweep, lidar: int) -> AimedRays:
 
 
 class RayTable(NamedTuple):
-    """Angles (rad) between neighbouring rays, in B bins of elevation by C bins of azimuth.
-
-    Bins of azimuth start at -pi. C is 1 if the angles do not depend on the azimuth.
-    """
+    """Angles (rad) between neighbouring rays, by B bins of elevation and C of azimuth, from -pi."""
 
     # Lowest elevation of bin 0. The outermost bins also stand for all elevations beyond.
     low_rad: float
@@ -203,10 +197,10 @@ class Layout:
 def measure_layout(sweeps: Sequence[AimedRays]) -> Layout:
     """Return the layout of one scanner, measured in its rays of a few sweeps.
 
-    There are three outcomes. Most scanners have distinct rings. Lasers that do not share an origin,
-    as in KITTI's HDL-64E, mix their rings at close range, but their returns still follow at even
-    steps along the azimuth: the scanner samples in lines. All other scanners are unordered. Fewer
-    than 200 returns in all give the default layout, lines with the spacing of a 64-beam scanner.
+    Lasers that do not share an origin, as in KITTI's HDL-64E, mix their rings at close range, but
+    their returns follow at even steps along the azimuth: lines. Scanners with neither rings nor
+    lines are unordered. Fewer than 200 returns give the default, lines with the spacing of a
+    64-beam scanner.
     """
     if sum(len(rays.azimuth) for rays in sweeps) < FEW_POINTS:
         return _default_layout()
@@ -237,8 +231,6 @@ def find_rings(elevation: Float32) -> Float | None:
     """Return the (K,) ascending elevations of the rings, None if the returns are not on rings.
 
     Rings are separate peaks of a fine histogram of (N,) elevations that hold nearly all returns.
-    Each ring is the mean elevation of the returns close to it. Merged scanners, processed clouds,
-    and lasers that do not share an origin have no rings.
     """
     # The last bin but one holds the zenith; one more is spare for rounding.
     num_bins = int(np.pi / _RING_BIN_RAD) + 2
@@ -284,11 +276,7 @@ def _find_peaks(counts: Float) -> Int:
 
 
 def fires_by_azimuth(rays: AimedRays) -> bool:
-    """Return True if rays of the same azimuth are fired at nearly one time, or have no times.
-
-    More than half of the columns of 1 degree must have a spread of firing times below 3 % of the
-    sweep's duration.
-    """
+    """Return True if rays of the same azimuth are fired at nearly one time, or have no times."""
     duration_s = float(np.ptp(rays.offset_s)) if len(rays.offset_s) else 0.0
     if duration_s == 0.0:
         return True

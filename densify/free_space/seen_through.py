@@ -52,10 +52,7 @@ class FreeSpace:
         return float(self.sensors.finest_gap_m(position_lidar)[0])
 
     def others(self, i: int) -> list[int]:
-        """Return the indices of the sweeps to test against sweep i, one for each other batch.
-
-        A batch is tested if any of its sweeps is within `REACH_S` of sweep i.
-        """
+        """Return the index of a sweep of each other batch within `REACH_S` of sweep i."""
         return [
             batch[0]
             for batch in self.batches
@@ -70,12 +67,8 @@ class FreeSpace:
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
         """Return (N,) True where the batch of sweep j certainly observed free space.
 
-        Every return near the direction of the point must be clearly farther away, in all sweeps of
-        the batch. Together the sweeps must have enough returns there.
-
-        Args:
-            points: (N,3) positions in the world frame at the reference time of sweep j.
-            velocity_m_s: (N,3) velocities in the world frame, None for static points.
+        Every return near the direction of the point must be clearly farther away. Points and
+        velocities (None: static) are (N,3) in the world frame at the reference time of sweep j.
         """
         batch = self._batch_of[j]
         # In a single sweep the image counts only full neighbourhoods; of several, the sum decides.

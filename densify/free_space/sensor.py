@@ -95,10 +95,7 @@ class SensorModel(Layout):
         return rows
 
     def directions(self, points: Float) -> tuple[Float, Float, Float]:
-        """Return azimuth and elevation (rad) and range (m) of points (N,3), lidar frame.
-
-        They are (N,) each, as seen from the scanner, in its axes.
-        """
+        """Return azimuth, elevation (rad), range (m), scanner axes, of points in lidar frame."""
         ray = points - self.origin_m
         x, y, z = (ray if np.array_equal(self.axes, np.eye(3)) else ray @ self.axes.T).T
         horizontal_m = np.hypot(x, y)
@@ -114,11 +111,9 @@ class SensorModel(Layout):
         return in_view & (elevation >= low) & (elevation <= high)
 
     def gap_m(self, points: Float) -> tuple[Float, Bool]:
-        """Return the (N,) distance in metres to the next ring, and (N,) True for points in view.
+        """Return the (N,) metres to the next ring or ray, and (N,) True for points in view.
 
-        For a scanner without rings it is the distance to the next ray. The width of a beam is
-        added, because a return may be from anywhere within the beam. ``points`` (N,3) are in metres
-        in the lidar frame.
+        The width of a beam is added. ``points`` (N,3) are in metres in the lidar frame.
         """
         azimuth, elevation, range_m = self.directions(points)
         gap_rad = self.table.at(azimuth, elevation)[:, 1]
@@ -148,10 +143,7 @@ class Sensors:
         return origins_m
 
     def gap_m(self, points: Float, lidar: NDArray[np.uint8]) -> Float:
-        """Return the (N,) distance in metres to the next ring of each point's own scanner.
-
-        ``points`` (N,3) are in the lidar frame; ``lidar`` (N,) are the indices of their scanners.
-        """
+        """Return the (N,) metres to the next ring of the points' scanners, lidar frame."""
         gap_m = np.zeros(len(points))
         for number, model in self.models.items():
             rows = np.flatnonzero(lidar == number)
@@ -159,10 +151,7 @@ class Sensors:
         return gap_m
 
     def finest_gap_m(self, points: Float) -> Float:
-        """Return the (N,) ring spacing in metres of the scanner with the finest view of each point.
-
-        Points out of all views take the spacing of the coarsest scanner.
-        """
+        """Return (N,) metres, ring spacing of the scanner with the finest view of each point."""
         gaps_m, in_view = zip(*(model.gap_m(points) for model in self.models.values()), strict=True)
         finest_m = np.where(in_view, gaps_m, np.inf).min(axis=0)
         return np.where(np.isfinite(finest_m), finest_m, np.max(gaps_m, axis=0))

@@ -27,13 +27,9 @@ _BEYOND_PERCENT = 0.2  # percent of the points outside the object's box, on each
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
     """Return the points of all sweeps as one cloud in the lidar frame of the key sweep.
 
-    Moving points are displaced by their scene flow from each sweep to the key sweep's reference
-    time. Static points keep their rigid positions, bit for bit.
-
-    Args:
-        fields: Flow of each sweep's points to the key sweep.
-        drop_lost: Leave out moving points that cannot be followed to the key sweep, else they keep
-            their rigid positions.
+    Moving points are displaced by ``fields``, each sweep's flow to the key sweep. Those that cannot
+    be followed are left out if ``drop_lost``, else they keep their rigid positions, as static
+    points do.
     """
     sweep_rows = [np.flatnonzero(~(drop_lost & flow.lost)) for flow in fields]
     cloud = _empty_cloud(sum(map(len, sweep_rows)))
@@ -96,13 +92,10 @@ def object_tracks(
 ) -> tuple[ObjectTrack, ...]:
     """Return the track of each moving object, ordered by instance number.
 
-    The pose at a sweep comes from the rigid motion that best fits, in least squares, the flow of
-    the object's points to the key sweep. A sweep with fewer than three of these points has no pose,
-    and an object needs at least one pose.
-
-    The x axis of an object points along its velocity, or along its path over the window if that is
-    longer. For objects of 3 m and more these are taken at the rear axle, where a vehicle that turns
-    moves where it points. ``fields`` are the flow of each sweep's points to the key sweep.
+    A pose is the rigid motion that best fits ``fields``, each sweep's flow to the key sweep, at
+    three or more points of the object. An object needs one pose. Its x axis is along its velocity,
+    or along its path over the window if that is longer, for objects of 3 m and more at the rear
+    axle.
     """
     objects = _collect_objects(stretch, fields, key)
     stamps_ns = {registered.frame: registered.sweep.stamp_ns for registered in stretch.sweeps}
@@ -188,15 +181,7 @@ class _Box(NamedTuple):
 def _fit_box(
     points: Float, velocity_m_s: Float, T_first_key: Float, T_last_key: Float, duration_s: float
 ) -> _Box:
-    """Return the box around points (N,3) at the key's time, whose x axis is along the motion.
-
-    Args:
-        points: (N,3) metres, key sweep's lidar frame.
-        velocity_m_s: (3,) velocity of the object, same frame.
-        T_first_key: (4,4) motion of the object from the key to the first sweep, same frame.
-        T_last_key: (4,4) motion of the object from the key to the last sweep, same frame.
-        duration_s: Time from the first to the last sweep.
-    """
+    """Return the box around points (N,3), key frame, whose x axis is along the motion."""
     reference = np.median(points, axis=0)
     begin, end = (poses.transform(T, reference[None])[0] for T in (T_first_key, T_last_key))
     by_velocity = velocity_m_s * duration_s if duration_s else velocity_m_s

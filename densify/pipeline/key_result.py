@@ -70,10 +70,7 @@ COMPARED = ("none", "icp", "flow")
 
 
 def methods_of_run(method: str, settings: Config) -> tuple[str, ...]:
-    """Return the method of `RUN`, preceded by its simpler baselines if results are scored.
-
-    Raises InputError if the method is not one of `RUN`.
-    """
+    """Return the method of `RUN`, preceded by its simpler baselines if results are scored."""
     if method not in RUN:
         raise InputError(f"method {method}: expected one of {', '.join(RUN)}")
     return RUN[: RUN.index(method) + 1] if settings.is_scored else (method,)
@@ -106,10 +103,8 @@ def result_of_method(
 ) -> Result:
     """Return the result of the method ``name``, without its baselines.
 
-    Args:
-        moments: Points at the key's time by method. Those of this method are taken out to save
-            memory.
-        filled: Fill holes of the maps by interpolation.
+    Its points at the key's time are taken out of ``moments`` to save memory. If ``filled``, holes
+    of the maps are filled by interpolation.
     """
     method, output = METHODS[name], scene.settings.output
     views, watch, stretch = scene.views, scene.watch, scene.stretch
@@ -288,15 +283,9 @@ def complete_with_prior(
 ) -> Result:
     """Return the result with completed maps (``full``) and their scores.
 
-    A prior that does not fit the measured depth is not used, and a warning is logged.
-
-    Args:
-        shots: Map name -> image that the map shows.
-        truth: Map name -> ground-truth depth (H,W) in metres and mask (H,W) of moving pixels.
-        kind: The setting ``prior.kind``.
-
-    Raises:
-        InputError: The prior has no depth image for any map of the key.
+    A prior that does not fit the measured depth is not used, with a warning. By map name, ``shots``
+    are the images that maps show, and ``truth`` has depth (H,W), metres, and mask (H,W) of moving
+    pixels.
     """
     full = {}
     metrics = copy.deepcopy(dict(result.metrics))

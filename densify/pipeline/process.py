@@ -22,11 +22,7 @@ _PER_MB = 1024 * 1024 if sys.platform == "darwin" else 1024  # units of getrusag
 
 
 class Watch:
-    """Measure the wall time and memory of stages, which may run in several threads.
-
-    Times of all threads are added up. While a stage calls an inner stage, only the inner stage's
-    time counts.
-    """
+    """Measure wall time and memory of stages, summed over threads, without inner stages."""
 
     def __init__(self, progress: Progress | None = None) -> None:
         """Begin to measure; ``progress`` is called by one thread at a time."""
@@ -79,9 +75,8 @@ class Watch:
 def keep_freed_memory() -> None:
     """Let all threads of this process share one heap that keeps the freed memory of large arrays.
 
-    By default each thread has its own heap, and the system takes back and clears the pages of every
-    large array. Call this before threads are started. It does nothing if the C library is not
-    glibc.
+    By default each thread has a heap, and the system clears the pages of every large array. Call
+    this before threads are started. Without glibc it does nothing.
     """
     with suppress(OSError, AttributeError, TypeError):  # another library, or none by that name
         mallopt = ctypes.CDLL(None).mallopt

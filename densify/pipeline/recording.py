@@ -139,12 +139,9 @@ class Recording:
         Args:
             window: Number of sweeps on each side of a key.
             keys: Frame numbers, around which sweeps are read; None for every frame.
-            cache: Cache on disk for registration, motion and far; None for no cache.
-            run: Name of a run whose processes share results through the cache; None for no sharing.
+            cache: Keeps registration, motion and far on disk.
+            run: Name of a run whose processes share results through the cache.
             looks_around: True also searches motion ``flow.look_around_s`` beyond the windows.
-
-        Raises:
-            InputError: A key does not exist, or the window is invalid.
         """
         self.sequence = sequence
         self.settings = settings
@@ -182,10 +179,8 @@ class Recording:
     def window_frames(self, key: int) -> WindowFrames:
         """Return the frames of a key's window, and the reasons if it is smaller than requested.
 
-        Raises:
-            InputError: The key does not exist or is unusable.
-            UnplacedSweepError: The key cannot be registered.
-            SweepError: None of its neighbours can be registered.
+        An UnplacedSweepError means that the key cannot be registered, a SweepError that none of its
+        neighbours can.
         """
         requested = self.timeline.window(key, self._num_beside)
         block_index = self.cut.number_of[key]
@@ -232,10 +227,7 @@ class Recording:
         return len(self._searched(self._piece(key))) == 2
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
-        """Return the scene flow of all points in a key's window; raise as `window_frames`.
-
-        ``engine`` None or "" is the configured engine ``flow.engine``.
-        """
+        """Return the scene flow of all points in a key's window; engine None or "": configured."""
         engine = engine or self.settings.flow.engine
         window = self.window(key)
         piece = self._piece(key)
@@ -254,10 +246,7 @@ class Recording:
         return self._motion(piece, engine).with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
-        """Return the flow of a sweep to the next sweep, or without one to the previous sweep.
-
-        Without neighbours in the window the flow has no steps.
-        """
+        """Return the flow of a sweep to the next, else previous; without neighbours no steps."""
         window = self.window(frame)
         later = [other for other in window.frames if other > frame]
         earlier = [other for other in window.frames if other < frame]
@@ -270,12 +259,10 @@ class Recording:
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
     ) -> Moment:
-        """Return the points of a key's window, accumulated at the key's reference time.
+        """Return the points of a key's window, or of the key sweep alone, at its reference time.
 
-        Args:
-            all_sweeps: Use all sweeps of the window, else the key sweep alone.
-            engine: Scene-flow engine, "" for the configured engine, None for rigid accumulation.
-            with_flow: Also return the flow of every sweep to the next sweep towards the key.
+        ``engine`` is "" for the configured engine, None for rigid accumulation. ``with_flow`` adds
+        the flow of every sweep to the next sweep towards the key.
         """
         stretch = self.window(key)
         used = stretch if all_sweeps else Stretch((stretch[key],))
@@ -309,8 +296,7 @@ class Recording:
     def find_beyond(self, key: int) -> Beyond | None:
         """Return the static surfaces along the road beyond the key's window.
 
-        None if the far range is not requested (``accumulate.far_m`` is 0), or if no sweep beyond
-        the window can be used.
+        None if ``accumulate.far_m`` is 0, or if no sweep beyond the window can be used.
         """
         if not self.settings.accumulate.far_m:
             return None

@@ -82,12 +82,9 @@ class Road:
     views: Sequence[tuple[Camera, Float]]  # cameras with their poses ``T_cam_world`` (4,4)
 
     def find_static_surfaces(self, with_window: bool) -> StandingWorld:
-        """Return the static surfaces along the road, in the world of the window.
+        """Return the static surfaces along the road that a view may see, world of the window.
 
-        Only points that one of the views may see are kept.
-
-        Args:
-            with_window: Include the points of the window's own sweeps.
+        ``with_window`` includes the points of the window's own sweeps.
         """
         window_sweeps = self._thin_window()
         with ThreadPoolExecutor(num_threads()) as pool:

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run the pipeline: `run`, `run_keys`, `compare` and `flow_steps` check arguments, then call it.
-
-`densify` is all of it for one key::
+"""Run the pipeline. `densify` is all of it for one key::
 
     register and deskew the window     recording.window
     accumulate rigidly, or with flow   recording.moment   (free space, ground, motion)
@@ -71,7 +69,10 @@ def run(
     progress: Progress | None = None,
     prior: str | Path | None = None,
 ) -> Result:
-    """Densify one key.
+    """Densify one key, and return its result.
+
+    With ``output.score`` it also has the simpler methods as ``baselines``, and scores of maps made
+    without the key sweep.
 
     Args:
         key: Frame number of the key sweep.
@@ -83,10 +84,6 @@ def run(
         config: Settings, see `densify.config.resolve`.
         progress: Callback (stage, done, total).
         prior: Folder of depth images that complete the pixels without measured or filled depth.
-
-    Returns:
-        The result. With ``output.score`` it also has the simpler methods as ``baselines``, and
-            scores of maps made without the key sweep.
     """
     results = run_keys(sequence, [key], window, method, cameras, config, progress, prior=prior)
     ((_, result),) = results  # the pair of the only key
@@ -109,8 +106,7 @@ def run_keys(
     """Densify several keys, and yield (key, result or error) by ascending key.
 
     Keys whose windows overlap share registration, ground and motion. Objects are tracked over all
-    sweeps of these windows, which can improve a key slightly over `run`. The ``cache`` keeps shared
-    results on disk. The other arguments are as in `run`.
+    these sweeps, which can improve a key slightly over `run`, whose arguments apply.
     """
     methods = methods_of_run(method, resolve(config))
     watch = Watch(progress)
@@ -134,18 +130,11 @@ def compare(
     cache: Cache | None = None,
     prior: str | Path | None = None,
 ) -> dict[str, Result]:
-    """Densify one key with several methods on the same registration, and score them.
+    """Densify one key with several methods, and return method -> result with its scores.
 
-    The arguments are as in `run`, except for these.
-
-    Args:
-        methods: Some of ``none``, ``icp``, ``icp-visible``, ``icp-far``, ``flow-plain``, ``paper``
-            and ``flow``.
-        cache: Keeps the results of steps on disk.
-        prior: Folder of depth images that complete the maps of the last method.
-
-    Returns:
-        Method -> result. Each result has the results before it as ``baselines``.
+    The methods share the registration, and each result has those before it as ``baselines``. Names
+    are ``none``, ``icp``, ``icp-visible``, ``icp-far``, ``flow-plain``, ``paper`` and ``flow``. The
+    ``prior`` completes the maps of the last method. Other arguments are as in `run`.
     """
     watch = Watch(progress)
     settings = resolve(config).scored()
@@ -163,8 +152,8 @@ def flow_steps(
 ) -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
     """Yield (frame, scene flow to the next sweep, or error) for sweeps of a whole recording.
 
-    If no next sweep exists, as at the end or before a hole in time, the flow is to the previous
-    sweep. ``frames`` ascend. The other arguments are as in `run_keys`.
+    Without a next sweep, at the end or a hole in time, it is to the previous one. ``frames``
+    ascend.
     """
     recording = _open(sequence, frames, 1, ["flow"], None, config, cache, None)
 
@@ -188,16 +177,9 @@ def densify(
 ) -> dict[str, Result]:
     """Return method -> result for one key. Each result has the results before it as baselines.
 
-    Unless results are scored, only the maps of the last method are filled.
-
-    Args:
-        recording: The recording, whose blocks include the key.
-        methods: Names of `METHODS`.
-        watch: Measures the cost of each stage, from zero. A stage shared by several keys counts for
-            the first of them.
-        with_images: Colour the cloud, and score depth if there is ground truth. The maps are the
-            same either way.
-        priors: Depth images that complete the maps of the last method.
+    Unless results are scored, only the maps of the last method are filled, as only they are
+    completed with ``priors``. A stage shared by several keys counts in ``watch`` for the first of
+    them. Only ``with_images`` is the cloud coloured, and depth scored if there is ground truth.
     """
     methods = tuple(dict.fromkeys(methods))  # each once, in order
     sequence = recording.sequence
@@ -261,7 +243,7 @@ def scene_of(
     """Return the shared inputs of a key's methods.
 
     ``shots`` and ``images`` (H,W,3) are by map name. ``cloud`` says which points of the key sweep
-    move. ``with_images`` colours the cloud, and scores depth if there is ground truth.
+    move.
     """
     sequence = recording.sequence
     settings = recording.settings

@@ -36,10 +36,7 @@ def add_warnings(
     key: int,
     shots: Mapping[str, Shot],
 ) -> dict[str, Result]:
-    """Return the ``results`` of one key, by method, with the field ``warnings`` filled in.
-
-    ``shots`` are the images that the maps show, by map name.
-    """
+    """Return the ``results`` of one key, by method, with the field ``warnings`` filled in."""
     sequence = recording.sequence
     stretch = recording.window(key)
     cameras = {shot.camera.name for shot in shots.values()}
