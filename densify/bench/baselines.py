@@ -37,10 +37,7 @@ GROUPS: Mapping[str, tuple[GateKey, ...]] = {
 def errors_of_methods(
     keys: Sequence[GateKey], folder: Path | None
 ) -> dict[str, dict[str, DepthErrors]]:
-    """Return method -> part of the pixels (as `errors_by_part`) -> mean errors over the keys.
-
-    ``folder`` holds the real recordings.
-    """
+    """Return method -> part of the pixels (as `errors_by_part`) -> mean errors over the keys."""
     errors: dict[str, dict[str, list[DepthErrors]]] = {}
     for key in keys:
         subject = Subject.of(key, folder, None)

@@ -100,10 +100,7 @@ def without_scanner(sequence: LidarSequence, scanner: int) -> Any:
 def scanner_truth(
     scanner: int, recording: Recording, key: int, shots: Mapping[str, Shot]
 ) -> dict[str, TruthMap]:
-    """Return the depth measured by one scanner in the key sweep, by name of the map.
-
-    ``shots`` has the camera and exposure of each map, by name.
-    """
+    """Return the depth measured by one scanner in the key sweep, by name of the map."""
     sequence = recording.sequence
     config = recording.settings
     cloud = recording.moment(key, all_sweeps=True, engine="").cloud
@@ -132,14 +129,7 @@ def scanner_truth(
 def exact_truth(
     sequence: LidarSequence, key_sweep: Sweep, shots: Mapping[str, Shot], config: Config
 ) -> dict[str, TruthMap]:
-    """Return the exact depth within 80 m and below the highest returns of the key sweep.
-
-    ``shots`` has the camera and exposure of each map, by name. A recording without exact ground
-    truth gives {}.
-
-    Returns:
-        Name of the map -> true depth, for maps of existing images.
-    """
+    """Return map name -> exact depth within 80 m below the top ring; {} without exact truth."""
     maps: dict[str, TruthMap] = {}
     if sequence.truth is None:
         return maps
@@ -171,8 +161,8 @@ def stereo_truth(folder: Path, frame: int, camera: Camera) -> TruthMap:
     """Return the depth of KITTI's 2015 stereo benchmark, whose moving cars are whole models.
 
     ``folder`` has ``frameN_disparity.png`` (uint16, 256 × disparity in px, 0 for none) and
-    ``frameN_objects.png`` (above 0 at moving cars). ``camera`` is the left colour camera. Source:
-    Menze and Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015.
+    ``frameN_objects.png`` (above 0 at moving cars), of the left colour camera. Source: Menze and
+    Geiger, "Object Scene Flow for Autonomous Vehicles", CVPR 2015.
     """
     disparity_px = read_depth_png(folder / f"frame{frame}_disparity.png")
     depth_m = np.zeros_like(disparity_px)
@@ -183,13 +173,7 @@ def stereo_truth(folder: Path, frame: int, camera: Camera) -> TruthMap:
 
 
 def agrees_beside(truth: TruthMap, depth_m: Float32, reach_px: int, focal_px: float) -> Bool:
-    """Return (H,W) True where the true depth of a pixel in the same row agrees with a depth map.
-
-    Args:
-        depth_m: (H,W) depth in metres, 0 for none.
-        reach_px: Greatest distance of that pixel along the row.
-        focal_px: Focal length, which outliers by disparity depend on.
-    """
+    """Return (H,W) True where a true depth at most ``reach_px`` along the row agrees with a map."""
     agrees = np.zeros(depth_m.shape, bool)
     for shift in range(-reach_px, reach_px + 1):
         beside = truth._replace(depth_m=np.roll(truth.depth_m, shift, axis=1))
@@ -210,15 +194,10 @@ def bench_depth(
 ) -> dict[str, Any]:
     """Densify the key sweeps with each variant, and pool the scores over key sweeps and cameras.
 
-    Args:
-        variants: Name -> settings to compare.
-        scanner: Index of the scanner whose returns are the ground truth, None for none.
-        method: Name of a method in `densify.pipeline.key_result.METHODS`.
-
-    Returns:
-        Under ``variants`` by name: ``density``, mean share of pixels with a depth in the measured
-            and the filled map; ``seconds`` of projection per key sweep; ``scores`` (num_pixels,
-            coverage, outliers) by ground truth, map (measured, filled) and pixels (all, moving).
+    ``variants`` has name -> settings. Returns of the ``scanner`` are ground truth. The result has
+    under ``variants`` by name: ``density``, mean share of pixels with a depth in the measured and
+    the filled map; ``seconds`` of projection per key sweep; ``scores`` (num_pixels, coverage,
+    outliers) by ground truth, map (measured, filled) and pixels (all, moving).
     """
     choose_cameras(sequence, cameras)
     if method not in METHODS:

@@ -30,11 +30,7 @@ _AXES = ("pitch", "yaw", "roll")
 def bench_doctor(
     sequences: Sequence[LidarSequence], config: Config, progress: Progress | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Give recordings artificial errors of camera or poses, and count the doctor's verdicts.
-
-    Each error is applied in both directions; unchanged recordings count too. The result maps each
-    error to its number of cases (``of``) and the share of each verdict in its check.
-    """
+    """Give recordings errors; return error -> number of cases (``of``), share of each verdict."""
     counts: dict[str, Counter[Verdict]] = {}
     for number, sequence in enumerate(sequences):
         if progress:

@@ -2,11 +2,8 @@
 """Compare methods of scene flow on the same window of sweeps: ``densify bench flow``.
 
 Errors are those of the flow to the neighbouring sweep towards the key sweep, pooled over the points
-above the ground in all sweeps. Seconds per pair of sweeps cover ground estimation, this flow and
-the flow to the key sweep, without registration and compilation.
-
-``densify bench readme`` makes the tables of docs/results.md again, as Markdown. A table is a list
-of streets with key frame numbers, and a function that measures a row.
+above the ground. Seconds per pair of sweeps cover ground estimation, this flow and the flow to the
+key sweep. ``densify bench readme`` makes the tables of docs/results.md again.
 """
 
 from __future__ import annotations
@@ -76,16 +73,11 @@ def bench_flow(
 ) -> dict[str, Any]:
     """Run and measure methods of scene flow on the window of one key sweep.
 
-    Args:
-        window: Number of sweeps on each side of the key sweep.
-        methods: Names in `METHODS`. ``ours`` is the configured engine.
-        truth: Folder of true flow (`densify.readers.flow_files`), which scores only the sweeps
-            before the key sweep. None for the exact ground truth of the recording.
-
-    Returns:
-        ``data``, ``key``, ``frames``, ``num_pairs``, and ``methods``: name -> ``seconds_per_pair``
-            and the scores ``step``, ``challenge``, ``window`` of `Scorer`. Numbers are plain, None
-            if unknown.
+    Methods are names in `METHODS`, ``ours`` the configured engine. ``truth`` is a folder of true
+    flow (`densify.readers.flow_files`), which scores only the sweeps before the key sweep; None for
+    exact truth. The result has ``data``, ``key``, ``frames``, ``num_pairs``, and ``methods``: name
+    -> ``seconds_per_pair`` and the scores ``step``, ``challenge``, ``window`` of `Scorer`, None if
+    unknown.
     """
     unknown = [method for method in methods if method not in METHODS]
     if unknown or not methods:
@@ -113,10 +105,7 @@ def bench_flow(
 
 
 class SweepTruth(NamedTuple):
-    """The ground truth of the N points of a sweep: scene flow in metres without ego-motion.
-
-    Flow starts at the sweep's reference time and is in the lidar frame of that time.
-    """
+    """True scene flow (m, without ego-motion) of a sweep, lidar frame at its reference time."""
 
     step: Float  # (N,3) flow to the neighbouring sweep towards the key sweep
     to_key: Float  # (N,3) flow to the key sweep
@@ -167,10 +156,9 @@ class Scorer:
     def of(
         sequence: LidarSequence, key: int, size: int, config: Config, folder: Path | None
     ) -> Scorer:
-        """Register the window of a key sweep and read its ground truth.
+        """Register the window of a key sweep, ``size`` sweeps on each side, and read its truth.
 
-        ``size`` is the number of sweeps on each side of the key sweep, ``folder`` that of true flow
-        (`densify.readers.flow_files`), None for exact truth, if the recording has it.
+        The ``folder`` has true flow (`densify.readers.flow_files`); None for exact truth, if any.
         """
         recording = Recording(sequence, config, size, [key], looks_around=True)
         stretch = recording.window(key)
@@ -193,10 +181,7 @@ class Scorer:
         return Scorer(stretch, key, recording.around(key), above, sources, truths, labels)
 
     def pooled_challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
-        """Return `challenge_scores` of all labelled pairs, None without ground truth.
-
-        ``steps`` is frame number -> flow to the neighbour towards the key sweep.
-        """
+        """Return `challenge_scores` of frame -> flow towards the key; None without truth."""
         if not self.labels:
             return None
         columns = []
@@ -207,9 +192,7 @@ class Scorer:
         return challenge_scores(*map(np.concatenate, zip(*columns, strict=True)))
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the scores of the flow to the neighbouring sweep, pooled over the sources.
-
-        ``steps`` is frame number -> flow to the neighbour towards the key sweep.
+        """Return the scores of frame -> flow to the neighbour towards the key sweep, pooled.
 
         ``found`` is the share of ``certain`` moving points that are called moving,
         ``falsely_moving`` that of static points, ground included. End-point errors in metres are
@@ -238,11 +221,10 @@ class Scorer:
         }
 
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the scores of the flow to the key sweep: ghost rate and errors of moving points.
+        """Return the scores of frame -> flow to the key sweep: ghost rate and, given truth, errors.
 
-        ``to_key`` is frame number -> flow to the key sweep. With ground truth there are end-point
-        errors in metres of points above the ground, by number of sweeps to the key:
-        ``movers_m_by_hops`` of moving points, ``found_movers_m_by_hops`` of those called moving.
+        Errors are metres, above the ground, by number of sweeps to the key: ``movers_m_by_hops`` of
+        moving points, ``found_movers_m_by_hops`` of those called moving.
         """
         stretch, key = self.stretch, self.key
         frames = stretch.frames
@@ -347,10 +329,7 @@ class _Table(NamedTuple):
 
 
 def tables(names: Sequence[str], progress: Progress | None = None) -> Iterator[str]:
-    """Measure tables of `TABLES` and yield each line of their Markdown.
-
-    ``names`` are those of the tables, empty for all. Raise InputError for an unknown name.
-    """
+    """Measure tables of `TABLES`, by names or all, and yield each line of their Markdown."""
     for name in names:
         if name not in TABLES:
             hint = did_you_mean(name, TABLES)

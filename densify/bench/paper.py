@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Make the tables of the scene flow paper again: ``densify bench paper``.
 
-Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020.
-
-Methods get 2,048 points drawn from each cloud within 35 m, as in the paper. ``ours`` and trained
-networks get all points, and are scored at the drawn points. Scores are the paper's, averaged over
-pairs of clouds: mean end-point error; share of points with an error below 5 cm or 5 %, and below 10
-cm or 10 %; mean angle to the true flow over points with true flow.
+Pontes, Hays, Lucey, "Scene Flow from Point Clouds with or without Learning", 3DV 2020. Methods get
+2,048 points drawn from each cloud within 35 m, as in the paper. ``ours`` and trained networks get
+all points, and are scored at the drawn points. Scores are the paper's, averaged over pairs.
 
 Other data sets are folders of .npz files by FlowNet3D's authors (Liu et al., CVPR 2019).
 FlyingThings3D has ``points1``, ``points2``, ``flow`` and ``valid_mask1`` in camera axes, z forward.
@@ -105,11 +102,7 @@ def bench_paper(
     num_points: int = NUM_POINTS,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure methods and trained networks on pairs of clouds.
-
-    Returns:
-        ``num_pairs``, ``num_points`` and ``methods``: name of the method or file -> mean scores.
-    """
+    """Measure methods and networks on pairs; return their number and name -> mean scores."""
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
     for name in methods:
@@ -175,10 +168,7 @@ def has_truth(spec: str) -> bool:
 
 
 def pair_of_recording(spec: str, key: int) -> PaperPair:
-    """Return sweep ``key`` of a recording and the next sweep, with the true flow.
-
-    For a recording without exact ground truth, this package's flow counts as true.
-    """
+    """Return sweep ``key`` and the next, with the true flow, or without truth this package's."""
     sequence = open_sequence(spec)
     teacher, settings = "engine", resolve(None)
     if sequence.truth is not None:

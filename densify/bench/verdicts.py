@@ -28,13 +28,10 @@ Curve = Mapping[str, Any]
 
 
 def curve(num_true: int, confidence: Float | Float32, outliers: Bool) -> Curve:
-    """Return the curve of outliers over coverage of a map.
+    """Return the curve of outliers over coverage of a map with ``num_true`` true depths.
 
-    Args:
-        num_true: Number of pixels with a true depth.
-        confidence: (K,) confidence of those of them that have a depth. Pixels of equal confidence
-            share their outliers evenly.
-        outliers: (K,) True for outliers among these.
+    ``confidence`` and ``outliers`` are (K,), of those pixels that also have a depth. Pixels of
+    equal confidence share their outliers evenly.
     """
     _, rank, size = np.unique(-confidence, return_inverse=True, return_counts=True)
     outliers_of_rank = np.bincount(rank, outliers, len(size))
@@ -57,13 +54,9 @@ def outliers_at(outliers: Curve, covered_percent: float) -> float:
 
 
 def change(figure: str, before: Any, now: Any) -> dict[str, float]:
-    """Return the change of a figure, by name: of a curve two changes, else one.
+    """Return the changes of a figure (`Curve`, number or numbers of repeated draws), by name.
 
     Those of a curve are of its outliers at equal coverage and of its coverage, in percent.
-
-    Args:
-        figure: Name of the figure.
-        before: A `Curve`, a number, or numbers of repeated draws.
     """
     if isinstance(before, Mapping):
         covered = min(coverage(before), coverage(now))
@@ -91,8 +84,8 @@ def verdicts(
 ) -> Iterator[Verdict]:
     """Yield the verdict of each figure over all keys that both measurements have.
 
-    Measurements map key -> figure -> `Curve`, number or draws. ``luck`` maps key -> name of a
-    `change` -> its standard deviation by luck.
+    Measurements map key -> figure -> value; ``luck`` maps key -> name of a `change` -> its
+    deviation.
     """
     changes: dict[str, dict[str, _KeyChange]] = defaultdict(dict)
     for key in [key for key in before if key in now]:
@@ -146,12 +139,7 @@ def _verdict(name: str, change_of_key: Mapping[str, _KeyChange]) -> Verdict:
 def beyond_luck(
     before: Mapping[str, Any], now: Mapping[str, Any], luck: Mapping[str, float], sigmas: float
 ) -> dict[str, float]:
-    """Return those changes of one key's figures that are worse by more than luck explains.
-
-    Args:
-        before: Figures of the key by name, first measurement.
-        sigmas: Limit, in standard deviations of the difference of two measurements.
-    """
+    """Return the changes of one key's figures that are worse than luck by ``sigmas`` deviations."""
     worse = {}
     for figure in before:
         for name, difference in change(figure, before[figure], now[figure]).items():

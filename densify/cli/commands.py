@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""List the verbs with their options, and parse the command line.
-
-The module of a verb's answer is imported when the verb runs, with its heavy packages, so help
-answers at once.
-"""
+"""List the verbs with their options; the module of a verb is imported only when it runs."""
 
 from __future__ import annotations
 
@@ -376,11 +372,7 @@ _GROUPS = {
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parse a command line and return its options, with the `Verb` as ``options.verb``.
-
-    ``arguments`` are the words after the program's name, None for those of this process. A wrong
-    command line ends the process with exit code 2.
-    """
+    """Parse a command line, None for this process's; return options with the `Verb` as ``verb``."""
     parser = command_line()
     texts = list(sys.argv[1:] if arguments is None else arguments)
     if "" in texts:  # an empty path would be the current folder

@@ -45,11 +45,7 @@ def words(text: str) -> list[str]:
 
 
 def key_range(text: str, alternative: str = "") -> range:
-    """Parse ``A:B[:S]`` as the range of frame numbers from A to B - 1 with a step of S (1).
-
-    ``alternative`` is another accepted form, such as "all, or ", for the message of the
-    ArgumentTypeError that other texts raise.
-    """
+    """Parse ``A:B[:S]``, frames A to B - 1 by S (1); the message also names the ``alternative``."""
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
         first, end = int(numbers[0]), int(numbers[1])
@@ -136,10 +132,7 @@ def _settings_of(usage: str) -> dict[str, Any]:
 
 
 def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
-    """Return the specifications of the recordings that a command names.
-
-    Without any, log that ``default`` is taken and return it.
-    """
+    """Return the specifications of a command's recordings; without any, log the ``default``."""
     positional = [options.spec] if isinstance(options.spec, str) else options.spec or []
     specs = [*positional, *(options.data or [])]
     if not specs:
@@ -168,11 +161,7 @@ def config_of(options: argparse.Namespace) -> Config:
 
 
 def check_new_file(path: Path, overwrite: bool, suffix: str = "", option: str = "--out") -> None:
-    """Raise InputError, before the computation, if a file exists or cannot be created.
-
-    ``overwrite`` allows an existing file; ``suffix`` is that which the name must have, "" for any;
-    ``option`` names the file in messages.
-    """
+    """Raise InputError if the file of ``option`` exists, lacks ``suffix`` or cannot be made."""
     if path.suffix != (suffix or path.suffix):
         raise InputError(f"{option} {path}: expected a name that ends in {suffix}")
     if path.is_dir():
@@ -202,10 +191,7 @@ def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:
 
 
 def raise_failures(failures: Mapping[int, Exception], num: int, unit: str) -> None:
-    """Raise ComputationError, with the reasons, if some of ``num`` keys or sweeps failed.
-
-    ``failures`` has the errors by frame number; ``unit`` is "key" or "sweep".
-    """
+    """Raise ComputationError, with reasons by frame, if some of ``num`` keys or sweeps failed."""
     if failures:
         reasons = "; ".join(f"{unit} {number}: {error}" for number, error in failures.items())
         raise ComputationError(f"{len(failures)} of {num} {unit}s not made: {reasons}")

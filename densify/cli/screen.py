@@ -186,10 +186,7 @@ def screen() -> Iterator[Screen]:
 
 @contextmanager
 def progress_on_stderr() -> Iterator[Progress]:
-    """Yield a callback (stage, done, total) that shows progress on stderr.
-
-    It is a bar on a terminal. Elsewhere it is a line at most every 10 s.
-    """
+    """Yield a callback (stage, done, total): a bar on a terminal, elsewhere a line every 10 s."""
     from tqdm import tqdm
 
     is_hidden = not sys.stderr.isatty()

@@ -43,12 +43,7 @@ class Section:
 
 
 def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
-    """Return a user's value converted to the type of its setting.
-
-    Args:
-        section: Class with the setting.
-        value: Value as parsed from YAML.
-    """
+    """Return a user's value, as parsed from YAML, converted to the type of its setting."""
     knob = section.__dataclass_fields__[key]
     kind, _, optional = str(knob.type).partition(" | ")
     if optional and value is None:
@@ -104,12 +99,7 @@ class FlowSettings(Section):
         check_engine_spec(self.engine)
 
     def around(self, points_per_s: float) -> tuple[float, float]:
-        """Return where motion is searched beyond the window, for a number of points per second.
-
-        Returns:
-            Greatest time from the window in s, and time between the searched sweeps in s, 0 for
-            every sweep.
-        """
+        """Return how far to search beyond the window and the step (0 every sweep), in seconds."""
         # Sparse sweeps show little of a moving object, so more of them are searched, and farther.
         is_sparse = points_per_s < _FEW_POINTS_PER_S
         needed_s, step_s = (_AROUND_FEW_S, 0.0) if is_sparse else (_AROUND_S, _AROUND_S)
@@ -204,14 +194,9 @@ def resolve(
 ) -> Config:
     """Return the settings given by ``config``, then changed by the overrides.
 
-    Args:
-        config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a
-            YAML file of that form; or a str, the name of a preset or else of a file. Settings that
-            are not given have their defaults.
-        overrides: Texts ``section.key=value``, with values as in YAML; later overrides win.
-
-    Raises:
-        InputError: A file, section, key or value is unknown or does not fit.
+    ``config`` is None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to
+    a YAML file of that form; or a str, the name of a preset or else of a file. Settings that are
+    not given have their defaults. Overrides are ``section.key=value``, with values as in YAML.
     """
     values = as_mapping(config if isinstance(config, Config) else Config())
     if isinstance(config, Mapping):
@@ -265,13 +250,7 @@ def apply_overrides(
     overrides: Iterable[str],
     sections: Mapping[str, type[Section]] = _SECTIONS,
 ) -> None:
-    """Overwrite settings in place by texts ``section.key=value``.
-
-    Args:
-        values: The settings, ``{section: {key: value}}``.
-        overrides: Texts, with values as in YAML.
-        sections: Class of each section, by name.
-    """
+    """Overwrite settings ``{section: {key: value}}`` in place by texts ``section.key=value``."""
     for override in overrides:
         where = f"--set {override}"
         name, equals, text = override.partition("=")

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cache results of pipeline steps on disk, addressed by a digest of all their inputs.
-
-An entry is an ``.npz`` file without pickles. A damaged entry is computed again. Only the user can
-write to the folder.
-"""
+"""Cache results of pipeline steps on disk, addressed by a digest of all their inputs."""
 
 from __future__ import annotations
 
@@ -47,10 +43,7 @@ class Cache:
     """A folder of cached results."""
 
     def __init__(self, limit_bytes: int = 10 * 1024**3, folder: Path | None = None) -> None:
-        """Open a folder of entries, by default the user's; `trim` limits it to ``limit_bytes``.
-
-        A folder that cannot be made gives a warning, and nothing is kept.
-        """
+        """Open a folder of entries, by default the user's; if that fails, warn and keep nothing."""
         self._folder = folder or own_folder("steps")
         self._limit_bytes = limit_bytes
         try:
@@ -61,10 +54,7 @@ class Cache:
     def get(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
         """Return the cached result of a step, or make and keep it.
 
-        Args:
-            step: Name of the step, with which the entry's file name begins.
-            inputs: All that the result depends on, of types that `digest` accepts.
-            make: Function that makes the result.
+        All that it depends on is in ``inputs``, of types that `digest` accepts.
         """
         path = self._folder / f"{step}-{digest((__version__, inputs))}.npz"
         if (entry := _read(path)) is not None:
@@ -138,10 +128,7 @@ def code_digest() -> str:
 
 
 def kept(cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:
-    """Return `Cache.get` of a cache, or without a cache (None) the result of ``make``.
-
-    ``inputs`` is a function, called only with a cache.
-    """
+    """Return `Cache.get`, or without a cache the result of ``make`` without calling ``inputs``."""
     return make() if cache is None else cache.get(step, inputs(), make)
 
 
@@ -211,10 +198,7 @@ def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 
 def own_folder(name: str) -> Path:
-    """Make and return the folder of this name in DENSIFY_CACHE_DIR or the user's cache directory.
-
-    Raise InputError if other users can write to it.
-    """
+    """Make and return the user's own cache folder of this name, by DENSIFY_CACHE_DIR if set."""
     named = os.environ.get("DENSIFY_CACHE_DIR")
     root = Path(named or platformdirs.user_cache_dir("densify"))
     for folder in (root, root / name):

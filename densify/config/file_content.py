@@ -116,11 +116,7 @@ def read_yaml(path: Path) -> tuple[Any, dict[str, int]]:
 
 
 def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
-    """Parse YAML text; raise InputError, with ``where`` first, if it is invalid.
-
-    Returns:
-        The content, None if empty, and the line number of each key, by dotted name (``a.b``).
-    """
+    """Return the content of YAML text, None if empty, and the line number of each dotted key."""
     import yaml
 
     try:
@@ -153,13 +149,7 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
 
 
 def needed(module: str, extra: str, needed_by: str) -> Any:
-    """Import and return an optional module; raise InputError if it is not installed.
-
-    Args:
-        module: Import path.
-        extra: Extra of this package that installs it, for the message.
-        needed_by: Begin of the message, such as "EXR files".
-    """
+    """Import and return an optional module, which the ``extra`` of this package installs."""
     package = module.partition(".")[0]
     try:
         return import_module(module)

@@ -24,10 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Plugin:
-    """One reader or scene-flow engine.
-
-    Another package's module may set the other fields: ``recognises``, ``HOLDS``, ``BOXES`` etc.
-    """
+    """One reader or scene-flow engine, with fields that another package's module may also set."""
 
     name: str  # name, as users write it
     module: str  # import path of its module
@@ -75,10 +72,7 @@ class Table:
             )
 
     def row(self, name: str, where: str) -> Plugin:
-        """Return the plug-in of this name; raise InputError, with ``where`` first, without one.
-
-        The module of another package is imported.
-        """
+        """Return the plug-in of this name; another package's module is imported."""
         self.require(name, where)
         return self._loaded(self._rows()[name])
 
@@ -140,12 +134,7 @@ ENGINES = Table(
 
 
 def check_engine_spec(spec: str) -> tuple[str, str]:
-    """Split an engine's ``NAME[:ARGUMENT]`` into name and argument; the engine is not imported.
-
-    "network:flow.npz" gives ("network", "flow.npz"), "groups" gives ("groups", ""). Raise
-    InputError for an unknown name, a missing argument, or an argument that the engine does not
-    take.
-    """
+    """Split an engine's ``NAME[:ARGUMENT]`` into name and argument, "" for none, without import."""
     name, _, argument = spec.partition(":")
     ENGINES.require(name, "flow.engine")
     for row in ENGINES.built_in:
@@ -155,10 +144,7 @@ def check_engine_spec(spec: str) -> tuple[str, str]:
 
 
 def engine(spec: str) -> tuple[Plugin, str]:
-    """Return the plug-in and the argument ("" for none) of an engine's ``NAME[:ARGUMENT]``.
-
-    Raise InputError as `check_engine_spec` does.
-    """
+    """Return the plug-in and the argument ("" for none) of an engine's ``NAME[:ARGUMENT]``."""
     name, argument = check_engine_spec(spec)
     return ENGINES.row(name, "flow.engine"), argument
 

@@ -49,14 +49,9 @@ def call_all(
 
     An item whose process dies is tried a second time, alone. A second death or an unexpected error
     gives a ComputationError as outcome. InputError and ComputationError of ``call`` are raised.
-
-    Args:
-        call: A function of a module.
-        groups: Non-empty groups of hashable, picklable items. A group's first item is finished
-            before the others begin, so they find shared results in the cache.
-        num_workers: Number of processes; 1 uses this process.
-        log: File to which worker processes append their log.
-        scheduler: Address of a Dask scheduler whose workers replace local processes.
+    Items are hashable and picklable. A group's first item is finished before the others begin, so
+    they find shared results in the cache. ``scheduler`` is a Dask address, whose workers replace
+    processes.
     """
     if num_workers == 1 and scheduler is None:
         for group in groups:
@@ -80,11 +75,7 @@ def call_all(
 
 @contextmanager
 def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
-    """Append the log messages of ``densify`` to a file within the block.
-
-    ``thread`` is the identifier of the only thread whose messages are written, None for all. Raise
-    OutputError if the file cannot be written.
-    """
+    """Append the log messages of ``densify``, of one thread's identifier or all, to a file."""
     try:
         handler = logging.FileHandler(path, encoding="utf-8")
     except OSError as error:
@@ -104,10 +95,7 @@ def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
 
 
 def share_of_cores(num_workers: int) -> dict[str, str]:
-    """Return environment variables that limit the threads of one of ``num_workers`` workers.
-
-    Each worker gets an equal share of the cores.
-    """
+    """Return environment variables that give one of ``num_workers`` an equal share of cores."""
     share = str(max(1, len(os.sched_getaffinity(0)) // num_workers))
     names = [f"{library}_NUM_THREADS" for library in ("NUMBA", "OMP", "OPENBLAS", "MKL")]
     return dict.fromkeys([*names, "OPENCV_FOR_THREADS_NUM"], share)

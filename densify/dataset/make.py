@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make a training set: plan it, skip finished key sweeps, densify and record the others.
-
-The command's process plans, records and judges; `make_key` runs in any process.
-"""
+"""Make a training set: plan it, skip finished key sweeps, densify and record the others."""
 
 from __future__ import annotations
 
@@ -98,13 +95,12 @@ def make_dataset(
     """Make a training set from the key sweeps of whole recordings, and return the final progress.
 
     A repeated call keeps finished key sweeps. Files do not depend on processes or interruptions. A
-    full disk or the loss of all workers raises ComputationError; finished key sweeps are kept.
+    full disk or the loss of all workers raises ComputationError.
 
     Args:
         data: Recordings, as `densify.open_sequence` takes them.
         out: Folder of the training set.
-        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``; no start or stop
-            means the first frame or the last. None for all.
+        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``; None for all.
         recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
         num_workers: Number of processes, as many as possible if None. More than one needs ``if
             __name__ == "__main__"`` in a script.
@@ -154,10 +150,7 @@ def status(out: Path) -> Summary:
 
 
 def damaged(out: Path) -> list[str]:
-    """Return the files of finished key sweeps that are missing or changed, relative to ``out``.
-
-    Contents are compared with the hashes in the manifest.
-    """
+    """Return the files, relative to ``out``, that are missing or differ from recorded hashes."""
     finished_records = (
         record for record in read_manifests(out).values() if record.status != "failed"
     )
@@ -268,15 +261,10 @@ def _record(
 
 
 def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) -> dict[Key, str]:
-    """Return the finished keys with far more ghosts or outliers than their neighbours, and why.
+    """Return finished key -> reason, where ghosts or outliers exceed its neighbours' median.
 
-    A limit for all recordings lets keys pass that are bad for their own recording, such as keys
-    with cut windows at its ends.
-
-    ``max_ratio`` is the greatest share, as a multiple of the median of the neighbouring keys.
-
-    Returns:
-        Key -> reason, for the keys beyond the ratio.
+    They exceed it by more than ``max_ratio``. A limit for all recordings lets keys pass that are
+    bad for their own recording, such as keys with cut windows at its ends.
     """
     drives: dict[str, list[KeyRecord]] = defaultdict(list)
     for record in records.values():
@@ -325,10 +313,7 @@ class Job:
 
 
 def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
-    """Densify and write one key, and return its record.
-
-    On an error the status of the record is ``failed``; only OutputError is raised.
-    """
+    """Densify and write one key, and return its record, ``failed`` on errors but OutputError."""
     job, key = job_and_key
     start_s = time.perf_counter()
     try:

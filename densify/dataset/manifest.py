@@ -12,8 +12,7 @@ The file is ``OUT/manifest.jsonl``, or ``OUT/manifest-2of4.jsonl`` for the secon
     seconds          computing time
     warnings         sentences about assumptions and suspicions
 
-Each line is on the disk before the next begins. A killed process can damage only the last line,
-whose key sweep is made again. A later line of a key sweep replaces an earlier line.
+A killed process can damage only the last line. A later line of a key sweep replaces an earlier one.
 """
 
 from __future__ import annotations
@@ -117,8 +116,7 @@ def manifest(folder: str | Path) -> Any:
 def read_manifests(root: Path) -> dict[Key, KeyRecord]:
     """Return the records of all manifests in a folder, ordered by drive and frame number.
 
-    In a file, the last line of a key sweep counts. Of several shards' records, done counts before
-    aside before failed. Damaged lines before the last line give a warning.
+    In a file, the last line of a key sweep counts; of shards, done before aside before failed.
     """
     rank = _STATUSES.index
     records: dict[Key, KeyRecord] = {}
@@ -130,10 +128,7 @@ def read_manifests(root: Path) -> dict[Key, KeyRecord]:
 
 
 def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> list[str]:
-    """Return the missing or changed files of a record, relative to ``root``.
-
-    Sizes are compared, and hashes of the contents too if ``by_content``.
-    """
+    """Return a record's files that are missing or changed in size or, ``by_content``, in hash."""
     damaged = []
     for name, file in record.files.items():
         try:
@@ -148,10 +143,7 @@ def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> lis
 
 
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
-    """Return the names of the records that are done or aside and whose files exist in ``root``.
-
-    If ``verify``, the contents of the files must match their hashes too.
-    """
+    """Return the names of records done or aside whose files exist and, if asked, match hashes."""
     return {
         record.name
         for record in records
@@ -161,10 +153,7 @@ def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> 
 
 
 class Manifest:
-    """The manifest file of a run or shard, open for writing by one process; a context manager.
-
-    Opening and closing sort the file: one line per key sweep, by drive and frame number.
-    """
+    """The manifest file of a run or shard, open for one process. Opening and closing sort it."""
 
     def __init__(self, root: Path, shard: tuple[int, int] | None = None) -> None:
         """Open the manifest of a training set, or of shard (k, n); its folder is made if needed."""
@@ -196,10 +185,7 @@ class Manifest:
             os.fsync(file.fileno())
 
     def set_aside(self, reasons: Mapping[Key, str]) -> list[KeyRecord]:
-        """Delete the files of finished key sweeps, record the reasons, and return the new records.
-
-        ``reasons`` has the reason for each key. Key sweeps that another manifest records stay.
-        """
+        """Delete the files of these finished keys, record the reasons, return the new records."""
         aside = []
         for name, (record, _) in _read(self.path).items():
             if name not in reasons or record.status != "done":

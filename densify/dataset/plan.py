@@ -53,8 +53,7 @@ class Gate(Section):
         max_outliers: Greatest share of outliers against the held-out key sweep, in every camera.
         min_sweeps: Least number of sweeps in the window, which ends and holes in time may cut.
         max_ratio: Greatest share of ghosts or held-out outliers, as a multiple of the median of the
-            neighbouring key sweeps. These share most of their sweeps, so traffic alone changes
-            their scores less.
+            neighbouring key sweeps.
         split: Split of the tree, ``train`` or ``val``; ``kitti`` takes KITTI's official split.
     """
 
@@ -66,10 +65,7 @@ class Gate(Section):
     split: str = one_of("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
-        """Return the reason why a key sweep is not written, None if it is within all limits.
-
-        ``scores`` are those of a manifest line, ``num_sweeps`` the sweeps in its window.
-        """
+        """Return the reason why a key sweep with a manifest's scores is not written, else None."""
         ghost, outliers = scores["ghost"], scores["outliers"]
         if self.min_sweeps is not None and num_sweeps < self.min_sweeps:
             return f"{num_sweeps} sweeps, expected at least {self.min_sweeps}"
@@ -136,11 +132,7 @@ class Drive:
 
 
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]:
-    """Open every recording and choose its key sweeps.
-
-    The arguments are as in `densify.dataset.make.make_dataset`. Raise InputError for a recording
-    that is given twice, has no camera, or has none of the keys.
-    """
+    """Open every recording and choose its key sweeps, by the arguments of `make_dataset`."""
     drives: dict[str, Drive] = {}
     for spec in data:
         sequence = open_sequence(spec)

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write HTML pages: ``report.html`` of a run or training set, ``compare.html`` of a comparison.
-
-The page of a set has pictures of its keys, distributions of scores, and lists. It is one file
-without scripts. It opens from disk and loads no other file.
-"""
+"""Write HTML pages: ``report.html`` of a run or training set, ``compare.html`` of a comparison."""
 
 from __future__ import annotations
 
@@ -217,11 +213,7 @@ def write_comparison_page(folder: Path) -> Path:
 
 
 def write_report(folder: Path, overwrite: bool = False) -> list[Path]:
-    """Write the HTML pages of a folder and return their paths.
-
-    The folder is that of a run, a comparison, a training set, or of a recording with one key sweep.
-    Raise InputError for other folders, or if a page exists and ``overwrite`` is False.
-    """
+    """Write the HTML pages of a run, comparison or training set, and return their paths."""
     pages = _pages(folder)
     for path in pages:
         if path.exists() and not overwrite:

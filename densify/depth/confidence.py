@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Compute the confidence of pixels from the probability that a pixel is an outlier (KITTI's rule).
 
-The probability P is that of a logistic regression (Cox, "The regression analysis of binary
-sequences", 1958) on physical features of the pixel:
-
-    P = 1 / (1 + exp(-(w0 + w1 x1 + ... + w9 x9)))
-
-The confidence is -log10(P) / 5, limited to 0 to 1. The weights `WEIGHTS` were fitted to exact truth
-of simulated streets and to the truth of real recordings, each recording with equal weight, by
-``examples/fit_confidence.py``.
+The probability is a logistic regression (Cox, "The regression analysis of binary sequences", 1958)
+on physical features, ``P = 1 / (1 + exp(-(w0 + w1 x1 + ... + w9 x9)))``, and the confidence
+-log10(P) / 5, limited to 0 to 1. ``examples/fit_confidence.py`` fitted `WEIGHTS` to exact truth of
+simulated streets and to the truth of real recordings, each with equal weight.
 """
 
 from __future__ import annotations
@@ -54,16 +50,10 @@ _UNCONFIRMED = 2.7  # found / expected outliers of one sweep alone: 0.9 to 6, on
 def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
     """Return the (P,10) features of the P pixels with a filled or rejected depth, row by row.
 
-    Shares, steps and ages enter by their logarithm to base 10, because probabilities of errors are
-    proportional to powers of them. The step is the logarithm of the ratio of the greatest to the
-    least depth around, as a multiple of the tolerance of KITTI's rule. Age and discontinuity are
-    those of the nearest measured pixel. A moving body has no discontinuity. Spacings are those of
-    neighbouring rays.
-
-    Args:
-        record: The map, before `densify.depth.fill.measure_spots`.
-        since_key_ns: (M,) ns from the key sweep of the points of the cloud.
-        camera: Camera of the map.
+    The ``record`` is that before `densify.depth.fill.measure_spots`. Shares, steps, ages enter by
+    their logarithm to base 10: probabilities of errors are proportional to powers of them. Age and
+    discontinuity are those of the nearest measured pixel; moving bodies have no discontinuity.
+    ``since_key_ns`` (M,) are ns from the key sweep of the cloud's points.
     """
     shown, rejected = record.filled_m > 0, record.rejected_m > 0
     has_depth = shown | rejected
@@ -134,11 +124,7 @@ def _log_rejected_share(record: MapRecord, size_px: int) -> Float:
 
 
 def _log_step(depth_m: Float32, filled_m: Float32, size_px: int) -> Float32:
-    """Return the (H,W) logarithm of the greatest by the least depth of a pixel and those around.
-
-    ``depth_m`` is the filled or rejected depth, ``filled_m`` the filled depth alone. The greatest
-    depth around is of filled pixels only.
-    """
+    """Return (H,W) the log ratio of the greatest filled depth around to the least, or rejected."""
     own_m = np.where(depth_m > 0, depth_m, np.inf)
     near_m = np.minimum(np.where(filled_m > 0, filled_m, np.inf), own_m).astype(np.float32)
     nearest_m = np.minimum(ndimage.minimum_filter(near_m, size_px), near_m)
@@ -150,10 +136,7 @@ def _log_step(depth_m: Float32, filled_m: Float32, size_px: int) -> Float32:
 
 
 def confidence_of(evidence: NDArray[np.floating], weights: Float | None = None) -> Float32:
-    """Return the (P,) confidence ``-log10(P) / 5`` of pixels with `features` (P,10).
-
-    ``weights`` (10,) replace `WEIGHTS`.
-    """
+    """Return (P,) ``-log10(P) / 5`` of pixels with `features` (P,10), by (10,) ``weights``."""
     if weights is None:
         weights = np.array([*WEIGHTS.values()])
     log_p = -np.logaddexp(0, -(evidence @ weights)) / np.log(10)
@@ -168,12 +151,9 @@ def confidence_by_age(since_key_ns: Int) -> Float32:
 def choose_most_certain(
     confidence: Float32, max_outliers: float, before: Float32 | None = None
 ) -> Bool:
-    """Return (P,) True at the most certain pixels, as many as keep the expected outliers low.
+    """Return (P,) True at as many of the most certain pixels as ``max_outliers`` permits.
 
-    Args:
-        confidence: (P,) confidences of the pixels to choose from.
-        max_outliers: Greatest expected share of outliers, of the chosen pixels and those before.
-        before: Confidences of pixels that are chosen already; None for none.
+    It is the greatest expected share of outliers, with those of confidences ``before``.
     """
     before_probability = outlier_probability(np.zeros(0) if before is None else before)
     best_first = np.argsort(-confidence, kind="stable")
@@ -190,13 +170,8 @@ def choose_most_certain(
 def with_max_outliers(depth_map: DepthMap, max_outliers: float | None) -> DepthMap:
     """Return the map with as many pixels as possible at this expected share of outliers.
 
-    If the map expects fewer outliers, the most certain of its rejected pixels are given back. If it
-    expects more, its least certain pixels are left out. A map without calibrated confidence stays.
-
-    Args:
-        depth_map: A map with its ``rejected`` pixels.
-        max_outliers: Greatest expected share of outliers of the filled map; None leaves its pixels
-            as they are.
+    Its most certain ``rejected`` pixels are given back, or its least certain ones left out. None
+    for the share, or a map without calibrated confidence, leaves it as it is.
     """
     rejected = depth_map.rejected
     if rejected is None or max_outliers is None:
@@ -231,14 +206,9 @@ def without_times(
 ) -> DepthMap:
     """Return the map with lower confidence at near pixels, for sweeps without times of points.
 
-    The vehicle's motion within such a sweep moves depths by an unknown amount up to ``smear_m`` in
-    either direction. Near pixels tolerate less of it than far pixels.
-
-    Args:
-        depth_map: The map.
-        smear_m: Half the travel in metres along the camera's axis from sweep to sweep.
-        camera: Camera of the map.
-        share: Share of the sweeps without times.
+    Motion within such a sweep moves depths by an unknown amount up to ``smear_m``, half the travel
+    in metres along the camera's axis from sweep to sweep. Near pixels tolerate less of it.
+    ``share`` is that of the sweeps without times.
     """
 
     def outlier_or_smeared(probability: Float, depth_m: Float32) -> Float:
@@ -274,10 +244,7 @@ def _with_probability(depth_map: DepthMap, change: Callable[[Float, Float32], Fl
 
 
 def expected_outliers(depth_map: DepthMap) -> dict[str, float | None]:
-    """Return the expected share of outliers of the ``measured`` and the ``filled`` map.
-
-    It is None for a map without pixels.
-    """
+    """Return the expected outlier share of the ``measured`` and ``filled`` map, None if empty."""
     shares: dict[str, float | None] = {}
     for name, depth_m in (("measured", depth_map.depth_m), ("filled", depth_map.filled_m)):
         probability = outlier_probability(depth_map.confidence[depth_m > 0])
@@ -286,15 +253,10 @@ def expected_outliers(depth_map: DepthMap) -> dict[str, float | None]:
 
 
 def reliability(depth_map: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[str, Any]]:
-    """Return expected and true outliers by confidence, over the filled pixels with ground truth.
+    """Return expected and true outliers by confidence, over filled pixels with ground truth.
 
     Each interval of 0.05 with pixels has ``confidence`` (its start), ``num_compared`` pixels, and
-    the ``expected`` and the true share of ``outliers``.
-
-    Args:
-        depth_map: The map.
-        truth_m: (H,W) true depth in metres, 0 none.
-        camera: Camera of the map.
+    the ``expected`` and true share of ``outliers``. ``truth_m`` (H,W) is depth in metres, 0 none.
     """
     compared = (truth_m > 0) & (depth_map.filled_m > 0)
     confidence = depth_map.confidence[compared]

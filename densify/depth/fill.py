@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Add pixels to the measured ones of a depth map, where the votes of known pixels confirm them.
-
-The stages are, in order: accept boundary pixels by the image, fill windows by planes, fill holes
-by stars, and count the pixels that a laser's spot covers as measured.
-"""
+"""Add pixels to the measured ones of a depth map, where the votes of known pixels confirm them."""
 
 from __future__ import annotations
 
@@ -50,11 +46,7 @@ _SPOT_PX = 4  # greatest half width of a spot
 
 
 def accept_boundary_pixels(record: MapRecord, rims: str) -> None:
-    """Accept the boundary pixels that the image confirms; reject the others.
-
-    With ``rims=image`` a pixel is accepted if 97 % of the votes are for its depth. ``keep`` accepts
-    all pixels, ``strict`` none.
-    """
+    """Accept boundary pixels with 97 % of the votes (rims ``image``), all (``keep``) or none."""
     pixel = np.flatnonzero(record.boundary_m)
     depth_m = record.boundary_m.flat[pixel]
     if record.lab.size:
@@ -69,11 +61,7 @@ def accept_boundary_pixels(record: MapRecord, rims: str) -> None:
 
 
 def fill(record: MapRecord, reach: float) -> None:
-    """Fill the pixels that have measured pixels on both sides, if the pixels around confirm them.
-
-    A filled depth stays if at least nine tenths of the votes (`votes_for`) are for it. ``reach`` is
-    the half size of the largest window in spacings of rays.
-    """
+    """Fill pixels between measured pixels where nine tenths of the votes (`votes_for`) agree."""
     empty = record.filled_m == 0
     fill_between(record.filled_m, record.tilt, record.spacing_px, reach)
     _reject_unconfirmed(record, empty, _FILL_SHARE)
@@ -108,20 +96,13 @@ class _Known(NamedTuple):
 def fill_between(filled_m: Float32, tilt: Float32, spacing_px: Float32, reach: float) -> None:
     """Interpolate empty pixels that have measured pixels on both sides, in place.
 
-    The window around an empty pixel must hold measured pixels to its left, to its right, above and
-    below: nothing is extrapolated. No depth discontinuity may run through them. There is a
-    discontinuity if deviations from a plane differ by more than 0.2 m and 6 % of the nearest depth.
-    With fewer than six pixels the depths themselves are compared.
+    The window around a pixel must hold measured pixels left, right, above and below: nothing is
+    extrapolated. Deviations from their plane, whose depth the pixel gets, must not differ by more
+    than 0.2 m and 6 % of the nearest depth (with fewer than six pixels, the depths themselves). Of
+    the windows up to ``reach`` ray spacings of half size the smallest sufficient one counts.
 
-    The pixel gets the depth of the plane. Weights fall to zero just outside the window. The window
-    grows in thirds of the ray spacing, then to ``reach`` spacings. The smallest sufficient window
-    is taken.
-
-    Args:
-        filled_m: (H,W) depths of the measured pixels, 0 elsewhere; the filled depths are added.
-        tilt: (H,W,2) slopes as in `MapRecord`; those of filled pixels are added.
-        spacing_px: (H,W,2) spacing of rays across and down.
-        reach: Half size of the largest window in spacings of rays.
+    ``filled_m`` (H,W) metres, 0 for none, and slopes ``tilt`` (H,W,2) are changed; ``spacing_px``
+    (H,W,2) is the spacing of rays across and down.
     """
     sizes = min(reach, 1.0) * np.arange(1, _NUM_SIZES + 1) / _NUM_SIZES
     reaches = np.append(sizes, reach) if reach > 1 else sizes
@@ -162,10 +143,7 @@ def _surrounded(num, window, row, column):  # type: ignore[no-untyped-def]
 
 @inlined
 def _sum_up(known, window, row, column, moments):  # type: ignore[no-untyped-def]
-    """Fill in the ``moments`` (9,) of a window's pixels for `plane`, relative to the pixel.
-
-    Returns the number of pixels, and their nearest and farthest inverse depth.
-    """
+    """Fill in a window's ``moments`` (9,); return pixels, nearest and farthest inverse depth."""
     top, bottom, left, right = window
     reach_v, reach_u = max(row - top, bottom - 1 - row), max(column - left, right - 1 - column)
     num, nearest, farthest = 0, 0.0, np.inf
@@ -195,10 +173,7 @@ def _spread(known, window, row, column, centre, slope_u, slope_v):  # type: igno
 
 @Kernel
 def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ignore[no-untyped-def]
-    """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`.
-
-    ``reaches`` are half sizes of windows in spacings of rays, ascending.
-    """
+    """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`; reaches ascend."""
     height, width = filled_m.shape
     moments = np.empty(9)
     for p in range(first, last):
@@ -243,10 +218,9 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ign
 def fill_stars(record: MapRecord) -> None:
     """Fill holes from the first known pixel, measured or filled, in each of 16 directions.
 
-    At least eight directions must have a known pixel within a spacing of rays, and at most seven
-    neighbouring directions none. The surface of each known pixel is extended to the hole. These
-    predictions must agree to 10 % of inverse depth. Their mean, weighted by the reciprocal of the
-    steps, needs eight tenths of the votes.
+    At least eight directions need a known pixel within a ray spacing, at most seven neighbouring
+    ones none. Their surfaces, extended to the hole, must agree to 10 % of inverse depth. The mean,
+    weighted by the reciprocal of the steps, needs eight tenths of the votes.
     """
     empty = record.filled_m == 0
     pixel = np.flatnonzero(empty)
@@ -295,11 +269,7 @@ def _star(first, last, pixel, known, spacing_px, predicted_m):  # type: ignore[n
 
 
 def measure_spots(record: MapRecord) -> None:
-    """Count filled pixels as measured if the laser spot of a measured return covers them.
-
-    The fill must lie on the surface of the return. A covered pixel takes the ``point`` of the
-    nearest return, and keeps its filled depth and confidence. Pixels without fill stay empty.
-    """
+    """Count filled pixels as measured, in depth unchanged, if a return's laser spot covers them."""
     points = record.points
     measured = np.flatnonzero(record.depth_m > 0)
     index_in_image = np.zeros(len(record.reason), np.int64)  # by index in the cloud
@@ -319,12 +289,7 @@ def measure_spots(record: MapRecord) -> None:
 
 @Kernel
 def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, source_pixel, nearest_px2):  # type: ignore[no-untyped-def]
-    """Find for each filled pixel the measured pixel, nearest in the image, whose spot covers it.
-
-    ``filled_m`` is 0 where no pixel may be covered. ``source_pixel`` (H,W) is the index of the
-    measured pixel, -1 at first. ``nearest_px2`` (H,W) is the squared distance to the centre of its
-    spot, inf at first.
-    """
+    """Find for each filled pixel the nearest measured pixel whose spot covers it, -1 for none."""
     height, width = filled_m.shape
     for i in range(len(pixel)):
         v, u = pixel[i] // width, pixel[i] % width

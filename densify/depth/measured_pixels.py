@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Define the record of a depth map in the making, and measure its pixels by the points in an image.
 
-Among the visible points in a pixel, the one measured nearest in time to the key sweep wins. A plane
-is fitted to the surrounding points that agree with it, and the pixel gets the depth of the plane at
-its centre. The pixel is measured if, of all sweeps with points around it, the one nearest to the
-key is among those that agree. Close to a depth discontinuity it becomes a boundary pixel.
+Of the visible points in a pixel, the one nearest in time to the key sweep wins. The pixel gets the
+depth of a plane through the points around that agree. It is measured if, of all sweeps around it,
+the one nearest to the key agrees; close to a depth discontinuity it becomes a boundary pixel.
 """
 
 from __future__ import annotations
@@ -70,10 +69,7 @@ class MapInputs(NamedTuple):
 
 @dataclass
 class MapRecord:
-    """One depth map in the making, changed in place by the stages of `densify.depth.project`.
-
-    Images are (H,W) with depths in metres, 0 for no depth.
-    """
+    """One depth map in the making, changed in place by its stages; (H,W) metres, 0 for no depth."""
 
     depth_m: Float32  # depth of pixels that are accepted as measured
     # Depth of boundary pixels, measured so close to a depth discontinuity that they may show the
@@ -109,10 +105,7 @@ class MapRecord:
         return replace(self, **{name: getattr(self, name)[box] for name in names})
 
     def reject(self, dropped: Bool) -> None:
-        """Remove the pixels ``dropped`` (H,W) from the filled map.
-
-        Measured pixels among them become boundary pixels that are not accepted.
-        """
+        """Remove pixels ``dropped`` (H,W) from the filled map; measured ones become boundary."""
         dropped = dropped & (self.filled_m > 0)
         np.copyto(self.boundary_m, self.depth_m, where=dropped & (self.depth_m > 0))
         np.copyto(self.rejected_m, self.filled_m, where=dropped)
@@ -121,10 +114,9 @@ class MapRecord:
 
 
 def measure(inputs: MapInputs) -> MapRecord:
-    """Return the record of a map with its measured pixels and boundary pixels.
+    """Return the record of a map's measured and boundary pixels.
 
-    Points beyond the window come second. They measure pixels that the window leaves empty, away
-    from depth discontinuities.
+    Points beyond the window only measure what it leaves empty, away from depth discontinuities.
     """
     camera = inputs.camera
     points = points_in_image(inputs.cloud, inputs.view, inputs.patches)
@@ -225,11 +217,7 @@ class _Winners(NamedTuple):
 def _measure_visible(
     record: MapRecord, points: PointsInImage, camera: Camera, beyond_window: bool = False
 ) -> None:
-    """Measure pixels without a depth by visible points, and set the reason of each point.
-
-    With ``beyond_window`` the points include those of sweeps beyond the window. Only the reasons of
-    these are set then.
-    """
+    """Measure pixels without a depth by visible points, and set the reason of each point."""
     hidden = is_occluded(points, camera)
     winners = _find_winners(record, points, hidden, camera)
     reasons = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
@@ -321,14 +309,7 @@ def _count(bits):  # type: ignore[no-untyped-def]
 
 @inlined
 def _compare(by_pixel, i, u0, v0, centre, tolerance, outer, moments, reach):  # type: ignore[no-untyped-def]
-    """Compare the points around pixel (v0, u0) with the tangent plane of point i.
-
-    The plane has inverse depth ``centre`` (1/m) in the pixel. Visible points within ``tolerance``
-    (1/m) of it agree. Points farther behind it, within ``outer`` (px), show a discontinuity. Filled
-    in are ``moments`` (9,) of `plane`, of deviations from the tangent plane, and the extent of the
-    surface, ``reach`` (8,). Returned are a bit for each sweep that agrees, True if no other sweep
-    there is nearer to the key, and True if a point is close behind.
-    """
+    """Compare the points around pixel (v0, u0) with point i's plane: agreeing sweeps, two tests."""
     points, hidden, start, shape = by_pixel
     uv, inverse, age_ns = points.uv, points.inverse, points.age_ns
     slope_u, slope_v, inverse_i = points.slope[i, 0], points.slope[i, 1], inverse[i]
@@ -363,12 +344,7 @@ def _compare(by_pixel, i, u0, v0, centre, tolerance, outer, moments, reach):  # 
 
 @Kernel
 def _settle(first, last, by_pixel, done, settled):  # type: ignore[no-untyped-def]
-    """Find the depth of each pixel from the surrounding points that agree with its first point.
-
-    Pixels that are ``done`` (P,) are left out. The rows of ``settled`` (4,P) are the depth in
-    metres, the number of sweeps that agree, 1 if no sweep nearer to the key disagrees, and the
-    extent of the surface in radii of discontinuities.
-    """
+    """Fill ``settled`` (4,P): depth (m), agreeing sweeps, 1 if none nearer disagrees, extent."""
     moments, reach = np.empty(9), np.empty(8)
     points, start, width = by_pixel.points, by_pixel.start, by_pixel.shape[1]
     for p in range(first, last):

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Close the surfaces of moving objects, so that no background shows through them.
 
-Dark paint and glass give few returns, and other sweeps measured the background there. Every moving
-object has a body (`MovingBody`). It is closed where rays end on it, and open where they pass. Its
-front is the nearest surface of the hull in each pixel, moved smoothly onto the object's own
-returns. Pixels well inside the closed part show it, the image decides the silhouette.
+Dark paint and glass give few returns, and other sweeps measured the background there. A body
+(`MovingBody`) is closed where rays end on it, open where they pass.
 """
 
 from __future__ import annotations
@@ -44,8 +42,8 @@ def close_bodies(
 ) -> None:
     """Put the surfaces of moving bodies into the record; ``on_body`` marks their pixels.
 
-    Depths clearly in front of a body stay. Elsewhere inside the outline of its hull only depths of
-    moving objects stay. Pixels with a return of the body on its surface count as measured.
+    Depths clearly in front stay. Elsewhere inside the outline of a hull only depths of moving
+    objects stay. Pixels with a return of the body on its surface count as measured.
     """
     margin_px = round(VOTERS_REACH * float(np.median(record.gap_px)))
     for instance, body in bodies.items():
@@ -207,15 +205,7 @@ class _Shown(NamedTuple):
 def _show(
     record: MapRecord, cloud: Cloud, surface: Float, allowed_m: Float | Float32, share: Float
 ) -> _Shown:
-    """Show a body in the record.
-
-    Args:
-        record: The record, cut to the box of the front.
-        cloud: The cloud of the record.
-        surface: (h,w) inverse depth of the body's surface, 1/m.
-        allowed_m: (h,w) greatest deviation of a return from the surface.
-        share: (h,w) share of the rays that end on the body, 0 outside its outline.
-    """
+    """Show a body's surface (h,w), 1/m, in the record; returns may be ``allowed_m`` (h,w) off."""
     inside = share > 0
     surface_m = (1 / surface).astype(np.float32)
     is_whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE

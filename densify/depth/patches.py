@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Compute the surface patch of each accumulated point, in space and in an image, and occlusion.
 
-A patch is as large as the spacing of the neighbouring rays of its own sweep, and tangent to the
-neighbouring points. It occludes what lies behind it. On a plane the inverse range is normal ·
-direction, so its derivatives by azimuth and elevation give the normal. In an image the inverse
-depth of a plane is linear, so planes are fitted in inverse depth.
+A patch is as large as the spacing of its sweep's rays, tangent to the neighbouring points, and
+occludes what lies behind it. On a plane the inverse range is normal · direction, so its derivatives
+by azimuth and elevation give the normal. In an image the inverse depth of a plane is linear.
 """
 
 from __future__ import annotations
@@ -46,16 +45,10 @@ def hidden_m(surface_m: Float | Float32) -> Float | Float32:
 def find_patches(
     cloud: Cloud, sensors: Sensors, origins: Mapping[int, Float], wanted: Bool | None = None
 ) -> Patches:
-    """Return the surface patches of a cloud.
+    """Return the surface patches of a cloud of M points, facing the scanner if on no one surface.
 
-    A patch is tangent to the neighbouring returns of the same scanner and sweep. If the neighbours
-    are on no single surface, the patch faces the scanner.
-
-    Args:
-        cloud: The cloud of M points.
-        sensors: Scanners of the recording.
-        origins: (S,3) origins of the scanners, key sweep's lidar frame, by frame number.
-        wanted: (M,) True for points in view of a camera, None for all. Other points get zeros.
+    ``origins`` (S,3) are those of the scanners, key sweep's lidar frame, by frame number. Points
+    that are not ``wanted`` (M,), not in view of a camera, get zeros; None wants all.
     """
     frames, index = np.unique(cloud.frame, return_inverse=True)
     sweep: NDArray[np.int32] = index.ravel().astype(np.int32)
@@ -72,18 +65,12 @@ def fit_tangents(
     origins: Sequence[Float],
     wanted: Bool | None = None,
 ) -> Patches:
-    """Return the patches of M points, see `find_patches`.
+    """Return the patches of M ``points`` (M,3) in any one frame, see `find_patches`.
 
     A point p is on the tangent plane if normal · (p - origin) = 1. Spacings are metres between
-    neighbouring rays, along the azimuth and along the elevation.
-
-    Args:
-        points: (M,3) points, in any one frame.
-        lidar: (M,) number of the scanner of each point.
-        sweep: (M,) index of each point's sweep in ``origins``.
-        sensors: Scanners of the recording.
-        origins: (S,3) origins of the scanners for each sweep, in the frame of the points.
-        wanted: As in `find_patches`.
+    neighbouring rays, along the azimuth and the elevation. ``sweep`` (M,) is the index of each
+    point's sweep in ``origins``, (S,3) in the frame of the points; ``lidar`` (M,) is its scanner's
+    number.
     """
     normal = np.zeros((len(points), 3), np.float32)
     spacing_m = np.zeros((len(points), 2), np.float32)
@@ -190,11 +177,7 @@ def _slope(slope_a, slope_b, step, range_m):  # type: ignore[no-untyped-def]
 
 @inlined
 def _change(spherical, i, j, axis, across, slope_across):  # type: ignore[no-untyped-def]
-    """Return the change of inverse range per radian from point i to j, NaN if unknown.
-
-    It is along ``axis``, 0 for the azimuth or 1 for the elevation. ``across`` is the other axis,
-    and the change along it, at ``slope_across``, is removed.
-    """
+    """Return the change of inverse range per radian from i to j along ``axis``, NaN if unknown."""
     if j < 0:
         return np.nan
     apart = spherical[axis, j] - spherical[axis, i]
@@ -208,10 +191,7 @@ def _change(spherical, i, j, axis, across, slope_across):  # type: ignore[no-unt
 
 @inlined
 def _put(i, spherical, table, slope_u, slope_v, normal, spacing):  # type: ignore[no-untyped-def]
-    """Fill in normal and spacing of point i from its slopes of inverse range per radian.
-
-    ``slope_u`` is the slope along the azimuth, ``slope_v`` along the elevation.
-    """
+    """Fill in normal and spacing of point i from its slopes of inverse range per radian."""
     azimuth, elevation, range_m = spherical[0, i], spherical[1, i], spherical[2, i]
     azimuth_gap, elevation_gap = _spacing(azimuth, elevation, table)
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
@@ -302,9 +282,9 @@ def is_occluded(points: PointsInImage, camera: Camera) -> Bool:
 def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
     """Raise ``canvas`` (H,W) float32 in place to the greatest inverse depth of the patches there.
 
-    A patch covers the pixel centres within ``half_px`` (K,2) of its point uv (K,2). Its inverse
-    depth is ``inverse + slope · offset``, between half of ``inverse`` and all of it: no patch is
-    nearer than its point. ``inverse`` (K,) is in 1/m, ``slope`` (K,2) in 1/m per px.
+    A patch covers the pixel centres within ``half_px`` (K,2) of uv (K,2). Its inverse depth is
+    ``inverse + slope · offset``, between half of ``inverse`` and all of it, never nearer than its
+    point. ``inverse`` (K,) is in 1/m, ``slope`` (K,2) in 1/m per px.
     """
     height, width = canvas.shape
     for i in range(len(inverse)):
@@ -323,10 +303,9 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
 
 
 def sorted_by_pixel(points: PointsInImage, rank: Int, camera: Camera) -> tuple[Int, Int]:
-    """Sort the points by pixel, the best point of each pixel first.
+    """Return ``start`` (H·W+1,) and ``order`` (K,), the points by pixel, the best first.
 
-    The lowest ``rank`` (K,) comes first, then the nearest point. Returns ``start`` (H·W+1,) and
-    ``order`` (K,): the points of pixel p are ``order[start[p]:start[p + 1]]``.
+    Pixel p has ``order[start[p]:start[p + 1]]``, by lowest ``rank`` (K,), then nearest point.
     """
     row, column = pixel_of(points.uv)
     start = np.empty(camera.height_px * camera.width_px + 1, np.int64)
@@ -401,10 +380,9 @@ def add_moments(moments, weight, u, v, w):  # type: ignore[no-untyped-def]
 
 @inlined
 def plane(moments, ridge):  # type: ignore[no-untyped-def]
-    """Return inverse depth at the origin and both slopes of the least-squares plane.
+    """Return inverse depth at the origin and both slopes of the plane of `add_moments`' sums (9,).
 
-    ``moments`` (9,) are the sums of `add_moments`. ``ridge`` is a variance (px²) added in both
-    directions: pixels on one line do not tilt the plane across the line.
+    ``ridge``, a variance (px²), keeps pixels on one line from tilting the plane across the line.
     """
     n = moments[0]
     u, v, w = moments[1] / n, moments[2] / n, moments[6] / n

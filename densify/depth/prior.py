@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Complete depth from a depth image of the user (the prior), such as one of a monocular network.
 
-A robust curve converts the values of the prior to metres. The remaining error differs over the
-image. It is corrected by a membrane in the logarithm of depth, tied to the known pixels and torn at
-the prior's own depth discontinuities (random walks, Grady, "Random walks for image segmentation",
-PAMI 2006).
+A robust curve converts the prior to metres. The remaining error is corrected by a membrane in log
+depth, tied to the known pixels and torn at the prior's own depth discontinuities (random walks,
+Grady, "Random walks for image segmentation", PAMI 2006).
 """
 
 from __future__ import annotations
@@ -39,15 +38,11 @@ _EMPTY = 2 * np.log(FAR_M)  # logarithm of a depth beyond all others
 def complete(depth_map: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
     """Return the depth map with pixels of the prior where it has no measured or filled depth.
 
-    A pixel stays empty if the prior has no value, shows sky by the mask, or is beyond ``FAR_M`` or
-    at its far limit. Pixels on the blurred transition between two surfaces stay empty too. A prior
-    that does not fit is not used. Confidences are a ranking. A pixel of the prior has at most 0.2,
-    less where the prior is steep or deviates from known pixels nearby. All known pixels have more.
-
-    Args:
-        depth_map: The map to complete.
-        prior: Depth image of the user, of the map's shape and measure of depth.
-        kind: What the prior's values are: ``depth``, ``inverse`` (depth) or ``auto``.
+    ``prior`` has the map's shape and measure of depth; ``kind`` says what its values are,
+    ``depth``, ``inverse`` or ``auto``. A prior that does not fit is not used. A pixel stays empty
+    without a value, in the sky of the mask, beyond ``FAR_M``, at the prior's far limit, and on the
+    blurred transition between two surfaces. Confidences are a ranking: at most 0.2 for the prior,
+    less where it is steep or deviates from known pixels nearby, more for all known pixels.
     """
     has_value = (prior.value > 0) & ~prior.sky
     has_depth = depth_map.filled_m > 0
@@ -88,14 +83,9 @@ def complete(depth_map: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth
 
 
 def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
-    """Return the curve from the values of a prior to depth with the least ``residual``.
+    """Return the curve from values (N,) of a prior to depths (N,) in metres, least ``residual``.
 
-    A curve that turns near into far is rejected.
-
-    Args:
-        value: (N,) values of the prior, above 0.
-        depth_m: (N,) depths of the same pixels in metres, above 0.
-        kind: As in `complete`.
+    Both are above 0, ``kind`` is as in `complete`. A curve that turns near into far is rejected.
     """
     p, z = value.astype(np.float64), depth_m.astype(np.float64)
     fits = [_fit_form(form, p, z) for form in _FORMS[kind]]
@@ -126,11 +116,7 @@ def _fit_form(form: str, p: Float, z: Float) -> PriorFit:
 
 
 def _fit_curve(form: str, p: Float, z: Float) -> tuple[float, float]:
-    """Return scale and shift of the curve of one form through values p and depths z, both (N,).
-
-    The curve is log(z) = scale · log(p) + shift for the form ``log``, z = scale · p + shift for
-    ``depth``, and 1 / z = scale · p + shift for ``inverse``.
-    """
+    """Return scale and shift of a curve of one form through values p and depths z, both (N,)."""
     # Values are divided by their median, so that both unknowns are of similar size.
     unit = float(np.median(p))
     ones = np.ones(len(z))
@@ -196,10 +182,7 @@ class _Cells(NamedTuple):
         return sparse.diags_array(weights.sum(axis=1)) - weights
 
     def at_pixels(self, values: Float, guide: Float32) -> Float:
-        """Return (K,H,W) the values (K,RC) of cells, interpolated between four cells.
-
-        ``guide`` (H,W) is the logarithm of depth of the pixels.
-        """
+        """Return (K,H,W) the cells' values (K,RC) between four cells, by log depth ``guide``."""
         grid = values.reshape(-1, *self.guide.shape)
         # Positions of the image's rows and columns, in cells from the centre of the first
         down, right = ((np.arange(length) - self.size // 2) / self.size for length in guide.shape)
@@ -227,15 +210,7 @@ def _cells_beside(position: Float, num_cells: int) -> list[tuple[Int, Float]]:
 def _correction(
     filled_m: Float32, log_depth: Float, guide: Float32, steepness: Float32, usable: Bool
 ) -> tuple[Float, Float]:
-    """Return (H,W) the correction of the logarithm of depth, and (H,W) its remaining error.
-
-    Args:
-        filled_m: (H,W) known depth, 0 for none.
-        log_depth: (H,W) logarithm of depth by the prior's curve.
-        guide: The same, smoothed.
-        steepness: Range of the guide around each pixel.
-        usable: True where the prior has a depth.
-    """
+    """Return (H,W) the correction of the prior's log depth, and (H,W) its remaining error."""
     cells = _Cells.over(guide)
     area, num_cells = cells.size**2, cells.guide.size
     # Pixels on another surface than the centre of their cell do not tie the cell.

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Follow the rays of a window's sweeps: where they start, and how they meet moving objects.
 
-Rays that meet a moving object are moved along with it to the key sweep's time. They show its body:
-where they end on its hull it is closed, where they pass it is open. They also complete its box
-along the sides that no sweep saw. A side is seen if rays pass or end close beside it. Where no ray
-was, a box grows to the usual size of a vehicle of its width or length, but not into space that rays
-passed through. It stands on the ground.
+These rays are moved along with the object to the key sweep's time: where they end on its hull its
+body is closed, where they pass it is open. Where no ray was, its box grows to the usual size of a
+vehicle of its width or length, and down to the ground.
 """
 
 from __future__ import annotations
@@ -46,10 +44,7 @@ class Rays:
     key: int  # frame number of the key sweep
 
     def origins_of(self, cloud: Cloud) -> Float:
-        """Return the (M,3) origins of the rays of a cloud's M points, at their firing times.
-
-        They are in the key sweep's lidar frame.
-        """
+        """Return the (M,3) origins at firing time of M points' rays, key sweep's lidar frame."""
         origins = np.empty((len(cloud), 3))
         for frame in np.unique(cloud.frame).tolist():
             rows = np.flatnonzero(cloud.frame == frame)
@@ -93,22 +88,15 @@ def _find_returns(sweep: Sweep, numbers: Int) -> Int:
 
 
 def half_spaces(corners: Float) -> Float:
-    """Return the (F,4) sides of the corners' (V,3) convex hull: unit normal n and offset d.
-
-    A point x is inside if n · x + d ≤ 0 for all sides.
-    """
+    """Return the (F,4) sides n, d of the corners' (V,3) convex hull, inside if n · x + d ≤ 0."""
     return np.unique(ConvexHull(corners).equations, axis=0)
 
 
 def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float, Float]:
     """Return the (K,) t at which lines start + t · direction enter a convex body, and leave it.
 
-    A line that misses the body leaves before it enters.
-
-    Args:
-        spaces: (F,4) sides of the body from `half_spaces`.
-        start: (K,3) points on the lines, or (3,) for all lines.
-        direction: (K,3) directions of the lines, of any length.
+    A line that misses it leaves first. ``spaces`` is (F,4), ``start`` (K,3) or (3,), ``direction``
+    (K,3).
     """
     enter, leave = np.full(len(direction), -np.inf), np.full(len(direction), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -124,10 +112,7 @@ def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float,
 
 
 def passes_near(corners: Float, start: Float, direction: Float) -> Bool:
-    """Return (K,) True for lines that meet a sphere around the corners (V,3).
-
-    The lines are those of `find_crossing`.
-    """
+    """Return (K,) True for lines of `find_crossing` that meet a sphere around corners (V,3)."""
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius_m = np.linalg.norm(corners - middle, axis=1).max()
     # The distance of a line from the middle, times the length of its direction
@@ -151,14 +136,7 @@ class ObjectRays(NamedTuple):
 def rays_toward(
     cloud: Cloud, rays: Rays, rows_of: Mapping[int, Int], corners: Mapping[int, Float]
 ) -> dict[int, ObjectRays]:
-    """Return the rays of all sweeps that may meet the hull of each object, by instance number.
-
-    Args:
-        cloud: The cloud that the rays measured.
-        rays: The rays of the window's sweeps.
-        rows_of: Indices of each object's points in the cloud.
-        corners: (V,3) corners of each object's hull at the key's time, key sweep's lidar frame.
-    """
+    """Return the rays that may meet each object's hull, (V,3) corners, by instance number."""
     by_sweep: dict[int, list[ObjectRays]] = {instance: [] for instance in rows_of}
     for frame in rays.stretch.frames if rows_of else ():
         for instance, object_rays in _sweep_rays(cloud, rays, frame, rows_of, corners).items():
@@ -214,11 +192,7 @@ def _sweep_rays(
 
 
 def _may_meet(xy: Float32, bound_m: float, corners: Float) -> Bool:
-    """Return (N,) True for returns at xy (2,N) whose rays may meet a hull with corners (V,3).
-
-    Both are in metres from the lidar at the sweep's reference time. The rays start up to
-    ``bound_m`` metres from the lidar.
-    """
+    """Return (N,) True for returns at xy (2,N) m whose rays may meet a hull with corners (V,3)."""
     x, y, _ = corners.T
     middle = np.array([x.mean(), y.mean()])
     range_m = np.hypot(*middle)
@@ -248,10 +222,7 @@ class MovingBody(NamedTuple):
 def find_moving_bodies(
     cloud: Cloud, rays: Rays, exposures: Collection[Exposure]
 ) -> dict[int, MovingBody]:
-    """Return the bodies of moving objects in view of a camera, by instance number.
-
-    Objects whose points span no volume have no body. The ``rays`` measured the ``cloud``.
-    """
+    """Return the bodies, if of any volume, of moving objects a camera sees, by instance number."""
     moving = np.flatnonzero(cloud.moving & (cloud.instance >= 0))
     instance_of = cloud.instance[moving]
     rows_of = {
@@ -279,11 +250,7 @@ def find_moving_bodies(
 def without_sweep(
     bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
 ) -> dict[int, MovingBody]:
-    """Return the bodies without the points and rays of sweep ``frame``.
-
-    ``cloud`` has the points of all other sweeps. Bodies whose points there span no volume are left
-    out.
-    """
+    """Return the bodies that still span a volume without the points and rays of a sweep."""
     reduced_bodies = {}
     for instance, body in bodies.items():
         corners = _hull_corners(cloud.points[cloud.moving & (cloud.instance == instance)])
@@ -296,10 +263,7 @@ def without_sweep(
 
 
 def _hull_corners(points: Float) -> Float:
-    """Return the (V,3) hull corners of the points (N,3) that have other points around.
-
-    There are none if the points span no volume.
-    """
+    """Return the (V,3) hull corners of points (N,3) with others around, none without a volume."""
     # One more point than needed: the nearest is the point itself.
     distance_m, _ = KDTree(points).query(points, [_LEAST_NEAR + 1])
     points = points[np.ravel(distance_m) <= _NEAR_M]
@@ -329,14 +293,7 @@ def _body(
 def complete_boxes(
     tracks: Sequence[ObjectTrack], cloud: Cloud, rays: Rays, ground: HeightMap
 ) -> tuple[ObjectTrack, ...]:
-    """Return the tracks with completed boxes, and with the sides that were seen.
-
-    Args:
-        tracks: The tracked objects, with boxes around their points.
-        cloud: The cloud of the window.
-        rays: The rays that measured the cloud.
-        ground: The ground in the world frame of their sweeps.
-    """
+    """Return the tracks with completed boxes, and with the sides that were seen."""
     tracks = [_lower_to_ground(track, rays, ground) for track in tracks]
     reach = {track.instance: _reach_corners(track, rays.key) for track in tracks}
     rows_of = {
@@ -382,10 +339,7 @@ def _reach_corners(track: ObjectTrack, key: int) -> Float:
 
 
 def corners_of(size_m: Float) -> Float:
-    """Return the (8,3) corners of a box of (3,) metres around the origin.
-
-    Corners at the bottom and at the top take turns.
-    """
+    """Return the (8,3) corners, bottom and top in turn, of a box of (3,) m around the origin."""
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1)
     corners: Float = signs.reshape(-1, 3) * size_m / 2
     return corners
@@ -424,16 +378,7 @@ def _share_growth(missing_m: float, room_m: Sequence[float]) -> list[float]:
 def _free_m(
     size_m: Float, missing_m: Float, axis: int, sign: int, start: Float, to_return: Float
 ) -> float:
-    """Return the metres from a side of a box to the nearest free space outside; inf for none.
-
-    Args:
-        size_m: (3,) size of the box, around the origin.
-        missing_m: (3,) greatest growth of the box along each axis.
-        axis: Axis across the side.
-        sign: -1 for the side at the lower end of the axis, 1 for the upper.
-        start: (K,3) origins of rays in the frame of the box.
-        to_return: (K,3) vectors from the origins to the returns.
-    """
+    """Return the metres from a side of a box to the nearest free space outside; inf for none."""
     # The space outside the flat part of the side; vertical sides are tested below the windows.
     half = np.stack([-size_m / 2, size_m / 2])
     low, high = _MIDDLE * half
@@ -460,10 +405,7 @@ def _box_spaces(low: Float, high: Float) -> Float:
 
 
 def grow_box(track: ObjectTrack, axis: int, before_m: float, after_m: float) -> ObjectTrack:
-    """Return the track with a longer box.
-
-    The box grows along ``axis`` by ``before_m`` at its lower end and by ``after_m`` at its upper.
-    """
+    """Return the track, its box longer along ``axis`` by metres at its lower and upper end."""
     size_m, T_key_object = track.size_m.copy(), track.T_key_object.copy()
     size_m[axis] += before_m + after_m
     shift_m = (after_m - before_m) / 2

@@ -95,15 +95,8 @@ class Views:
     ) -> Views:
         """Return the cameras and times of the maps of a key sweep.
 
-        Images are used unless ``project.rims`` is ``strict`` or they are misaligned (`is_off`).
-
-        Args:
-            sequence: The recording.
-            stretch: Registered sweeps of the window.
-            key: Frame number of the key sweep.
-            shots: What each map shows, by name of the map.
-            images: (H,W,3) RGB images by name of the map.
-            settings: Configuration of the run.
+        ``shots`` and RGB ``images`` (H,W,3) are by map name. Images are used unless
+        ``project.rims`` is ``strict`` or they are misaligned (`is_off`).
         """
         sensors = Sensors.of(stretch.sweeps)
         exposures = {
@@ -150,10 +143,7 @@ class Views:
     def see_far(
         self, world: StandingWorld, T_key_world: Float, stretch: Stretch, standing_only: bool
     ) -> SeenCloud:
-        """Return the points of sweeps beyond the window, as the cameras see them.
-
-        The arguments are those of `densify.depth.far.far_cloud`.
-        """
+        """Return the points of sweeps beyond the window as cameras see them, see `far_cloud`."""
         cloud, surface = far_cloud(
             world, T_key_world, stretch, self.key, self.exposures, standing_only
         )
@@ -162,11 +152,7 @@ class Views:
     def depth_maps(
         self, seen: SeenCloud, visible: bool = True, filled: bool = True
     ) -> dict[str, DepthMap]:
-        """Return the depth map of each view by name.
-
-        ``visible`` leaves out occluded and unsupported points. ``filled`` interpolates between
-        measured pixels.
-        """
+        """Return each view's depth map by name, of ``visible`` points, ``filled`` in between."""
         settings = replace(self.settings, visibility=visible)
         depth_maps = {}
         for name, view in seen.in_view.items():
@@ -192,16 +178,7 @@ class Views:
         depth_maps: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
-        """Return the cloud with the colours of the images that observe its points.
-
-        A point is observed unless it is clearly behind the depth of its pixel. Pixels without
-        depth give no colour.
-
-        Args:
-            seen: The cloud and its points in the images.
-            depth_maps: Depth maps of the cloud, by name of the map.
-            images: (H,W,3) RGB images, by name of the map.
-        """
+        """Return the cloud with colours of the RGB images (H,W,3) that observe its points."""
         rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
             view = seen.in_view[name]
@@ -215,14 +192,10 @@ class Views:
     def with_confidence(
         self, seen: SeenCloud, cloud: Cloud, depth_maps: Mapping[str, DepthMap]
     ) -> Cloud:
-        """Return the cloud with the greatest confidence of the pixels that agree with each point.
+        """Return the cloud with each point's greatest confidence of the pixels that agree with it.
 
-        A pixel agrees if the point is no outlier there. Points that no map confirms have 0.
-
-        Args:
-            seen: The points in the images.
-            cloud: The same points.
-            depth_maps: Maps made of them, by name.
+        A pixel agrees if the point is no outlier there; 0 where none does. ``seen`` are the points
+        in the images, the maps are made of them.
         """
         confidence = np.zeros(len(cloud), np.float32)
         for name, view in seen.in_view.items():
@@ -268,11 +241,7 @@ class Views:
     def rejection_reasons(
         self, seen: SeenCloud, depth_maps: Mapping[str, DepthMap]
     ) -> dict[str, NDArray[np.uint8]]:
-        """Return by map name (H,W) the `Reason` of the nearest rejected point in each pixel.
-
-        Pixels without a rejected point have 0. A point that lost its pixel to another point is not
-        rejected.
-        """
+        """Return by map (H,W) the `Reason` of each pixel's nearest rejected point, 0 for none."""
         reason_maps = {}
         for name, view in seen.in_view.items():
             reason = depth_maps[name].reason[view.rows]
@@ -293,16 +262,7 @@ class Views:
         bodies: Mapping[int, MovingBody],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> dict[int, Mover]:
-        """Return every moving object alone, by instance number.
-
-        Moving points without an object are together, with the number -1.
-
-        Args:
-            cloud: The cloud of the window.
-            visible: Leave out occluded and unsupported points.
-            bodies: Hulls of the moving objects, by instance number.
-            images: (H,W,3) RGB images, by name of the map.
-        """
+        """Return every moving object alone, by instance number; -1 for points of no object."""
         movers = {}
         for instance in np.unique(cloud.instance[cloud.moving]).tolist():
             seen = self.see(cloud.select(cloud.moving & (cloud.instance == instance)))
@@ -334,8 +294,8 @@ def optical_flow(
 ) -> Float32:
     """Return the (H,W,2) flow in pixels, right and down, between two exposures; NaN if unknown.
 
-    The flow includes ego-motion, and moving objects continue at their velocity. Pixels that only a
-    laser spot covers take the flow of the nearest measured pixel. Other filled pixels have none.
+    It includes ego-motion; moving objects keep their velocity. Pixels under a laser spot take the
+    flow of the nearest measured pixel, other filled pixels have none.
     """
     chosen = np.flatnonzero(depth_map.reason == Reason.KEPT)
     points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
@@ -354,15 +314,10 @@ def optical_flow(
 def with_ages(
     depth_map: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: float
 ) -> DepthMap:
-    """Return the map with ``age_s``, seconds between its time and the source sweep of each pixel.
+    """Return the map with ``age_s``, seconds from each pixel's source sweep to the map's time.
 
-    A filled pixel has the age of the nearest measured pixel in the image.
-
-    Args:
-        depth_map: The map.
-        stamps_ns: Times of the sweeps by frame number.
-        key: Frame number of the key sweep.
-        late_s: Time that the map shows, in seconds after the key sweep.
+    That time is ``late_s`` after the key sweep. Filled pixels have the nearest measured pixel's
+    age.
     """
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
     age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
@@ -396,10 +351,7 @@ class HeldOut:
 
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
-        """Return the ground truth of a key sweep.
-
-        ``cloud`` has the points of the window's sweeps, and velocities of its moving points.
-        """
+        """Return the ground truth of a key sweep; ``cloud`` has velocities of moving points."""
         settings = replace(views.settings, rims="strict", visibility=True)
         key_cloud = cloud.select(cloud.frame == views.key)
         seen = views.see(key_cloud)
@@ -429,11 +381,7 @@ class HeldOut:
         return SeenCloud(cloud, seen.patches.select(keep), in_view, bodies)
 
     def judged_maps(self, seen: SeenCloud, visible: bool) -> dict[str, JudgedMap]:
-        """Return each map made without the key sweep with its ground truth, by name of the map.
-
-        Returns from far inside a moving body are no ground truth: they passed its windows, but the
-        map shows the glass. The result is empty if no points remain.
-        """
+        """Return each map made without the key sweep with its truth, by name; {} without points."""
         neighbours_only = self.without_key(seen)
         if not len(neighbours_only.cloud):
             return {}
@@ -450,9 +398,8 @@ class HeldOut:
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Return the scores of each map made without the key sweep, None if no points remain.
 
-        Besides `depth_metrics.depth_scores` each has the ``curve`` of precision over density,
-        ``reliability``, and the share ``unjudged`` of filled pixels without a return of the key
-        sweep within a ray spacing.
+        Besides `depth_scores` these are ``curve`` (precision over density), ``reliability``, and
+        ``unjudged``, the filled share without a key return within a ray spacing.
         """
         scores: dict[str, Any] = {}
         for name, judged in self.judged_maps(seen, visible).items():
@@ -470,10 +417,7 @@ class HeldOut:
     def _unjudged_shares(
         self, name: str, depth_map: DepthMap, bodies: Mapping[int, MovingBody]
     ) -> dict[str, float | None]:
-        """Return the share of a map's filled pixels without a return of the key sweep nearby.
-
-        The keys are ``all``, ``moving`` and ``static`` pixels; None for no pixels.
-        """
+        """Return the filled share (all, moving, static) without a key return nearby, or None."""
         exposure = self.views.exposures[name]
         to_return_px = ndimage.distance_transform_edt(self.key_alone[name].depth_m == 0)
         unjudged = to_return_px > self.gap_rad * exposure.camera.focal_px

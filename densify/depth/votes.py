@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Let the known pixels around a pixel vote on its depth, by their surfaces and the camera image.
 
-The first known pixel in each of 16 directions votes. A vote weighs less the more the image's
-colours change between both pixels, as in a bilateral grid or in geodesic matting. Two pixels
-without an image edge between them belong to the same surface.
+The first known pixel in each of 16 directions votes, with less weight the more the image's colours
+change in between, as in a bilateral grid or in geodesic matting.
 """
 
 from __future__ import annotations
@@ -60,10 +59,7 @@ from the right. Each step goes to one of the eight neighbours."""
 
 
 def steps_to_known(known: Bool) -> NDArray[np.uint8]:
-    """Return the (16,H,W) number of steps to the first known pixel in each of `DIRECTIONS`.
-
-    It is 0 at a known pixel, and `NONE` if there is no known pixel.
-    """
+    """Return (16,H,W) steps to the first known pixel in `DIRECTIONS`, 0 if known, or `NONE`."""
     # Two steps go up to two pixels beyond the image: there is a border of two on each side.
     padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
     steps = padded[:, 2:-2, 2:-2]
@@ -107,10 +103,9 @@ def offset(d, k):  # type: ignore[no-untyped-def]
 
 @inlined
 def extend(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
-    """Return the inverse depth of a pixel to which the surface of pixel (v, u) is extended.
+    """Return the inverse depth that the surface of pixel (v, u) has du columns and dv rows away.
 
-    Pixel (v, u) is du columns and dv rows away. ``inverse`` (H,W) is in 1/m, ``tilt`` (H,W,2) is
-    its slope to the right and down in 1/m per px.
+    ``inverse`` (H,W) is in 1/m, ``tilt`` (H,W,2) its slope right and down in 1/m per px.
     """
     known = inverse[v, u]
     return limit_inverse(known - tilt[v, u, 0] * du - tilt[v, u, 1] * dv, known)
@@ -134,18 +129,11 @@ def votes_for(
 ) -> Float32:
     """Return the (P,) weighted share of the votes, 0 to 1, that confirm the depth of each pixel.
 
-    A known pixel votes for the depth if its own surface, extended to the pixel, has that depth.
-    Otherwise it votes against. Edges of the image weaken votes.
-
-    Args:
-        record: Record with the image, the slopes and the spacing of rays.
-        maps_m: Depths (H,W) of the pixels that vote, 0 for other pixels. The least share of the
-            maps counts.
-        pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
-        depth_m: (P,) depths to confirm.
-        with_shifts: True takes the least share of five positions of the image, with a small
-            constant vote. The image is unshifted, and shifted by 0.6 ray spacings to each side.
-            False takes the unshifted image; the share is 0 without voters.
+    A known pixel votes for it if its own surface, extended to the pixel, has that depth. ``pixel``
+    (P,) are flat indices (row · W + column) of depths ``depth_m`` (P,). Of the ``maps_m``, (H,W)
+    depths of the pixels that vote, 0 for none, the least share counts. ``with_shifts`` takes the
+    least of five positions of the image, in place and 0.6 ray spacings to each side, with a small
+    constant vote; else the share is 0 without voters.
     """
     shares = np.ones((len(maps_m), len(pixel)), np.float32)
     # The kernel is compiled for each memory layout of its arrays: here they have one.
@@ -176,11 +164,7 @@ def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 @inlined
 def _cast_votes(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill in the 16 votes on the pixel in row v, column u; return the numbers for and against.
-
-    ``depth`` is in metres, ``gap`` in px. ``steps`` (16,) lead to the voter in each direction, 0
-    without a vote.
-    """
+    """Fill in the 16 votes on the pixel in row v, column u; return the numbers for and against."""
     tolerance_m = HIDDEN_M + HIDDEN_FRACTION * depth
     num_for, num_against = 0, 0
     for d in range(len(steps)):
@@ -199,11 +183,7 @@ def _cast_votes(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-unt
 
 @inlined
 def _colour_weight(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
-    """Return the weight exp(-c² / 2 s²) + ``_THROUGH`` of a vote by the colours of the image.
-
-    The voter is k steps in direction d from row v, column u. c² is the greatest squared colour
-    distance from the start along the path, and s is ``_COLOURS``.
-    """
+    """Return the weight of a vote by the greatest colour change on k steps in direction d."""
     if lab.size == 0:
         return 1 + _THROUGH
     stride = max(np.int64(gap / _STRIDE), 1)

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Examine a recording before it is densified: find probable errors and their remedies.
-
-A check in `CHECKS` compares the `Sample` as given with versions corrected for common mistakes.
-"""
+"""Examine a recording before it is densified: find probable errors and their remedies."""
 
 from __future__ import annotations
 

@@ -95,11 +95,7 @@ def _check_images(sample: Sample, camera: Camera) -> Finding:
 def camera_views(
     sample: Sample, camera: Camera, silhouettes: dict[int, Silhouettes]
 ) -> tuple[list[View], str]:
-    """Return views (a sweep and its nearest image) from all registered spots.
-
-    The first image that cannot be read ends the views. The second value is its error, "" if all
-    images can be read. Missing ``silhouettes``, by frame, are added.
-    """
+    """Return all spots' views up to the first unreadable image, and its error, "" for none."""
     stamps_ns = sample.sequence.image_stamps_ns(camera.name)
     pairs = _pair_images(sample, stamps_ns)
     num_views = max(_LEAST_IMAGES, _MOST_IMAGES // len(sample.sequence.cameras))
@@ -146,10 +142,7 @@ def correct_common_mistakes(T_cam_lidar: Float) -> dict[str, Float]:
 
 
 def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
-    """Return findings about the calibration and, if it can be fitted, about the camera's clock.
-
-    The given calibration is compared with nearby offsets and with common mistakes.
-    """
+    """Return findings about the calibration and, if it can be fitted, about the camera's clock."""
     name = f"{camera.name}: calibration"
     num_images = len(views)
     if num_images < _LEAST_IMAGES:

@@ -196,11 +196,7 @@ def _own_returns(spots: list[Spot]) -> Float:
 
 
 def _own_candidates(points: Float, twist: Float, R_level_lidar: Float) -> Float:
-    """Return the points (K,3) of a sweep that are near enough to be of the own vehicle.
-
-    The ground is excluded, because it is at the same position in all sweeps too. ``twist`` (6,) is
-    the velocity of the lidar.
-    """
+    """Return the (K,3) points, without ground, near enough to be of the own vehicle."""
     range_m = np.linalg.norm(points, axis=1)
     close = points[range_m < _CLOSE_M]
     right = np.array([twist[4], -twist[3]]) / np.hypot(twist[3], twist[4])
@@ -255,10 +251,7 @@ def _with_times(sample: Sample, spot: Spot, sign: int) -> Spot:
 
 
 def _apart_m(spot: Spot) -> float:
-    """Return the median distance (m) of near points above ground between a spot's end sweeps.
-
-    It is at most 1 m, and 1 m for spots that are not registered or have too few points.
-    """
+    """Return the median distance (m) of near points of a spot's end sweeps; 1 m if unknown."""
     if spot.trajectory is None:
         return _APART_M
     first, last = spot.stretch.sweeps[0], spot.stretch.sweeps[-1]
@@ -342,10 +335,7 @@ def _format_position(position_m: Float) -> str:
 
 
 def find_origin(points: Float, start_m: Float) -> Float:
-    """Return the (3,) position near a start (3,) where the rings of points (N,3) are sharpest.
-
-    All are in metres, in the axes of the scanner.
-    """
+    """Return the position (3,), metres, near a start where the rings of (N,3) are sharpest."""
     # a coarse grid, with a sample of far points
     axes = [
         np.arange(-reach_m, reach_m + 1e-9, step_m)

@@ -30,11 +30,10 @@ class ChainedMotion:
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of all points of sweep ``frame`` to the reference time of ``target``.
 
-        The flow excludes ego-motion and is in the lidar frame of ``frame``. At each sweep on the
-        way, points of an object take the object's rigid motion there, plus the mean deviation of
-        the nearest points. Points without an object take the mean flow of the nearest moving
-        points. A point is lost if its object has no points in the next sweep, or if no moving point
-        is within 0.5 m.
+        It excludes ego-motion, in the lidar frame of ``frame``. At each sweep on the way, points of
+        an object take its rigid motion plus the mean deviation of the nearest points, others the
+        mean flow of the nearest moving points. A point is lost if its object has no points in the
+        next sweep, or if no moving point is within 0.5 m.
         """
         i = self.stretch.frames.index(frame)
         j = self.stretch.frames.index(target)

@@ -51,18 +51,17 @@ class SharedMotion(Motion, Protocol):
 
 
 class EngineModule(Protocol):
-    """The functions of an engine's module.
+    """The functions of an engine's module, perhaps with ``check_argument(argument: str) -> None``.
 
-    The module may also have ``check_argument(argument: str) -> None``. The function is called
-    before anything is computed, and raises InputError for a bad argument.
+    It is called before anything is computed, and raises InputError for a bad argument.
     """
 
     def estimate_motion(self, scene: Scene, settings: Config, argument: str) -> Motion:
         """Return the motion of all points in the scene; the same input gives the same bytes.
 
-        ``argument`` is the part of ``flow.engine`` after the colon, "" without a colon. Work may be
-        postponed until the motion's ``flow`` is called. An engine whose row in the plugin table
-        says ``shared`` returns a `SharedMotion`.
+        ``argument`` is what follows the colon in ``flow.engine``, or "". Work may wait until the
+        motion's ``flow`` is called. An engine that its plugin row calls ``shared`` returns a
+        `SharedMotion`.
         """
         ...
 

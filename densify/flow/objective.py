@@ -2,8 +2,8 @@
 """Solve the scene flow objective of Pontes, Hays, Lucey (3DV 2020) between two clouds.
 
 ``adam`` is the published protocol. ``pcg`` alternates nearest neighbours with preconditioned
-conjugate gradients. It reaches the same or a lower energy in a fraction of the time. The engine
-``paper`` solves the objective between neighbouring sweeps, above the ground.
+conjugate gradients, and reaches the same or a lower energy in a fraction of the time. The engine
+``paper`` solves it between neighbouring sweeps, above the ground.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
     """Return the weights W of the undirected k-nearest-neighbour graph of points (n,3), metres.
 
     W is (n,n) symmetric float64, with ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is
-    among the k nearest of the other, 1 on the diagonal, 0 elsewhere. k excludes the point itself
-    and is at most n - 1. A larger k couples the flow of points farther apart.
+    among the k nearest of the other, itself excluded, 1 on the diagonal, 0 elsewhere; k is at most
+    n - 1. A larger k couples the flow of points farther apart.
     """
     if num_neighbors < 1:
         raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
@@ -75,9 +75,8 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
 def laplacian(weights: csr_array) -> csr_array:
     """Return the (n,n) graph Laplacian ``L = D^-1/2 (D - W) D^-1/2`` of the W of `knn_graph`.
 
-    L is symmetric, positive semi-definite, float64. The degree D holds the row sums of W with
-    ``W_ii = 1``, as in the paper. The null space of L is ``D^1/2 · 1``: a constant flow costs
-    energy where the density changes.
+    L is symmetric, positive semi-definite, float64. D holds the row sums of W with ``W_ii = 1``, as
+    in the paper. The null space is ``D^1/2 · 1``: constant flow costs energy where density changes.
     """
     degree = weights.sum(axis=1)
     scale = diags_array(1.0 / np.sqrt(degree))
@@ -132,14 +131,10 @@ def solve(
     settings: SolverSettings | None = None,
     initial: ArrayLike | None = None,
 ) -> Solution:
-    """Return the smooth flow that moves ``source`` onto ``target``, a minimum of the objective.
+    """Return the smooth flow that moves ``source`` (n,3) onto ``target`` (m,3), metres, one frame.
 
-    All is computed in float64. The same input gives the same bytes on the same CPU.
-
-    Args:
-        source: (n,3) metres.
-        target: (m,3) metres, in the same frame.
-        initial: (n,3) flow to start from, None for 0. With it, pcg uses the final alpha at once.
+    Computed in float64; the same input gives the same bytes on the same CPU. From an ``initial``
+    flow (n,3), None for 0, pcg uses the final alpha at once.
     """
     settings = settings or SolverSettings()
     points = checked_cloud(source, "source")
@@ -307,7 +302,7 @@ def flow_between(
     settings: ObjectiveSettings,
     initial: ArrayLike | None = None,
 ) -> FlowField:
-    """Return the flow of a source cloud (N,3) to a target (M,3), by the published objective.
+    """Return the flow of a source (N,3) to a target (M,3), metres, by the published objective.
 
     With ``static_prior`` only groups that certainly move have flow. See `densify.estimate_flow`.
     """

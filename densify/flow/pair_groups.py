@@ -2,13 +2,10 @@
 """Find the rigid groups of one cloud that certainly moved to another position in another cloud.
 
 The rings of a scanner hit other parts of an object after it has moved. A point therefore costs
-nothing anywhere along a surface of the other cloud, and costs more away from the surface. A surface
-is a normal distribution, fitted to neighbours that are thinned until they span several rings
-(Biber, Straßer, "The Normal Distributions Transform", IROS 2003).
-
-A vote proposes the displacements that bring most points of a group close to the other cloud (Hough
-1962). The group is aligned from each of them. A motion is judged by the likelihood ratio of both
-clouds: the group moves, or it is static. Points with firing times are compared at their own times.
+nothing anywhere along a surface of the other cloud, a normal distribution fitted to neighbours
+thinned until they span several rings (Biber, Straßer, "The Normal Distributions Transform", IROS
+2003). A vote proposes displacements (Hough 1962), from which the group is aligned. The likelihood
+ratio of both clouds judges if it moves. Firing times, where known, place the points.
 """
 
 from __future__ import annotations
@@ -114,10 +111,7 @@ _MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # greatest heights of a group's lowest and h
 
 
 def find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
-    """Return (N,) True for points of ``cloud`` without a counterpart in ``other_cloud``.
-
-    A counterpart is a point of the other cloud within 0.1 m, or one of its surfaces.
-    """
+    """Return (N,) True for points without a counterpart: no other surface or point in 0.1 m."""
     unmatched = np.flatnonzero(~is_near(tree_of(other_cloud.points), cloud.points, _NOISE_M))
     surface = Surface(other_cloud.points[other_cloud.evenly(np.arange(len(other_cloud.points)))])
     unexplained = np.zeros(len(cloud.points), bool)
@@ -128,8 +122,8 @@ def find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
 def group_around(points: Float, unexplained: Bool) -> Int:
     """Return (N,) labels of the groups of points (N,3) that may be moving, -1 for none.
 
-    Connected points form one group if it is no longer than a vehicle. In longer groups, such as
-    walls, only points close to ``unexplained`` (N,) points form groups.
+    Connected points form one group if no longer than a vehicle. In longer groups, such as walls,
+    only points close to ``unexplained`` (N,) points form groups.
     """
     num_groups, group = link(points, LINK_M)
     low = np.full((num_groups, 2), np.inf)
@@ -146,13 +140,7 @@ def group_around(points: Float, unexplained: Bool) -> Int:
 
 
 def road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
-    """Return the rows of each group that may be a road user, and not a treetop or a wall.
-
-    Args:
-        group: (N,) label of each point's group, -1 for none.
-        unexplained: (N,) True for points without a counterpart in the other cloud.
-        height_m: (N,) height of the points above the ground.
-    """
+    """Return the rows of each group (N,) that may be a road user, and not a treetop or a wall."""
     rows = np.flatnonzero(group >= 0)
     rows = rows[np.argsort(group[rows], kind="stable")]
     begins = np.flatnonzero(np.diff(group[rows])) + 1  # where the label changes
@@ -230,11 +218,7 @@ class Proposal:
         return bool(np.linalg.norm(offset) < FIT_M)
 
     def moves(self, free: Bool | None = None) -> bool:
-        """Return True if the group certainly moves.
-
-        Args:
-            free: (K,) True for target points that no other motion explains. None for all.
-        """
+        """Return True if the group certainly moves; ``free`` (K,) target points count, or all."""
         counted_gain = self.target_gain
         if free is not None:
             counted_gain = self.target_gain[free | (self.target_gain < 0)]
@@ -246,15 +230,10 @@ class Proposal:
 def judge(
     group: int, members: Int, motion: RigidMotion, source: PairCloud, target: PairCloud
 ) -> Proposal:
-    """Return a motion of one group as a proposal, with the evidence that the group moves.
+    """Return a motion of one group, of source rows (K,), as a proposal with its evidence.
 
-    Source points are compared with the target. Target points are compared with the source, in which
-    only the group moves: points that stay at its old position count against the motion.
-
-    Args:
-        group: Index of the group.
-        members: (K,) rows of the group's source points.
-        motion: Motion of the group that is judged.
+    Target points are compared with the source, in which only the group moves: points that stay at
+    its old position count against the motion.
     """
     static = replace(motion, state=np.zeros(4))
     members = source.evenly(members)
@@ -281,14 +260,9 @@ def judge(
 def compare(
     source: PairCloud, members: Int, target: PairCloud, motion: RigidMotion
 ) -> tuple[Float, Int]:
-    """Compare source points with the target's surfaces, which are moved back by a motion.
+    """Return the (K,) costs of source rows (K,) at the target's surfaces, moved back by a motion.
 
-    Args:
-        members: (K,) rows of the source points.
-
-    Returns:
-        The (K,) costs of the source points, and the indices of the target points that come close
-            to the source points when they are moved back.
+    Also the indices of the target points that, moved back, come close to these points.
     """
     points = motion.at_start(source, members)
     positions = [motion.place(points, share) for share in (target.share.min(), target.share.max())]
@@ -311,12 +285,7 @@ class Search:
     initial: Float | None
 
     def proposals(self, group: int, members: Int) -> list[Proposal]:
-        """Return the motions by which a group may move, with their evidence.
-
-        Args:
-            group: Index of the group.
-            members: (K,) rows of the group's source points.
-        """
+        """Return the motions by which a group, source rows (K,), may move, with their evidence."""
         points = self.source.points[members]
         centre = points.mean(axis=0)
         reach_m = MAX_SPEED_M_S * min(self.apart_s or _USUAL_S, _LONGEST_S)
@@ -342,14 +311,10 @@ class Search:
         return [proposal for proposal in judged if proposal.moves()]
 
     def refine(self, proposal: Proposal, members: Int) -> Proposal:
-        """Return the proposal with the most likely motion nearby, by a pattern search.
+        """Return the proposal with the most likely motion nearby, for source rows (K,).
 
         Alignment is biased towards positions at which scan lines match scan lines. The likelihood
         is not. Pattern search: Hooke, Jeeves, JACM 1961.
-
-        Args:
-            proposal: Motion of the group to start from.
-            members: (K,) rows of the group's source points.
         """
         slope = _slope_of(self.ground, proposal.motion.centre)
         # Steps (x, y, z, yaw): along the motion, across the motion, and about the vertical
@@ -458,17 +423,11 @@ def find_movers(
     apart_s: float | None = None,
     initial: Float | None = None,
 ) -> tuple[list[RigidMotion], Int]:
-    """Return the motions of the moving groups, and the group of each source point.
+    """Return the motions of the moving groups, and (N,) each source point's motion, or -1.
 
-    Args:
-        source: N points above the ground.
-        target: M points of the other cloud above the ground, in the same frame.
-        height_m: (N,) height of the source points above the ground.
-        apart_s: Time between the clouds, None if unknown. The search covers up to 38 m/s.
-        initial: (N,3) flow. The search of a group also starts at the median flow of its members.
-
-    Returns:
-        The motions, and (N,) the index of each source point's motion, -1 for static points.
+    Both clouds, N and M points, are above the ground in one frame; ``height_m`` (N,) is the
+    source's height above it. The search covers up to 38 m/s over ``apart_s``, None if unknown, and
+    also starts at a group's median ``initial`` (N,3) flow.
     """
     clouds = source, target
     with ThreadPoolExecutor(2) as pool:

@@ -27,13 +27,7 @@ _LOOSE = 10.0
 
 
 def apply(state: Float, points: Float, centre: Float) -> Float:
-    """Return the (N,3) points of an object, turned about its centre and displaced.
-
-    Args:
-        state: (4,) state of all points, or (N,4) one for each point.
-        points: (N,3) metres.
-        centre: (3,) centre of the rotation, or (N,3) one for each point.
-    """
+    """Return points (N,3), metres, turned about their centre and displaced by (4,) or (N,4)."""
     return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
 
@@ -53,12 +47,9 @@ def _turned(arms: Float, yaw: float | Float) -> Float:
 
 
 def surface_information(points: Float, rows: Int, loose: float = 1.0) -> Float:
-    """Return the (N,3,3) inverse covariances (1/m²) of a surface at N positions.
+    """Return the (N,3,3) inverse covariances (1/m²) of a surface ``points`` (M,3) at N positions.
 
-    Args:
-        points: (M,3) points of the surface, metres.
-        rows: (N,k) rows of the neighbours that span the surface at each position.
-        loose: Factor of the covariance. Above 1 the surface constrains less.
+    ``rows`` (N,k) are the neighbours that span it there; ``loose`` above 1 constrains less.
     """
     offset = points[rows]
     offset -= offset.mean(axis=1, keepdims=True)
@@ -94,14 +85,10 @@ class Model:
     ) -> Float | None:
         """Return the state (4,) that fits the model to the points, None for too few matches.
 
-        Displacement x, y and yaw are solved with Tukey weights. The height z stays as predicted: on
-        an object hit by few beams it would follow the beams. Of many points some 250 are used.
-
-        Args:
-            points: (N,3) world, metres, all at one time.
-            centre: (3,) centre of the rotation, object's frame.
-            predicted: (4,) state to start from.
-            prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
+        ``points`` (N,3) are metres, world, at one time; ``centre`` (3,) is in the object's frame.
+        Displacement x, y and yaw are solved with Tukey weights from the ``predicted`` state (4,)
+        with standard deviation (3,) of x, y (m), yaw (rad). The height z stays as predicted: on an
+        object hit by few beams it would follow the beams. Of many points some 250 are used.
         """
         points = np.ascontiguousarray(points[:: max(1, len(points) // _NUM_ALIGNED)])
         state = predicted.copy()
@@ -121,10 +108,7 @@ class Model:
 
 @inlined
 def _nearest(point: Float, surface: Float, within_m: float) -> tuple[int, float]:
-    """Return the row of the nearest surface point within ``within_m``, and its squared distance.
-
-    The row is -1 if there is none. ``surface`` (M,3) ascends in x.
-    """
+    """Return the row in ``surface`` (M,3), ascending in x, and squared distance; -1 for none."""
     # The search starts at the point's x, and ends where x alone is farther than the nearest point.
     nearest_row, nearest_squared = -1, within_m**2
     middle = np.searchsorted(surface[:, 0], point[0])

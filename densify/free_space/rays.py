@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Measure the rays of a scanner, and how they sample directions: in rings, lines, or unordered.
-
-Only in the scanner's frame at the firing time do the returns form rings. Angles are in radians.
-"""
+"""Measure the rays of a scanner (angles in radians), and how they sample directions."""
 
 from __future__ import annotations
 
@@ -228,10 +225,7 @@ def _default_layout() -> Layout:
 
 
 def find_rings(elevation: Float32) -> Float | None:
-    """Return the (K,) ascending elevations of the rings, None if the returns are not on rings.
-
-    Rings are separate peaks of a fine histogram of (N,) elevations that hold nearly all returns.
-    """
+    """Return the (K,) ascending elevations of the rings, None if the returns are not on rings."""
     # The last bin but one holds the zenith; one more is spare for rounding.
     num_bins = int(np.pi / _RING_BIN_RAD) + 2
     bin_of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)

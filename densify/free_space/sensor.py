@@ -111,10 +111,7 @@ class SensorModel(Layout):
         return in_view & (elevation >= low) & (elevation <= high)
 
     def gap_m(self, points: Float) -> tuple[Float, Bool]:
-        """Return the (N,) metres to the next ring or ray, and (N,) True for points in view.
-
-        The width of a beam is added. ``points`` (N,3) are in metres in the lidar frame.
-        """
+        """Return (N,) metres from points, lidar frame, to the next ring or ray; (N,) in view."""
         azimuth, elevation, range_m = self.directions(points)
         gap_rad = self.table.at(azimuth, elevation)[:, 1]
         return range_m * (gap_rad + _BEAM_RAD), self.sees(azimuth, elevation)

@@ -18,12 +18,7 @@ T = TypeVar("T")
 
 
 def select_rows(container: T, keep: Bool | Int | slice, columns: Sequence[str] = ()) -> T:
-    """Return a dataclass or named tuple with only some rows of its columns.
-
-    Args:
-        keep: Mask of the rows, array of row numbers, or slice.
-        columns: Names of the fields with an array of rows, or None; by default all fields.
-    """
+    """Return a dataclass or named tuple with the rows ``keep`` of its ``columns``, else all."""
     names = columns or _field_names(container)
     arrays = {name: getattr(container, name) for name in names}
     rows = np.arange(len(arrays[names[0]]))[keep]  # once for all columns
@@ -34,10 +29,7 @@ def select_rows(container: T, keep: Bool | Int | slice, columns: Sequence[str] =
 
 
 def joined_rows(containers: Iterable[T]) -> T:
-    """Return one dataclass or named tuple with the rows of all ``containers``, in order.
-
-    Every field of the containers is a column.
-    """
+    """Return one dataclass or named tuple, all fields columns, with the rows of all given ones."""
     pieces = list(containers)
     columns = {
         name: np.concatenate([getattr(piece, name) for piece in pieces])

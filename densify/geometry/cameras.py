@@ -40,17 +40,16 @@ _CONVERGED = np.sqrt(np.finfo(float).eps)  # from here one more step of Newton's
 
 
 def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
-    """Return the projection of points (N,3), metres, camera frame, into the image of a camera.
+    """Return the pixels of points (N,3), metres, camera frame, and which of them are visible.
 
-    A distortion polynomial is valid only inside the image. Beyond the angle at which the distorted
-    radius stops growing, it would fold points back into the image. Such points, and points more
-    than the camera's ``max_angle_deg`` off its axis, are invisible.
+    The first is (N,2) image coordinates, integers at pixel centres, NaN for a point that is too
+    near or outside the view of the lens. The second is (N,) True for a point in the view that falls
+    on a pixel after ``rint`` and is farther than 0.1 m: in z for a pinhole, in range for other
+    lenses.
 
-    Returns:
-        uv: (N,2) image coordinates in pixels, integers at pixel centres. NaN for a point that is
-            too near or outside the view of the lens.
-        visible: (N,) True for a point in the view of the lens that falls on a pixel after ``rint``
-            and is farther than 0.1 m: in z for a pinhole, in range for other lenses.
+    Points beyond the angle at which the distorted radius stops growing, or more than
+    ``max_angle_deg`` off the axis, are invisible: the distortion polynomial would fold them back
+    into the image.
     """
     lens = _lens(camera)
     uv = np.full((len(points_cam), 2), np.nan)
@@ -68,11 +67,7 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
 
 
 def rays(camera: Camera, uv: Float) -> Float:
-    """Return (N,3) unit vectors in the camera frame along the viewing rays of image coordinates.
-
-    This inverts `image_points`: ``uv`` (N,2) are pixels, integers at pixel centres. The ray is NaN
-    outside the view of the lens.
-    """
+    """Return (N,3) unit rays, camera frame, of pixels ``uv`` (N,2); NaN outside the lens's view."""
     lens = _lens(camera)
     plane_xy = (np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T)[:, :2]
     if not camera.is_rectified:
@@ -87,8 +82,7 @@ def rays(camera: Camera, uv: Float) -> Float:
 def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
     """Return the (N,2,3) Jacobian of the projection of visible points (N,3), camera frame.
 
-    Element [n, i, j] is the change of u (i = 0) or v (i = 1) of point n in pixels, per metre of
-    motion along axis j of the camera frame.
+    Element [n, i, j] is the change of u (i = 0) or v (i = 1) in pixels per metre along axis j.
     """
     lens = _lens(camera)
     range_m = np.linalg.norm(points_cam, axis=1, keepdims=True)
@@ -111,15 +105,10 @@ def depth_along(points_cam: Float, measure: str) -> Float:
 
 
 def converted(camera: Camera, depth_m: Float32, from_measure: str, to_measure: str) -> Float32:
-    """Return a depth map of a camera converted from one measure of depth to another.
+    """Return a depth map (H,W), metres, converted from one measure of depth to another.
 
-    Pixels whose ray has z <= 0 become 0. If the measures are the same, the map is returned
-    unchanged.
-
-    Args:
-        depth_m: (H,W) depth in metres, 0 for none.
-        from_measure: ``z``, along the optical axis, or ``range``.
-        to_measure: ``z`` or ``range``.
+    A measure is ``z``, along the optical axis, or ``range``. Pixels whose ray has z <= 0 become 0.
+    If the measures are the same, the map is returned unchanged.
     """
     if from_measure == to_measure:
         return depth_m

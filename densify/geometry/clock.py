@@ -47,12 +47,7 @@ class Clock:
         return max(1, round(duration_s * 1e9 / self.period_ns))
 
     def batches(self) -> tuple[tuple[int, ...], ...]:
-        """Return groups of consecutive sweep indices, each covering about 0.1 s.
-
-        A faster scanner measures fewer points per sweep, and objects move less between its sweeps.
-        A batch therefore has about as many points as one sweep at 10 Hz. At 10 Hz or slower each
-        batch is one sweep.
-        """
+        """Return groups of consecutive sweep indices, each of 0.1 s, or one sweep if slower."""
         groups: list[list[int]] = []
         for i, time_ns in enumerate(self.time_ns.tolist()):
             since_first_ns = time_ns - self.time_ns[groups[-1][0]] if groups else np.inf
@@ -64,10 +59,7 @@ class Clock:
         return tuple(map(tuple, groups))
 
     def at(self, i: int, later_s: float) -> int | None:
-        """Return the index of the sweep nearest to ``later_s`` after sweep i.
-
-        A negative ``later_s`` searches the sweeps before i. None if no sweep is on that side.
-        """
+        """Return the sweep nearest to ``later_s`` after i; None if no sweep is on that side."""
         candidates = range(i + 1, len(self.time_ns)) if later_s > 0 else range(i - 1, -1, -1)
         wanted_ns = self.time_ns[i] + later_s * 1e9
         return min(candidates, key=lambda j: abs(self.time_ns[j] - wanted_ns), default=None)

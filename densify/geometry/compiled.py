@@ -117,10 +117,9 @@ class _Kept(FunctionCache):
 class Kernel:
     """A function compiled by numba at the first call with new types, and cached for later runs.
 
-    The cache is beside the source file, else in the user's cache directory, or in the folder that
-    the environment variable NUMBA_CACHE_DIR names. It is loaded as code, and therefore ignored if
-    users who cannot change the source could have written it. Without a usable cache the function is
-    compiled in every run.
+    The cache is beside the source file, in the user's cache directory, or in NUMBA_CACHE_DIR. It is
+    loaded as code, and therefore ignored if users who cannot change the source could have written
+    it.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -144,8 +143,7 @@ class Kernel:
     def over_rows(self, num_rows: int, *arguments: Any) -> None:
         """Call ``kernel(begin, end, *arguments)`` on all cores, for ranges that cover all rows.
 
-        The kernel writes its result into the arguments and must not call `over_rows`. Its result
-        for a row must depend on that row alone.
+        The kernel must not call `over_rows`. Its result for a row must depend on that row alone.
         """
         num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
         if num_parts <= 1:

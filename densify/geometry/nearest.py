@@ -22,9 +22,9 @@ def tree_of(points: Float) -> cKDTree:
 
 
 def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Float, Int]:
-    """Return (N,) distances to the nearest points of the tree, and (N,) rows of these points.
+    """Return (N,) distances from queries (N,d) to the nearest points of the tree, and their rows.
 
-    They are inf and -1 for a query (N,d) without a point closer than ``within_m``.
+    They are inf and -1 for a query without a point closer than ``within_m``.
     """
     distance_m, tree_row = tree.query(queries, distance_upper_bound=within_m)
     row = np.asarray(tree_row, np.int64)
@@ -33,10 +33,7 @@ def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Fl
 
 
 def nearest_k(tree: cKDTree, queries: Float, k: int) -> tuple[Float, Int]:
-    """Return (N,k) ascending distances from queries (N,d) to the k nearest points, and their rows.
-
-    A tree of fewer than k points gives all of them.
-    """
+    """Return (N,k) ascending distances from queries (N,d) to the k nearest points, and rows."""
     distance_m, row = tree.query(queries, np.arange(1, min(k, tree.n) + 1))
     return np.asarray(distance_m), np.asarray(row, np.int64)
 
@@ -47,13 +44,10 @@ def is_near(tree: cKDTree, queries: Float, within_m: float) -> Bool:
 
 
 def thinned(points: Float | Float32, order: Int, step: float, max_per_cell: int) -> Int:
-    """Return the ascending rows of the points that stay after thinning by a grid.
+    """Return the ascending rows of points (N,3) that stay after thinning by cells of side ``step``.
 
-    Args:
-        points: (N,3) coordinates. The box around them has at most 2^63 / N cells.
-        order: (K,) rows of the candidates, the preferred ones first.
-        step: Side of a cell, in the unit of the points.
-        max_per_cell: Greatest number of points that a cell keeps.
+    ``order`` (K,) are the rows of the candidates, the preferred ones first. The box around the
+    points has at most 2^63 / N cells.
     """
     cell = np.zeros(len(points), np.int64)
     for coordinate in points.T:
@@ -72,16 +66,11 @@ def thinned(points: Float | Float32, order: Int, step: float, max_per_cell: int)
 
 
 def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
-    """Return (N,) True for the points (N,D) around which a grid fits into memory.
+    """Return (N,) True for points (N,D) around which a grid has at most ``most_cells`` cells.
 
     These are all points if the box around them is small enough. Otherwise up to 1 % of them, the
-    farthest from their median, are left out, such as a few stray returns. If the box is still too
-    large, the points are spread out, and none is left out.
-
-    Args:
-        points: (N,D) coordinates.
-        cell: Side of a cell of the grid, in the unit of the points.
-        most_cells: Greatest number of cells.
+    farthest from their median, are left out. If the box is still too large, none is left out.
+    ``cell`` is the side of a cell, in the unit of the points.
     """
     all_points = np.ones(len(points), bool)
     if not len(points) or _num_cells(points, cell) <= most_cells:
@@ -100,19 +89,11 @@ def _num_cells(points: NDArray[Any], cell: float) -> float:
 
 
 def link(points: Float, distance_m: float) -> tuple[int, Int]:
-    """Group points by single linkage: points closer than ``distance_m`` share a group.
+    """Return the number of groups of points (N,3), and (N,) group of each, by single linkage.
 
-    The points are sorted into a grid whose cell diagonal equals the distance, hence all points of a
-    cell are linked. Only neighbouring cells are compared, and the cost does not grow with the
-    square of the point density.
-
-    Args:
-        points: (N,3) positions in metres.
-        distance_m: Distance below which two points are linked.
-
-    Returns:
-        num_groups: Number of groups G.
-        label: (N,) group of each point, 0 to G - 1, numbered by the first point of each group.
+    Points closer than ``distance_m`` share a group, numbered by its first point. In a grid whose
+    cell diagonal is this distance, all points of a cell are linked: the cost does not grow with the
+    square of the density.
     """
     if not len(points):
         return 0, np.zeros(0, np.int64)
@@ -140,13 +121,9 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
 
 
 def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
-    """Return (N,) True for the points (N,3) closer than ``within_m`` to a dense seed.
+    """Return (N,) True for the points (N,3), metres, closer than ``within_m`` to a dense seed.
 
-    Args:
-        points: (N,3) positions in metres.
-        seed: (N,) True for seeds.
-        within_m: Radius around a seed.
-        least_share: Least share of seeds among the points around a dense seed.
+    A seed is dense if ``least_share`` of the points around it are seeds.
     """
     is_close = np.zeros(len(points), bool)
     seeds = points[seed]

@@ -43,11 +43,7 @@ def rotate(T_a_b: Float, vectors_b: Float) -> Float:
 
 
 def log(T_a_b: Float) -> Float:
-    """Return the (...,6) twists of poses (...,4,4): rotation vector (rad), then translation (m).
-
-    The translation is the pose's own, not the one of a screw motion. For a vehicle that turns by at
-    most 0.1 rad within a sweep the two paths differ by millimetres.
-    """
+    """Return the (...,6) twists of poses (...,4,4): rotation vector (rad), own translation (m)."""
     rotation = Rotation.from_matrix(T_a_b[..., :3, :3]).as_rotvec()
     return np.concatenate([rotation, T_a_b[..., :3, 3]], axis=-1)
 
@@ -96,7 +92,7 @@ def interpolate(T_world_a: Float, T_world_b: Float, fraction: float) -> Float:
 def fit_rigid(source: Float, target: Float) -> Float:
     """Return the (4,4) rigid motion that maps source (N,3) to target points in least squares.
 
-    A rotation that the points do not determine, as about a line of points, is zero (Kabsch 1976).
+    A rotation that the points do not determine is zero (Kabsch 1976).
     """
     source_mean = source.mean(axis=0)
     target_mean = target.mean(axis=0)

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Use a trained network as an engine: its flow proposes, `densify.flow.tracking` decides.
-
-Groups of points that move according to the network start at the network's velocity. They are
-tracked and confirmed as by the engine ``groups``. The network's flow alone moves no point.
-"""
+"""Use a trained network as an engine: its flow proposes, `densify.flow.tracking` decides."""
 
 from __future__ import annotations
 
@@ -28,11 +24,7 @@ def check_argument(argument: str) -> None:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """Return the motion of a scene by a trained network.
-
-    ``argument`` is the path of the model file; `densify.flow.engines.EngineModule` describes the
-    rest. Raise InputError if the file is no model.
-    """
+    """Return the motion of a scene by the network of the model file ``argument``."""
     model = read_model(Path(argument))
     sweeps = scene.stretch.sweeps
     pairs = zip(sweeps, scene.candidates, strict=True)
@@ -55,11 +47,8 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
 def flows_of(model: Model, above: list[AboveGround], origins: list[Float]) -> list[Float]:
     """Return for each sweep the flow (n,3) to the next sweep, metres, world, ego-motion removed.
 
-    The last sweep has its flow to the previous sweep. A single sweep has flow 0.
-
-    Args:
-        above: The n points above the ground of each sweep.
-        origins: (3,) position of the scanner in each sweep, world.
+    The last sweep has its flow to the previous sweep, a single one flow 0. ``above`` are the points
+    above the ground, ``origins`` (3,) the position of the scanner in each sweep, world.
     """
     flows = []
     for index, source in enumerate(above):

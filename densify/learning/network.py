@@ -2,10 +2,7 @@
 """Define a network for whole sweeps: points to a grid of pillars, a U-Net, back to points.
 
 It follows FastFlow3D (Jund et al., "Scalable Scene Flow from Point Clouds in the Real World", RA-L
-2022) and DeFlow (Zhang et al., ICRA 2024), and is small enough for a CPU. Each sweep's points are
-encoded and averaged over the cells of a grid of 0.4 m. One U-Net compares the grids of all sweeps.
-Each source point joins the result at its position with its own code, and two more layers compute
-its flow.
+2022) and DeFlow (Zhang et al., ICRA 2024), and is small enough for a CPU. Cells are 0.4 m.
 
 A model file is a numpy archive, read without running any code. ``header`` holds JSON (format,
 version, network, how it was trained), ``weights/NAME`` the network's arrays.
@@ -80,13 +77,10 @@ class AboveGround(NamedTuple):
 
 
 def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> list[int | None]:
-    """Return the indices of the sweeps that the network needs for the flow from source to target.
+    """Return the indices of ``num_wanted`` sweeps for the flow from source to target.
 
-    They are source, target, and further sweeps on the other side of the source.
-
-    Args:
-        num_sweeps: Number of existing sweeps; other indices become None.
-        num_wanted: Number of sweeps that the network takes.
+    They are source, target, and further sweeps on the other side of the source, None for missing
+    ones.
     """
     step = source - target
     wanted = [source, target, *(source + step * number for number in range(1, num_wanted - 1))]
@@ -119,10 +113,7 @@ class Voxels(nn.Module):
             self.decode[-1].bias.zero_()  # type: ignore[operator, union-attr]
 
     def forward(self, sweeps: Sweeps) -> Tensor:
-        """Return the flow (n,3) of the first sweep's points to the second sweep, metres.
-
-        It excludes ego-motion, is in the world axes of the input, and is 0 beyond the grid.
-        """
+        """Return the flow (n,3), m, world axes, of the first sweep's points; 0 off the grid."""
         clouds = [*sweeps[:NUM_SWEEPS], *[None] * (NUM_SWEEPS - len(sweeps))]
         source = clouds[0]
         if source is None:

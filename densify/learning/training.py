@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Train a network by Adam on pairs of sweeps from clips of recordings, with the loss of a teacher.
 
-A clip is a few registered, deskewed sweeps in a row, without the ground. With labels, each sweep
-has its flow to the sweeps before and after it. The pairs of several clips are mixed, in both
-directions of time, and drawn several times, each time turned about the vertical, mirrored and
-scaled at random. Clips and pairs follow from a seed alone, and torch has one thread: the same seed
-gives the same bytes on CPUs of one kind.
+A clip is a few registered, deskewed sweeps in a row, without the ground. Its pairs are drawn in
+both directions of time, each turned about the vertical, mirrored and scaled at random. The same
+seed gives the same bytes on CPUs of one kind.
 
-A teacher is a source of supervision. ``objective`` is the published objective in m² per point
-(Pontes, Hays, Lucey, 3DV 2020, sections 3 and 4), with alpha = 4 (10 without learning) and a graph
-of 50 neighbours. It needs no labels. ``engine`` and ``truth`` compare with a known flow. A plain
-mean over points, nearly all static, teaches a network to predict no motion. Therefore the loss, in
-metres, is a sum of means over static points, points slower than 1 m/s, and faster points (DeFlow,
-Zhang et al., ICRA 2024, eq. 5).
+``objective`` is the published objective in m² per point (Pontes, Hays, Lucey, 3DV 2020, sections 3
+and 4), with alpha = 4 (10 without learning) and a graph of 50 neighbours. It needs no labels.
+``engine`` and ``truth`` compare with a known flow: a sum, in metres, of means over static points,
+points slower than 1 m/s, and faster points (DeFlow, Zhang et al., ICRA 2024, eq. 5), because a
+plain mean teaches a network to predict no motion.
 """
 
 from __future__ import annotations
@@ -207,9 +204,8 @@ def _new_street(spec: str, rng: np.random.Generator) -> LidarSequence:
 def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
     """Return the clip of up to 7 sweeps around a key frame.
 
-    Args:
-        teacher: Source of the labels: "truth" for the ground truth, "engine" for the flow of the
-            engine ``groups``; other names give no labels.
+    Labels are the ground truth for the teacher "truth", the flow of the engine ``groups`` for
+    "engine".
     """
     stretch = Recording(sequence, settings, _CLIP_SWEEPS // 2, [key]).window(key)
     heights, frames = ground(stretch), stretch.frames
@@ -290,10 +286,9 @@ def sample_of(
     num_wanted: int,
     rng: np.random.Generator | None = None,
 ) -> Sample:
-    """Return the training sample of two neighbouring sweeps of a clip.
+    """Return the training sample of ``num_wanted`` sweeps of a clip, from source to target index.
 
-    ``source`` and ``target`` are indices in the clip, ``num_wanted`` the number of sweeps that the
-    network takes. With ``rng`` the sample is turned, mirrored, scaled and drawn at random.
+    With ``rng`` the sample is turned, mirrored, scaled and drawn at random.
     """
     source_sweep, target_sweep = clip[source], clip[target]
     augmentation = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
@@ -339,10 +334,7 @@ def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
 
 
 def objective_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the published objective for the drawn points of a sample, m² per point, 0-d.
-
-    ``predict`` is the network: it returns the (n,3) flow of the source points.
-    """
+    """Return the published objective for the drawn points of a sample, m² per point, 0-d."""
     source: Tensor = sample.sweeps[0].points[sample.drawn]  # type: ignore[union-attr]
     graph = knn_graph(source.detach().cpu().double().numpy(), NUM_NEIGHBORS)
     flow = predict(sample.sweeps)[sample.drawn]
@@ -351,10 +343,7 @@ def objective_loss(predict: Predict, sample: Sample) -> Tensor:
 
 
 def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the sum of the mean errors over static, slow and fast points, metres, 0-d.
-
-    ``predict`` is the network: it returns the (n,3) flow of the source points.
-    """
+    """Return the sum of the mean errors over static, slow and fast points, metres, 0-d."""
     flow, true, moving = predict(sample.sweeps), sample.flow, sample.moving
     fast = true.norm(dim=1) >= _FAST_M_S * sample.duration_s
     # The gradient of the norm itself is not a number at 0.

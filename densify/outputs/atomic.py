@@ -40,8 +40,8 @@ def file_aside(path: Path) -> Iterator[Path]:
 def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
     """Yield a folder to write into, which becomes ``folder`` if the block ends without an error.
 
-    ``owned`` names the entries of ``folder`` that are replaced or removed; others stay. On an error
-    ``folder`` is as before. Raise OutputError if it cannot be written.
+    ``owned`` names the entries of ``folder`` that are replaced or removed. An error changes
+    nothing.
     """
     folder = Path(os.path.realpath(folder))
     missing_parents = [parent for parent in folder.parents if not parent.exists()]

@@ -65,14 +65,11 @@ def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:
 def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write the input of 3-D Gaussian splatting (Kerbl et al., SIGGRAPH 2023).
 
-    The static world is a COLMAP model, also as points3D.ply. Depth maps are for ``-d depths``:
-    inverse depth is ``value / 65536 * scale + offset``, by ``sparse/0/depth_params.json``. The
-    training takes an empty pixel as infinitely far. Images are therefore transparent, and not
-    trained, where no depth is measured, filled or from a prior.
-
+    The static world is a COLMAP model. Depth maps are for ``-d depths``: inverse depth is ``value /
+    65536 * scale + offset``, by ``sparse/0/depth_params.json``. As an empty pixel counts as
+    infinitely far, images are transparent, and not trained, where depth is unknown.
     ``movers/0003.ply`` has the points of object 3 in its own frame, ``movers/others.ply`` moving
-    points without a track in the key sweep's lidar frame. ``tracks.json`` is the run's movers.json.
-    With several runs, each has its folder ``movers/000120/``.
+    points without a track in the key sweep's lidar frame; with several runs in ``movers/000120/``.
     """
     pictures = _pictures(runs, flat=True)
     cloud = _world_cloud(runs)
@@ -118,10 +115,7 @@ def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write a scene that map-anything reads (format: its data_processing/README.md).
-
-    Poses are camera to world. ``depth/NAME.exr`` is measured depth in metres, 0 for no depth.
-    """
+    """Write a scene as map-anything's data_processing/README.md has it; depth in metres, 0 none."""
     save_exr = exr_writer()
     pictures = _pictures(runs, flat=True)
     _write_jpegs(pictures, folder)
@@ -148,11 +142,7 @@ def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write a training set that MoGe reads (format: its docs/train.md and moge/utils/io.py).
-
-    .index.txt lists the folders with image.jpg, meta.json (K for width and height 1) and depth.png:
-    16 bits, measured depth on a logarithmic scale from ``near`` to ``far``, 0 for no depth.
-    """
+    """Write a training set as MoGe's docs/train.md has it; depth on a log scale, 0 for none."""
     names = []
     for run in runs:
         for picture in _pictures([run], flat=True):
@@ -193,10 +183,7 @@ def _write_jpegs(pictures: Sequence[Picture], folder: Path) -> None:
 
 
 def _world_cloud(runs: Sequence[FinishedRun]) -> StoredCloud:
-    """Return the points that a camera observed, in the world.
-
-    They are the whole cloud of one run, or the key sweeps' points of several runs.
-    """
+    """Return the points, world, that a camera observed, of several runs only their key sweeps'."""
     clouds = []
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
         cloud = run.cloud()

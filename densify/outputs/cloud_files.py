@@ -98,11 +98,7 @@ class StoredCloud:
         return StoredCloud(**columns)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return the (M,) values of each column, by name; booleans as uint8, positions as float32.
-
-        The names are x, y, z, displaced_x, displaced_y, displaced_z, red, green, blue, intensity,
-        confidence, displaced, frame, instance, gps_time, moving and far.
-        """
+        """Return the (M,) values of each column by LAZ name; booleans uint8, positions float32."""
         names = ("intensity", "confidence", "displaced", "frame", "instance", "gps_time")
         return {  # float32 keeps 1 mm up to 8 km
             **dict(zip("xyz", self.points.T.astype(np.float32), strict=True)),
@@ -117,8 +113,7 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     """Write a cloud as LAZ with the extra dimensions of `_EXTRA_DIMENSIONS`, rounded to 1 mm.
 
     ``gps_time`` is as in LAS 1.4: seconds since 1980-01-06 minus 10^9, without leap seconds. The
-    header has the day of ``stamp_ns``, the key sweep's reference time since 1970. Equal clouds give
-    equal bytes.
+    header has the day of ``stamp_ns``. Equal clouds give equal bytes.
     """
     import laspy
 

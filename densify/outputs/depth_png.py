@@ -44,26 +44,17 @@ def map_path(folder: Path, kind: str, name: str, suffix: str = ".png") -> Path:
 
 
 def write_depth_png(path: Path, depth_m: Float32) -> None:
-    """Write an (H,W) depth map in metres as 16-bit PNG: ``rint(256 * depth_m)``, 0 for no depth.
-
-    Depths beyond 65535/256 = 256 m or below 2 mm (half a step) become 0.
-    """
+    """Write (H,W) depth in metres as 16-bit PNG ``rint(256 * depth_m)``, 0 for none or > 256 m."""
     write_file(path, encode_png(_quantised(depth_m)))
 
 
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
-    """Write an (H,W) map of confidence, 0 to 1, as 8-bit PNG with values of `stored_confidence`.
-
-    Pixels are 0 where `write_depth_png` stores no depth.
-    """
+    """Write (H,W) confidence as 8-bit PNG of `stored_confidence`, 0 where no depth is stored."""
     _write_where_depth(path, depth_m, confidence, stored_confidence)
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
-    """Write an (H,W) map of ages in seconds as 16-bit PNG with values of `stored_age`.
-
-    Pixels are 0 where `write_depth_png` stores no depth.
-    """
+    """Write (H,W) ages in seconds as 16-bit PNG of `stored_age`, 0 where no depth is stored."""
     _write_where_depth(path, depth_m, age_s, stored_age)
 
 
@@ -83,10 +74,7 @@ def stored_confidence(confidence: ArrayLike) -> NDArray[np.uint8]:
 
 
 def confidence_of(stored: NDArray[np.uint8]) -> Float32:
-    """Return the (H,W) confidence, 0 to 1, of stored pixel values, 0 without depth.
-
-    `stored_confidence` describes the values.
-    """
+    """Return the (H,W) confidence, 0 to 1, of values of `stored_confidence`, 0 without depth."""
     return np.maximum(stored.astype(np.float32) - 1, 0) / np.float32(STEPS_OF_CONFIDENCE)
 
 
@@ -104,8 +92,8 @@ def age_of(stored: NDArray[np.uint16]) -> Float32:
 def write_flow_png(path: Path, flow_px: Float32) -> None:
     """Write (H,W,2) optical flow, NaN where unknown, as KITTI does (Menze and Geiger, CVPR 2015).
 
-    The PNG has 16 bits. Red stores ``rint(64 * u) + 2^15`` for the flow u to the right in pixels,
-    green the same for the flow down, blue 1. All are 0 for unknown flow and flow beyond 512 px.
+    The PNG has 16 bits. Red stores ``rint(64 * u) + 2^15`` for u px to the right, green the same
+    down, blue 1. All are 0 for unknown flow and flow beyond 512 px.
     """
     levels = np.rint(_STEPS_PER_PX * flow_px.astype(np.float64)) + 2**15
     known = ((levels >= 0) & (levels <= _MAX_VALUE)).all(axis=2)

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read the folder of a densified key, with thresholds on confidence and age.
-
-`densify.outputs.key_outputs` writes the files.
-"""
+"""Read the folder of a key that `key_outputs` writes, with thresholds on confidence and age."""
 
 from __future__ import annotations
 
@@ -215,8 +212,7 @@ class FinishedRun:
     def maps(self, camera: str) -> dict[str, NDArray[Any]]:
         """Return the (H,W) stored values of a camera's maps, 0 beyond a threshold.
 
-        The keys are depth, depth_filled, confidence and age; `densify.outputs.depth_png` converts
-        the values. Raise InputError for missing, damaged or unequal maps.
+        The keys are depth, depth_filled, confidence and age, values of `densify.outputs.depth_png`.
         """
         maps: dict[str, NDArray[Any]] = {}
         for kind, dtype in _KINDS.items():
@@ -261,10 +257,7 @@ class FinishedRun:
 
 
 def finished_runs(folder: Path, thresholds: Thresholds = EVERYTHING) -> list[FinishedRun]:
-    """Return the run in a folder, or the runs up to two levels below, by parent folder and frame.
-
-    Raise InputError if there is none.
-    """
+    """Return the run in a folder, or those up to two levels below, by parent folder and frame."""
     paths = [path for depth in ("*", "*/*") for path in folder.glob(f"{depth}/run.yaml")]
     folders = sorted(path.parent for path in paths)
     if (folder / "run.yaml").is_file() or not folders:

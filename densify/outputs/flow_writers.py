@@ -41,11 +41,7 @@ flow to the previous sweep instead."""
 def flow_writer(
     form: str, sequence: LidarSequence, out: Path, frames: Sequence[int], overwrite: bool
 ) -> Iterator[FlowWriter]:
-    """Yield a function that writes the flow of one sweep; some forms are completed at the end.
-
-    ``form`` is "npz", "av2", "opensceneflow", "semantickitti" or "doc-depth"; ``frames`` are the
-    ascending frame numbers of all sweeps that will be written.
-    """
+    """Yield a function that writes the flow of one sweep as ``form``; ``frames`` ascend."""
     paths = {frame: _path_of(form, sequence, out, frame) for frame in frames}
     if form == "av2":
         needed("pyarrow.feather", "argoverse", "Argoverse 2's flow files")
@@ -102,10 +98,7 @@ def _npz_path(folder: Path, frame: int, target: int) -> Path:
 
 
 def write_flow_npz(folder: Path, flow: StretchFlow, recording: str) -> None:
-    """Write a file for each step between two sweeps, such as ``folder/000119_000120.npz``.
-
-    ``recording`` is the name that the files store.
-    """
+    """Write a file for each step between two sweeps, such as ``folder/000119_000120.npz``."""
     for (frame, target), field in flow.steps.items():
         data = flow_npz(
             field,
@@ -118,10 +111,7 @@ def write_flow_npz(folder: Path, flow: StretchFlow, recording: str) -> None:
 
 
 def flow_npz(field: FlowField, **more_arrays: Any) -> bytes:
-    """Return the bytes of a .npz file with a flow field of N points and more arrays.
-
-    ``residual_flow`` (N,3) is in metres, without ego-motion. Floats are float32.
-    """
+    """Return the bytes of a .npz file with a flow field, in float32 metres, and more arrays."""
     arrays: dict[str, Any] = {"residual_flow": field.displacement}
     arrays |= {name: getattr(field, name) for name in ("moving", "instance", "lost")} | more_arrays
     if field.to_reference is not None:

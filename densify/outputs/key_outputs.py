@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write the folder of a key, ``OUT/000120/``, all files or none. `finished_run` reads it.
-
-docs/outputs.md describes each file and the fields of the tables.
-"""
+"""Write the folder of a key, ``OUT/000120/``, all files or none; see docs/outputs.md."""
 
 from __future__ import annotations
 
@@ -76,10 +73,7 @@ def write_comparison(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write compare.json and compare.png of several methods, and return the paths of the files.
-
-    The folder ``compare/`` has the files of the last method. Other arguments as in `write_result`.
-    """
+    """Write compare.json, compare.png and, of the last method, ``compare/``; return the paths."""
     last = list(results.values())[-1]
     table = {
         "schema_version": SCHEMA_VERSION,
@@ -98,11 +92,7 @@ def write_comparison(
 
 @contextmanager
 def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
-    """Check that a folder can be written, and yield the folder to write into (`staged_folder`).
-
-    ``owned`` names the entries that are written. ``out`` is the user's folder, for messages. Raise
-    InputError if entries exist and ``overwrite`` is False.
-    """
+    """Check that entries ``owned`` of a folder can be written, and yield the `staged_folder`."""
     _check_folder(folder, owned, out, overwrite)
     with staged_folder(folder, owned) as staging:
         yield staging

@@ -67,11 +67,7 @@ def write_key(
 ) -> dict[str, FileRecord]:
     """Write the depth maps of one key sweep, and return path in the tree -> size and hash.
 
-    Equal maps give equal bytes.
-
-    Args:
-        sparse: Maps of the key sweep alone, by camera.
-        dense: Maps of all sweeps, by camera.
+    By camera, ``sparse`` are of the key sweep alone, ``dense`` of all. Equal maps give equal bytes.
     """
     paths = []
     for camera, maps in dense.items():
@@ -95,8 +91,8 @@ def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write a depth completion tree with images ``SPLIT/DRIVE/CAMERA/data/0000000120.png``.
 
     K is in ``intrinsics/CAMERA/0000000120.txt``. Recordings unknown to the benchmark are in train.
-    files.txt has a line for each map: paths of image, measured and filled depth. annotations.json
-    adds ``cam_in`` (fx fy cx cy) and ``depth_scale``, for Metric3D.
+    files.txt has each map's image, measured and filled depth, annotations.json ``cam_in`` for
+    Metric3D.
     """
     entries: list[dict[str, Any]] = []
     for run in runs:
@@ -144,10 +140,9 @@ class _KeyObjects(NamedTuple):
 def write_kitti_tracking(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write labels, calibration, key sweeps (deskewed) and images of one camera.
 
-    The labels are those of Geiger, Lenz, Urtasun, CVPR 2012; `densify.readers.kitti` reads
-    the tree. A sequence is a recording, a frame is a key. A box is where the key sweep measured the
-    object. Its type follows from the size. ``occluded`` is 3, unknown. ``truncated`` is 1 at the
-    image's border. Objects out of view are left out.
+    The labels are those of Geiger, Lenz, Urtasun, CVPR 2012. A sequence is a recording, a frame is
+    a key. A box is where the key sweep measured the object, its type follows from the size.
+    ``occluded`` is 3, unknown. ``truncated`` is 1 at the image's border.
     """
     for number, (_, sequence) in enumerate(groupby(runs, key=lambda run: run.folder.parent)):
         name, lines = f"{number:04d}", list[str]()

@@ -47,13 +47,8 @@ def front_first(
 ) -> list[str]:
     """Return the names of maps: first that of the camera that looks ahead, the others in order.
 
-    Ahead is the direction of the vehicle's motion in the window. Without motion, a camera whose
-    name holds "front" is taken.
-
-    Args:
-        names: Names of the maps.
-        views: Camera and pose of each map; it may lack some.
-        T_key_lidar: (4,4) lidar poses in the key sweep's lidar frame, by frame number.
+    Ahead is the direction of motion in ``T_key_lidar``, (4,4) by frame number. Without motion, a
+    camera whose name holds "front" is taken.
     """
     frames = sorted(T_key_lidar)
     travel_m = np.zeros(3)
@@ -78,11 +73,7 @@ def write_key_figure(result: Result, folder: Path) -> None:
 
 
 def write_figure(path: Path, results: Mapping[str, Result]) -> None:
-    """Write a figure of each method's measured depth in the camera that looks ahead.
-
-    The last method's depth completed with a prior is added if there is one. Without maps nothing is
-    written.
-    """
+    """Write a figure of each method's depth, and the prior's, ahead; nothing without maps."""
     method, last = list(results.items())[-1]
     if not last.depth:
         return
@@ -110,10 +101,10 @@ def _error(result: Result, camera: str, product: str) -> str:
 
 
 def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
-    """Return a BGR picture (h,w,3) of panels with depth over a camera's image in gray.
+    """Return a BGR picture (h,w,3) of panels with depth over a camera's RGB image in gray.
 
-    ``panels`` has title -> (H,W) metres, 0 for no depth. Each depth covers 3 x 3 pixels, nearest on
-    top, from red at 3 m to blue at 80 m on a logarithmic scale. ``image`` is (H,W,3) RGB.
+    ``panels`` has title -> (H,W) metres, 0 for no depth, drawn in 3 x 3 pixels, nearest on top,
+    from red at 3 m to blue at 80 m on a logarithmic scale.
     """
     kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
     gray = (_BRIGHTNESS * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8)
@@ -184,10 +175,7 @@ def score_figure(title: str, unit: str, values: Float) -> str:
 
 
 def write_curve(result: Result, folder: Path) -> None:
-    """Write ``curve.png`` of all cameras, if a method has scores with the key sweep held out.
-
-    If there is ground truth, the result is drawn against it too.
-    """
+    """Write ``curve.png`` of all cameras, if a method has scores with the key sweep held out."""
     curves: dict[str, dict[str, Curve]] = {}
     for method, of_method in {**result.baselines, result.method: result}.items():
         for camera, scores in (of_method.metrics.get("held_out") or {}).items():
@@ -204,10 +192,7 @@ def write_curve(result: Result, folder: Path) -> None:
 
 
 def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
-    """Draw the share of outliers over the density, and what the confidence expects of the last.
-
-    ``curves`` is title -> method -> `precision_density`.
-    """
+    """Draw the share of outliers over the density: title -> method -> `precision_density`."""
     from matplotlib.figure import Figure
 
     columns, rows = min(2, len(curves)), -(-len(curves) // 2)

@@ -47,10 +47,7 @@ def split_of(recording: str) -> Split:
 
 
 def drive_folder(recording: str) -> str:
-    """Return a folder name for a recording's name, different for different recordings.
-
-    A name that is valid for a folder, such as KITTI's, is kept.
-    """
+    """Return a folder name for a recording's name, different for different recordings."""
     # street:highway?seed=0&sensor=hdl64 -> street-highway_seed-0_sensor-hdl64
     if recording == _DEFAULT_STREET:
         return "street"
@@ -67,10 +64,7 @@ def default_folder(recording: str) -> Path:
 
 
 def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = ()) -> None:
-    """Raise InputError if a folder holds results of another recording, by `is_same`.
-
-    Results without the name of a recording are not compared.
-    """
+    """Raise InputError if a folder holds results of another recording, by `is_same`."""
     for result in _stored_results(out, keys):
         if not any(is_same(recording, data, stored.recording, stored.data) for stored in result):
             stored = result[0]
@@ -82,10 +76,7 @@ def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = 
 
 
 def is_same(recording: str, data: str, stored_recording: str, stored_data: str) -> bool:
-    """Return True if two pairs of a recording's name and text of ``--data`` mean one recording.
-
-    A recording that was moved is still the same.
-    """
+    """Return True if two pairs of a name and ``--data`` mean one recording, perhaps moved."""
     if drive_folder(recording) != drive_folder(stored_recording):
         return False
     path, stored_path = (Spec.parse(text).path.resolve() for text in (data, stored_data))

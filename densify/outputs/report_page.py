@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make the HTML page of one key sweep from the readable files of a run or a comparison.
-
-The page is one file with data, script and style. It opens from disk and loads no other file.
-"""
+"""Make the HTML page of one key sweep, one file, from the files of a run or a comparison."""
 
 from __future__ import annotations
 
@@ -99,11 +96,9 @@ class KeyFiles:
         return KeyFiles(folder / "compare", about, methods)
 
     def read(self, read: Callable[[Path], T], name: str, optional: bool = False) -> T | None:
-        """Read a file of the folder; None, with a note in ``missing``, if it cannot be read.
+        """Return what ``read`` makes of a file; if it fails None, with a note in ``missing``.
 
-        Args:
-            read: Function that returns the content of a path.
-            optional: True to return None without a note if the file does not exist.
+        A file that does not exist and is ``optional`` has no note.
         """
         path = self.maps / name
         if optional and not path.is_file():
@@ -115,10 +110,7 @@ class KeyFiles:
             return None
 
     def camera(self, name: str) -> dict[str, NDArray[Any]]:
-        """Return the (H,W) stored values of all readable maps of a camera, by kind.
-
-        The kinds are those of `_MAPS` without "scene/", and the names of the baselines.
-        """
+        """Return the (H,W) stored values of a camera's maps, by `_MAPS` kind or baseline name."""
         maps: dict[str, NDArray[Any]] = {}
         maps_of_methods = {f"scene/{method}": np.uint16 for method in self.methods}
         for folder, pixel_type in {**_MAPS, **maps_of_methods}.items():
@@ -150,7 +142,7 @@ def key_page(files: KeyFiles, shown_folder: str) -> bytes:
     """Return the bytes of the HTML page of a key sweep.
 
     ``shown_folder`` is the run's folder as the user names it, "" for a comparison. Files that
-    cannot be read are named in the page. Raise InputError if there is neither a map nor a cloud.
+    cannot be read are named in the page.
     """
     scene = files.read(read_scene, "scene/scene.json", optional=True)
     views, sweeps = (scene.table["views"], scene.table["sweeps"]) if scene else ({}, [])
@@ -224,14 +216,10 @@ class Blobs:
         self.texts: dict[str, str] = {}
 
     def add(self, array: NDArray[Any]) -> dict[str, Any]:
-        """Pack an array of integers, and return the description with which the page unpacks it.
+        """Pack integers from 0 to 2^32 - 1, and return the description with which the page unpacks.
 
-        Args:
-            array: (N,) or (H,W) whole numbers from 0 to 2^32 - 1.
-
-        Returns:
-            ``blob``, name of the packed bytes; ``bytes``, size of an element; ``shape``; ``delta``,
-            True if differences along the last axis are stored, which is done if they are smaller.
+        It has ``blob``, ``bytes`` of an element, ``shape``, and ``delta``, True if differences
+        along the last axis are stored because they are smaller.
         """
         array = array.astype(np.min_scalar_type(int(array.max(initial=0))))
         steps = np.diff(array, axis=-1, prepend=array.dtype.type(0))
@@ -265,11 +253,7 @@ def _deflated(array: NDArray[Any], effort: int) -> bytes:
 def _packed_camera(
     blobs: Blobs, maps: Mapping[str, NDArray[Any]], jpeg: bytes | None, focal_px: float | None
 ) -> dict[str, Any]:
-    """Pack the maps of `KeyFiles.camera` into ``blobs`` and return the camera's entry in the page.
-
-    The map ``source`` has indices into ``sources``, whose rows are [index of the sweep + 1, age in
-    ms + 1, measured 0 or 1], 0 where unknown.
-    """
+    """Pack the maps of `KeyFiles.camera` into ``blobs`` and return the camera's entry."""
     nothing = np.zeros_like(next(iter(maps.values())), np.uint16)
     depth, filled, sweep, age = (
         maps.get(kind, nothing) for kind in ("depth", "depth_filled", "sweep", "age")
@@ -300,13 +284,10 @@ def packed_cloud(
 ) -> dict[str, Any]:
     """Pack a thinned cloud into ``blobs`` and return its entry in the page, moving points first.
 
-    ``frames`` are the sweeps of the page, ``instances`` the numbers of its tracked objects.
-
-    Returns:
-        The entry. Positions are ``low_m`` + ``step_m`` times 16-bit integers. ``sweep`` has indices
-            in ``frames``. ``mover`` is 0 for static points, 1 for moving points without a track, 2
-            and up for tracked objects by ``instances``. ``displaced``, for moving points only, is
-            32768 plus the displacement beyond rigid alignment in steps of ``displaced_step_m``.
+    Positions are ``low_m`` + ``step_m`` times 16-bit integers. ``sweep`` has indices in ``frames``.
+    ``mover`` is 0 for static points, 1 for moving points without a track, 2 and up by
+    ``instances``. ``displaced``, of moving points, is 32768 plus the displacement in
+    ``displaced_step_m``.
     """
     rows = thinned(cloud.points, cloud.moving, _MOST_POINTS)
     chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])
@@ -335,10 +316,7 @@ def packed_cloud(
 
 
 def thinned(points: Float, moving: Bool, max_points: int) -> Int:
-    """Return (K,) ascending indices of at most ``max_points`` points, drawn with a fixed seed.
-
-    The probability grows with squared distance from the origin, for equal density in angle.
-    """
+    """Return (K,) ascending indices of at most ``max_points`` points, the far ones preferred."""
     if len(points) <= max_points:
         return np.arange(len(points))
     weight = np.maximum((points**2).sum(axis=1), _NEAR_M**2)

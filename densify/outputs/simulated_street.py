@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write frames of the simulated street as KITTI raw drive or plain folder, with ground truth.
-
-docs/formats/reading.md lists the files.
-"""
+"""Write frames of the simulated street with ground truth, as docs/formats/reading.md has them."""
 
 from __future__ import annotations
 
@@ -114,10 +111,7 @@ class Excerpt:
         return encode_png(self.street.image(camera, number)[:, :, ::-1])
 
     def T_world_ego(self, stamp_ns: Int, T_lidar_ego: Float | None = None) -> Float:
-        """Return the (n,4,4) true poses of an ego frame at (n,) times (ns).
-
-        ``T_lidar_ego`` is the (4,4) pose of the ego frame in the lidar frame, None for the lidar.
-        """
+        """Return the (n,4,4) true poses of an ego frame, None for the lidar, at (n,) times (ns)."""
         T_world_lidar = [self.street.simulator.T_world_lidar_at(int(ns)) for ns in stamp_ns]
         return np.stack(T_world_lidar) @ (np.eye(4) if T_lidar_ego is None else T_lidar_ego)
 
@@ -281,7 +275,7 @@ def stamp_lines(stamps_ns: Int) -> str:
 
 
 def sweep_data(street: Street, frame: int, points: Float | Float32 | None = None) -> bytes:
-    """Return the bytes of a KITTI sweep file: float32 x y z intensity for each return of a sweep.
+    """Return the bytes of a KITTI sweep file, float32 x y z intensity for each return.
 
     ``points`` (N,3) replaces the positions if given.
     """
@@ -296,10 +290,7 @@ def T_lidar_imu(tilt_deg: float) -> Float:
 
 
 def oxts_line(street: Street, frame: int, first: int) -> str:
-    """Return the line of an oxts record with the true pose of the inertial unit at a frame.
-
-    ``first`` is the first frame of the drive. Velocities, accelerations and turn rates are 0.
-    """
+    """Return the oxts line with the true pose of the inertial unit at a frame; velocities are 0."""
     # Readers take the Mercator scale from the latitude of frame ``first``, which is fixed.
     T_lidar_ego = T_lidar_imu(street.simulator.tilt_deg)
     T_world_now, T_world_first = (

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Show one key sweep or a drive: Foxglove (MCAP), rerun (https://rerun.io), open3d, a video.
-
-docs/formats/writing.md lists the topics and entities.
-"""
+"""Show a key or a drive, as docs/formats/writing.md lists: Foxglove, rerun, open3d, a video."""
 
 from __future__ import annotations
 

@@ -294,10 +294,7 @@ class Recording:
         return float(np.concatenate(is_below).mean())
 
     def find_beyond(self, key: int) -> Beyond | None:
-        """Return the static surfaces along the road beyond the key's window.
-
-        None if ``accumulate.far_m`` is 0, or if no sweep beyond the window can be used.
-        """
+        """Return the static surfaces beyond the key's window; None without ``far_m`` or sweeps."""
         if not self.settings.accumulate.far_m:
             return None
         piece = self._piece(key)

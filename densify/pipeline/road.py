@@ -82,10 +82,7 @@ class Road:
     views: Sequence[tuple[Camera, Float]]  # cameras with their poses ``T_cam_world`` (4,4)
 
     def find_static_surfaces(self, with_window: bool) -> StandingWorld:
-        """Return the static surfaces along the road that a view may see, world of the window.
-
-        ``with_window`` includes the points of the window's own sweeps.
-        """
+        """Return the static surfaces that a view may see, world; also the window's if asked."""
         window_sweeps = self._thin_window()
         with ThreadPoolExecutor(num_threads()) as pool:
             sweeps_before, sweeps_after = pool.map(self._collect_side, (-1, 1))

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Run the pipeline. `densify` is all of it for one key::
+"""Run the pipeline.
+
+`densify` is all of it for one key::
 
     register and deskew the window     recording.window
     accumulate rigidly, or with flow   recording.moment   (free space, ground, motion)
@@ -177,9 +179,9 @@ def densify(
 ) -> dict[str, Result]:
     """Return method -> result for one key. Each result has the results before it as baselines.
 
-    Unless results are scored, only the maps of the last method are filled, as only they are
-    completed with ``priors``. A stage shared by several keys counts in ``watch`` for the first of
-    them. Only ``with_images`` is the cloud coloured, and depth scored if there is ground truth.
+    Unless results are scored, only the maps of the last method are filled. ``priors`` complete the
+    maps of the last method. A stage shared by several keys counts in ``watch`` for the first of
+    them. ``with_images`` colours the cloud, and scores depth if there is ground truth.
     """
     methods = tuple(dict.fromkeys(methods))  # each once, in order
     sequence = recording.sequence

@@ -75,13 +75,8 @@ def _exists(location: str) -> bool:
 def open_sequence(spec: str | Path = "street") -> LidarSequence:
     """Open a recording; sweeps and images are read later, on demand.
 
-    Args:
-        spec: A path, ``READER:PATH[#SCENE]``, or ``street[:PRESET][?seed=N&sensor=NAME]`` for the
-            built-in simulated street. Without ``READER:`` the reader is recognised by the files.
-
-    Raises:
-        InputError: No reader recognises the path, the scene is missing or not unique, or the first
-            image of a camera does not have the size of its calibration.
+    ``spec`` is a path, ``READER:PATH[#SCENE]``, or ``street[:PRESET][?seed=N&sensor=NAME]`` for the
+    built-in simulated street. Without ``READER:`` the reader is recognised by the files.
     """
     parsed = Spec.parse(spec)
     if parsed.reader == "street":
@@ -160,10 +155,7 @@ def in_lines(lines: Sequence[tuple[str, str]]) -> str:
 
 
 def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
-    """Return a summary of a recording as (name, text) pairs, such as frames, rate and cameras.
-
-    Only the first and the last readable sweep are loaded.
-    """
+    """Return a recording's summary as (name, text) pairs, by its first and last readable sweep."""
     timeline = Timeline.of(sequence)
     unreadable = dict(timeline.unknown)
     first = _readable(sequence, timeline.frames, unreadable)

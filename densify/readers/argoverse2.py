@@ -8,10 +8,9 @@
     LOG/annotations.feather                                  optional: tracked boxes
 
 Points are in the vehicle's frame (x forward, y left, z up), float16, ego-motion compensated to the
-file's stamp, the *start* of the sweep. The reader undoes this with the poses and the firing times
-(``offset_ns``). Two scanners turn half a revolution apart: lasers 0 to 31 are ``up_lidar``, 32 to
-63 ``down_lidar``, upside down (issue 77 of av2-api). Images are undistorted (k1 to k3 do not apply)
-and stamped at their exposure. Sweeps and images are numbered from 0 in the order of time.
+file's stamp, the *start* of the sweep; poses and ``offset_ns`` undo this. Lasers 0 to 31 are
+``up_lidar``, 32 to 63 ``down_lidar``, upside down, half a revolution apart (issue 77 of av2-api).
+Images are undistorted (k1 to k3 do not apply). Sweeps and images are numbered by time from 0.
 """
 
 from __future__ import annotations
@@ -107,10 +106,7 @@ class Argoverse2(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's annotated boxes in the lidar frame.
-
-        None without a file of boxes (test split), or if the file has no boxes of this sweep.
-        """
+        """Return a sweep's boxes in the lidar frame; None without annotations of this sweep."""
         path, columns = self.where / "annotations.feather", self._annotations
         stamp_ns = self.stamp_ns(frame)
         rows = np.flatnonzero(columns["timestamp_ns"] == stamp_ns) if columns else np.zeros(0, int)

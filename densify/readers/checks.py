@@ -28,9 +28,8 @@ def numbered_files(
 ) -> dict[int, Path]:
     """Return the numbered files of a folder, such as ``0000000120.bin``, by ascending number.
 
-    Args:
-        *suffixes: Accepted suffixes. Of files with the same number, the earliest suffix is taken.
-        stem: Pattern of a whole name without suffix; its first group is the number.
+    Of files with the same number, the earliest of ``suffixes`` is taken. The first group of
+    ``stem``, which matches a whole name without suffix, is the number.
     """
     entries = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
     files = [
@@ -66,10 +65,7 @@ def drive_around(path: Path) -> Path | None:
 
 
 def of_frame(entries: Mapping[int, T], frame: int, kind: str, where: Path) -> T:
-    """Return the entry of a frame, such as a file or stamp; raise InputError if it is missing.
-
-    The message begins with ``where`` and names the ``kind`` of the entry.
-    """
+    """Return the entry of a frame; the error for a missing one names ``where`` and ``kind``."""
     if frame not in entries:
         raise InputError(
             f"{where}: no {kind} of frame {frame}; frames that exist: {format_frames(entries)}"
@@ -111,10 +107,7 @@ def pinhole(
     where: str,
     **lens: Any,
 ) -> Camera:
-    """Return a camera with zero skew; raise InputError for impossible numbers.
-
-    ``lens`` has further arguments of `Camera`, such as ``distortion``. ``where`` begins messages.
-    """
+    """Return a camera with zero skew, after checks; ``lens`` has further arguments of `Camera`."""
     fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
         raise InputError(
@@ -128,12 +121,7 @@ def pinhole(
 def chosen_scene(
     reader: str, path: Path, scene: str | None, names: Sequence[str], none: str
 ) -> str:
-    """Return the name of the requested scene; for None, the name of the only scene.
-
-    Args:
-        names: Names of the existing scenes.
-        none: Message of the InputError if there are no scenes.
-    """
+    """Return the requested scene, for None the only one; ``none`` is the error without any."""
     if not names:
         raise InputError(f"{path}: {none}")
     if scene in names or (scene is None and len(names) == 1):
@@ -166,10 +154,7 @@ def parse_numbers(text: str, where: str, count: int) -> Float:
 
 
 def rigid(T: Any, where: str) -> Float:
-    """Return a (4,4) rigid transform after checks; raise InputError if it is none.
-
-    ``T`` is given as (4,4), (3,4), or 16 or 12 numbers. ``where`` begins messages.
-    """
+    """Return a (4,4) rigid transform, checked, from (4,4), (3,4), or 16 or 12 numbers."""
     T = np.asarray(T, np.float64)
     T = T.reshape(-1, 4) if T.size in (12, 16) else T
     if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Read columns of feather, parquet and pickled files of data frames as arrays, and check them.
 
-A pickle may import and call any function. Here imported names become classes that only store their
-arguments, from which the columns are taken; names that a data frame does not need are refused.
+No code of a pickle is run: imported names become classes that only store their arguments, from
+which the columns are taken. Names that a data frame does not need are refused.
 """
 
 from __future__ import annotations
@@ -40,14 +40,10 @@ def read_arrow(
 ) -> dict[str, NDArray[Any]]:
     """Return columns (N,) of a feather or parquet file by name.
 
-    Args:
-        path: File whose suffix is .feather or .parquet.
-        columns: Name of a column -> its kind: "n" finite numbers, "m" numbers or NaN, "i"
-            integers, "s" strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of
-            arrays or None).
-        data_set: Extra that installs pyarrow, and the name of the recordings for messages.
-        where: Name of a column -> value that the rows to read have there, for a parquet file; None
-            for all rows.
+    ``columns`` gives the kind of each column: "n" finite numbers, "m" numbers or NaN, "i" integers,
+    "s" strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of arrays or None).
+    ``where`` selects the rows of a parquet file by values of columns. ``data_set``, an extra that
+    installs pyarrow and the recordings' name, is for messages.
     """
     needed("pyarrow", *data_set)
     is_feather = path.suffix == ".feather"
@@ -153,8 +149,7 @@ class _Unpickler(pickle._Unpickler):
 def read_pickled(path: Path) -> dict[str, NDArray[Any]]:
     """Return the columns (N,) of a gzipped, pickled pandas data frame, by name; no code is run.
 
-    A column of texts holds Python objects, whose type the caller must check. Raise InputError for
-    a damaged file or other content.
+    A column of texts holds Python objects, whose type the caller must check.
     """
     data = read_bytes(path)
     try:

@@ -56,12 +56,7 @@ def read_array(path: Path) -> NDArray[Any]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
 ) -> Arrays:
-    """Return the arrays of a .npz file by name.
-
-    Args:
-        names: Names of the arrays to read, of which some may be missing; None for all.
-        most_bytes: Greatest size of these arrays together.
-    """
+    """Return arrays of a .npz by name, ``most_bytes`` together at most; ``names`` None for all."""
     data = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -105,10 +100,9 @@ def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
 
 
 def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDArray[Any]:
-    """Decode the bytes of a PNG or JPEG file to (H,W,3) uint8 pixels in blue, green, red.
+    """Decode PNG or JPEG bytes to (H,W,3) uint8 pixels in blue, green, red.
 
-    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16. Raise InputError
-    for a damaged image; a JPEG file with a mendable error is read with a warning.
+    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16.
     """
     import cv2
     from PIL import Image
@@ -172,11 +166,7 @@ def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
 
 
 def decode_jpeg(data: bytes) -> tuple[NDArray[np.uint8], str]:
-    """Decode a JPEG file, after mending errors that leave all pixels.
-
-    Returns:
-        Pixels (H,W,3) in blue, green, red, and a description of the repairs, "" for none.
-    """
+    """Return a JPEG file's (H,W,3) pixels in blue, green, red, and its repairs, "" for none."""
     pixels, complaint = _decoded_strictly(data)
     repairs = []
     if complaint.startswith(_NO_END):

@@ -9,8 +9,7 @@ Estimated and true maps each have one of these layouts (`densify dataset`: the 1
     000005/depth/image_02/000007.png                        its maps of single images, by number
     [image_02/]0000000005.png, scene_a.png                  plain folders; the name is the frame
 
-A drive is KITTI's dated name anywhere in a path, or the folder that holds proj_depth. Copies that
-`densify export` wrote into PREDICTED are left out.
+A drive is KITTI's dated name anywhere in a path, or the folder that holds proj_depth.
 """
 
 from __future__ import annotations
@@ -85,16 +84,11 @@ class _File(NamedTuple):
 def pair_depth_files(
     predicted: Path, truth: Path, mask: Path | None = None, *, filled: bool = False
 ) -> DepthPairs:
-    """Pair estimated PNG depth maps with true depth maps and with masks of moving objects.
+    """Pair estimated PNG depth maps with true ones and masks of moving objects: files or folders.
 
-    Two files are paired whatever their names. In folders the frames must agree; the drive and the
-    camera too if all paths name them.
-
-    Args:
-        predicted: File of an estimated map, or folder that is searched with its subfolders. Files
-            of a known layout exclude others.
-        mask: File or folder of masks, None for none.
-        filled: True to pair densify's filled maps instead of its maps of measured pixels.
+    Two files are paired whatever their names. In folders the frames must agree, and drive and
+    camera too if all paths name them; files of a known layout exclude others, and copies by
+    `densify export` are left out. ``filled`` pairs densify's filled maps, not the measured ones.
     """
     estimated = _of_product(_depth_files(predicted, "PREDICTED"), predicted, filled)
     files = _depth_files(truth, "TRUTH")

@@ -5,9 +5,8 @@
     ROOT/scene_02/calibration/<hash>.json  extrinsics (on the vehicle) and intrinsics, by name
     ROOT/scene_02/point_cloud/LIDAR/<stamp>.npz    ROOT/scene_02/rgb/CAMERA_01/<stamp>.jpg
 
-Sweeps and the images of each camera are numbered from 0 in the order of time; the number of a
-missing file stays unused. Each has an ISO date and a pose of its sensor. Points have no times and
-are in the sensor's frame. Images are of pinhole cameras without distortion.
+Sweeps and each camera's images are numbered by time from 0; a missing file's number stays unused.
+Each has a pose. Points have no times and are in the sensor's frame. Images have no distortion.
 """
 
 from __future__ import annotations

@@ -116,9 +116,7 @@ class FileSequence(ABC):
     def __getitem__(self, frame: int) -> Sweep:
         """Read a sweep and return its valid points, in file order, at their own firing times.
 
-        Rows at 0 0 0 (padding) or with a position that is not finite are dropped. Intensities that
-        are not finite become 0. Raise InputError without a valid row, or for an impossible number
-        of a scanner.
+        Rows at 0 0 0 (padding) or not finite are dropped; intensities that are not finite become 0.
         """
         path, returns = self._checked_returns(frame)
         x, y, z = returns.points.T  # by columns: reductions over rows of three are far slower

@@ -49,10 +49,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Return the motion of all points from the flow files of a folder: the engine ``npz:FOLDER``.
-
-    ``argument`` is the path of the folder; `densify.flow.engines.EngineModule` describes the rest.
-    """
+    """Return the motion of all points from a folder's flow files: the engine ``npz:FOLDER``."""
     check_argument(argument)
     step = partial(read_step, Path(argument), scene.stretch)
     return ChainedMotion(scene.stretch, step)
@@ -65,11 +62,7 @@ def check_argument(argument: str) -> None:
 
 
 def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowField:
-    """Read the flow of a sweep's points to another sweep, ego-motion removed, in its lidar frame.
-
-    ``source`` and ``target`` are indices in ``stretch.sweeps``. Points that are missing
-    in the flow file are static.
-    """
+    """Read a sweep's flow to another, ego-motion removed, lidar frame; 0 for missing points."""
     columns = _step_columns(folder, stretch, stretch.frames[source], stretch.frames[target])
     residual = columns["residual_flow"]
     moving = columns["moving"].astype(bool)
@@ -80,11 +73,7 @@ def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowF
 
 
 def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Columns:
-    """Read a flow file's arrays, as the module describes them, for N points in the sweep's order.
-
-    Missing residual_flow, moving, object and valid are added. A point that is missing in the file
-    has flow 0 and object -1, and is not valid.
-    """
+    """Return a flow file's arrays for a sweep's N points; missing ones have flow 0, object -1."""
     path = folder / f"{frame:06d}_{target:06d}.npz"
     sweep = stretch[frame].sweep
     row = sweep.row

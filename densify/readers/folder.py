@@ -95,11 +95,7 @@ class SweepColumns:
         )
 
     def stamp_ns(self, frame: int) -> int:
-        """Return a sweep's stamp (ns).
-
-        Without stamps it is a time of the sweep's points if those are absolute, else the frame
-        number times the period.
-        """
+        """Return a sweep's stamp (ns), else an absolute time of its points, else frame x period."""
         if self.series.stamps_ns is not None:
             return self.series.stamps_ns[frame]
         times = self._point_clock
@@ -315,10 +311,7 @@ class Folder(FileSequence):
 
 
 def _find_sweeps(folder: Path, files: str) -> list[Path]:
-    """Return the numbered point files of a folder, all of the preferred suffix.
-
-    ``files`` is the subfolder of the sweeps; "" searches the folder and two levels below it.
-    """
+    """Return the numbered point files in ``files`` ("": two levels deep), all of one suffix."""
     if files:
         existing(folder, files, "sweeps: {files: ...}", is_folder=True)
     below = files_below(folder / files, SUFFIXES, 0 if files else _SEARCH_DEPTH)

@@ -103,10 +103,7 @@ def _scene(reader: str, path: Path, scene: str | None, names: list[str]) -> str:
 
 
 class Drive(FileSequence):
-    """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped when it faces forward.
-
-    Azimuth and the median period give the firing times. A subclass sets ``cameras`` and ``truth``.
-    """
+    """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped when it faces forward."""
 
     def __init__(
         self, name: str, where: Path, sweeps: Path, stamps: Stamps, images: Mapping[str, Path]
@@ -149,9 +146,8 @@ class Drive(FileSequence):
 class KittiRaw(Drive):
     """A KITTI raw drive as a `LidarSequence`, stamped at the middle of the revolution.
 
-    Without ``timestamps.txt`` a stamp is the mean of start and end. Without start or end of the
-    revolution ``offset_ns`` is None. The world is the frame of the GPS/IMU unit at the first oxts
-    file.
+    Without ``timestamps.txt`` a stamp is the mean of start and end; without these ``offset_ns`` is
+    None. The world is the frame of the GPS/IMU unit at the first oxts file.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -278,10 +274,9 @@ class KittiOdometry(Drive):
     """A KITTI odometry sequence as a `LidarSequence`.
 
     ``times.txt`` has seconds since the first frame. Points are ego-motion compensated to the stamp,
-    without firing times. The poses undo this by fixed-point iteration: firing time and azimuth at
-    firing depend on each other. Without poses ``offset_ns`` is None. Images are rectified.
-    ``calib.txt`` has their projections and ``Tr``, T_cam_lidar of camera 0. A pose P is T_first_now
-    of camera 0; the scanner's is Tr⁻¹ P Tr.
+    without firing times; poses undo this by fixed-point iteration, as firing time and azimuth at
+    firing depend on each other. Without poses ``offset_ns`` is None. Images are rectified. ``Tr``
+    is T_cam_lidar of camera 0. A pose P is T_first_now of camera 0; the scanner's is Tr⁻¹ P Tr.
     """
 
     def __init__(self, path: Path) -> None:
@@ -336,12 +331,10 @@ class KittiOdometry(Drive):
 class KittiTracking(Drive):
     """A KITTI tracking sequence as a `LidarSequence`, without stamps.
 
-    Points are not deskewed. Images are rectified. ``calib`` has projections, R_rect, Tr_velo_cam
-    and Tr_imu_velo. The world is the frame of the GPS/IMU unit (oxts) at frame 0.
-
-    A label line is ``frame track type truncated occluded alpha left top right bottom height width
-    length x y z rotation_y [score]``. x y z is the middle of the box's bottom in rectified camera
-    0, at the time at which the scanner faced the object. rotation_y is the heading about y, 0 along
+    Points are not deskewed. Images are rectified. The world is the frame of the GPS/IMU unit (oxts)
+    at frame 0. A label line is ``frame track type truncated occluded alpha left top right bottom
+    height width length x y z rotation_y [score]``. x y z is the middle of the box's bottom in
+    rectified camera 0 when the scanner faced the object; rotation_y is the heading about y, 0 along
     x. Only objects in view of image_02 have boxes; ``DontCare`` rectangles may hold more objects.
     """
 
@@ -368,11 +361,7 @@ class KittiTracking(Drive):
         return T_first_imu(first, record) @ poses.inverse(self._calibration.motion("Tr_imu_velo"))
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return the labelled boxes of a sweep in the lidar frame; None without a file of labels.
-
-        Objects are labelled only in view of image_02; without images its smallest size is assumed.
-        A box is at the position of its object when the scanner faced it, at ``offset_ns``.
-        """
+        """Return a sweep's boxes (at ``offset_ns``) in the lidar frame; None without labels."""
         self.check_frame(frame)
         path = self.where / "label_02" / self._scene_file
         if not path.is_file():
@@ -410,8 +399,7 @@ class Kitti360(Drive):
     """A KITTI-360 drive as a `LidarSequence`, stamped at the middle of the revolution.
 
     Points are not deskewed. image_00 and image_01 are rectified; image_02 and image_03 are fisheyes
-    to the sides (Mei's model), used up to 90 degrees off the axis. Poses are the GPS/IMU unit's and
-    are interpolated, since frames at standstill have no pose.
+    (Mei's model), used up to 90 degrees off the axis. Poses are the GPS/IMU unit's, interpolated.
     """
 
     def __init__(self, path: Path, drive: str) -> None:

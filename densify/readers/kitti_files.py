@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read the files that KITTI's data sets share: sweeps, stamps, GPS/IMU records, calibration, boxes.
-
-Errors begin with the file, and the line where there is one.
-"""
+"""Read the files of KITTI's data sets: sweeps, stamps, GPS/IMU records, calibration, boxes."""
 
 from __future__ import annotations
 
@@ -76,10 +73,7 @@ class Stamps:
 
 
 def read_stamps(path: Path, required: bool = True) -> Stamps:
-    """Read the dates (UTC) of a file with a line for each frame; lines without a date are skipped.
-
-    ``required`` is True to raise InputError for a missing file; else it has no stamps.
-    """
+    """Read the dates (UTC), a line for each frame; none for a missing file not required."""
     if not required and not path.exists():
         return Stamps(path, {})
     lines = [line.strip() for line in read_text(path).splitlines()]
@@ -99,10 +93,7 @@ def read_stamps(path: Path, required: bool = True) -> Stamps:
 
 
 def parse_oxts(text: str, where: str) -> Float:
-    """Return the (30,) numbers of a record of the GPS/IMU unit; errors begin with ``where``.
-
-    The first six are latitude and longitude (deg), altitude (m), roll, pitch and yaw (rad).
-    """
+    """Return (30,): first latitude, longitude (deg), altitude (m), roll, pitch and yaw (rad)."""
     values = checks.parse_numbers(text, where, 30)
     if abs(values[0]) >= 90:
         raise InputError(f"{where}: got a latitude of {values[0]:g} deg, expected -90 to 90")
@@ -110,10 +101,7 @@ def parse_oxts(text: str, where: str) -> Float:
 
 
 def T_first_imu(first: Float, record: Float) -> Float:
-    """Return the (4,4) pose of the GPS/IMU unit relative to its pose at the drive's first record.
-
-    Both records are as `parse_oxts` returns them.
-    """
+    """Return a record's (4,4) pose of the GPS/IMU unit relative to the drive's first record."""
     return poses.inverse(_T_mercator_imu(first, first)) @ _T_mercator_imu(record, first)
 
 
@@ -159,10 +147,7 @@ class Calibration:
         return checks.rigid(self.numbers(key, 3, 4), f"{self.path}: {key}")
 
     def rotation(self, key: str, translation: str = "") -> Float:
-        """Return the (4,4) transform of an entry of nine numbers, a (3,3) rotation.
-
-        ``translation`` names the entry of the translation (m), "" for none.
-        """
+        """Return the (4,4) transform of an entry's rotation (3,3) and a named translation (m)."""
         t = self.numbers(translation, 3, 1) if translation else np.zeros((3, 1))
         return checks.rigid(np.hstack([self.numbers(key, 3, 3), t]), f"{self.path}: {key}")
 
@@ -171,8 +156,7 @@ class Calibration:
     ) -> Camera:
         """Return the rectified camera of an entry with a projection matrix P = K [I | t].
 
-        ``size_px`` is width and height, or the entry that has them. ``T_rect_lidar`` (4,4) maps the
-        lidar frame to the frame of rectified camera 0.
+        ``size_px`` is (width, height) or its entry; ``T_rect_lidar`` leads to rectified camera 0.
         """
         P = self.numbers(key, 3, 4)
         if isinstance(size_px, str):
@@ -208,11 +192,7 @@ def read_fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
 
 
 def read_labels(path: Path) -> tuple[Float, Bool]:
-    """Read the label lines of a tracking sequence, described in `densify.readers.kitti`.
-
-    Returns:
-        (n,16) numbers of the lines without type and score, and an (n,) mask of DontCare lines.
-    """
+    """Return (n,16) numbers of label lines without type and score, and an (n,) mask of DontCare."""
     rows, is_area = [], []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()

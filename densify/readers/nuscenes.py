@@ -5,15 +5,13 @@
     ROOT/v1.0-trainval/sample_annotation.json    optional: tracked boxes
     ROOT/{samples,sweeps}/LIDAR_TOP/*.pcd.bin    ROOT/samples/CAM_FRONT/*.jpg ...
 
-A scene's sweeps, and each camera's images, are numbered from 0 in the order of time; the number of
-a missing file is skipped. Images are undistorted and stamped at the exposure. The vehicle's path
-joins the poses of all records of a scene.
+Sweeps and each camera's images are numbered by time from 0; a missing file's number is skipped.
+Images are undistorted and stamped at the exposure.
 
 The scanner is one HDL-32E at 20 Hz. Points are in the scanner's frame (x right, y forward, z up),
 ego-motion compensated to the sweep's stamp, the time of the *last* packet, and have no times. A
-file lists the firings in order, 32 rings each, 46.08 µs apart (HDL-32E manual, 9.3). Firing c of n
-is (c + 1 - n) · 46.08 µs after the stamp. With these times the compensation is undone; missing
-returns then lie at the origin and are left out.
+file lists the firings in order, 32 rings each, 46.08 µs apart (HDL-32E manual, 9.3): firing c of n
+is (c + 1 - n) · 46.08 µs after the stamp. With these times the compensation is undone.
 """
 
 from __future__ import annotations
@@ -61,10 +59,7 @@ def stamp_ns(record: Record) -> int:
 
 
 def pose_of(record: Record, where: str) -> Float:
-    """Return the (4,4) pose in a record of ego_pose, calibrated_sensor or sample_annotation.
-
-    Such a record has a quaternion w x y z and a translation in metres. ``where`` begins messages.
-    """
+    """Return the (4,4) pose (m) of a record with a quaternion w x y z and a translation."""
     return checks.quaternion_pose(record["rotation"], record["translation"], where)
 
 
@@ -75,10 +70,7 @@ def read_table(path: Path) -> dict[str, Record]:
 
 
 def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Record]:
-    """Return some records of a JSON table by their tokens, without parsing the others.
-
-    Records are returned if their field ``key`` holds one of the tokens ``wanted``.
-    """
+    """Return the records of a JSON table whose field ``key`` is in ``wanted``, by token."""
     pattern = re.compile(rb'"%s"\s*:\s*"([^"]*)"' % key.encode())
     names = frozenset(name.encode() for name in wanted)
     records = []
@@ -126,10 +118,7 @@ class Annotations:
 
     @staticmethod
     def read(tables: Path, scene: str) -> Annotations | None:
-        """Read the boxes of a scene; None if the table is missing or has no box of the scene.
-
-        ``tables`` is the folder of the tables, ``scene`` the token of the scene.
-        """
+        """Read the boxes of a scene (a token); None without a table or boxes of this scene."""
         path = tables / "sample_annotation.json"
         if not path.is_file():
             return None
@@ -151,11 +140,7 @@ class Annotations:
         return Annotations(str(path), key_ns, (*boxes.values(),)) if any(boxes.values()) else None
 
     def at(self, stamp_ns: int, T_lidar_world: Float) -> Boxes | None:
-        """Return the boxes at a time, interpolated between key frames, in the lidar frame.
-
-        None before the first or after the last key frame. ``T_lidar_world`` (4,4) maps world
-        coordinates to the lidar frame at that time.
-        """
+        """Return the boxes at a time, interpolated, lidar frame; None outside the key frames."""
         if not self.key_ns[0] <= stamp_ns <= self.key_ns[-1]:
             return None
         after = int(np.searchsorted(self.key_ns, stamp_ns))
@@ -311,11 +296,7 @@ class NuScenes(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the lidar frame, interpolated between the annotated key frames.
-
-        None if the sweep lies outside the time span of the key frames, or if the scene has no
-        annotations (test split).
-        """
+        """Return a sweep's boxes, lidar frame; None outside key frames or without annotations."""
         self.check_frame(frame)
         if self._annotations is None:
             return None

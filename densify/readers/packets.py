@@ -78,11 +78,7 @@ def open_recording(path: Path, scene: str | None) -> FileSequence:
 
 
 def find_metadata(path: Path) -> Path | None:
-    """Return the metadata file in the folder of a capture; None if the choice is not clear.
-
-    The file with the longest name that begins the name of the capture is chosen, or else the only
-    ``.json`` file.
-    """
+    """Return a capture's .json: the longest name that begins its own, or the only one; or None."""
     json_files = sorted(path.parent.glob("*.json"))
     named = [p for p in json_files if path.stem.startswith(p.stem)]
     if named:
@@ -141,10 +137,7 @@ class Velodyne(FileSequence):
 
 
 def _find_packets(path: Path) -> Int:
-    """Return (4,P) values of the packets with returns, in the order of the file.
-
-    The rows are offset in the file, capture time (ns), azimuth (0.01 deg) and packet clock (us).
-    """
+    """Return the packets' (4,P) file offset, capture time (ns), azimuth (0.01 deg), clock (us)."""
     packets = []
     with open_file(path) as file:
         magic = file.read(24)[:4]
@@ -277,10 +270,7 @@ class Ouster(FileSequence):
 def lost_and_doubled(turn: Int, column: Int) -> tuple[int, int]:
     """Return the number of packets missing between others, and of those captured a second time.
 
-    Args:
-        turn: (P,) number of the turn of each packet, which wraps at 16 bits.
-        column: (P,) number of the first column of each packet. A sensor with a limited azimuth
-            sends some columns only.
+    ``turn`` (P,) of the packets wraps at 16 bits; ``column`` (P,) is the first column of each.
     """
     step = np.diff(turn, prepend=turn[:1])
     turn = np.cumsum((step + _HALF_WRAP) % (2 * _HALF_WRAP) - _HALF_WRAP)

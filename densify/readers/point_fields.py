@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Find the meaning of a point cloud's fields by their names, and of times also by their values.
 
-Velodyne's ``time`` is in seconds since the stamp, Ouster's ``t`` and Livox's ``offset_time`` in
-nanoseconds, Hesai's and RoboSense's ``timestamp`` in seconds since 1970. The span of a sweep's
-times tells the unit: units differ by a factor of 1000, and a sweep takes about one period.
+Units differ by a factor of 1000 and a sweep takes about one period, so the span of a sweep's times
+tells their unit: Velodyne's ``time`` is in s since the stamp, Ouster's ``t`` and Livox's
+``offset_time`` in ns, Hesai's and RoboSense's ``timestamp`` in s since 1970.
 """
 
 from __future__ import annotations
@@ -60,10 +60,7 @@ class Fields:
 
 
 def find_fields(names: Collection[str]) -> Fields:
-    """Find the field of each quantity among the names of a cloud's fields, in any case of letters.
-
-    If several names fit, the order of the aliases in `_NAMES` decides.
-    """
+    """Find the field of each quantity by its name, in any case; the order of aliases decides."""
     # CloudCompare puts scalar_ before the names of fields.
     lower = {name.lower().removeprefix("scalar_"): name for name in reversed(list(names))}
     field_of_quantity = {
@@ -89,15 +86,7 @@ class PointTimes:
     reference: str
 
     def offset_ns(self, values: NDArray[Any], stamp_ns: int) -> tuple[Int, Bool]:
-        """Convert the times of a sweep's points to ns since its stamp.
-
-        Args:
-            values: (N,) times in the field's unit.
-            stamp_ns: Stamp of the sweep.
-
-        Returns:
-            (N,) int64 times, 0 where invalid, and an (N,) mask of the valid times.
-        """
+        """Return point times (N,) as int64 ns since the stamp, 0 if invalid, and a valid mask."""
         times_ns, is_valid = self._times_ns(values, stamp_ns)
         offset_ns = np.zeros(len(values), np.int64)
         if is_valid.any():
@@ -108,10 +97,7 @@ class PointTimes:
         return offset_ns, is_valid
 
     def own_stamp_ns(self, values: NDArray[Any]) -> int | None:
-        """Return a stamp (ns) for a sweep whose (N,) point times are absolute.
-
-        The stamp is the earliest time or the time of `reference`; None if no time is valid.
-        """
+        """Return a stamp (ns) by a sweep's (N,) absolute point times; None if none is valid."""
         times_ns, is_valid = self._times_ns(values, None)
         return self._reference_ns(times_ns[is_valid]) if is_valid.any() else None
 
@@ -160,11 +146,7 @@ def _extent(times: NDArray[Any]) -> tuple[float, float]:
 
 
 def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K, Columns]:
-    """Read the columns of up to 5 sweeps with points, spread over a recording, by sweep.
-
-    ``read`` returns the columns of a sweep. Unreadable sweeps are left out; if no other sweep has
-    points, InputError is raised.
-    """
+    """Read the columns of up to 5 readable sweeps with points, spread over a recording."""
     columns_of_sweep, errors = dict[K, Columns](), list[InputError]()
     for sweep in sweeps[:: max(1, len(sweeps) // _NUM_SAMPLED)][:_NUM_SAMPLED]:
         try:
@@ -194,17 +176,7 @@ def find_times(
     period_ns: int,
     stamps_ns: Sequence[int] | None,
 ) -> tuple[PointTimes | None, str]:
-    """Find the unit, epoch, middle and span of point times.
-
-    The middle and the span are medians over the sweeps.
-
-    Args:
-        period_ns: Time between consecutive sweeps.
-        stamps_ns: Stamp of each of these sweeps, None without stamps.
-
-    Returns:
-        The meaning of the times and its description; or None and the reason of the failure.
-    """
+    """Return the meaning of the sweeps' point times and its description, or None and the reason."""
     finite = [values[np.isfinite(values)] for values in sweeps]
     extents = np.array([_extent(values) for values in finite if len(values)] or [(0.0, 0.0)])
     middle, reach = np.median(extents, axis=0).tolist()
@@ -256,19 +228,13 @@ def find_times(
 
 
 def _unit_of(span_in_periods: float) -> str:
-    """Return the unit in which a span is about the span of a sweep; "" if no unit fits.
-
-    ``span_in_periods`` is the span divided by the period in ns.
-    """
+    """Return the unit in which a span, over the period in ns, fits a sweep; "" if none fits."""
     shares = {unit: span_in_periods * unit_ns for unit, unit_ns in UNIT_NS.items()}
     return next((unit for unit, share in shares.items() if _SHORTEST < share < _LONGEST), "")
 
 
 def full_scale(intensity: NDArray[Any]) -> float:
-    """Return the divisor that scales intensities to the range 0 to 1.
-
-    It is the smallest of 1, 255 and 65535 that suffices, or else the largest finite intensity.
-    """
+    """Return the divisor that scales intensities to 0 to 1: 1, 255, 65535 or their maximum."""
     greatest = float(np.max(intensity, initial=0.0, where=np.isfinite(intensity)))
     return next((scale for scale in _FULL_SCALES if greatest <= scale), greatest)
 
@@ -300,12 +266,8 @@ class PointLayout:
     ) -> PointLayout:
         """Find the meaning of the fields from several sweeps of a sensor.
 
-        Args:
-            period_ns: Time between consecutive sweeps.
-            stamps_ns: Stamp of each sweep, None without stamps.
-            named: Quantity -> name of its field, where the user states it.
-            intensity_scale: Divisor of intensities that the user states, 0 to find it.
-            **times: unit, absolute or reference that the user states, as in `TimeField`.
+        The user may state ``named`` (quantity -> field), ``intensity_scale`` (0 to find it), and
+        ``times`` (unit, absolute, reference as in `TimeField`). ``stamps_ns`` are the sweeps'.
         """
         fields = Fields(**(vars(find_fields(sweeps[0])) | dict(named or {})))
         missing = [axis for axis in "xyz" if not getattr(fields, axis)]
@@ -328,8 +290,7 @@ class PointLayout:
     def returns(self, columns: Columns, where: Path | str, stamp_ns: int) -> tuple[Returns, Bool]:
         """Return all N rows of a sweep, and a mask (N,) of the valid rows.
 
-        A valid row has a finite position other than 0 0 0 and a time inside the sweep. Invalid
-        rows get the position 0 0 0.
+        Valid rows have a finite position, not 0 0 0, and a time inside the sweep; others get 0 0 0.
         """
         missing = [name for name in vars(self.fields).values() if name and name not in columns]
         if missing:

@@ -54,9 +54,7 @@ class PointTable:
 
 
 def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
-    """Read all rows of a point file, in file order; raise InputError for other or damaged files.
-
-    ``names`` gives names to the columns of a file without names, by default those of `unnamed`.
+    """Read all rows of a point file, in file order; ``names`` replace the columns of `unnamed`.
 
     .bin        float32 columns; without ``names``, those of KITTI, nuScenes or Waymo if size and
                 values fit one of them

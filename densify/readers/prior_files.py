@@ -4,10 +4,9 @@
     DIR/[CAMERA/[data/]]FRAME.npy, .exr or .png    CAMERA may be omitted for a single camera
     DIR/sky/[CAMERA/]FRAME.png    optional masks, nonzero for sky
 
-A single file is accepted too. FRAME is the number of the image: 120, 0000000120, 0000000120_depth
-or _disp. Arrays are (H,W) of any number type; axes of length 1 are dropped. EXR files have one
-channel, or one called Z, Y or depth. PNG files are 16 bit gray. A pixel that is not finite or not
-above 0 has no value.
+FRAME is the image's number: 120, 0000000120, 0000000120_depth or _disp. Arrays are (H,W) of any
+number type; EXR files have one channel, or one called Z, Y or depth; PNG files are 16 bit gray. A
+pixel that is not finite or not above 0 has no value. A single file is accepted too.
 """
 
 from __future__ import annotations
@@ -69,16 +68,13 @@ class PriorFiles:
         return PriorFiles(path, values, sky)
 
     def describe_available(self, camera: str) -> str:
-        """Return a clause for messages, such as "there are 96-135": a camera's images with priors.
-
-        ``camera`` is its name.
-        """
+        """Return a clause on the images of ``camera`` with priors, such as "there are 96-135"."""
         return f"there are {format_frames(self.values[camera])}"
 
     def prior(self, camera: Camera, number: int) -> Prior | None:
-        """Read the prior of image ``number`` at the camera's size (H,W); None if it has no prior.
+        """Read an image's prior at the camera's size (H,W); None if it has no prior.
 
-        A prior of another size is resized if its aspect ratio agrees to 2 %, else InputError.
+        A prior of another size is resized if its aspect ratio agrees to 2 %.
         """
         path = self.values[camera.name].get(number)
         if path is None:

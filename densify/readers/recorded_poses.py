@@ -47,10 +47,7 @@ class PoseTrack:
             )
 
     def at(self, time_ns: int) -> Float:
-        """Return T_world_ego (4,4) at a time, interpolated between the nearest poses.
-
-        It is extrapolated up to 0.2 s beyond the ends of the path; farther, InputError is raised.
-        """
+        """Return T_world_ego (4,4) at a time, interpolated, or extrapolated by up to 0.2 s."""
         begin, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
         beyond_ns = max(begin - time_ns, time_ns - end)
         if beyond_ns > _MAX_BEYOND_NS:
@@ -69,14 +66,8 @@ class PoseTrack:
     def as_fired(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
         """Undo ego-motion compensation: return points in the vehicle frame at their firing times.
 
-        Many data sets store a sweep as if measured at one time, which smears moving objects and
-        bends rings.
-
-        Args:
-            points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``; padding at 0 0 0
-                stays.
-            stamp_ns: Time to which the points are compensated.
-            offset_ns: (N,) firing times since ``stamp_ns``.
+        ``points`` (N,3), metres, are in the vehicle frame at ``stamp_ns``, padding at 0 0 0 stays;
+        ``offset_ns`` (N,) are the firing times since then.
         """
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
@@ -86,10 +77,7 @@ class PoseTrack:
         return self._carry(points, stamp_ns, offset_ns, inverse=False)
 
     def taken_back(self, placed: Returns, stamp_ns: int) -> Returns:
-        """Return world points that were placed with this path in the vehicle frame, as fired.
-
-        Points of a sweep without times are in the vehicle frame at ``stamp_ns`` instead.
-        """
+        """Return world points as fired, or without times in the vehicle frame at ``stamp_ns``."""
         points = taken_back(placed.points, self.at(stamp_ns))
         if placed.offset_ns is not None:
             points = self.as_fired(points, stamp_ns, placed.offset_ns)
@@ -138,9 +126,8 @@ class PoseFile:
     ) -> PoseFile | None:
         """Read the poses of a recording; None without any.
 
-        ``name`` is the pose file; "" searches for a file of a usual name, a file with the suffix
-        .pose beside each sweep, or the viewpoints of .pcd files. ``unit`` is the unit of the times,
-        "" to find it.
+        ``name`` is the pose file; "" searches for a usual name, a .pose file beside each sweep, or
+        the viewpoints of .pcd files. ``unit`` is the unit of the times, "" to find it.
         """
         if name:
             return PoseFile.read(existing(folder, name, "poses: {file: ...}"), unit)
@@ -155,10 +142,7 @@ class PoseFile:
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
-        """Read a file with one pose on each line; raise InputError if the lines are no poses.
-
-        ``unit`` is the unit of the times, "" to find it.
-        """
+        """Read a file with a pose on each line; ``unit`` is the times' unit, "" to find it."""
         table = TextTable.read(path, [name for names in _TURNS for name in names])
         columns = [i for names in (*_TURNS, *_POSITIONS) if (i := table.column(names)) is not None]
         width, form, time = len(table.rows[0]), "table with quaternions", None
@@ -209,10 +193,7 @@ class PoseFile:
             return None
 
     def by_frame(self, frames: Sequence[int]) -> dict[int, Float]:
-        """Return the (4,4) poses by frame number, for the ascending ``frames`` of a recording.
-
-        The file has a pose for each of the frames, or for each number from 0, else InputError.
-        """
+        """Return the (4,4) poses of ascending ``frames``, listed in order or by number from 0."""
         if self.frames is not None:
             return dict(zip(self.frames, self.T, strict=True))
         if len(self.T) == len(frames):

@@ -79,11 +79,7 @@ class Topics(NamedTuple):
 
     @staticmethod
     def choose(bag: Bag, options: str | None) -> Topics:
-        """Choose the topics to read by the user's options and the message types.
-
-        ``options`` is the text after ``#``, None without. Raise InputError for an unknown topic, or
-        if several topics could be the sweeps.
-        """
+        """Choose the topics by the ``options`` after ``#``, None without, and the message types."""
         named = dict(parse_qsl(options or "", keep_blank_values=True))
         unknown = [key for key in named if key not in _TYPES]
         if unknown or (options and not named):
@@ -198,10 +194,7 @@ class Transforms:
         return None
 
     def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
-        """Return the name of a frame's moving parent, and the path T_parent_frame over time.
-
-        None if no frame above it moves.
-        """
+        """Return a frame's moving parent and T_parent_frame over time; None if nothing moves."""
         # The nearest moving parent is usually odom, not map, which jumps at loop closures.
         for body, T_body_frame in self._above(frame).items():
             if body in self.moving:

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Read ROS bags without ROS: index their messages, and decode points, images and calibrations.
-
-One scan indexes header stamps; a message is decoded on demand.
-"""
+"""Read ROS bags without ROS: index header stamps in one scan, and decode messages on demand."""
 
 from __future__ import annotations
 
@@ -133,11 +130,7 @@ class Bag:
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Return the index entries of the messages of each topic, by ascending stamp.
-
-        Messages without a stamp are counted in ``num_unstamped``. A message that was recorded twice
-        is indexed once and counted in ``num_twice``.
-        """
+        """Return each topic's entries by ascending stamp; count those unstamped and those twice."""
         entries_of_topic: dict[str, list[Entry]] = {topic: [] for topic in topics}
         num_recorded_at = Counter[tuple[str, int]]()
         indexed: set[tuple[str, int, int]] = set()
@@ -359,10 +352,7 @@ def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
 def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, where: str) -> Camera:
     """Convert a CameraInfo message to a camera, adjusted for binning and region of interest.
 
-    Args:
-        T_optical_lidar: (4,4) pose of the lidar in the message's optical frame.
-        rectified: True for rectified images, which use P and the rotation R; raw images use K and
-            the distortion D.
+    Rectified images use P and R, raw ones K and D; ``T_optical_lidar`` leads to the optical frame.
     """
     matrix = {  # ROS 1 writes K, ROS 2 k
         key: np.asarray(getattr(info, key if hasattr(info, key) else key.upper()), np.float64)

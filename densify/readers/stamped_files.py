@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find files of sweeps and images, and their times in file names or in a text file beside them.
-
-The unit of times since 1970 is found by their size.
-"""
+"""Find files of sweeps and images, and their times in file names or in a text file beside them."""
 
 from __future__ import annotations
 
@@ -108,8 +105,7 @@ class TextTable(NamedTuple):
     def times_ns(self, column: int, unit: str) -> tuple[tuple[int, ...], str]:
         """Return the times of a column in nanoseconds, and the unit in the file ("date" for dates).
 
-        With "" for ``unit``, the unit of times since 1970 is found by their size; other times are
-        in seconds. Raise InputError for a text that is no time, or for times too far apart.
+        ``unit`` "" finds the unit of times since 1970 by their size; others are in seconds.
         """
         times = [words[column] for words in self.rows]
         dates = "-" in times[0][1:] and ":" in times[0]
@@ -175,10 +171,7 @@ class StampFile(NamedTuple):
         return StampFile(path, stamps_ns, unit, names)
 
     def of(self, paths: Mapping[int, Path]) -> dict[int, int]:
-        """Return the stamp (ns) of each of the given files, by number.
-
-        Lines belong to files by name, or in order, or by number. Raise InputError if none fits.
-        """
+        """Return the stamps (ns) of files by number; lines belong by name, order or number."""
         if self.names is not None:
             by_name = {Path(n).stem: ns for n, ns in zip(self.names, self.stamp_ns, strict=True)}
             missing = [path for path in paths.values() if path.stem not in by_name]
@@ -242,12 +235,8 @@ def in_time(
 ) -> Series:
     """Order files by time and find their stamps; files whose names are times are numbered from 0.
 
-    Args:
-        paths: Files.
-        stamps: "names" if file names are stamps, "sweeps" for files without stamps, the name of a
-            stamp file beside the files or below ``root``, or "" to search for one.
-        unit: Unit of the stamps, "" to detect it.
-        shared: True to search in ``root`` too.
+    ``stamps`` is "names", "sweeps" (no stamps), or a stamp file beside the files or below ``root``,
+    "" to search (``shared``: in ``root`` too). ``unit`` is theirs, "" to detect it.
     """
     by_names = stamps == "names"
     names = [NamedFile.of(path, unit if by_names else "") for path in paths]
@@ -312,10 +301,7 @@ def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path
 
 
 def files_below(root: Path, suffixes: Sequence[str], depth: int) -> dict[str, list[Path]]:
-    """Return the visible files with one of the suffixes by folder, ``depth`` levels down at most.
-
-    Folders are named relative to ``root``; links to folders and broken links are left out.
-    """
+    """Return the visible files by folder relative to ``root``, at most ``depth`` levels down."""
     files_of_folder = {}
     for folder, subfolders, names in os.walk(root):
         # os.walk visits the subfolders that remain in the list.

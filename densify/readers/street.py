@@ -2,8 +2,7 @@
 """Provide the built-in simulated street as a recording. Frames are rendered on demand and cached.
 
 ``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``, 16 seconds long. The
-cache (DENSIFY_CACHE_DIR, or the user's cache directory) may be deleted: rendering is reproducible
-byte for byte.
+cache (DENSIFY_CACHE_DIR, or the user's) may be deleted: rendering is reproducible byte for byte.
 """
 
 from __future__ import annotations
@@ -51,10 +50,8 @@ class Street:
     ) -> None:
         """Set up the street; sweeps and images are rendered on demand.
 
-        Args:
-            preset: "street", "highway", "static" (only the ego vehicle moves) or "crossing" (the
-                ego vehicle stands).
-            tilt_deg: Pitch of the lidar's mount, nose down. Cameras are not tilted.
+        ``preset``: "street", "highway", "static" (only the ego vehicle moves), "crossing" (it
+        stands). ``tilt_deg`` is the pitch of the lidar's mount, nose down.
         """
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)

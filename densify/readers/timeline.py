@@ -74,10 +74,7 @@ class Timeline:
 
     @staticmethod
     def of(sequence: LidarSequence) -> Timeline:
-        """Read the stamps of a recording's sweeps, without points.
-
-        Missing stamps and those out of order are interpolated by index.
-        """
+        """Read the sweeps' stamps; those missing or out of order are interpolated by index."""
         frames = tuple(sequence.frames)
         unknown = {}
         stamps_ns = np.zeros(len(frames), np.int64)
@@ -127,11 +124,7 @@ class Timeline:
         return [self.frames[row] for row in np.flatnonzero(inside)]
 
     def runs(self, frames: Collection[int]) -> list[list[int]]:
-        """Split frame numbers into ascending series of consecutive sweeps.
-
-        A series ends where a sweep of the recording is missing from ``frames``, or before a hole in
-        time of more than 3.1 median periods.
-        """
+        """Split frames into ascending consecutive series, also at holes over 3.1 median periods."""
         series: list[list[int]] = []  # indices of the sweeps
         for row in sorted(self.row[frame] for frame in frames):
             if series and series[-1][-1] == row - 1 and not self._hole_before(row):
@@ -153,8 +146,7 @@ class Timeline:
     ) -> WindowFrames:
         """Return the key frame and up to ``window`` sweeps before and after the key frame.
 
-        A side ends early at the end of the recording, a hole in time, or an unusable sweep, whose
-        reason is in ``left_out`` by frame number.
+        A side ends at the recording's end, a hole, or a sweep in ``left_out`` (frame -> reason).
         """
         check_window(window)
         if key not in self.row:
@@ -169,10 +161,7 @@ class Timeline:
     def _side(
         self, key: int, step: int, num: int, left_out: Mapping[int, str]
     ) -> tuple[list[int], str]:
-        """Return up to ``num`` frames beside the key, nearest first, and why there are no more.
-
-        ``step`` is -1 for frames before the key and 1 for frames after it.
-        """
+        """Return up to ``num`` frames beside the key, nearest first, and why there are no more."""
         side: list[int] = []
         key_row = self.row[key]
         for row in range(key_row + step, key_row + step * (num + 1), step):
@@ -224,11 +213,9 @@ def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) 
 
 
 def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
-    """Return the sweep without returns that are too near, too far or lone.
+    """Return the sweep without returns that are too near (the own vehicle), too far or lone.
 
-    Returns nearer than ``settings.min_range_m`` (the own vehicle) or farther than ``max_range_m``
-    are removed; ranges are measured from the scanner that fired. In snow, rain and dust, returns
-    without neighbours are removed too. The copy counts the removed near and lone returns.
+    Ranges are from the scanner that fired. Near and lone returns (snow, rain, dust) are counted.
     """
     origins_m = sweep.scanner_origins
     x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T

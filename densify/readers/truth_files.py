@@ -36,22 +36,13 @@ def write_bodies(folder: Path, bodies: Bodies) -> None:
 def write_points(
     folder: Path, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], point: Float
 ) -> None:
-    """Write the ground truth of a sweep's N raw points, row by row.
-
-    Args:
-        body: (N,) index of the body of each point.
-        instance: (N,) number of its object, -1 for none.
-        point: (N,3) position in metres in the frame of the body.
-    """
+    """Write the truth of N points: body (N,), object (N,) or -1, ``point`` (N,3) m in the body."""
     path = folder / "points" / f"{frame:010d}.npz"
     _save(path, body=body, instance=instance, point=point)
 
 
 def write_depth(folder: Path, camera: str, frame: int, depth_m: Float32, moving: Bool) -> None:
-    """Write the true depth (H,W) in metres and the mask (H,W) of moving objects of an image.
-
-    ``folder`` is the ``truth`` folder, ``frame`` the number of the image.
-    """
+    """Write the true depth (H,W) in metres and the mask (H,W) of moving objects of an image."""
     _save(folder / "depth" / camera / f"{frame:010d}.npz", depth_m=depth_m, moving=moving)
 
 

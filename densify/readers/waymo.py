@@ -4,20 +4,18 @@
     ROOT/{lidar,lidar_calibration,vehicle_pose}/CONTEXT.parquet
     ROOT/{camera_image,camera_calibration,lidar_box}/CONTEXT.parquet    optional
 
-ROOT is ``training``, ``validation`` or ``testing``. A segment is named by ``#CONTEXT``. Frames are
-numbered from 0 in the order of time. An image has the number of its frame. Lidars 0 to 4 are TOP,
-FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. A return is a pixel of a range image: column is azimuth, row is
-inclination (range_image_utils.py of the data set). First returns precede second returns. Points are
-in the vehicle's frame (x forward, y left, z up) *when fired*, without compensation. The columns of
-TOP are spread evenly over the frame's period from ``frame_timestamp_micros``. The other lidars'
-returns are assumed to be at the sweep's stamp. Intensity has no upper bound and is mapped by tanh.
+ROOT is ``training``, ``validation`` or ``testing``; ``#CONTEXT`` names a segment. Frames, and their
+images, are numbered by time from 0. Lidars 0 to 4 are TOP, FRONT, SIDE_LEFT, SIDE_RIGHT, REAR. A
+return is a pixel of a range image: column is azimuth, row is inclination (range_image_utils.py of
+the data set). First returns precede second returns. Points are in the vehicle's frame (x forward, y
+left, z up) *when fired*, without compensation. TOP's columns are spread evenly over the frame's
+period from ``frame_timestamp_micros``; other lidars' returns are assumed to be at the stamp.
 
-``vehicle_pose`` is the pose at the middle of the spin and equals the pose of the FRONT image (issue
-464 of waymo-open-dataset). The sweep's stamp is the ``pose_timestamp`` of this image, or without
-images half a period after the frame's stamp. Cameras have distortion (k1 k2 p1 p2 k3) and rolling
-shutters, usually sideways. An image's pose is moved to the middle of its exposure. Coordinate 0 of
-the calibration is the left edge of the first pixel. Built on published formulas; not tried on real
-files.
+``vehicle_pose`` is at the middle of the spin and equals the pose of the FRONT image (issue 464 of
+waymo-open-dataset). The stamp is this image's ``pose_timestamp``, or without images half a period
+after the frame's. Cameras have distortion (k1 k2 p1 p2 k3) and rolling shutters, usually sideways;
+poses are moved to the middle of the exposure. Calibrated coordinate 0 is the left edge of the first
+pixel. Built on published formulas; not tried on real files.
 """
 
 from __future__ import annotations
@@ -74,10 +72,7 @@ class Segment(NamedTuple):
     def read(
         self, component: str, kinds: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Read columns of a component; return them by name, without the name of the component.
-
-        ``kinds`` and ``where`` are as in `densify.readers.column_files.read_arrow`.
-        """
+        """Return columns of a component by short name; arguments are as in `read_arrow`."""
         full_kinds = {full_name(component, name): kind for name, kind in kinds.items()}
         path, data_set = self.file(component), ("waymo", "Waymo recordings")
         columns = read_arrow(path, full_kinds, data_set, where)
@@ -151,10 +146,7 @@ def read_boxes(segment: Segment) -> dict[int, Boxes]:
 
 
 def read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]:
-    """Return times and poses of images by camera name and frame number.
-
-    ``starts_us`` has the (n,) ``frame_timestamp_micros`` of the frames.
-    """
+    """Return times and poses of images by camera and frame; ``starts_us`` (n,) are the frames'."""
     keys = ("shutter", "camera_trigger_time", "camera_readout_done_time")
     seconds = ("pose_timestamp", *(f"rolling_shutter_params.{key}" for key in keys))
     kinds = {STAMP: "i", CAMERA: "i", "pose.transform": "l", **dict.fromkeys(seconds, "n")}
@@ -256,10 +248,7 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the vehicle's frame.
-
-        None without a file of boxes (test split), or if the file has no boxes of this sweep.
-        """
+        """Return a sweep's boxes in the vehicle's frame; None without annotations of this sweep."""
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))
 

@@ -79,24 +79,18 @@ def thin(points: Float, voxel_m: float) -> Any:
 
 
 def make_map() -> Any:
-    """Return an empty map of surfaces, a ``GaussianVoxelMap`` of small_gicp.
+    """Return an empty map of surfaces, a ``GaussianVoxelMap`` of small_gicp with 1 m voxels.
 
-    Each cubic voxel, 1 m wide, holds the mean and the covariance of its points (Koide et al.,
-    "Voxelized GICP for Fast and Accurate 3D Point Cloud Registration", ICRA 2021).
+    Koide et al., "Voxelized GICP for Fast and Accurate 3D Point Cloud Registration", ICRA 2021.
     """
     return small_gicp.GaussianVoxelMap(_LEAF_M)
 
 
 def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> Alignment:
-    """Align a source with a target, and return the alignment.
+    """Return the alignment of a source, in its own frame, with a target, from (4,4) initial pose.
 
-    A source `Surface` is aligned by generalized ICP, other points are aligned point to plane.
-
-    Args:
-        target: A `Surface`, or a map (`make_map`) of surfaces.
-        source: A `Surface`, or points without covariances (`thin`), in its own frame.
-        T_target_source: (4,4) initial pose of the source.
-        match_m: Greatest distance in metres between corresponding points.
+    A `Surface` is aligned with a `Surface` or map (`make_map`) by generalized ICP, other points
+    (`thin`) point to plane, with matches up to ``match_m`` metres.
     """
     is_surface = isinstance(source, Surface)
     points = source.points if is_surface else source

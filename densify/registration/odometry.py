@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Register sweeps, point to plane, on the surfaces of the preceding second.
 
-`find_odometry` predicts the motion of dense sweeps by KISS-ICP.
-
-KISS-ICP (Vizzo et al., RA-L 2023) matches a sample of a sweep with the scan pattern of earlier
-sweeps. A rosette pattern that turns 7 degrees a sweep turns these poses with it. The surface
-normals of one second do not depend on the pattern (Chen, Medioni, "Object modelling by registration
-of multiple range images", IVC 1992).
+KISS-ICP (Vizzo et al., RA-L 2023) predicts the motion of dense sweeps. It matches a sweep with the
+scan pattern of earlier ones: a rosette that turns 7 degrees a sweep turns these poses with it.
+Surface normals of one second do not depend on the pattern (Chen, Medioni, "Object modelling by
+registration of multiple range images", IVC 1992).
 """
 
 from __future__ import annotations
@@ -47,18 +45,11 @@ _DAMPING = np.diag([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
 def register_on_surfaces(
     sweeps: Sequence[Sweep], twists: Float | None = None
 ) -> tuple[Float, list[Float]]:
-    """Register raw sweeps, each with the sweeps of the preceding 1 s.
+    """Return (S,4,4) poses of raw sweeps in the first's frame, and (N,3) deskewed points in it.
 
-    The first sweeps are registered with the sweeps of the following 1 s.
-
-    Args:
-        sweeps: S raw sweeps, ascending in time.
-        twists: (S,6) predicted velocities (rad/s, m/s), each from the preceding sweep to this one,
-            in the lidar frame, from `find_odometry`. None predicts constant velocity.
-
-    Returns:
-        The (S,4,4) poses in the frame of the first sweep, and (N,3) deskewed points of each sweep
-            in that frame, at most about 15,000.
+    Each is registered with the sweeps of the preceding 1 s, the first with those of the following 1
+    s. ``twists`` (S,6) of `find_odometry` predict, rad/s, m/s, lidar frame, from the preceding
+    sweep; None predicts constant velocity. Each sweep has at most about 15,000 points.
     """
     if twists is not None:
         return _SweepSeries(sweeps, _NUM_NEIGHBORS, _MATCH_M).register(twists[0], twists)
@@ -90,12 +81,7 @@ class _SweepSeries:
     def __init__(
         self, sweeps: Sequence[Sweep], num_neighbors: int, match_m: Sequence[float]
     ) -> None:
-        """Prepare the sweeps.
-
-        Args:
-            num_neighbors: Number of neighbours that give a point's normal.
-            match_m: Greatest distance of a match, for each round of alignment.
-        """
+        """Prepare the sweeps, with matches up to ``match_m`` for each round of alignment."""
         self._sweeps = [subsample(sweep, FEW_POINTS) for sweep in sweeps]
         self.stamp_ns = np.array([sweep.stamp_ns for sweep in sweeps], np.int64)
         self._step_s = np.diff(self.stamp_ns) * 1e-9
@@ -146,10 +132,7 @@ class _SweepSeries:
     def _place(
         self, i: int, velocity_index: int, T_guess: Float, twist: Float, neighbours: range
     ) -> Float:
-        """Align sweep i with ``neighbours``, nearest first, and return the sweep's velocity (6,).
-
-        The velocity is that from sweep ``velocity_index - 1`` to ``velocity_index``.
-        """
+        """Align sweep i with ``neighbours``, nearest first, and return its velocity (6,)."""
         self._T[i] = T_guess  # without neighbours the sweep keeps its prediction
         if neighbours:
             surface, T_world_surface = self._surface_for(i, neighbours)
@@ -204,10 +187,10 @@ _ABOVE_GROUND_M = 0.4
 def find_odometry(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
     """Return the (S,6) approximate velocities (rad/s, m/s) of S >= 2 raw sweeps, by KISS-ICP.
 
-    Each is the velocity from the preceding sweep, in the lidar frame; the first equals the second.
-    Only points above the ground are registered. With rings on flat ground, a highway of 64 rings
-    looks as if the vehicle were at rest. KISS-ICP assumes a start at rest. Therefore prediction
-    starts from `search_twist`, and sweeps of a fast scanner are registered about 0.1 s apart.
+    Each is from the preceding sweep, in the lidar frame; the first equals the second. Only points
+    above the ground count: by rings on flat ground a highway of 64 rings looks at rest. KISS-ICP
+    assumes a start at rest. Therefore `search_twist` starts it, and sweeps of a fast scanner are
+    registered about 0.1 s apart.
     """
     from kiss_icp.config import KISSConfig
     from kiss_icp.kiss_icp import KissICP
@@ -243,13 +226,8 @@ def find_odometry(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
 def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
     """Return the (6,) initial velocity (rad/s, m/s), without rotation, by a grid search.
 
-    It is the velocity that best aligns the points above the ground in the first three sweeps. The
-    grid moves the second sweep by steps of 1 m, then by 0.5 m around the best position. The steps
-    are shorter for sweeps less than 0.1 s apart.
-
-    Args:
-        stamp_ns: (S,) reference times of the sweeps.
-        points: (N,3) of each sweep, metres, in its own lidar frame.
+    It best aligns the points above the ground in the first three sweeps, each (N,3), metres, in its
+    lidar frame. Steps are 1 m, then 0.5 m, shorter for sweeps less than 0.1 s apart.
     """
     step_s = np.diff(stamp_ns[:3]) * 1e-9
     pairs = []
@@ -301,10 +279,7 @@ def _grid(center: Float, reach_m: float, step_m: float) -> Float:
 
 
 def above_ground(points: Float) -> Float:
-    """Return those of (N,3) points over 0.4 m above the lowest in their 1 m grid cell.
-
-    All points are returned if none is as high.
-    """
+    """Return those of (N,3) points 0.4 m above the lowest in their 1 m cell, or all if none is."""
     if not len(points):
         return points
     x, y, z = points.T

@@ -17,9 +17,9 @@ _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
 def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
     """Return (M,) True for ghosts, and (M,) True for points that the key sweep cannot judge.
 
-    A ghost is a point of another sweep at a position that the key sweep saw through: all returns of
-    the key sweep in the point's cell and the eight cells around it, at least six, are farther by
-    more than max(0.5 m, 2 % of its range). Dark paint and glass give no return and hide ghosts.
+    At a ghost's position, all returns of the key sweep in its cell and the eight around it, at
+    least six, are farther by more than max(0.5 m, 2 % of its range). Dark paint and glass hide
+    ghosts.
     """
     ghost, unjudged = np.zeros((2, len(cloud)), bool)
     rows = np.flatnonzero(_others(cloud, key))
@@ -40,9 +40,9 @@ def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
 def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
     """Return the shares of `ghosts` among the ``num_points`` points of the window's other sweeps.
 
-    They are for ``all``, ``moving`` and ``static`` points, by distance from the key sweep in frames
-    (``by_distance["3"]``) and by time from it, rounded to 10 ms (``by_seconds["0.30"]``).
-    ``unjudged`` has the shares without returns of the key sweep to compare.
+    They are for ``all``, ``moving`` and ``static`` points, by frames (``by_distance["3"]``) and
+    seconds (``by_seconds["0.30"]``) from the key sweep. ``unjudged`` has the shares that it cannot
+    judge.
     """
     rows = np.flatnonzero(_others(cloud, key))
     ghost, unjudged = (mask[rows] for mask in ghosts(cloud, key_image, key))

@@ -63,15 +63,9 @@ def depth_errors(
 ) -> DepthErrors:
     """Return the errors of depths over the pixels with ground truth.
 
-    A depth z is an outlier if its disparity ``focal_px * baseline_m / z`` differs by more than 3 px
-    *and* by more than 5 % from the true disparity.
-
-    Args:
-        predicted_m: (H,W) map or (N,) list of depths, camera z in metres, 0 for none.
-        truth_m: True depths of the same shape.
-        mask: True at the pixels that count, None for all.
-        focal_px: Focal length fx.
-        baseline_m: Stereo baseline.
+    Depths (H,W) or (N,) are camera z in metres, 0 for none; ``mask`` is True at the pixels that
+    count. A depth z is an outlier if its disparity ``focal_px * baseline_m / z`` differs by more
+    than 3 px *and* by more than 5 % from the true disparity.
     """
     has_truth = truth_m > 0 if mask is None else (truth_m > 0) & mask
     is_compared = has_truth & (predicted_m > 0)
@@ -105,14 +99,10 @@ def precision_density(
 ) -> list[dict[str, float | None]]:
     """Return density and share of outliers for each least confidence 0, 0.05, … 0.95.
 
-    Args:
-        truth_m: (H,W) true depth in metres, 0 for none.
-
-    Returns:
-        For each least confidence ``min_confidence``, and for ``measured`` and ``filled`` depth:
-            ``density_*``, share of the pixels that keep a depth; ``outliers_*``, share of outliers
-            among those with a true depth, None for none; ``expected_*``, share of outliers that the
-            confidence of the kept pixels promises.
+    Each has ``min_confidence``, and for ``measured`` and ``filled`` depth: ``density_*``, share of
+    the pixels that keep a depth; ``outliers_*``, share of outliers among those with a true depth,
+    None for none; ``expected_*``, share of outliers that the confidence of the kept pixels
+    promises.
     """
     curve = []
     for min_confidence in _LEAST_CONFIDENCES:
@@ -139,8 +129,6 @@ def errors_by_part(
 ) -> dict[str, DepthErrors]:
     """Return `depth_errors` of parts of the pixels (H,W), by name of the part.
 
-    The arguments are as in `depth_errors`; ``moving`` is True at pixels of moving objects.
-
     The parts are ``all`` pixels, ranges of true depth (``0-10 m`` … ``over 80 m``), `depth_edges`
     (``edge``), other pixels (``not edge``) and, given a mask, ``moving`` and ``static`` pixels.
     """
@@ -161,15 +149,10 @@ def errors_by_part(
 
 
 def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_BASELINE_M) -> Bool:
-    """Return (H,W) True at pixels with a true depth close to a depth discontinuity.
+    """Return (H,W) True at pixels with a true depth in metres close to a depth discontinuity.
 
     Within 3 px of such a pixel, another true depth would be an outlier at this pixel. Level ground
     is no discontinuity: for a camera 1.65 m above it, disparity grows by 0.54/1.65 px per row.
-
-    Args:
-        truth_m: (H,W) true depth in metres, 0 for none.
-        focal_px: Focal length, which gives disparity with the baseline.
-        baseline_m: Stereo baseline.
     """
     known = truth_m > 0
     disparity_px = np.zeros(truth_m.shape)
@@ -221,16 +204,10 @@ def scores_by_motion(
 
 
 def outlier_probability(confidence: Float | Float32) -> Float:
-    """Return the probability that a pixel is an outlier by KITTI's rule.
+    """Return the probability, in the shape of ``confidence``, of an outlier by KITTI's rule.
 
     It is ``10 ** (-5 * confidence)``. A pixel value v above 0 of a confidence PNG means the
     confidence ``(v - 1) / 254``.
-
-    Args:
-        confidence: Confidence of 0 to 1, of any shape.
-
-    Returns:
-        Probabilities of the same shape.
     """
     probability: Float = 10.0 ** (-DECADES * np.asarray(confidence, np.float64))
     return probability

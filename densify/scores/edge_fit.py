@@ -93,8 +93,8 @@ def silhouettes_of(sweep: Sweep) -> Silhouettes:
 def depth_edges(points: Float) -> Silhouettes:
     """Return the depth discontinuities of one scanner's points (N,3), metres, in its own frame.
 
-    A return is at an edge if its inverse range lies above the line through both neighbours. On a
-    plane inverse range is linear at any slant, so neither a distant road nor a fence gives edges.
+    There inverse range, linear on a plane at any slant, lies above the line through both
+    neighbours.
     """
     x, y, z = points.T
     range_m = np.linalg.norm(points, axis=1)
@@ -133,10 +133,7 @@ def depth_edges(points: Float) -> Silhouettes:
 
 
 def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, float]:
-    """Return `View.strength` and `View.scale` of an (H,W,3) RGB image.
-
-    ``focal_px`` is the focal length of the image.
-    """
+    """Return `View.strength` and `View.scale` of an (H,W,3) RGB image with a focal length."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     scale = _FOCAL_PX / focal_px
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -166,14 +163,12 @@ def score(camera: Camera, views: Sequence[View]) -> tuple[float, int]:
 
 
 def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -> bool:
-    """Return True if an image is clearly turned against the depth discontinuities of a sweep.
+    """Return True if an RGB image is clearly turned against the depth discontinuities of a sweep.
 
     It is if a turn of up to 2.7 degrees scores better than the best turn within 0.3 degrees, by two
-    standard errors of the sum of their differences at the discontinuities, and if that turn stands
-    out: where discontinuities are few, the best of many turns is better by chance too.
-
-    ``camera`` has its pose at the exposure of the (H,W,3) RGB image. ``silhouettes`` are of the
-    sweep nearest in time.
+    standard errors of the sum of their differences at the discontinuities, and stands out: where
+    discontinuities are few, the best of many turns is better by chance too. ``camera`` has its pose
+    at the exposure of the (H,W,3) image.
     """
     view = View(silhouettes, *image_edges(image, camera.focal_px), np.zeros(6), 0.0)
     lines = _Lines.of(camera, view, np.zeros(4))
@@ -190,10 +185,9 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
 
 
 def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
-    """Return the best-fitting offset of a camera to two or more views.
+    """Return the best-fitting offset of a camera to two or more views, with a delay or without.
 
-    The delay is fitted only ``with_clock``, else it is 0. Among local maxima that fit equally well,
-    the one that changes the fewest parameters is chosen.
+    Among equal local maxima, the one that changes the fewest parameters is chosen.
     """
     free = np.array([True, True, True, with_clock])
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]

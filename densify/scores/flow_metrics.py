@@ -37,18 +37,15 @@ def end_point_error(estimated: Float, true: Float, mask: Bool | None = None) -> 
 
 
 def accuracy(estimated: Float, true: Float, limit: float) -> float:
-    """Return the share (0 to 1) of the points with a small end-point error.
-
-    The error is below ``limit`` metres *or* below ``limit`` times the length of the true flow.
-    """
+    """Return the share of points with an error below ``limit`` metres or times the true flow."""
     error_m = end_point_errors(estimated, true)
     return mean_of((error_m < limit) | (error_m < limit * np.linalg.norm(true, axis=1)))
 
 
 def angle_error_rad(estimated: Float, true: Float) -> float:
-    """Return the mean angle in radians between the estimated and the true flow.
+    """Return the mean angle from true to estimated flow, where true flow is not 0.
 
-    Points whose true flow is 0 do not count. An estimate of 0 counts as a right angle.
+    An estimate of 0 counts as a right angle.
     """
     length_m = np.linalg.norm(true, axis=1)
     flow, truth, length_m = (values[length_m > 0] for values in (estimated, true, length_m))
@@ -68,21 +65,14 @@ def challenge_scores(
 ) -> dict[str, Any]:
     """Score flow as the Argoverse 2 scene flow challenges do, within 35 m of the vehicle.
 
-    Args:
-        points: (N,3) metres, vehicle frame, of all pairs of sweeps, without the ground.
-        estimated: (N,3) flow to the next sweep.
-        true: (N,3) true flow to the next sweep.
-        classes: (N,) indices in `CLASSES`, or `IGNORED`.
-
-    Returns:
-        ``three_way``: mean errors in metres of moving objects (0.05 m a sweep or more), of other
-            objects, of the background, and the mean of the three (Chodosh, Ramanan, Lucey, WACV
-            2024; the package av2). ``bucketed``: name of each class with points, and MEAN ->
-            ``static_m``, ``dynamic`` (Khatri et al., "I Can't Believe It's Not Scene Flow!", ECCV
-            2024; the package bucketed-scene-flow-eval). Points of a class are sorted into buckets
-            by their true flow. ``static_m`` is the mean error in the first bucket. ``dynamic`` is
-            the mean over the other buckets of error divided by true length. ``num_points``: number
-            of scored points.
+    Points and flows (N,3) are metres, vehicle frame, without ground; ``classes`` indices in
+    `CLASSES` or `IGNORED`. ``three_way`` are mean errors in metres of moving objects (0.05 m a
+    sweep or more), of other objects, of the background, and the mean of the three (Chodosh,
+    Ramanan, Lucey, WACV 2024; the package av2). ``bucketed`` has, for each class with points and
+    MEAN, ``static_m``, the mean error in the first bucket of true flow, and ``dynamic``, the mean
+    over the others of error divided by true length (Khatri et al., "I Can't Believe It's Not Scene
+    Flow!", ECCV 2024; the package bucketed-scene-flow-eval). ``num_points`` is the number of scored
+    points.
     """
     scored = np.abs(points[:, :2]).max(axis=1, initial=0) < _WITHIN_M
     scored &= classes < len(CLASSES)

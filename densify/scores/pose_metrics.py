@@ -18,13 +18,9 @@ _OFF_M, _OFF_PER_M, _OFF_DEG = 0.03, 0.01, 0.3
 def window_pose_errors(
     stretch: Stretch, key: int, T_world_lidar: Callable[[int], Float]
 ) -> tuple[float, float]:
-    """Return the errors of a window's poses relative to the key sweep's pose.
+    """Return the root mean square errors (m, degrees) of a window's poses relative to the key's.
 
     ``T_world_lidar`` returns the true (4,4) pose of a frame.
-
-    Returns:
-        Root mean squares over the sweeps of the translation error (m) and of the rotation error
-            (degrees).
     """
     T_key_world = poses.inverse(T_world_lidar(key))
     true = T_key_world @ np.stack([T_world_lidar(frame) for frame in stretch.frames])
@@ -48,10 +44,7 @@ class RecordedError(NamedTuple):
 
     @staticmethod
     def of(recorded: Sequence[Float], odometry: Sequence[Float]) -> RecordedError:
-        """Compare recorded motions with odometry.
-
-        Both are one or more (4,4) motions, each from the first to the last sweep of a stretch.
-        """
+        """Compare recorded motions (4,4), each over one stretch of sweeps, with odometry's."""
         T_recorded, T_odometry = np.stack(recorded), np.stack(odometry)
         difference = poses.log(poses.inverse(T_recorded) @ T_odometry)
         way_m = np.linalg.norm(T_odometry[:, :3, 3], axis=1)
@@ -65,14 +58,9 @@ class RecordedError(NamedTuple):
 def main_error(
     recorded: Sequence[Float], odometry: Sequence[Float], duration_s: float
 ) -> tuple[str, str]:
-    """Describe the main error of recorded motions, scale or drift, and its correction.
+    """Return a clause about the main error of recorded motions, and one about its correction.
 
-    Args:
-        odometry: The same motions by odometry.
-        duration_s: Duration of a motion.
-
-    Returns:
-        A clause about the error, and a clause about the correction, "" if there is none.
+    The error is scale or drift over ``duration_s``; the correction is "" if there is none.
     """
     recorded_m, odometry_m = (
         np.array([T[:3, 3] for T in motions]) for motions in (recorded, odometry)

@@ -114,8 +114,7 @@ class Picture:
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
     """Render the picture of a camera with a rolling shutter: each row at its own time.
 
-    The camera's pose is relative to a lidar on a level mount of the vehicle ``ego``. ``time_s`` is
-    the exposure time of the middle row, in seconds since frame 0.
+    Camera poses are relative to a level lidar; the middle row is at ``time_s`` since frame 0.
     """
     h, w = camera.height_px, camera.width_px
     v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)

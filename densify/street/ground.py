@@ -83,10 +83,7 @@ class Ground:
         return self.terrain.height(xy) + self.kerb_m * (self.distance(xy) > 0)
 
     def mesh(self, margin_m: float, cell_m: float) -> Mesh:
-        """Return the mesh of the ground: cells of ``cell_m`` near roads, 8 m elsewhere.
-
-        ``margin_m`` is the greatest distance of fine cells from a road.
-        """
+        """Return the mesh: cells of ``cell_m`` within ``margin_m`` of roads, 8 m elsewhere."""
         centre = np.concatenate([road.curve(road.curve.knots_m) for road in self.roads])
         low = centre.min(axis=0) - margin_m - _BORDER_M
         high = centre.max(axis=0) + margin_m + _BORDER_M
@@ -198,10 +195,7 @@ class Side:
 
 
 def mark_road(ground: Ground, road: Road, row: Any, spans: Spans) -> Mesh:
-    """Return the painted lines of a row of ``markings`` in scenes.yaml.
-
-    ``spans`` are the intervals of arc length (m) along the road that have lines.
-    """
+    """Return the painted lines of a row of ``markings``, at the arc lengths ``spans`` (m)."""
     dashes = [
         (station, station + _DASH_M)
         for begin, end in spans

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Simulate sweeps of the lidars in lidars.yaml: every pulse, and what comes back from it.
 
-A scan pattern has two methods. ``num_pulses(period_s)`` returns the number of pulses in a sweep.
-``directions(number, share, time_s)`` returns (N,3) unit vectors in the axes of the scanner. Its
-arguments describe N pulses: index from 0; firing time minus the reference time in periods, -0.5 to
-0.5; and firing time in seconds since frame 0.
+A scan pattern has ``num_pulses(period_s)`` and ``directions(number, share, time_s)``: unit vectors
+(N,3) in the scanner's axes, by index, firing time in periods about the reference time (-0.5 to
+0.5), and firing time in seconds since frame 0.
 """
 
 from __future__ import annotations
@@ -191,12 +190,7 @@ class Firings:
 
 
 def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
-    """Return all pulses of one sweep, evenly spaced in time.
-
-    Args:
-        time_s: Reference time in the middle of the sweep, seconds since frame 0.
-        period_ns: Duration of the sweep.
-    """
+    """Return a sweep's pulses, evenly spaced about its middle ``time_s``, seconds since frame 0."""
     pulses = []
     for index, scanner in enumerate(sensor.scanners):
         num = scanner.pattern.num_pulses(period_ns * _S_PER_NS)
@@ -274,12 +268,7 @@ def _decide_at_shell(outcome: Int, world: World, met: Meeting, rows: Int) -> Non
 
 
 def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
-    """Return the (N,) shares of pulses without a return, besides pulses that vehicles absorb.
-
-    Args:
-        tint: (N,) factors on their reflectivity.
-        range_m: (N,) ranges in metres.
-    """
+    """Return the (N,) shares of pulses lost; ``tint`` (N,) are factors on the reflectivity."""
     table = _TABLES.lost_elsewhere
     ground, dark, bright = (
         np.interp(range_m, table.range_m, shares)
@@ -291,12 +280,7 @@ def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
 
 
 def patches(position: Float, owner: Int) -> Float:
-    """Return (N,) random numbers, uniform from 0 to 1, that vary smoothly over a surface.
-
-    Args:
-        position: (N,3) positions on the surfaces in metres.
-        owner: (N,) numbers of the objects; each object has its own random numbers.
-    """
+    """Return (N,) random numbers, 0 to 1, smooth over the surface (N,3), metres, of each object."""
     # Normal random numbers at the corners of a grid of cells are interpolated.
     cell = np.floor(position / _PATCH_M)
     share = position / _PATCH_M - cell
@@ -374,10 +358,7 @@ class Mount(NamedTuple):
 
 
 def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) -> Returns:
-    """Simulate one sweep of a mounted sensor; ``rng`` always draws in the same order.
-
-    ``time_s`` is the reference time in the middle of the sweep, in seconds since frame 0.
-    """
+    """Simulate a mounted sensor's sweep whose middle is ``time_s``, in seconds since frame 0."""
     sensor = mount.sensor
     T = T_ego_lidar(mount.tilt_deg)
     fired = firings(sensor, time_s, mount.period_ns)

@@ -84,12 +84,7 @@ class Mesh:
 
     @staticmethod
     def quads(corners: Float, material: Material, tint: Tint | Float = WHITE) -> Mesh:
-        """Return a mesh of K quads, two triangles each. Texture x runs along the first side.
-
-        Args:
-            corners: (K,4,3) corners in metres, in order around each quad.
-            tint: (3,) factors on its colour, or (K,3) for each quad.
-        """
+        """Return a mesh of quads (K,4,3), metres, in order around; texture x is the first side."""
         num = len(corners)
         first_side = corners[:, 1] - corners[:, 0]
         last_side = corners[:, 3] - corners[:, 0]
@@ -147,10 +142,7 @@ def box(low: Point | Float, high: Point | Float, material: Material, tint: Tint 
 def frustum(
     low: Point, high: Point, material: Material, tint: Tint = WHITE, taper: Point = (1.0, 1.0)
 ) -> Mesh:
-    """Return a box whose top is scaled by ``taper`` in x and y about its own centre.
-
-    ``low`` and ``high`` are opposite corners (3,) of the box before the scaling, in metres.
-    """
+    """Return a box from ``low`` to ``high`` (3,), metres, its top scaled by ``taper`` in x, y."""
     lowest, highest = np.asarray(low, float), np.asarray(high, float)
     middle = (lowest + highest)[:2] / 2
     half = (highest - lowest)[:2] / 2
@@ -206,13 +198,7 @@ def ball(centre: Point, radius_m: Point, material: Material, tint: Tint = WHITE)
 
 
 def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint = WHITE) -> Mesh:
-    """Return square leaves, turned at random; each square stands for a bunch of leaves.
-
-    Args:
-        centres: (K,3) centres of the squares in metres.
-        size_m: Mean side of a square.
-        tint: Mean factors on the colour of the material.
-    """
+    """Return squares at ``centres`` (K,3), metres, turned at random, each a bunch of leaves."""
     num = len(centres)
     # Unit vectors along the sides of each square
     u = rng.normal(size=(num, 3))

@@ -53,11 +53,7 @@ class Actor:
 
 @lru_cache(_CACHED_MODELS)
 def model(name: str, **parameters: Any) -> Mesh:
-    """Return a model of models.yaml, joined from its solids.
-
-    ``parameters`` gives a value (a length, a colour or a material) to each name that the rows of
-    the model use.
-    """
+    """Return a model of models.yaml; ``parameters`` gives values to the names its rows use."""
     return Mesh.join([_solid(solid, parameters) for solid in getattr(_SHAPES, name)])
 
 
@@ -92,11 +88,7 @@ def _repeated_offsets(row: Any, parameters: dict[str, Any]) -> Float:
 
 
 def resolve(value: Any, parameters: Mapping[str, Any]) -> Any:
-    """Return a value of a table in which names are replaced by the values of parameters.
-
-    A pair [name, number] is replaced by the sum of the parameter and the number. Other lists are
-    resolved item by item, and unknown names stay.
-    """
+    """Return a value with names replaced by parameters; a pair [name, number] gives the sum."""
     if isinstance(value, str):
         return parameters.get(value, value)
     if not isinstance(value, list):

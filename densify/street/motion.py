@@ -62,13 +62,7 @@ class Curve:
     def bending(
         length_m: float, curvature: Callable[[Float], Float], origin_m: float = 0.0
     ) -> Curve:
-        """Return the curve with a given curvature that passes the origin in the direction +x.
-
-        Args:
-            length_m: Length of the curve.
-            curvature: Function from (N,) arc lengths to (N,) curvatures in 1/m, left positive.
-            origin_m: Arc length at which the curve passes the origin.
-        """
+        """Return the curve of a curvature (1/m, left positive) through the origin along +x."""
         step = _FINE_M
         station = np.arange(0.0, length_m + step, step)
         heading = np.concatenate([[0.0], np.cumsum(curvature(station[:-1] + step / 2) * step)])
@@ -170,10 +164,7 @@ class Terrain:
 
     @staticmethod
     def hilly(rng: np.random.Generator, max_slope: float, scale_m: float = 1.0) -> Terrain:
-        """Return a terrain of three waves in random directions, nowhere steeper than ``max_slope``.
-
-        ``scale_m`` is a factor on the lengths of the waves.
-        """
+        """Return a terrain of three random waves, nowhere steeper than ``max_slope``."""
         length_m = _WAVE_M * scale_m
         angle = rng.uniform(0, 2 * np.pi, 3)
         wave = (2 * np.pi / length_m)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -287,13 +278,9 @@ class Driving:
 def on_ground(
     terrain: Terrain, rear: Float, front: Float, lift_m: Float, upright: bool = False
 ) -> Poses:
-    """Return the N poses of bodies that stand on the ground, or above it.
+    """Return the N poses of bodies on the ground, or above it.
 
-    Args:
-        rear: (N,2) rear points of contact, world.
-        front: (N,2) front points of contact, world.
-        lift_m: (N,) heights of both points above the ground.
-        upright: True to stay vertical on slopes.
+    Points of contact ``rear`` and ``front`` (N,2), world, are ``lift_m`` (N,) above the ground.
     """
     rear_xyz = np.column_stack([rear, terrain.height(rear) + lift_m])
     front_xyz = np.column_stack([front, terrain.height(front) + lift_m])
@@ -313,12 +300,7 @@ class Towed:
     def __init__(
         self, tractor: Driving, kingpin_m: float, wheelbase_m: float, first_s: float, last_s: float
     ) -> None:
-        """Compute the path of the axle.
-
-        Args:
-            kingpin_m: Position of the kingpin on the x axis of the tractor.
-            wheelbase_m: Distance from the kingpin to the axle of the trailer.
-        """
+        """Compute the axle's path, ``wheelbase_m`` behind a kingpin on the tractor's x axis."""
         self._tractor = tractor
         self._kingpin_m = kingpin_m
         times = np.arange(first_s, last_s, _TOW_S)
@@ -372,10 +354,7 @@ class Rectangles(NamedTuple):
 
     @staticmethod
     def of(mesh: Mesh, poses: Poses, slack_m: float = 0.0) -> Rectangles:
-        """Return the N footprints of a mesh at N poses: its bounds from above, with a margin.
-
-        ``slack_m`` is the width of the margin on each side.
-        """
+        """Return a mesh's footprints from above at N poses, wider by ``slack_m`` on each side."""
         low, high = mesh.bounds
         n = len(poses.position)
         middle = np.append((low + high)[:2] / 2, 0.0)

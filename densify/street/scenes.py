@@ -184,13 +184,7 @@ class Scenery:
         self._num_parked = 0
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
-        """Place a mesh on the ground.
-
-        Args:
-            xy: (2,) position, world.
-            heading: Rotation about z in rad.
-            solid: Part of the mesh that traffic must not touch; None for all of it.
-        """
+        """Place a mesh at ``xy`` (2,), world, heading in rad; traffic avoids ``solid``."""
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
         self._stand(mesh, upright((*xy, z), heading), solid or mesh)
 
@@ -200,10 +194,7 @@ class Scenery:
         self.footprints.append(Rectangles.of(solid, pose))
 
     def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
-        """Return True if the mesh is clear of the carriageway and of all other objects.
-
-        ``kerb_gap_m`` is the least distance from the kerb; `put` describes the other arguments.
-        """
+        """Return True if a mesh is clear of all objects, and ``kerb_gap_m`` from the kerb."""
         outline = Rectangles.of(mesh, upright((*xy, 0.0), heading), _CLEAR_M)
         if self.footprints:
             self.footprints = [Rectangles.joined(self.footprints)]
@@ -223,10 +214,7 @@ class Scenery:
             self.put(mesh, xy, heading, solid)
 
     def park(self, xy: Float, forward: Float) -> None:
-        """Place a parked car of random shape, tilted with the slope like a driving car.
-
-        ``xy`` is its (2,) position and ``forward`` its (2,) unit direction, world.
-        """
+        """Place a parked car of random shape at ``xy`` (2,), along ``forward`` (2,), world."""
         mesh = models.parked_car(FIRST_PARKED + self._num_parked, self.rng)
         self._num_parked += 1
         half = forward * WHEELBASE_M["car"] / 2
@@ -238,14 +226,7 @@ class Scenery:
     def row(
         self, make: Callable[[float], Mesh], start: Float, end: Float, kerb_gap_m: float
     ) -> None:
-        """Place the panels of a fence, wall or hedge in a line, each on the ground below it.
-
-        Args:
-            make: Function that returns a panel of a given length (m).
-            start: (2,) begin of the line, world.
-            end: (2,) end of the line.
-            kerb_gap_m: Panels nearer to the kerb are left out.
-        """
+        """Place panels, made by length (m), on the ground from start to end (2,), world."""
         length = float(np.linalg.norm(end - start))
         num_panels = max(1, round(length / _TABLES.plots.panel_m))
         heading = float(np.arctan2(*(end - start)[::-1]))
@@ -436,12 +417,7 @@ class Traffic:
     def __init__(
         self, ego: Driving, scenery: Scenery, lanes: Mapping[str, Any], curves: Mapping[str, Curve]
     ) -> None:
-        """Start without actors.
-
-        Args:
-            lanes: Rows of ``lanes`` in scenes.yaml, by name.
-            curves: Curves of the roads, by name.
-        """
+        """Start without actors; ``lanes`` are the rows in scenes.yaml, ``curves`` the roads'."""
         self.actors: list[Actor] = []
         self._ground = scenery.ground
         self._rng = scenery.rng

@@ -35,12 +35,7 @@ class Bodies:
     moving: Bool  # (F,B) bool, True if the body's object moves around that time
 
     def place(self, frame: int, body: NDArray[np.int32], points: Float) -> Float:
-        """Return the (N,3) world positions of points at a frame's reference time.
-
-        Args:
-            body: (N,) index of the body of each point.
-            points: (N,3) metres, each in the frame of its body.
-        """
+        """Return world positions (N,3) of points (N,3), metres, in their ``body`` (N,)."""
         T_world_body = self.T_world_body[frame][body]
         placed: Float = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points)
         return placed + T_world_body[:, :3, 3]
@@ -48,11 +43,7 @@ class Bodies:
     def sweep(
         self, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], points: Float
     ) -> SweepTruth:
-        """Return the ground truth of a sweep with N points.
-
-        ``instance`` has the (N,) object numbers of the points; `place` describes the other
-        arguments.
-        """
+        """Return the truth of a sweep's N points; ``instance`` (N,) are their object numbers."""
         T_world_lidar = self.T_world_lidar[frame]
         from_lidar = self.place(frame, body, points) - T_world_lidar[:3, 3]
         return SweepTruth(
@@ -62,11 +53,7 @@ class Bodies:
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
     ) -> Float:
-        """Return the (N,3) true scene flow of points from a frame to the frame ``target``.
-
-        It is in metres in the lidar frame of ``frame``, ego-motion removed. `place` describes the
-        other arguments.
-        """
+        """Return the true flow (N,3), metres, ego-motion removed, lidar frame of ``frame``."""
         self.check(target)
         after = self.place(target, body, points)
         before = self.place(frame, body, points)
@@ -149,10 +136,7 @@ class Simulator:
         return self.bodies_at([self.stamp_ns(frame) for frame in range(self.num_frames)])
 
     def bodies_at(self, stamps_ns: Sequence[int], indices: Sequence[int] | None = None) -> Bodies:
-        """Return the poses of bodies at these absolute times.
-
-        ``indices`` selects bodies; it must hold all bodies of an object or none. None selects all.
-        """
+        """Return the poses of bodies at these times; an object's bodies are selected together."""
         times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
         if indices is not None:

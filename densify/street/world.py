@@ -66,10 +66,7 @@ class Meeting(NamedTuple):
     passed: NDArray[np.int32]
 
     def positions(self, rows: Int) -> Float:
-        """Return the (R,3) positions at which some of the rays meet it, in the body's frame.
-
-        ``rows`` are (R,) indices into the K rays.
-        """
+        """Return the (R,3) positions of some rays' ends (R,) in the body's frame."""
         return self.origin[rows] + self.distance_m[rows, None] * self.direction[rows]
 
 
@@ -112,16 +109,10 @@ class Triangles:
     def first_hit(
         self, spans: Iterable[tuple[int, int]], origin: Float, direction: Float
     ) -> tuple[Int, Int, Float]:
-        """Return the first triangle that each ray hits on its own body.
+        """Return rays (K,) with a hit on their body, their first triangles (K,), and u and v (K,2).
 
-        Args:
-            spans: Index of each body and end of its rays, ascending: a span begins where the
-                previous one ends.
-            origin: (N,3) origins, each in the frame of its body.
-            direction: (N,3) unit vectors, each in the frame of its body.
-
-        Returns:
-            Indices (K,) of the rays with a hit, their (K,) triangles, and (K,2) u and v there.
+        ``spans`` are each body's index and the end of its rays, ascending. ``origin`` (N,3) and
+        ``direction`` (N,3), unit vectors, are in the frame of the body.
         """
         start = origin.astype(np.float32)
         ray = direction.astype(np.float32)
@@ -156,10 +147,7 @@ class World:
     def cast(self, rays: Rays, optics: Optics, num_together: int = 1, spread: float = 0.0) -> Hits:
         """Return the first surface at which each ray ends, by the decisions of ``optics``.
 
-        Args:
-            rays: N rays in the world.
-            num_together: Number of consecutive rays that share origin and time.
-            spread: Greatest angle (rad) between the first of them and another.
+        ``num_together`` consecutive rays share origin and time, ``spread`` (rad) apart at most.
         """
         # The static world first; then the moving bodies in front of its surfaces
         every = np.arange(len(rays.time_s))

@@ -127,18 +127,11 @@ class Batch:
         )
 
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
-        """Concatenate the arrays of this batch's sweeps, in the order of ``obstacles``.
-
-        Args:
-            columns: For every sweep of the stretch, an array with a value for each obstacle.
-        """
+        """Concatenate this batch's sweeps of ``columns``, a value per obstacle of each sweep."""
         return np.concatenate([columns[j] for j in self.sweeps])
 
     def split(self, rows: Int) -> dict[int, Int]:
-        """Convert ascending rows (K,) of the batch's obstacles to rows of each sweep's `Obstacles`.
-
-        Return sweep index -> ascending rows, without sweeps that have none.
-        """
+        """Convert ascending rows (K,) of ``obstacles`` to rows by sweep, without empty sweeps."""
         rows_of_sweeps = np.split(rows, np.searchsorted(rows, self.begins[1:]))
         sweeps = zip(self.sweeps, rows_of_sweeps, self.begins, strict=True)
         return {j: sweep_rows - begin for j, sweep_rows, begin in sweeps if len(sweep_rows)}
@@ -180,13 +173,10 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
 def find_candidates(
     stretch: Stretch, space: FreeSpace, ground: HeightMap, among: Sequence[int] | None = None
 ) -> tuple[Candidates, ...]:
-    """Return the points above the ground of each sweep, and which of them may move.
+    """Return the points above the ground of each sweep, of ``among`` or all, and which may move.
 
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
     because usually only a part of a moving object's points is seen through.
-
-    Args:
-        among: Indices of the sweeps to work on, None for all.
     """
 
     def find_in_sweep(i: int) -> Candidates:
@@ -211,9 +201,8 @@ def find_candidates(
 def closer_rings(points: Float, gap_m: Float) -> Float:
     """Return the (N,3) points with heights compressed where rings are too far apart to be linked.
 
-    Args:
-        points: (N,3) metres, z up, relative to the scanner: level surfaces then stay level.
-        gap_m: (N,) distance between neighbouring rings at each point.
+    ``points`` are metres, z up, relative to the scanner: level surfaces stay level. ``gap_m`` (N,)
+    is the distance between neighbouring rings.
     """
     compressed = points.copy()
     compressed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
@@ -229,16 +218,9 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Link seeds and points within 0.4 m of seeds into clusters.
+    """Return the number of clusters of points (N,3) m within 0.4 m of seeds, and labels (N,).
 
-    Seeds with few other seeds around them, as in a hedge, do not count.
-
-    Args:
-        points: (N,3) metres.
-        seed: (N,) True for seeds.
-
-    Returns:
-        The number of clusters, and (N,) labels, -1 for points in no cluster.
+    Seeds with few other seeds around them, as in a hedge, do not count. Label -1 is none.
     """
     cluster = np.full(len(points), -1, np.int64)
     rows = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, MIN_SEED_SHARE))

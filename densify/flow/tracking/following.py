@@ -64,11 +64,7 @@ class DistanceField:
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_to(self, nearness: Bytes, group: Group, velocities: Float) -> None:
-        """Raise ``nearness`` (V,N) to the nearness of the moved group to this sweep's candidates.
-
-        Each of N points moves at each of the (V,3) velocities (m/s, world) to the time at which
-        this sweep would measure the group. Nearness is 0 to 255.
-        """
+        """Raise ``nearness`` (V,N), 0 to 255, of N points moved at velocities (V,3), m/s, world."""
         if self.tree is None:
             return
         # The firing time depends on the position, and the position on the time. Each is taken from
@@ -116,15 +112,9 @@ class Group:
 def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
     """Return the horizontal velocity (3,) of a cluster, m/s, that the neighbouring sweeps support.
 
-    At this velocity the group comes nearest to candidates of other batches. First the batches about
-    0.1 and 0.2 s before and after are compared, in coarse steps of velocity. A flat side shows its
-    speed only at its ends, which move by less than a voxel in this short time. Therefore batches up
-    to 0.5 s away are compared too, in fine steps.
-
-    Args:
-        group: The cluster's points in batch n.
-        fields: For each batch, the distance fields of its sweeps.
-        clock: Times of the batches.
+    There the group, of batch n, comes nearest to candidates of other batches, by ``fields`` of each
+    batch's sweeps. A flat side shows its speed only at its ends, which move by less than a voxel in
+    0.1 or 0.2 s. Therefore a coarse search of these is refined by batches up to 0.5 s away.
     """
     near_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
     far_s = max(_AROUND_S / 2, near_s)
@@ -225,11 +215,7 @@ _MISSES_ALLOWED, MISSED_S = 1, 0.2  # a track ends when both are exceeded
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
-    """Return the clusters that may start a track, the best first: batch index, rows of obstacles.
-
-    Large clusters make good models. Far from the ends of the recording, sweeps on both sides show
-    how the object moves.
-    """
+    """Return the clusters that may start a track, the best first: batch index, obstacle rows."""
     starts = []
 
     def worth(start: tuple[int, Int]) -> float:
@@ -251,15 +237,7 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
 def velocities_beside(
     batch: Batch, members: Int, objects: Sequence[MovingObject]
 ) -> Iterator[Float]:
-    """Yield the velocity (3,), m/s, of each object within 1 m of a cluster.
-
-    A trailer has the velocity of the car that tows it. The measurements alone hardly show how fast
-    a long flat side moves along itself.
-
-    Args:
-        members: Rows of the cluster in the batch's obstacles.
-        objects: Confirmed objects.
-    """
+    """Yield velocities (3,), m/s, of objects within 1 m of a cluster: a trailer has its car's."""
     points = batch.obstacles.points[members]
     tree = tree_of(points)
     middle = points.mean(0, keepdims=True)
@@ -292,13 +270,7 @@ class Follower:
     clock: Clock  # times of the batches
 
     def follow(self, members: Int, start: int, velocity: Float) -> Track:
-        """Track a cluster forwards, then backwards; the model is made of all points found so far.
-
-        Args:
-            members: Rows of the cluster in the obstacles of batch ``start``.
-            start: Batch index of the cluster.
-            velocity: (3,) m/s, world, at which the track starts.
-        """
+        """Track a cluster, rows of batch ``start``, both ways, from (3,) m/s, world."""
         batch = self.batches[start]
         rate = np.append(velocity, 0.0)  # of the state, without a turn
         seen_s = float(batch.obstacles.time_s[members].mean())

@@ -47,8 +47,8 @@ class GroupMotion:
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of all points of sweep ``frame`` to the reference time of ``target``.
 
-        The flow excludes ego-motion and is in the lidar frame of ``frame``. Points of an object are
-        lost if the target is more than 0.2 s before its first or after its last observation.
+        It excludes ego-motion, in the lidar frame of ``frame``. Points are lost if the target is
+        over 0.2 s before or after all observations of their object.
         """
         i = self.stretch.frames.index(frame)
         j = self.stretch.frames.index(target)
@@ -87,11 +87,7 @@ class Bending:
     softened: Softened  # points of the object in each of these sweeps, and how the points bend
 
     def carry(self, i: int, j: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
-        """Return the (N,3) points of sweep ``i`` at two reference times, object's frame.
-
-        The times are those of sweep ``i``, and of sweep ``j`` or the nearest sweep that
-        observed the object. ``seen_s`` (N,) are the firing times.
-        """
+        """Return (N,3) sweep i's points, object's frame, at the times of i and of j or nearest."""
         source = self.sweeps.index(i)
         target = self.sweeps.index(clock.nearest(j, self.sweeps))
         points = self.softened.snapshots[source].points
@@ -114,12 +110,9 @@ def motion_of(
     candidates: Sequence[Candidates],
     velocities_m_s: Sequence[Float] | None = None,
 ) -> GroupMotion:
-    """Find the moving objects among the points of each sweep that may move.
+    """Find the moving objects among each sweep's candidates.
 
-    Args:
-        candidates: For each sweep, its C points above the ground, and which may move.
-        velocities_m_s: For each sweep, (C,3) approximate velocities of these points, world frame.
-            None estimates them by a vote of neighbouring sweeps.
+    They start at ``velocities_m_s``, for each sweep (C,3), world; None lets the neighbours vote.
     """
     stretch, space = scene.stretch, scene.space
     obstacles = [
@@ -216,11 +209,8 @@ def join_pieces(
 ) -> JoinedObjects:
     """Find the object that each of the K tracks belongs to, and the motion of its points.
 
-    An object has the number of its piece with most points. A track without points is an object of
-    its own.
-
-    Args:
-        instance: For each sweep, (N,) int32, the index of each point's track, -1 for static points.
+    An object has the number of its piece with most points, a track without points its own.
+    ``instance`` has for each sweep (N,) int32 the index of each point's track, -1 for static.
     """
     pieces = _pieces(stretch, tracks, instance, space)
     number = np.arange(len(tracks))

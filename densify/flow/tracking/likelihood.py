@@ -2,9 +2,8 @@
 """Decide by a log-likelihood ratio whether a track moves or is static.
 
 A static object that looks different from sweep to sweep, such as a fence or a treetop, can seem to
-move. The log odds are ``w · terms - price``. Each term is the logarithm of a measured
-quantity. The weights w and the prior cost of a track, ``price``, were fitted to tracks of simulated
-streets: ``examples/fit_tracks.py`` makes the table, ``likelihood.json`` beside this file.
+move. The log odds are ``w · terms - price``, each term the logarithm of a measured quantity;
+``examples/fit_tracks.py`` fitted ``likelihood.json`` to tracks of simulated streets.
 """
 
 from __future__ import annotations
@@ -61,10 +60,7 @@ class Violations(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """Evidence that tells a moving track from a static one.
-
-    Lengths are divided by the distance up to which points count as neighbours there (`near_m`).
-    """
+    """Evidence that tells a moving track from a static one; lengths are divided by `near_m`."""
 
     violations: Violations  # violations by the track's points, as static and as moved
     before: Places  # observations at positions of the object before it arrives there
@@ -99,10 +95,7 @@ class Evidence(NamedTuple):
         }
 
     def log_odds(self, table: Mapping[str, float]) -> float:
-        """Return the log odds that the track moves.
-
-        ``table`` holds the weight of each term by its name, and ``price``, see `own_table`.
-        """
+        """Return the log odds that the track moves, by the weights and ``price`` of `own_table`."""
         return sum(table[name] * value for name, value in self.terms().items()) - table["price"]
 
 
@@ -129,13 +122,7 @@ def judge(
     objects: Sequence[MovingObject],
     record: RecordEvidence | None = None,
 ) -> Verdict:
-    """Return the log odds that a smoothed track moves, minus infinity below 3 observations.
-
-    Args:
-        obstacles: Points above the ground of each sweep of the stretch.
-        objects: Objects confirmed so far. Their returns do not count against the track.
-        record: Called with the track and its evidence.
-    """
+    """Return the log odds that a smoothed track moves, minus infinity below 3 observations."""
     if len(track.observations) < _NUM_STATES:
         return Verdict(-np.inf, -np.inf)
     violations = count_violations(track, obstacles, space)
@@ -211,16 +198,8 @@ def find_places_left(
 ) -> tuple[Places, Places]:
     """Count what was observed at an object's positions before its arrival, and after it left.
 
-    Vacated positions are free if the object moved. A static wire fence can imitate this: it is seen
-    through from some directions only. Its vacated positions then hold returns of the fence.
-
-    Args:
-        obstacles: Points above the ground of each sweep of the stretch.
-        objects: Other confirmed objects. Their returns do not count.
-        within_m: Distance up to which a return occupies a position.
-
-    Returns:
-        The counts before the object's arrival, and after it left.
+    Positions it left are free if it moved. A static wire fence can imitate this, but there
+    ``obstacles`` return within ``within_m``. Returns of other ``objects`` do not count.
     """
     sweeps = list(track.claimed)
     samples = [

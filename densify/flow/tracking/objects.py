@@ -50,16 +50,11 @@ class Path:
 
     @staticmethod
     def fit(times_s: Float, states: Float, weights: Float) -> Path:
-        """Fit a path to states, as stiff as the states allow.
+        """Fit a path to states (m,d), first x and y in metres, at ascending times (m,).
 
-        A softer path is taken only if its leave-one-out error, in closed form, is at least 20 %
-        lower. It needs at least 8 states and 0.65 s. Fewer than 5 states, or less than 0.35 s, give
-        a path of almost constant velocity.
-
-        Args:
-            times_s: (m,) ascending times, s.
-            states: (m,d) coordinates at these times, first x and y in metres.
-            weights: (m,) weights of the states, of any scale.
+        A softer path needs a leave-one-out error at least 20 % lower, 8 states and 0.65 s. Fewer
+        than 5 states, or less than 0.35 s, give almost constant velocity. ``weights`` (m,) have any
+        scale.
         """
         num_states = len(times_s)
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
@@ -147,10 +142,7 @@ _SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
 
 
 def near_m(gap_m: Float | float) -> Any:
-    """Return the neighbour distance: how far apart (m) two returns of one place may lie.
-
-    ``gap_m`` is the distance between neighbouring rings there; an array gives an array.
-    """
+    """Return how far apart (m) two returns of one place may lie, by the gap of rings; any shape."""
     return np.maximum(_NEAR_M, _NEAR_GAPS * gap_m)
 
 
@@ -170,8 +162,8 @@ class Observation:
 class Track:
     """One rigid object, its pose in each `Batch` of sweeps, and its points.
 
-    The object's frame coincides with the world at the first observation. From there the object
-    moves by a state: displacement x, y, z (m) and yaw (rad) about ``centre``.
+    The object's frame is the world at the first observation. From there it moves by a state:
+    displacement x, y, z (m) and yaw (rad) about ``centre``.
     """
 
     centre: Float  # (3,) position about which the object rotates, in the object's frame
@@ -183,14 +175,7 @@ class Track:
     path: Path = field(init=False)
 
     def add(self, n: int, batch: Batch, state: Float, seen_s: float, rows: Int) -> None:
-        """Add the observation in one batch.
-
-        Args:
-            n: Index of the batch.
-            state: (4,) state of the object.
-            seen_s: Mean firing time of the points.
-            rows: Ascending rows of the points in the batch's obstacles.
-        """
+        """Add the state (4,) observed in batch n by ascending obstacle ``rows`` at ``seen_s``."""
         rows_by_sweep = batch.split(rows)
         self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(rows_by_sweep))
         self.claimed |= rows_by_sweep
@@ -339,10 +324,7 @@ class MovingObject(NamedTuple):
     shape: Shape
 
     def may_be_near(self, points: Float, time_s: float | Float, within_m: float) -> bool:
-        """Return False if the box around the object and that of (N,3) world points are apart.
-
-        Points are measured at one time, or at (N,) times.
-        """
+        """Return False if the boxes around the object and (N,3) world points are apart."""
         at_s = float(np.mean(time_s))
         travel_m = float(np.ptp(time_s) * np.linalg.norm(self.track.path.rate(at_s)[:2]))
         rim = self.track.place(self.shape.rim, at_s)
@@ -352,8 +334,8 @@ class MovingObject(NamedTuple):
     def heading(self, at_s: float) -> Float:
         """Return (2,) the unit vector along the object at a time, world.
 
-        An object longer than 3 m points along the side closest to its velocity, because a turning
-        trailer does not move where it points. Other objects point along their velocity.
+        Beyond 3 m it is the side closest to the velocity, because a turning trailer does not move
+        where it points; for shorter objects it is the velocity.
         """
         velocity_m_s = self.track.path.rate(at_s)[:2]
         direction = velocity_m_s / max(float(np.linalg.norm(velocity_m_s)), 1e-6)

@@ -2,10 +2,9 @@
 """Estimate non-rigid motion: how a tracked object bends relative to its rigid motion.
 
 The smoothness term is the graph Laplacian of Pontes, Hays, Lucey (3DV 2020, section 3). Their data
-term, nearest points, pulls points onto the scan lines of the other sweep. Here a point moves by the
-mean of the target around it, a soft correspondence (Granger, Pennec, "Multi-scale EM-ICP", ECCV
-2002), minus the mean of its own sweep around it. The second mean removes the effect of the blur
-itself at edges and in holes.
+term, nearest points, pulls points onto scan lines. Here a point moves by the mean of the target
+around it, a soft correspondence (Granger, Pennec, "Multi-scale EM-ICP", ECCV 2002), minus the mean
+of its own sweep, which removes the effect of the blur at edges and in holes.
 """
 
 from __future__ import annotations
@@ -96,11 +95,10 @@ class Softened:
 def soften(snapshots: Sequence[Snapshot]) -> Softened:
     """Estimate how one object bends, from its snapshots by ascending time.
 
-    Every second snapshot is held out, and predicted from the bending between its neighbours. The
-    softest stiffness is taken that predicts clearly better than the rigid object, in most
-    snapshots. Otherwise the object stays rigid. Objects longer than 3 m always stay rigid, as do
-    objects with fewer than 5 snapshots, within less than 0.35 s, or with a median of fewer than 20
-    points per snapshot.
+    Every second snapshot is held out, and predicted from its neighbours' bending. The softest
+    stiffness is taken that predicts clearly better than the rigid object, in most snapshots.
+    Objects longer than 3 m, with fewer than 5 snapshots, within less than 0.35 s, or with a median
+    of fewer than 20 points stay rigid.
     """
     snapshots = tuple(snapshots)
     zero = tuple(np.zeros_like(snapshot.points) for snapshot in snapshots)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Search for moving objects: clusters of candidates are tracked, and kept if confirmed.
 
-A track starts from the velocity that most batches (sweeps within 0.1 s) agree on, is followed both
-ways, and is smoothed in time. It is confirmed only if the smooth motion explains the measurements.
+A track starts from the velocity that most batches (sweeps within 0.1 s) agree on, and is followed
+both ways. It is confirmed only if its smooth motion explains the measurements.
 """
 
 from __future__ import annotations
@@ -54,11 +54,9 @@ def find_tracks(
 ) -> list[Track]:
     """Return the confirmed tracks of all moving objects in the stretch (consecutive sweeps).
 
-    Args:
-        obstacles: Points above the ground of each sweep of the stretch.
-        velocities_m_s: For each sweep, (C,3) velocities of its obstacles, world frame, at which
-            tracks start. None lets the neighbouring sweeps vote.
-        record: Called with each track that was tried, and its evidence.
+    ``obstacles`` are each sweep's points above the ground. Tracks start at ``velocities_m_s``, for
+    each sweep (C,3), world; None lets neighbours vote. ``record`` gets each tried track and its
+    evidence.
     """
     return _Search(obstacles, space, ground, velocities_m_s, record).find_tracks()
 

@@ -211,10 +211,7 @@ class StretchFlow:
 
     @staticmethod
     def towards(key: int, stretch: Stretch, motion: Motion) -> StretchFlow:
-        """Return the flow of each sweep to the next sweep towards the key (a frame number).
-
-        The key sweep itself has the flow to a neighbour.
-        """
+        """Return each sweep's flow to the next sweep towards the key, the key's to a neighbour."""
         up_to_key = [frame for frame in stretch.frames if frame <= key]
         down_to_key = [frame for frame in reversed(stretch.frames) if frame >= key]
         hops = [*pairwise(up_to_key), *pairwise(down_to_key)]
@@ -273,10 +270,7 @@ class Camera:
 
     @property
     def measure(self) -> str:
-        """The default measure of depth: ``z`` along the optical axis, or ``range`` from the lens.
-
-        Only a pinhole uses ``z``, because other lenses may see points with a negative z.
-        """
+        """The default measure of depth: ``z``, or ``range`` for lenses that may see z < 0."""
         return "z" if self.model == "pinhole" else "range"
 
     @property
@@ -289,9 +283,8 @@ class Camera:
 class LidarSequence(Protocol):
     """A recording, opened lazily. A reader is one class with these members.
 
-    Frames are the data set's own sweep numbers. Methods raise InputError with a full sentence for
-    anything missing or malformed. A reader may also have these methods, which are looked up by
-    name:
+    Frames are the data set's own sweep numbers. Methods raise InputError for anything missing or
+    malformed. A reader may also have these methods, which are looked up by name:
 
     - findings() -> Sequence[tuple[str, str]]: short labels and texts of findings and assumptions.
     - gaps() -> Sequence[str]: a sentence for each missing part and its replacement.
@@ -326,10 +319,7 @@ class LidarSequence(Protocol):
         ...
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """Return image number -> exposure time of the middle row, for all images of a camera.
-
-        Numbers and times both ascend. Image numbers may differ from frame numbers.
-        """
+        """Return image number -> exposure time of the middle row, both ascending, of a camera."""
         ...
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
@@ -404,8 +394,7 @@ class Truth(Protocol):
     def depth_m(self, camera: str, number: int) -> Float32:
         """Return the (H,W) true depth of an image in metres, 0 where the ray meets no surface.
 
-        It is the depth of the nearest solid surface at the exposure of each row, in the camera's
-        own measure (`Camera.measure`).
+        It is at the exposure of each row, in the camera's own measure (`Camera.measure`).
         """
         ...
 

@@ -69,8 +69,7 @@ class Cloud:
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the attributes as (M,) columns by name, vectors split into one column per axis.
 
-        The vector columns are x y z, rigid_x rigid_y rigid_z, velocity_x velocity_y velocity_z
-        (m/s), and red green blue.
+        These are x y z, rigid_x ..., velocity_x ... (m/s), and red green blue.
         """
         by_axis = {
             "points": "x y z",
@@ -93,11 +92,7 @@ class Cloud:
 
 
 class Patches(NamedTuple):
-    """The surface patches of the M points of a cloud, in the same order.
-
-    A patch is the piece of surface around a point, as large as the spacing of the rays there. It
-    occludes what lies behind it (`densify.depth.patches`).
-    """
+    """The surface patches of the M points of a cloud, as large as the spacing of rays there."""
 
     normal: Float32  # (M,3) normal of the tangent plane, of any length, key frame
     # (M,2) distance to the neighbouring rays of the same sweep: in azimuth, then in elevation
@@ -204,9 +199,8 @@ class DepthMap:
     def to_points(self, view: CameraView, filled: bool = True) -> Float:
         """Return the map's pixels as points (K,3) in the key frame, metres, row by row.
 
-        Moving objects are at their position at the exposure of the image. ``view`` is from
-        ``Result.views``. ``filled`` includes interpolated pixels. Raises InputError if the camera
-        is not rectified or the map holds ranges.
+        Moving objects are at their position at the image's exposure. ``view`` is of
+        ``Result.views``. The camera must be rectified and the map hold z.
         """
         camera = view.camera
         if not camera.is_rectified or self.measure != "z":
@@ -244,8 +238,8 @@ METHOD_NAMES = {"none": "single sweep", "icp": "rigid accumulation", "flow": "sc
 class ObjectTrack:
     """Poses of one moving object at n reference times, of the sweeps it is seen in and of the key.
 
-    The origin of the object frame is the middle of the box. Its x axis is along the motion at the
-    key's time, and its z axis is parallel to the z axis of the key frame.
+    Its origin is the middle of the box, x along the motion at the key's time, z that of the key
+    frame.
     """
 
     instance: int  # number of the object, as in `Cloud`
@@ -264,10 +258,7 @@ class ObjectTrack:
 
 @dataclass(frozen=True)
 class Prior:
-    """A depth image supplied by the user, for example from a network, that completes a depth map.
-
-    It has the size of the map.
-    """
+    """A depth image (H,W) supplied by the user, as from a network, that completes a depth map."""
 
     value: Float32  # (H,W) depth or inverse depth, relative or metric; 0 for no value
     sky: Bool  # (H,W) True for pixels that stay without depth
@@ -276,10 +267,9 @@ class Prior:
 
 @dataclass(frozen=True)
 class PriorFit:
-    """The fit of a prior's values p to the measured depth z (metres) of a map.
+    """The fit of a prior's values p to the measured depth z (metres) of a whole map.
 
-    It is one fit for the whole image, before local correction. Kind ``depth``: z = scale p + shift
-    (m). ``inverse``: 1/z = scale p + shift (1/m). ``log``: ln z = scale ln p + shift.
+    Kind ``depth``: z = scale p + shift; ``inverse``: 1/z; ``log``: ln z = scale ln p + shift.
     """
 
     kind: str  # ``depth``, ``inverse`` or ``log``
