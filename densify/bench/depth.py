@@ -173,7 +173,13 @@ def stereo_truth(folder: Path, frame: int, camera: Camera) -> TruthMap:
 
 
 def agrees_beside(truth: TruthMap, depth_m: Float32, reach_px: int, focal_px: float) -> Bool:
-    """Return (H,W) True where a true depth at most ``reach_px`` along the row agrees with a map."""
+    """Return (H,W) True where the true depth of a pixel in the same row agrees with a depth map.
+
+    Args:
+        depth_m: (H,W) depth in metres, 0 for none.
+        reach_px: Greatest distance of that pixel along the row.
+        focal_px: Focal length, which outliers by disparity depend on.
+    """
     agrees = np.zeros(depth_m.shape, bool)
     for shift in range(-reach_px, reach_px + 1):
         beside = truth._replace(depth_m=np.roll(truth.depth_m, shift, axis=1))
@@ -194,10 +200,15 @@ def bench_depth(
 ) -> dict[str, Any]:
     """Densify the key sweeps with each variant, and pool the scores over key sweeps and cameras.
 
-    ``variants`` has name -> settings. Returns of the ``scanner`` are ground truth. The result has
-    under ``variants`` by name: ``density``, mean share of pixels with a depth in the measured and
-    the filled map; ``seconds`` of projection per key sweep; ``scores`` (num_pixels, coverage,
-    outliers) by ground truth, map (measured, filled) and pixels (all, moving).
+    Args:
+        variants: Name -> settings to compare.
+        scanner: Index of the scanner whose returns are the ground truth, None for none.
+        method: Name of a method in `densify.pipeline.key_result.METHODS`.
+
+    Returns:
+        Under ``variants`` by name: ``density``, mean share of pixels with a depth in the measured
+            and the filled map; ``seconds`` of projection per key sweep; ``scores`` (num_pixels,
+            coverage, outliers) by ground truth, map (measured, filled) and pixels (all, moving).
     """
     choose_cameras(sequence, cameras)
     if method not in METHODS:

@@ -73,11 +73,16 @@ def bench_flow(
 ) -> dict[str, Any]:
     """Run and measure methods of scene flow on the window of one key sweep.
 
-    Methods are names in `METHODS`, ``ours`` the configured engine. ``truth`` is a folder of true
-    flow (`densify.readers.flow_files`), which scores only the sweeps before the key sweep; None for
-    exact truth. The result has ``data``, ``key``, ``frames``, ``num_pairs``, and ``methods``: name
-    -> ``seconds_per_pair`` and the scores ``step``, ``challenge``, ``window`` of `Scorer`, None if
-    unknown.
+    Args:
+        window: Number of sweeps on each side of the key sweep.
+        methods: Names in `METHODS`. ``ours`` is the configured engine.
+        truth: Folder of true flow (`densify.readers.flow_files`), which scores only the sweeps
+            before the key sweep. None for the exact ground truth of the recording.
+
+    Returns:
+        ``data``, ``key``, ``frames``, ``num_pairs``, and ``methods``: name -> ``seconds_per_pair``
+            and the scores ``step``, ``challenge``, ``window`` of `Scorer`. Numbers are plain, None
+            if unknown.
     """
     unknown = [method for method in methods if method not in METHODS]
     if unknown or not methods:

@@ -158,10 +158,15 @@ def measure(
     """Return figures and their luck, the standard deviation of each `change` over ``draws``.
 
     Figures are curves of outliers (`densify.bench.verdicts.Curve`) of the measured and the filled
-    map; recall, errors and false positives of the scene flow, in eight draws with moved poses;
-    errors of poses. Without a ``folder`` real recordings are left out. ``kinds`` are some of
-    `KINDS`, ``names`` those of keys. A draw moves poses by 2 mm and 0.01°; luck is {} with 0 draws.
-    The ``cache`` pays if only depth changes.
+    map; recall, errors and false positives of the scene flow; errors of poses. Flow between two
+    sweeps is estimated in eight draws with moved poses.
+
+    Args:
+        folder: Folder of the real recordings; None leaves them out.
+        kinds: Some of `KINDS`.
+        names: Names of the keys; None for all.
+        draws: Number of times that the poses are moved by 2 mm and 0.01°; luck is {} with 0.
+        cache: Keeps registration and flow on disk, which pays if only depth changes.
     """
     chosen = _chosen((*KEYS, *PAIRS), folder, names)
     figures: dict[str, dict[str, Any]] = {}

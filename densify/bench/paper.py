@@ -102,7 +102,11 @@ def bench_paper(
     num_points: int = NUM_POINTS,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure methods and networks on pairs; return their number and name -> mean scores."""
+    """Measure methods and trained networks on pairs of clouds.
+
+    Returns:
+        ``num_pairs``, ``num_points`` and ``methods``: name of the method or file -> mean scores.
+    """
     if num_points < 1:
         raise InputError(f"--points {num_points}: expected 1 or more")
     for name in methods:

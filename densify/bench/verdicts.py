@@ -139,7 +139,12 @@ def _verdict(name: str, change_of_key: Mapping[str, _KeyChange]) -> Verdict:
 def beyond_luck(
     before: Mapping[str, Any], now: Mapping[str, Any], luck: Mapping[str, float], sigmas: float
 ) -> dict[str, float]:
-    """Return the changes of one key's figures that are worse than luck by ``sigmas`` deviations."""
+    """Return those changes of one key's figures that are worse by more than luck explains.
+
+    Args:
+        before: Figures of the key by name, first measurement.
+        sigmas: Limit, in standard deviations of the difference of two measurements.
+    """
     worse = {}
     for figure in before:
         for name, difference in change(figure, before[figure], now[figure]).items():

@@ -43,7 +43,12 @@ class Section:
 
 
 def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
-    """Return a user's value, as parsed from YAML, converted to the type of its setting."""
+    """Return a user's value converted to the type of its setting.
+
+    Args:
+        section: Class with the setting.
+        value: Value as parsed from YAML.
+    """
     knob = section.__dataclass_fields__[key]
     kind, _, optional = str(knob.type).partition(" | ")
     if optional and value is None:

@@ -54,7 +54,10 @@ class Cache:
     def get(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
         """Return the cached result of a step, or make and keep it.
 
-        All that it depends on is in ``inputs``, of types that `digest` accepts.
+        Args:
+            step: Name of the step, with which the entry's file name begins.
+            inputs: All that the result depends on, of types that `digest` accepts.
+            make: Function that makes the result.
         """
         path = self._folder / f"{step}-{digest((__version__, inputs))}.npz"
         if (entry := _read(path)) is not None:

@@ -49,9 +49,14 @@ def call_all(
 
     An item whose process dies is tried a second time, alone. A second death or an unexpected error
     gives a ComputationError as outcome. InputError and ComputationError of ``call`` are raised.
-    Items are hashable and picklable. A group's first item is finished before the others begin, so
-    they find shared results in the cache. ``scheduler`` is a Dask address, whose workers replace
-    processes.
+
+    Args:
+        call: A function of a module.
+        groups: Non-empty groups of hashable, picklable items. A group's first item is finished
+            before the others begin, so they find shared results in the cache.
+        num_workers: Number of processes; 1 uses this process.
+        log: File to which worker processes append their log.
+        scheduler: Address of a Dask scheduler whose workers replace local processes.
     """
     if num_workers == 1 and scheduler is None:
         for group in groups:

@@ -62,11 +62,13 @@ class DepthDataset(Dataset[dict[str, Any]]):
             crop: (height_px, width_px) of a cutout at the bottom of the image, where depth is, and
                 at a random column.
             flip: Mirror each sample with probability 0.5.
-            data: Drive -> new path of its recording, if it has moved since the set was made.
+            data: Drive -> new path of its recording, for `densify.open_sequence`, if it has moved
+                since the set was made.
             split: KITTI's split, ``train`` or ``val``, None for both.
-            max_outliers: Greatest expected share of outliers of a dense depth, 0.01 for 1 %; the
-                least certain pixels are left out. It cannot exceed ``project.max_outliers`` of the
-                set. None leaves out none.
+            max_outliers: Greatest expected share of outliers of a dense depth, 0.01 for 1 %. The
+                least certain pixels are left out until it is reached. Pixels that are not in the
+                set are not given back: make it with a ``project.max_outliers`` as high as any that
+                is wanted. None leaves out none.
         """
         self._root, self._crop, self._flip = Path(root), crop, flip
         self._max_outliers = max_outliers

@@ -95,12 +95,13 @@ def make_dataset(
     """Make a training set from the key sweeps of whole recordings, and return the final progress.
 
     A repeated call keeps finished key sweeps. Files do not depend on processes or interruptions. A
-    full disk or the loss of all workers raises ComputationError.
+    full disk or the loss of all workers raises ComputationError; finished key sweeps are kept.
 
     Args:
         data: Recordings, as `densify.open_sequence` takes them.
         out: Folder of the training set.
-        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``; None for all.
+        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``; no start or stop
+            means the first frame or the last. None for all.
         recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
         num_workers: Number of processes, as many as possible if None. More than one needs ``if
             __name__ == "__main__"`` in a script.

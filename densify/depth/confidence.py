@@ -50,10 +50,16 @@ _UNCONFIRMED = 2.7  # found / expected outliers of one sweep alone: 0.9 to 6, on
 def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
     """Return the (P,10) features of the P pixels with a filled or rejected depth, row by row.
 
-    The ``record`` is that before `densify.depth.fill.measure_spots`. Shares, steps, ages enter by
-    their logarithm to base 10: probabilities of errors are proportional to powers of them. Age and
-    discontinuity are those of the nearest measured pixel; moving bodies have no discontinuity.
-    ``since_key_ns`` (M,) are ns from the key sweep of the cloud's points.
+    Shares, steps and ages enter by their logarithm to base 10, because probabilities of errors are
+    proportional to powers of them. The step is the logarithm of the ratio of the greatest to the
+    least depth around, as a multiple of the tolerance of KITTI's rule. Age and discontinuity are
+    those of the nearest measured pixel. A moving body has no discontinuity. Spacings are those of
+    neighbouring rays.
+
+    Args:
+        record: The map, before `densify.depth.fill.measure_spots`.
+        since_key_ns: (M,) ns from the key sweep of the points of the cloud.
+        camera: Camera of the map.
     """
     shown, rejected = record.filled_m > 0, record.rejected_m > 0
     has_depth = shown | rejected
@@ -151,9 +157,12 @@ def confidence_by_age(since_key_ns: Int) -> Float32:
 def choose_most_certain(
     confidence: Float32, max_outliers: float, before: Float32 | None = None
 ) -> Bool:
-    """Return (P,) True at as many of the most certain pixels as ``max_outliers`` permits.
+    """Return (P,) True at the most certain pixels, as many as keep the expected outliers low.
 
-    It is the greatest expected share of outliers, with those of confidences ``before``.
+    Args:
+        confidence: (P,) confidences of the pixels to choose from.
+        max_outliers: Greatest expected share of outliers, of the chosen pixels and those before.
+        before: Confidences of pixels that are chosen already; None for none.
     """
     before_probability = outlier_probability(np.zeros(0) if before is None else before)
     best_first = np.argsort(-confidence, kind="stable")
@@ -170,8 +179,13 @@ def choose_most_certain(
 def with_max_outliers(depth_map: DepthMap, max_outliers: float | None) -> DepthMap:
     """Return the map with as many pixels as possible at this expected share of outliers.
 
-    Its most certain ``rejected`` pixels are given back, or its least certain ones left out. None
-    for the share, or a map without calibrated confidence, leaves it as it is.
+    If the map expects fewer outliers, the most certain of its rejected pixels are given back. If it
+    expects more, its least certain pixels are left out. A map without calibrated confidence stays.
+
+    Args:
+        depth_map: A map with its ``rejected`` pixels.
+        max_outliers: Greatest expected share of outliers of the filled map; None leaves its pixels
+            as they are.
     """
     rejected = depth_map.rejected
     if rejected is None or max_outliers is None:
@@ -206,9 +220,14 @@ def without_times(
 ) -> DepthMap:
     """Return the map with lower confidence at near pixels, for sweeps without times of points.
 
-    Motion within such a sweep moves depths by an unknown amount up to ``smear_m``, half the travel
-    in metres along the camera's axis from sweep to sweep. Near pixels tolerate less of it.
-    ``share`` is that of the sweeps without times.
+    The vehicle's motion within such a sweep moves depths by an unknown amount up to ``smear_m`` in
+    either direction. Near pixels tolerate less of it than far pixels.
+
+    Args:
+        depth_map: The map.
+        smear_m: Half the travel in metres along the camera's axis from sweep to sweep.
+        camera: Camera of the map.
+        share: Share of the sweeps without times.
     """
 
     def outlier_or_smeared(probability: Float, depth_m: Float32) -> Float:
@@ -253,10 +272,15 @@ def expected_outliers(depth_map: DepthMap) -> dict[str, float | None]:
 
 
 def reliability(depth_map: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[str, Any]]:
-    """Return expected and true outliers by confidence, over filled pixels with ground truth.
+    """Return expected and true outliers by confidence, over the filled pixels with ground truth.
 
     Each interval of 0.05 with pixels has ``confidence`` (its start), ``num_compared`` pixels, and
-    the ``expected`` and true share of ``outliers``. ``truth_m`` (H,W) is depth in metres, 0 none.
+    the ``expected`` and the true share of ``outliers``.
+
+    Args:
+        depth_map: The map.
+        truth_m: (H,W) true depth in metres, 0 none.
+        camera: Camera of the map.
     """
     compared = (truth_m > 0) & (depth_map.filled_m > 0)
     confidence = depth_map.confidence[compared]

@@ -54,10 +54,16 @@ def key_shots(
 ) -> dict[str, Shot]:
     """Return the `Shot` of each depth map of a key sweep, by the name of the map.
 
-    By default each camera has one map with its name, of the image exposed nearest to the key sweep,
-    the earlier of two; without one within about half a period it shows the time of the sweep. With
-    ``project.per=image`` a map CAMERA/NUMBER shows each image nearer to the key sweep than to
-    another.
+    By default each camera has one map, with its name. It shows the image exposed nearest to the key
+    sweep, the earlier of two. With ``project.per=image`` there is a map CAMERA/NUMBER for each
+    image nearer to the key sweep than to any other. Without an image within about half a period the
+    default map shows the time of the sweep.
+
+    Args:
+        sequence: The recording.
+        cameras: Cameras that get maps.
+        key: Frame number of the key sweep.
+        settings: ``per`` and ``at`` choose the maps and their times.
     """
     stamp_ns = sequence.stamp_ns(key)
     begin_ns, end_ns = _own_time_ns(sequence, key)
@@ -178,10 +184,17 @@ class Exposure:
     def of(
         sequence: LidarSequence, stretch: Stretch, key: int, shot: Shot, settings: Config
     ) -> Exposure:
-        """Return the camera of a map at the map's time, relative to the key sweep.
+        """Return the camera of a depth map at the map's time, relative to the key sweep.
 
-        The pose is the recorded one of the image, else the key sweep's moved by the twist.
-        ``output.optical_flow`` adds the ``neighbours``.
+        The camera pose is the recorded pose of the image. Without one it is extrapolated from the
+        key sweep with the vehicle's twist. ``output.optical_flow`` adds the ``neighbours``.
+
+        Args:
+            sequence: The recording.
+            stretch: Registered sweeps of the window.
+            key: Frame number of the key sweep.
+            shot: What the map shows.
+            settings: Configuration of the run.
         """
         exposure = _exposure(sequence, stretch, key, key, shot, settings)
         if not settings.output.optical_flow or shot.number is None:
@@ -192,11 +205,15 @@ class Exposure:
         return replace(exposure, neighbours=neighbours)
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
-        """Project ``points`` (N,3), metres, key sweep's lidar frame at its time, to the image.
+        """Project points to the image.
 
-        They advance by (N,3) or (3,) velocities without ego-motion to the exposure, with a rolling
-        shutter to that of their row or column. Beside or behind a wide lens they have no z and are
-        not inside.
+        Moving points advance by their velocity to the exposure. With a rolling shutter each row or
+        column has its own exposure time. Points beside or behind a wide lens have no z and are not
+        inside.
+
+        Args:
+            points: (N,3) positions in metres, key sweep's lidar frame, at its reference time.
+            velocity_m_s: Velocities without ego-motion, same frame; (N,3), or (3,) for all points.
         """
         at_shown_time = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, at_shown_time)

@@ -54,11 +54,14 @@ def in_reach(sweep: Sweep) -> Bool:
 def find_seen_through(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
     """Return for each sweep (N,) True where another sweep along the road saw through the point.
 
-    Some sweeps, 5 m of travel apart, test the points of the others: points ahead by the next
-    testing sweep at least 3.5 m farther, points behind by the previous one. By then even a vehicle
-    that drives along has left most of its place. At the ends of the road the last testing sweep is
-    taken, if 2 m away or more, or one on the other side. ``travel_m`` (S,) are ascending positions
-    of the sweeps.
+    Some sweeps, 5 m of travel apart, test the points of the others. Points ahead of a sweep are
+    tested by the next testing sweep at least 3.5 m farther, points behind it by the previous one.
+    By then even a vehicle that drives along has left most of its place. At the ends of the road the
+    last testing sweep is taken, if 2 m away or more, or the testing sweep on the other side.
+
+    Args:
+        sweeps: S deskewed sweeps.
+        travel_m: (S,) ascending positions of the sweeps along the road.
     """
     testers = _choose_testers(travel_m)
     with ThreadPoolExecutor(num_threads()) as pool:
@@ -165,10 +168,16 @@ _EMPTY_WORLD = StandingWorld(
 
 
 def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
-    """Return (N,) True for world ``points`` (N,3) that a camera may observe from near its pose.
+    """Return (N,) True for the points that a camera may observe.
 
-    It is False only if out of view from every position within ``slack_m`` metres of ``T_cam_world``
-    (4,4). For a lens that is no pinhole all are True.
+    It is False only if the point is out of view from every position near the camera's pose. For a
+    lens that is no pinhole all are True.
+
+    Args:
+        camera: The camera.
+        T_cam_world: (4,4) pose of the camera.
+        points: (N,3) points in the world frame.
+        slack_m: Greatest distance in metres of a position from the pose.
     """
     if camera.model != "pinhole":
         return np.ones(len(points), bool)
@@ -197,10 +206,15 @@ def far_cloud(
 ) -> tuple[Cloud, Patches]:
     """Return the points beyond the window that a camera observes, and their patches.
 
-    Both are in the key sweep's lidar frame, to which ``T_key_world`` (4,4) leads from the frame of
-    ``world``; one point per pixel and step of depth. ``exposures`` are by map name. With
-    ``standing_only`` points are left out that the first or the last sweep of the window saw
-    through.
+    Both are in the key sweep's lidar frame. One point per pixel and step of depth is kept.
+
+    Args:
+        world: Static points of the sweeps along the road.
+        T_key_world: (4,4) from the frame of ``world`` to the key sweep's lidar frame.
+        stretch: Registered sweeps of the window.
+        key: Frame number of the key sweep.
+        exposures: Cameras and times of the maps, by name of the map.
+        standing_only: Leave out points that the first or the last sweep of the window saw through.
     """
     is_beyond = ~np.isin(world.frames, stretch.frames)
     rows = np.flatnonzero(is_beyond[world.source])

@@ -96,13 +96,20 @@ class _Known(NamedTuple):
 def fill_between(filled_m: Float32, tilt: Float32, spacing_px: Float32, reach: float) -> None:
     """Interpolate empty pixels that have measured pixels on both sides, in place.
 
-    The window around a pixel must hold measured pixels left, right, above and below: nothing is
-    extrapolated. Deviations from their plane, whose depth the pixel gets, must not differ by more
-    than 0.2 m and 6 % of the nearest depth (with fewer than six pixels, the depths themselves). Of
-    the windows up to ``reach`` ray spacings of half size the smallest sufficient one counts.
+    The window around an empty pixel must hold measured pixels to its left, to its right, above and
+    below: nothing is extrapolated. No depth discontinuity may run through them. There is a
+    discontinuity if deviations from a plane differ by more than 0.2 m and 6 % of the nearest depth.
+    With fewer than six pixels the depths themselves are compared.
 
-    ``filled_m`` (H,W) metres, 0 for none, and slopes ``tilt`` (H,W,2) are changed; ``spacing_px``
-    (H,W,2) is the spacing of rays across and down.
+    The pixel gets the depth of the plane. Weights fall to zero just outside the window. The window
+    grows in thirds of the ray spacing, then to ``reach`` spacings. The smallest sufficient window
+    is taken.
+
+    Args:
+        filled_m: (H,W) depths of the measured pixels, 0 elsewhere; the filled depths are added.
+        tilt: (H,W,2) slopes as in `MapRecord`; those of filled pixels are added.
+        spacing_px: (H,W,2) spacing of rays across and down.
+        reach: Half size of the largest window in spacings of rays.
     """
     sizes = min(reach, 1.0) * np.arange(1, _NUM_SIZES + 1) / _NUM_SIZES
     reaches = np.append(sizes, reach) if reach > 1 else sizes

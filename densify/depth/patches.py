@@ -45,10 +45,16 @@ def hidden_m(surface_m: Float | Float32) -> Float | Float32:
 def find_patches(
     cloud: Cloud, sensors: Sensors, origins: Mapping[int, Float], wanted: Bool | None = None
 ) -> Patches:
-    """Return the surface patches of a cloud of M points, facing the scanner if on no one surface.
+    """Return the surface patches of a cloud.
 
-    ``origins`` (S,3) are those of the scanners, key sweep's lidar frame, by frame number. Points
-    that are not ``wanted`` (M,), not in view of a camera, get zeros; None wants all.
+    A patch is tangent to the neighbouring returns of the same scanner and sweep. If the neighbours
+    are on no single surface, the patch faces the scanner.
+
+    Args:
+        cloud: The cloud of M points.
+        sensors: Scanners of the recording.
+        origins: (S,3) origins of the scanners, key sweep's lidar frame, by frame number.
+        wanted: (M,) True for points in view of a camera, None for all. Other points get zeros.
     """
     frames, index = np.unique(cloud.frame, return_inverse=True)
     sweep: NDArray[np.int32] = index.ravel().astype(np.int32)
@@ -65,12 +71,18 @@ def fit_tangents(
     origins: Sequence[Float],
     wanted: Bool | None = None,
 ) -> Patches:
-    """Return the patches of M ``points`` (M,3) in any one frame, see `find_patches`.
+    """Return the patches of M points, see `find_patches`.
 
     A point p is on the tangent plane if normal · (p - origin) = 1. Spacings are metres between
-    neighbouring rays, along the azimuth and the elevation. ``sweep`` (M,) is the index of each
-    point's sweep in ``origins``, (S,3) in the frame of the points; ``lidar`` (M,) is its scanner's
-    number.
+    neighbouring rays, along the azimuth and along the elevation.
+
+    Args:
+        points: (M,3) points, in any one frame.
+        lidar: (M,) number of the scanner of each point.
+        sweep: (M,) index of each point's sweep in ``origins``.
+        sensors: Scanners of the recording.
+        origins: (S,3) origins of the scanners for each sweep, in the frame of the points.
+        wanted: As in `find_patches`.
     """
     normal = np.zeros((len(points), 3), np.float32)
     spacing_m = np.zeros((len(points), 2), np.float32)

@@ -38,11 +38,15 @@ _EMPTY = 2 * np.log(FAR_M)  # logarithm of a depth beyond all others
 def complete(depth_map: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
     """Return the depth map with pixels of the prior where it has no measured or filled depth.
 
-    ``prior`` has the map's shape and measure of depth; ``kind`` says what its values are,
-    ``depth``, ``inverse`` or ``auto``. A prior that does not fit is not used. A pixel stays empty
-    without a value, in the sky of the mask, beyond ``FAR_M``, at the prior's far limit, and on the
-    blurred transition between two surfaces. Confidences are a ranking: at most 0.2 for the prior,
-    less where it is steep or deviates from known pixels nearby, more for all known pixels.
+    A pixel stays empty if the prior has no value, shows sky by the mask, or is beyond ``FAR_M`` or
+    at its far limit. Pixels on the blurred transition between two surfaces stay empty too. A prior
+    that does not fit is not used. Confidences are a ranking. A pixel of the prior has at most 0.2,
+    less where the prior is steep or deviates from known pixels nearby. All known pixels have more.
+
+    Args:
+        depth_map: The map to complete.
+        prior: Depth image of the user, of the map's shape and measure of depth.
+        kind: What the prior's values are: ``depth``, ``inverse`` (depth) or ``auto``.
     """
     has_value = (prior.value > 0) & ~prior.sky
     has_depth = depth_map.filled_m > 0
@@ -83,9 +87,14 @@ def complete(depth_map: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth
 
 
 def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
-    """Return the curve from values (N,) of a prior to depths (N,) in metres, least ``residual``.
+    """Return the curve from the values of a prior to depth with the least ``residual``.
 
-    Both are above 0, ``kind`` is as in `complete`. A curve that turns near into far is rejected.
+    A curve that turns near into far is rejected.
+
+    Args:
+        value: (N,) values of the prior, above 0.
+        depth_m: (N,) depths of the same pixels in metres, above 0.
+        kind: As in `complete`.
     """
     p, z = value.astype(np.float64), depth_m.astype(np.float64)
     fits = [_fit_form(form, p, z) for form in _FORMS[kind]]

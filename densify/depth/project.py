@@ -119,12 +119,19 @@ def _finished(record: MapRecord, inputs: MapInputs) -> DepthMap:
 
 
 def reject_seen_through(record: MapRecord, cloud: Cloud, view: InView, rays: Rays) -> None:
-    """Reject in place the pixels of a record that over a quarter of their rays passed through.
+    """Reject the pixels of a record, in place, that rays passed through.
 
-    A ray passed through if its point is static and occluded (`Reason.HIDDEN`). It counts where it
-    crosses the surface of the map, clearly before its end. Any other ray stopped, and counts in the
-    pixel of its point. Counts are blurred by a third of the ray spacing. Moving bodies stay; sweeps
-    that ``rays`` lacks do not count.
+    A ray passed through if its point is static and occluded (`Reason.HIDDEN`). It counts in the
+    pixel where it crosses the surface of the map, clearly before its end. A ray stopped if its
+    point has any other reason. It counts in the pixel of its point. Both counts are blurred by a
+    third of the ray spacing. A pixel is rejected if more than a quarter of its rays passed through.
+    Moving bodies stay.
+
+    Args:
+        record: The map, with the reasons of all points.
+        cloud: The cloud of the record.
+        view: Points of the cloud in the image.
+        rays: Rays of the window; points of other sweeps do not count.
     """
     in_window = np.isin(cloud.frame, rays.stretch.frames)
     counted = in_window & (record.reason != Reason.OUTSIDE)
@@ -156,9 +163,14 @@ def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
 def find_crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Exposure) -> Float:
     """Return the (P,2) px where rays cross the surface of a map clearly before they end.
 
-    The search starts at the end of the ray, and repeats with the depth of the present pixel until
-    the depth stays the same. Rays lead ``from_key`` (K,3) ``to_key`` (K,3), key sweep's lidar
-    frame; ``surface_m`` (H,W) is metres, 0 for none.
+    The search starts at the end of the ray. It goes to the point of the ray at the surface's depth
+    in the present pixel, and repeats this until the depth stays the same.
+
+    Args:
+        surface_m: (H,W) depth of the surface in metres, 0 for none.
+        from_key: (K,3) origins of the rays, key sweep's lidar frame.
+        to_key: (K,3) ends of the rays, same frame.
+        exposure: Camera and time of the map.
     """
     start_cam = poses.transform(exposure.T_cam_key, from_key)
     end_cam = poses.transform(exposure.T_cam_key, to_key)

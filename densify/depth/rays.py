@@ -95,8 +95,12 @@ def half_spaces(corners: Float) -> Float:
 def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float, Float]:
     """Return the (K,) t at which lines start + t · direction enter a convex body, and leave it.
 
-    A line that misses it leaves first. ``spaces`` is (F,4), ``start`` (K,3) or (3,), ``direction``
-    (K,3).
+    A line that misses the body leaves before it enters.
+
+    Args:
+        spaces: (F,4) sides of the body from `half_spaces`.
+        start: (K,3) points on the lines, or (3,) for all lines.
+        direction: (K,3) directions of the lines, of any length.
     """
     enter, leave = np.full(len(direction), -np.inf), np.full(len(direction), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -136,7 +140,14 @@ class ObjectRays(NamedTuple):
 def rays_toward(
     cloud: Cloud, rays: Rays, rows_of: Mapping[int, Int], corners: Mapping[int, Float]
 ) -> dict[int, ObjectRays]:
-    """Return the rays that may meet each object's hull, (V,3) corners, by instance number."""
+    """Return the rays of all sweeps that may meet the hull of each object, by instance number.
+
+    Args:
+        cloud: The cloud that the rays measured.
+        rays: The rays of the window's sweeps.
+        rows_of: Indices of each object's points in the cloud.
+        corners: (V,3) corners of each object's hull at the key's time, key sweep's lidar frame.
+    """
     by_sweep: dict[int, list[ObjectRays]] = {instance: [] for instance in rows_of}
     for frame in rays.stretch.frames if rows_of else ():
         for instance, object_rays in _sweep_rays(cloud, rays, frame, rows_of, corners).items():
@@ -293,7 +304,14 @@ def _body(
 def complete_boxes(
     tracks: Sequence[ObjectTrack], cloud: Cloud, rays: Rays, ground: HeightMap
 ) -> tuple[ObjectTrack, ...]:
-    """Return the tracks with completed boxes, and with the sides that were seen."""
+    """Return the tracks with completed boxes, and with the sides that were seen.
+
+    Args:
+        tracks: The tracked objects, with boxes around their points.
+        cloud: The cloud of the window.
+        rays: The rays that measured the cloud.
+        ground: The ground in the world frame of their sweeps.
+    """
     tracks = [_lower_to_ground(track, rays, ground) for track in tracks]
     reach = {track.instance: _reach_corners(track, rays.key) for track in tracks}
     rows_of = {

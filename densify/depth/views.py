@@ -95,8 +95,15 @@ class Views:
     ) -> Views:
         """Return the cameras and times of the maps of a key sweep.
 
-        ``shots`` and RGB ``images`` (H,W,3) are by map name. Images are used unless
-        ``project.rims`` is ``strict`` or they are misaligned (`is_off`).
+        Images are used unless ``project.rims`` is ``strict`` or they are misaligned (`is_off`).
+
+        Args:
+            sequence: The recording.
+            stretch: Registered sweeps of the window.
+            key: Frame number of the key sweep.
+            shots: What each map shows, by name of the map.
+            images: (H,W,3) RGB images by name of the map.
+            settings: Configuration of the run.
         """
         sensors = Sensors.of(stretch.sweeps)
         exposures = {
@@ -178,7 +185,16 @@ class Views:
         depth_maps: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
-        """Return the cloud with colours of the RGB images (H,W,3) that observe its points."""
+        """Return the cloud with the colours of the images that observe its points.
+
+        A point is observed unless it is clearly behind the depth of its pixel. Pixels without
+        depth give no colour.
+
+        Args:
+            seen: The cloud and its points in the images.
+            depth_maps: Depth maps of the cloud, by name of the map.
+            images: (H,W,3) RGB images, by name of the map.
+        """
         rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
             view = seen.in_view[name]
@@ -192,10 +208,14 @@ class Views:
     def with_confidence(
         self, seen: SeenCloud, cloud: Cloud, depth_maps: Mapping[str, DepthMap]
     ) -> Cloud:
-        """Return the cloud with each point's greatest confidence of the pixels that agree with it.
+        """Return the cloud with the greatest confidence of the pixels that agree with each point.
 
-        A pixel agrees if the point is no outlier there; 0 where none does. ``seen`` are the points
-        in the images, the maps are made of them.
+        A pixel agrees if the point is no outlier there. Points that no map confirms have 0.
+
+        Args:
+            seen: The points in the images.
+            cloud: The same points.
+            depth_maps: Maps made of them, by name.
         """
         confidence = np.zeros(len(cloud), np.float32)
         for name, view in seen.in_view.items():
@@ -262,7 +282,16 @@ class Views:
         bodies: Mapping[int, MovingBody],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> dict[int, Mover]:
-        """Return every moving object alone, by instance number; -1 for points of no object."""
+        """Return every moving object alone, by instance number.
+
+        Moving points without an object are together, with the number -1.
+
+        Args:
+            cloud: The cloud of the window.
+            visible: Leave out occluded and unsupported points.
+            bodies: Hulls of the moving objects, by instance number.
+            images: (H,W,3) RGB images, by name of the map.
+        """
         movers = {}
         for instance in np.unique(cloud.instance[cloud.moving]).tolist():
             seen = self.see(cloud.select(cloud.moving & (cloud.instance == instance)))
@@ -314,10 +343,15 @@ def optical_flow(
 def with_ages(
     depth_map: DepthMap, stamps_ns: Mapping[int, int], key: int, late_s: float
 ) -> DepthMap:
-    """Return the map with ``age_s``, seconds from each pixel's source sweep to the map's time.
+    """Return the map with ``age_s``, seconds between its time and the source sweep of each pixel.
 
-    That time is ``late_s`` after the key sweep. Filled pixels have the nearest measured pixel's
-    age.
+    A filled pixel has the age of the nearest measured pixel in the image.
+
+    Args:
+        depth_map: The map.
+        stamps_ns: Times of the sweeps by frame number.
+        key: Frame number of the key sweep.
+        late_s: Time that the map shows, in seconds after the key sweep.
     """
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
     age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}

@@ -129,11 +129,18 @@ def votes_for(
 ) -> Float32:
     """Return the (P,) weighted share of the votes, 0 to 1, that confirm the depth of each pixel.
 
-    A known pixel votes for it if its own surface, extended to the pixel, has that depth. ``pixel``
-    (P,) are flat indices (row · W + column) of depths ``depth_m`` (P,). Of the ``maps_m``, (H,W)
-    depths of the pixels that vote, 0 for none, the least share counts. ``with_shifts`` takes the
-    least of five positions of the image, in place and 0.6 ray spacings to each side, with a small
-    constant vote; else the share is 0 without voters.
+    A known pixel votes for the depth if its own surface, extended to the pixel, has that depth.
+    Otherwise it votes against. Edges of the image weaken votes.
+
+    Args:
+        record: Record with the image, the slopes and the spacing of rays.
+        maps_m: Depths (H,W) of the pixels that vote, 0 for other pixels. The least share of the
+            maps counts.
+        pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
+        depth_m: (P,) depths to confirm.
+        with_shifts: True takes the least share of five positions of the image, with a small
+            constant vote. The image is unshifted, and shifted by 0.6 ray spacings to each side.
+            False takes the unshifted image; the share is 0 without voters.
     """
     shares = np.ones((len(maps_m), len(pixel)), np.float32)
     # The kernel is compiled for each memory layout of its arrays: here they have one.

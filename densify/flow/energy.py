@@ -31,14 +31,22 @@ class Energy(NamedTuple):
 def energy(
     flow: Tensor, source: Tensor, target: Tensor, laplacian: csr_array, alpha: float
 ) -> Energy:
-    """Return the energy E(F) of a flow (n,3) in metres, differentiable with respect to the flow.
+    """Return the energy E(F) of a flow, differentiable with respect to the flow.
 
-    It is a sum over ``source`` points p (n,3) and ``target`` points q (m,3), metres, one frame::
+    The energy is::
 
-        E(F) = Σ_p min_q |p + f_p - q|² + Σ_q min_p |p + f_p - q|² + alpha tr(Fᵀ L F)
+        E(F)   = E_d(F) + alpha tr(Fᵀ L F)
+        E_d(F) = Σ_p min_q |p + f_p - q|² + Σ_q min_p |p + f_p - q|²
 
-    L (n,n) is `densify.flow.objective.laplacian`. Nearest neighbours are found on the CPU without
-    gradient; the distances to them carry it. It is exact wherever no two neighbours tie.
+    Nearest neighbours are found on the CPU without gradient; the distances to them carry it. The
+    gradient is exact wherever no two neighbours tie. The energy is a sum over points, not a mean.
+
+    Args:
+        flow: (n,3) metres, F.
+        source: (n,3) metres, points p.
+        target: (m,3) metres, points q, in the frame of the source.
+        laplacian: (n,n) L of `densify.flow.objective.laplacian`.
+        alpha: Weight of smoothness.
     """
     if flow.shape != source.shape:
         raise InputError(

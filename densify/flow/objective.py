@@ -131,10 +131,14 @@ def solve(
     settings: SolverSettings | None = None,
     initial: ArrayLike | None = None,
 ) -> Solution:
-    """Return the smooth flow that moves ``source`` (n,3) onto ``target`` (m,3), metres, one frame.
+    """Return the smooth flow that moves ``source`` onto ``target``, a minimum of the objective.
 
-    Computed in float64; the same input gives the same bytes on the same CPU. From an ``initial``
-    flow (n,3), None for 0, pcg uses the final alpha at once.
+    All is computed in float64. The same input gives the same bytes on the same CPU.
+
+    Args:
+        source: (n,3) metres.
+        target: (m,3) metres, in the same frame.
+        initial: (n,3) flow to start from, None for 0. With it, pcg uses the final alpha at once.
     """
     settings = settings or SolverSettings()
     points = checked_cloud(source, "source")

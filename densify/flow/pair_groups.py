@@ -140,7 +140,13 @@ def group_around(points: Float, unexplained: Bool) -> Int:
 
 
 def road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
-    """Return the rows of each group (N,) that may be a road user, and not a treetop or a wall."""
+    """Return the rows of each group that may be a road user, and not a treetop or a wall.
+
+    Args:
+        group: (N,) label of each point's group, -1 for none.
+        unexplained: (N,) True for points without a counterpart in the other cloud.
+        height_m: (N,) height of the points above the ground.
+    """
     rows = np.flatnonzero(group >= 0)
     rows = rows[np.argsort(group[rows], kind="stable")]
     begins = np.flatnonzero(np.diff(group[rows])) + 1  # where the label changes
@@ -218,7 +224,11 @@ class Proposal:
         return bool(np.linalg.norm(offset) < FIT_M)
 
     def moves(self, free: Bool | None = None) -> bool:
-        """Return True if the group certainly moves; ``free`` (K,) target points count, or all."""
+        """Return True if the group certainly moves.
+
+        Args:
+            free: (K,) True for target points that no other motion explains. None for all.
+        """
         counted_gain = self.target_gain
         if free is not None:
             counted_gain = self.target_gain[free | (self.target_gain < 0)]
@@ -230,10 +240,15 @@ class Proposal:
 def judge(
     group: int, members: Int, motion: RigidMotion, source: PairCloud, target: PairCloud
 ) -> Proposal:
-    """Return a motion of one group, of source rows (K,), as a proposal with its evidence.
+    """Return a motion of one group as a proposal, with the evidence that the group moves.
 
-    Target points are compared with the source, in which only the group moves: points that stay at
-    its old position count against the motion.
+    Source points are compared with the target. Target points are compared with the source, in which
+    only the group moves: points that stay at its old position count against the motion.
+
+    Args:
+        group: Index of the group.
+        members: (K,) rows of the group's source points.
+        motion: Motion of the group that is judged.
     """
     static = replace(motion, state=np.zeros(4))
     members = source.evenly(members)
@@ -260,9 +275,14 @@ def judge(
 def compare(
     source: PairCloud, members: Int, target: PairCloud, motion: RigidMotion
 ) -> tuple[Float, Int]:
-    """Return the (K,) costs of source rows (K,) at the target's surfaces, moved back by a motion.
+    """Compare source points with the target's surfaces, which are moved back by a motion.
 
-    Also the indices of the target points that, moved back, come close to these points.
+    Args:
+        members: (K,) rows of the source points.
+
+    Returns:
+        The (K,) costs of the source points, and the indices of the target points that come close
+            to the source points when they are moved back.
     """
     points = motion.at_start(source, members)
     positions = [motion.place(points, share) for share in (target.share.min(), target.share.max())]
@@ -285,7 +305,12 @@ class Search:
     initial: Float | None
 
     def proposals(self, group: int, members: Int) -> list[Proposal]:
-        """Return the motions by which a group, source rows (K,), may move, with their evidence."""
+        """Return the motions by which a group may move, with their evidence.
+
+        Args:
+            group: Index of the group.
+            members: (K,) rows of the group's source points.
+        """
         points = self.source.points[members]
         centre = points.mean(axis=0)
         reach_m = MAX_SPEED_M_S * min(self.apart_s or _USUAL_S, _LONGEST_S)
@@ -311,10 +336,14 @@ class Search:
         return [proposal for proposal in judged if proposal.moves()]
 
     def refine(self, proposal: Proposal, members: Int) -> Proposal:
-        """Return the proposal with the most likely motion nearby, for source rows (K,).
+        """Return the proposal with the most likely motion nearby, by a pattern search.
 
         Alignment is biased towards positions at which scan lines match scan lines. The likelihood
         is not. Pattern search: Hooke, Jeeves, JACM 1961.
+
+        Args:
+            proposal: Motion of the group to start from.
+            members: (K,) rows of the group's source points.
         """
         slope = _slope_of(self.ground, proposal.motion.centre)
         # Steps (x, y, z, yaw): along the motion, across the motion, and about the vertical
@@ -423,11 +452,17 @@ def find_movers(
     apart_s: float | None = None,
     initial: Float | None = None,
 ) -> tuple[list[RigidMotion], Int]:
-    """Return the motions of the moving groups, and (N,) each source point's motion, or -1.
+    """Return the motions of the moving groups, and the group of each source point.
 
-    Both clouds, N and M points, are above the ground in one frame; ``height_m`` (N,) is the
-    source's height above it. The search covers up to 38 m/s over ``apart_s``, None if unknown, and
-    also starts at a group's median ``initial`` (N,3) flow.
+    Args:
+        source: N points above the ground.
+        target: M points of the other cloud above the ground, in the same frame.
+        height_m: (N,) height of the source points above the ground.
+        apart_s: Time between the clouds, None if unknown. The search covers up to 38 m/s.
+        initial: (N,3) flow. The search of a group also starts at the median flow of its members.
+
+    Returns:
+        The motions, and (N,) the index of each source point's motion, -1 for static points.
     """
     clouds = source, target
     with ThreadPoolExecutor(2) as pool:

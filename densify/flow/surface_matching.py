@@ -27,7 +27,13 @@ _LOOSE = 10.0
 
 
 def apply(state: Float, points: Float, centre: Float) -> Float:
-    """Return points (N,3), metres, turned about their centre and displaced by (4,) or (N,4)."""
+    """Return the (N,3) points of an object, turned about its centre and displaced.
+
+    Args:
+        state: (4,) state of all points, or (N,4) one for each point.
+        points: (N,3) metres.
+        centre: (3,) centre of the rotation, or (N,3) one for each point.
+    """
     return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
 
@@ -47,9 +53,12 @@ def _turned(arms: Float, yaw: float | Float) -> Float:
 
 
 def surface_information(points: Float, rows: Int, loose: float = 1.0) -> Float:
-    """Return the (N,3,3) inverse covariances (1/m²) of a surface ``points`` (M,3) at N positions.
+    """Return the (N,3,3) inverse covariances (1/m²) of a surface at N positions.
 
-    ``rows`` (N,k) are the neighbours that span it there; ``loose`` above 1 constrains less.
+    Args:
+        points: (M,3) points of the surface, metres.
+        rows: (N,k) rows of the neighbours that span the surface at each position.
+        loose: Factor of the covariance. Above 1 the surface constrains less.
     """
     offset = points[rows]
     offset -= offset.mean(axis=1, keepdims=True)
@@ -85,10 +94,14 @@ class Model:
     ) -> Float | None:
         """Return the state (4,) that fits the model to the points, None for too few matches.
 
-        ``points`` (N,3) are metres, world, at one time; ``centre`` (3,) is in the object's frame.
-        Displacement x, y and yaw are solved with Tukey weights from the ``predicted`` state (4,)
-        with standard deviation (3,) of x, y (m), yaw (rad). The height z stays as predicted: on an
-        object hit by few beams it would follow the beams. Of many points some 250 are used.
+        Displacement x, y and yaw are solved with Tukey weights. The height z stays as predicted: on
+        an object hit by few beams it would follow the beams. Of many points some 250 are used.
+
+        Args:
+            points: (N,3) world, metres, all at one time.
+            centre: (3,) centre of the rotation, object's frame.
+            predicted: (4,) state to start from.
+            prediction_std: (3,) standard deviation of the predicted x, y (m) and yaw (rad).
         """
         points = np.ascontiguousarray(points[:: max(1, len(points) // _NUM_ALIGNED)])
         state = predicted.copy()

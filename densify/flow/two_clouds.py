@@ -40,26 +40,30 @@ def estimate_flow(
 ) -> FlowField:
     """Estimate the scene flow between two clouds in one coordinate frame.
 
-    The flow excludes ego-motion if the common frame does not move with the vehicle, and leads from
-    the middle of the source's times to the target's. With times, ``to_reference`` is the motion
-    from a point's own time to the source's middle. Groups of points move only if their motion
-    explains, in both clouds, differences that a static group leaves unexplained. All other points
-    have exactly 0, also farther than 400 m from the middle. Without ``objective.static_prior``
-    every point takes the flow of the published objective; with ``flow.engine=paper`` the moving
-    groups do.
+    The flow excludes ego-motion, provided that the common frame does not move with the vehicle.
+    Groups of points move only if their motion explains, in both clouds, differences that a static
+    group leaves unexplained. The flow of all other points is exactly 0, also farther than 400 m
+    from the middle. Without ``objective.static_prior`` every point takes the flow of the published
+    objective. With ``flow.engine=paper`` the moving groups take it.
 
     Args:
         source: (N,3) metres, z up, with or without the ground.
         target: (M,3) metres, as ``source``.
         config: Settings; the sections ``flow`` and ``objective`` are used.
-        initial: (N,3) flow to start from, only needed for objects faster than the search covers:
-            38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
+        initial: (N,3) flow to start from. It is needed only for objects faster than the search
+            covers: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
         source_offset_ns: (N,) times of the points. Both clouds use one clock, or each counts from
-            its own sweep's reference time; the target is then taken for the next revolution.
-            Without times, the flow is wrong for objects met earlier or later in the second sweep.
+            its own sweep's reference time; in the second case the target is taken for the next
+            revolution. Without times, the flow is too slow or too fast for an object that the
+            scanner meets earlier or later in the second sweep.
         target_offset_ns: (M,) times of the points, both or none.
-        source_lidar: (N,) scanners' numbers. Without times, points compare within a scanner only.
+        source_lidar: (N,) numbers of the points' scanners. Without times, points are compared
+            within a scanner only.
         target_lidar: (M,) numbers of the points' scanners, both or none.
+
+    Returns:
+        Flow from the middle of the source's times to the target's middle, in the common frame. With
+            times, ``to_reference`` is the motion from a point's own time to the source's middle.
     """
     settings = resolve(config)
     if settings.flow.engine not in ("groups", "paper"):

@@ -79,10 +79,13 @@ class RangeImage:
 
     @staticmethod
     def of(registered: RegisteredSweep, num_together: int = 1, by_ring: bool = False) -> RangeImage:
-        """Return the range images of a deskewed sweep, for sums over ``num_together`` sweeps.
+        """Return the range images of a deskewed sweep.
 
-        The columns are finer by this number. ``by_ring`` also uses single rings: dense rings for
-        far points, and isolated rings at their rays.
+        Args:
+            num_together: Number of sweeps whose counts are added up. The columns are finer by this
+                factor.
+            by_ring: True also uses single rings: dense rings for far points, where an error of
+                registration is smaller than their spacing, and isolated rings at their rays.
         """
         scanners: list[ScannerImage] = []
         for lidar in np.unique(registered.sweep.lidar).tolist():
@@ -97,12 +100,19 @@ class RangeImage:
         min_filled: int = MIN_FILLED,
         velocity_m_s: Float | Float32 | None = None,
     ) -> Bool:
-        """Return (N,) True where the space at points (N,3), metres, lidar frame, is certainly free.
+        """Return (N,) True where the space at points (N,3) is certainly free.
 
-        At least ``min_filled`` of the 3 x 3 cells around a point's direction must hold a return,
-        and all their returns be farther than the point by more than ``max(margin_m, margin_fraction
-        * range)``. A larger margin tolerates errors of registration, but misses movers close to a
-        background. ``velocity_m_s`` is (N,3), lidar frame, without ego-motion; None if static.
+        At least ``min_filled`` of the 3 x 3 cells around a point's direction must hold a return.
+        Every return in them must be farther than the point by more than ``max(margin_m,
+        margin_fraction * range)``. A larger margin tolerates errors of registration, but misses
+        moving objects close to a background.
+
+        Args:
+            points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
+            margin_m: Least distance in metres of a return beyond the point.
+            margin_fraction: Least distance of a return beyond the point, as a share of its range.
+            min_filled: Least number of filled cells.
+            velocity_m_s: (N,3) lidar frame, without ego-motion; None for static points.
         """
         margins = margin_m, margin_fraction
         num_beyond = self.count_beyond(points, margins, min_filled, velocity_m_s)
@@ -117,8 +127,13 @@ class RangeImage:
     ) -> NDArray[np.int16]:
         """Return the (S,N) number of filled cells around each of N points in each of S images.
 
-        Among the 3 x 3 cells around a point, it is 0 if fewer than ``min_filled`` are filled, far
-        below 0 if any of their returns is not beyond the point. Counts of sweeps may be added.
+        The 3 x 3 cells around a point's direction are counted. There are three cases:
+
+        - The count is 0 if fewer than ``min_filled`` cells are filled.
+        - It is the number of filled cells if all their returns are beyond the point.
+        - It is far below 0 if any of these returns is not beyond the point.
+
+        The counts of several sweeps may be added.
 
         Args:
             points: (N,3) positions in metres, lidar frame at the reference time of the sweep.

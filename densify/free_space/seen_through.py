@@ -67,8 +67,12 @@ class FreeSpace:
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
         """Return (N,) True where the batch of sweep j certainly observed free space.
 
-        Every return near the direction of the point must be clearly farther away. Points and
-        velocities (None: static) are (N,3) in the world frame at the reference time of sweep j.
+        Every return near the direction of the point must be clearly farther away, in all sweeps of
+        the batch. Together the sweeps must have enough returns there.
+
+        Args:
+            points: (N,3) positions in the world frame at the reference time of sweep j.
+            velocity_m_s: (N,3) velocities in the world frame, None for static points.
         """
         batch = self._batch_of[j]
         # In a single sweep the image counts only full neighbourhoods; of several, the sum decides.

@@ -18,7 +18,12 @@ T = TypeVar("T")
 
 
 def select_rows(container: T, keep: Bool | Int | slice, columns: Sequence[str] = ()) -> T:
-    """Return a dataclass or named tuple with the rows ``keep`` of its ``columns``, else all."""
+    """Return a dataclass or named tuple with only some rows of its columns.
+
+    Args:
+        keep: Mask of the rows, array of row numbers, or slice.
+        columns: Names of the fields with an array of rows, or None; by default all fields.
+    """
     names = columns or _field_names(container)
     arrays = {name: getattr(container, name) for name in names}
     rows = np.arange(len(arrays[names[0]]))[keep]  # once for all columns

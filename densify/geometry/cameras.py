@@ -40,16 +40,17 @@ _CONVERGED = np.sqrt(np.finfo(float).eps)  # from here one more step of Newton's
 
 
 def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
-    """Return the pixels of points (N,3), metres, camera frame, and which of them are visible.
+    """Return the projection of points (N,3), metres, camera frame, into the image of a camera.
 
-    The first is (N,2) image coordinates, integers at pixel centres, NaN for a point that is too
-    near or outside the view of the lens. The second is (N,) True for a point in the view that falls
-    on a pixel after ``rint`` and is farther than 0.1 m: in z for a pinhole, in range for other
-    lenses.
+    A distortion polynomial is valid only inside the image. Beyond the angle at which the distorted
+    radius stops growing, it would fold points back into the image. Such points, and points more
+    than the camera's ``max_angle_deg`` off its axis, are invisible.
 
-    Points beyond the angle at which the distorted radius stops growing, or more than
-    ``max_angle_deg`` off the axis, are invisible: the distortion polynomial would fold them back
-    into the image.
+    Returns:
+        uv: (N,2) image coordinates in pixels, integers at pixel centres. NaN for a point that is
+            too near or outside the view of the lens.
+        visible: (N,) True for a point in the view of the lens that falls on a pixel after ``rint``
+            and is farther than 0.1 m: in z for a pinhole, in range for other lenses.
     """
     lens = _lens(camera)
     uv = np.full((len(points_cam), 2), np.nan)
@@ -105,10 +106,15 @@ def depth_along(points_cam: Float, measure: str) -> Float:
 
 
 def converted(camera: Camera, depth_m: Float32, from_measure: str, to_measure: str) -> Float32:
-    """Return a depth map (H,W), metres, converted from one measure of depth to another.
+    """Return a depth map of a camera converted from one measure of depth to another.
 
-    A measure is ``z``, along the optical axis, or ``range``. Pixels whose ray has z <= 0 become 0.
-    If the measures are the same, the map is returned unchanged.
+    Pixels whose ray has z <= 0 become 0. If the measures are the same, the map is returned
+    unchanged.
+
+    Args:
+        depth_m: (H,W) depth in metres, 0 for none.
+        from_measure: ``z``, along the optical axis, or ``range``.
+        to_measure: ``z`` or ``range``.
     """
     if from_measure == to_measure:
         return depth_m

@@ -44,10 +44,13 @@ def is_near(tree: cKDTree, queries: Float, within_m: float) -> Bool:
 
 
 def thinned(points: Float | Float32, order: Int, step: float, max_per_cell: int) -> Int:
-    """Return the ascending rows of points (N,3) that stay after thinning by cells of side ``step``.
+    """Return the ascending rows of the points that stay after thinning by a grid.
 
-    ``order`` (K,) are the rows of the candidates, the preferred ones first. The box around the
-    points has at most 2^63 / N cells.
+    Args:
+        points: (N,3) coordinates. The box around them has at most 2^63 / N cells.
+        order: (K,) rows of the candidates, the preferred ones first.
+        step: Side of a cell, in the unit of the points.
+        max_per_cell: Greatest number of points that a cell keeps.
     """
     cell = np.zeros(len(points), np.int64)
     for coordinate in points.T:
@@ -66,11 +69,16 @@ def thinned(points: Float | Float32, order: Int, step: float, max_per_cell: int)
 
 
 def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
-    """Return (N,) True for points (N,D) around which a grid has at most ``most_cells`` cells.
+    """Return (N,) True for the points (N,D) around which a grid fits into memory.
 
     These are all points if the box around them is small enough. Otherwise up to 1 % of them, the
-    farthest from their median, are left out. If the box is still too large, none is left out.
-    ``cell`` is the side of a cell, in the unit of the points.
+    farthest from their median, are left out, such as a few stray returns. If the box is still too
+    large, the points are spread out, and none is left out.
+
+    Args:
+        points: (N,D) coordinates.
+        cell: Side of a cell of the grid, in the unit of the points.
+        most_cells: Greatest number of cells.
     """
     all_points = np.ones(len(points), bool)
     if not len(points) or _num_cells(points, cell) <= most_cells:
@@ -89,11 +97,19 @@ def _num_cells(points: NDArray[Any], cell: float) -> float:
 
 
 def link(points: Float, distance_m: float) -> tuple[int, Int]:
-    """Return the number of groups of points (N,3), and (N,) group of each, by single linkage.
+    """Group points by single linkage: points closer than ``distance_m`` share a group.
 
-    Points closer than ``distance_m`` share a group, numbered by its first point. In a grid whose
-    cell diagonal is this distance, all points of a cell are linked: the cost does not grow with the
-    square of the density.
+    The points are sorted into a grid whose cell diagonal equals the distance, hence all points of a
+    cell are linked. Only neighbouring cells are compared, and the cost does not grow with the
+    square of the point density.
+
+    Args:
+        points: (N,3) positions in metres.
+        distance_m: Distance below which two points are linked.
+
+    Returns:
+        num_groups: Number of groups G.
+        label: (N,) group of each point, 0 to G - 1, numbered by the first point of each group.
     """
     if not len(points):
         return 0, np.zeros(0, np.int64)
@@ -121,9 +137,13 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
 
 
 def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
-    """Return (N,) True for the points (N,3), metres, closer than ``within_m`` to a dense seed.
+    """Return (N,) True for the points (N,3) closer than ``within_m`` to a dense seed.
 
-    A seed is dense if ``least_share`` of the points around it are seeds.
+    Args:
+        points: (N,3) positions in metres.
+        seed: (N,) True for seeds.
+        within_m: Radius around a seed.
+        least_share: Least share of seeds among the points around a dense seed.
     """
     is_close = np.zeros(len(points), bool)
     seeds = points[seed]

@@ -111,12 +111,20 @@ def flow_of_boxes(
     next_boxes: Boxes,
     margins: BoxMargins | None = None,
 ) -> tuple[FlowField, Bool]:
-    """Return the flow of the N points of one sweep to the next, and (N,) which flows are certain.
+    """Return the flow of the N points of one sweep to the next, and which flows are certain.
 
-    The flow has ego-motion removed, in the lidar frame of ``source``; ``instance`` is the row of
-    the point's box, -1 for no box. Boxes of one object share the track name. Not certain are points
-    in two boxes, just outside a box, at the bottom of a moving box, in a box that the next sweep
-    lacks, or in image areas without annotation.
+    Args:
+        source: Sweep of the N points.
+        after: Next sweep in the same world. Only its pose and time are used.
+        boxes: Boxes of ``source``.
+        next_boxes: Boxes of ``after``. Boxes of one object share the track name.
+        margins: Margins around the boxes, None for the defaults.
+
+    Returns:
+        The flow with ego-motion removed, in the lidar frame of ``source``; ``instance`` is the row
+            of the point's box, -1 for no box. Then (N,) True where the flow is certain. It is False
+            for points in two boxes, just outside a box, at the bottom of a moving box, in a box
+            that the next sweep lacks, or in image areas without annotation.
     """
     margins = margins or BoxMargins()
     points = source.sweep.points

@@ -77,10 +77,13 @@ class AboveGround(NamedTuple):
 
 
 def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> list[int | None]:
-    """Return the indices of ``num_wanted`` sweeps for the flow from source to target.
+    """Return the indices of the sweeps that the network needs for the flow from source to target.
 
-    They are source, target, and further sweeps on the other side of the source, None for missing
-    ones.
+    They are source, target, and further sweeps on the other side of the source.
+
+    Args:
+        num_sweeps: Number of existing sweeps; other indices become None.
+        num_wanted: Number of sweeps that the network takes.
     """
     step = source - target
     wanted = [source, target, *(source + step * number for number in range(1, num_wanted - 1))]

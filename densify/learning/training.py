@@ -204,8 +204,9 @@ def _new_street(spec: str, rng: np.random.Generator) -> LidarSequence:
 def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
     """Return the clip of up to 7 sweeps around a key frame.
 
-    Labels are the ground truth for the teacher "truth", the flow of the engine ``groups`` for
-    "engine".
+    Args:
+        teacher: Source of the labels: "truth" for the ground truth, "engine" for the flow of the
+            engine ``groups``; other names give no labels.
     """
     stretch = Recording(sequence, settings, _CLIP_SWEEPS // 2, [key]).window(key)
     heights, frames = ground(stretch), stretch.frames

@@ -58,6 +58,7 @@ def export_run(
         min_confidence: Least confidence of pixels and points, 0 to 1.
         max_age_ms: Greatest time from the measurement to the exposure (pixels) or the key sweep
             (points); None for any.
+        overwrite: Replace an earlier export.
     """
     if not 0 <= min_confidence <= 1:
         raise InputError(f"--min-confidence {min_confidence}: expected a number from 0 to 1")

@@ -67,7 +67,11 @@ def write_key(
 ) -> dict[str, FileRecord]:
     """Write the depth maps of one key sweep, and return path in the tree -> size and hash.
 
-    By camera, ``sparse`` are of the key sweep alone, ``dense`` of all. Equal maps give equal bytes.
+    Equal maps give equal bytes.
+
+    Args:
+        sparse: Maps of the key sweep alone, by camera.
+        dense: Maps of all sweeps, by camera.
     """
     paths = []
     for camera, maps in dense.items():

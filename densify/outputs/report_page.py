@@ -96,9 +96,11 @@ class KeyFiles:
         return KeyFiles(folder / "compare", about, methods)
 
     def read(self, read: Callable[[Path], T], name: str, optional: bool = False) -> T | None:
-        """Return what ``read`` makes of a file; if it fails None, with a note in ``missing``.
+        """Read a file of the folder; None, with a note in ``missing``, if it cannot be read.
 
-        A file that does not exist and is ``optional`` has no note.
+        Args:
+            read: Function that returns the content of a path.
+            optional: True to return None without a note if the file does not exist.
         """
         path = self.maps / name
         if optional and not path.is_file():
@@ -284,10 +286,13 @@ def packed_cloud(
 ) -> dict[str, Any]:
     """Pack a thinned cloud into ``blobs`` and return its entry in the page, moving points first.
 
-    Positions are ``low_m`` + ``step_m`` times 16-bit integers. ``sweep`` has indices in ``frames``.
-    ``mover`` is 0 for static points, 1 for moving points without a track, 2 and up by
-    ``instances``. ``displaced``, of moving points, is 32768 plus the displacement in
-    ``displaced_step_m``.
+    ``frames`` are the sweeps of the page, ``instances`` the numbers of its tracked objects.
+
+    Returns:
+        The entry. Positions are ``low_m`` + ``step_m`` times 16-bit integers. ``sweep`` has indices
+            in ``frames``. ``mover`` is 0 for static points, 1 for moving points without a track, 2
+            and up for tracked objects by ``instances``. ``displaced``, for moving points only, is
+            32768 plus the displacement beyond rigid alignment in steps of ``displaced_step_m``.
     """
     rows = thinned(cloud.points, cloud.moving, _MOST_POINTS)
     chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])

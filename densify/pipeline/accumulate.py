@@ -27,9 +27,13 @@ _BEYOND_PERCENT = 0.2  # percent of the points outside the object's box, on each
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
     """Return the points of all sweeps as one cloud in the lidar frame of the key sweep.
 
-    Moving points are displaced by ``fields``, each sweep's flow to the key sweep. Those that cannot
-    be followed are left out if ``drop_lost``, else they keep their rigid positions, as static
-    points do.
+    Moving points are displaced by their scene flow from each sweep to the key sweep's reference
+    time. Static points keep their rigid positions, bit for bit.
+
+    Args:
+        fields: Flow of each sweep's points to the key sweep.
+        drop_lost: Leave out moving points that cannot be followed to the key sweep, else they keep
+            their rigid positions.
     """
     sweep_rows = [np.flatnonzero(~(drop_lost & flow.lost)) for flow in fields]
     cloud = _empty_cloud(sum(map(len, sweep_rows)))

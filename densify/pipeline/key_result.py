@@ -103,8 +103,10 @@ def result_of_method(
 ) -> Result:
     """Return the result of the method ``name``, without its baselines.
 
-    Its points at the key's time are taken out of ``moments`` to save memory. If ``filled``, holes
-    of the maps are filled by interpolation.
+    Args:
+        moments: Points at the key's time by method. Those of this method are taken out to save
+            memory.
+        filled: Fill holes of the maps by interpolation.
     """
     method, output = METHODS[name], scene.settings.output
     views, watch, stretch = scene.views, scene.watch, scene.stretch
@@ -283,9 +285,15 @@ def complete_with_prior(
 ) -> Result:
     """Return the result with completed maps (``full``) and their scores.
 
-    A prior that does not fit the measured depth is not used, with a warning. By map name, ``shots``
-    are the images that maps show, and ``truth`` has depth (H,W), metres, and mask (H,W) of moving
-    pixels.
+    A prior that does not fit the measured depth is not used, and a warning is logged.
+
+    Args:
+        shots: Map name -> image that the map shows.
+        truth: Map name -> ground-truth depth (H,W) in metres and mask (H,W) of moving pixels.
+        kind: The setting ``prior.kind``.
+
+    Raises:
+        InputError: The prior has no depth image for any map of the key.
     """
     full = {}
     metrics = copy.deepcopy(dict(result.metrics))

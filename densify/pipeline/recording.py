@@ -139,9 +139,12 @@ class Recording:
         Args:
             window: Number of sweeps on each side of a key.
             keys: Frame numbers, around which sweeps are read; None for every frame.
-            cache: Keeps registration, motion and far on disk.
-            run: Name of a run whose processes share results through the cache.
+            cache: Cache on disk for registration, motion and far; None for no cache.
+            run: Name of a run whose processes share results through the cache; None for no sharing.
             looks_around: True also searches motion ``flow.look_around_s`` beyond the windows.
+
+        Raises:
+            InputError: A key does not exist, or the window is invalid.
         """
         self.sequence = sequence
         self.settings = settings
@@ -259,10 +262,12 @@ class Recording:
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
     ) -> Moment:
-        """Return the points of a key's window, or of the key sweep alone, at its reference time.
+        """Return the points of a key's window, accumulated at the key's reference time.
 
-        ``engine`` is "" for the configured engine, None for rigid accumulation. ``with_flow`` adds
-        the flow of every sweep to the next sweep towards the key.
+        Args:
+            all_sweeps: Use all sweeps of the window, else the key sweep alone.
+            engine: Scene-flow engine, "" for the configured engine, None for rigid accumulation.
+            with_flow: Also return the flow of every sweep to the next sweep towards the key.
         """
         stretch = self.window(key)
         used = stretch if all_sweeps else Stretch((stretch[key],))

@@ -82,7 +82,13 @@ class Road:
     views: Sequence[tuple[Camera, Float]]  # cameras with their poses ``T_cam_world`` (4,4)
 
     def find_static_surfaces(self, with_window: bool) -> StandingWorld:
-        """Return the static surfaces that a view may see, world; also the window's if asked."""
+        """Return the static surfaces along the road, in the world of the window.
+
+        Only points that one of the views may see are kept.
+
+        Args:
+            with_window: Include the points of the window's own sweeps.
+        """
         window_sweeps = self._thin_window()
         with ThreadPoolExecutor(num_threads()) as pool:
             sweeps_before, sweeps_after = pool.map(self._collect_side, (-1, 1))

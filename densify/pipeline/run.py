@@ -71,10 +71,7 @@ def run(
     progress: Progress | None = None,
     prior: str | Path | None = None,
 ) -> Result:
-    """Densify one key, and return its result.
-
-    With ``output.score`` it also has the simpler methods as ``baselines``, and scores of maps made
-    without the key sweep.
+    """Densify one key.
 
     Args:
         key: Frame number of the key sweep.
@@ -86,6 +83,10 @@ def run(
         config: Settings, see `densify.config.resolve`.
         progress: Callback (stage, done, total).
         prior: Folder of depth images that complete the pixels without measured or filled depth.
+
+    Returns:
+        The result. With ``output.score`` it also has the simpler methods as ``baselines``, and
+            scores of maps made without the key sweep.
     """
     results = run_keys(sequence, [key], window, method, cameras, config, progress, prior=prior)
     ((_, result),) = results  # the pair of the only key
@@ -132,11 +133,18 @@ def compare(
     cache: Cache | None = None,
     prior: str | Path | None = None,
 ) -> dict[str, Result]:
-    """Densify one key with several methods, and return method -> result with its scores.
+    """Densify one key with several methods on the same registration, and score them.
 
-    The methods share the registration, and each result has those before it as ``baselines``. Names
-    are ``none``, ``icp``, ``icp-visible``, ``icp-far``, ``flow-plain``, ``paper`` and ``flow``. The
-    ``prior`` completes the maps of the last method. Other arguments are as in `run`.
+    The arguments are as in `run`, except for these.
+
+    Args:
+        methods: Some of ``none``, ``icp``, ``icp-visible``, ``icp-far``, ``flow-plain``, ``paper``
+            and ``flow``.
+        cache: Keeps the results of steps on disk.
+        prior: Folder of depth images that complete the maps of the last method.
+
+    Returns:
+        Method -> result. Each result has the results before it as ``baselines``.
     """
     watch = Watch(progress)
     settings = resolve(config).scored()
@@ -179,9 +187,16 @@ def densify(
 ) -> dict[str, Result]:
     """Return method -> result for one key. Each result has the results before it as baselines.
 
-    Unless results are scored, only the maps of the last method are filled. ``priors`` complete the
-    maps of the last method. A stage shared by several keys counts in ``watch`` for the first of
-    them. ``with_images`` colours the cloud, and scores depth if there is ground truth.
+    Unless results are scored, only the maps of the last method are filled.
+
+    Args:
+        recording: The recording, whose blocks include the key.
+        methods: Names of `METHODS`.
+        watch: Measures the cost of each stage, from zero. A stage shared by several keys counts for
+            the first of them.
+        with_images: Colour the cloud, and score depth if there is ground truth. The maps are the
+            same either way.
+        priors: Depth images that complete the maps of the last method.
     """
     methods = tuple(dict.fromkeys(methods))  # each once, in order
     sequence = recording.sequence

@@ -33,9 +33,13 @@ class Sweeps:
         run: str | None,
         watch: Watch,
     ) -> None:
-        """Prepare to read; keep ``num_kept`` sweeps in memory.
+        """Prepare to read.
 
-        Processes of one ``run`` share digests of sweeps. ``watch`` measures the stage ``read``.
+        Args:
+            num_kept: Number of sweeps kept in memory.
+            cache: Cache on disk, None for no cache.
+            run: Name of a run whose processes share digests of sweeps; None for no sharing.
+            watch: Measures the stage ``read``.
         """
         self._sequence = sequence
         self._timeline = timeline
@@ -102,10 +106,18 @@ class Cut:
 
     @staticmethod
     def of(timeline: Timeline, window: int, keys: Collection[int], beyond_s: float = 0.0) -> Cut:
-        """Return the blocks around the windows, ``window`` sweeps on each side, of some keys.
+        """Return the blocks around the windows of some keys.
 
         Consecutive keys share a block if their windows overlap and the key is less than `BLOCK_S`
-        after the first. A block is longer than its windows by ``beyond_s`` on each side.
+        after the block's first key.
+
+        Args:
+            window: Number of sweeps on each side of a key.
+            keys: Frame numbers of the keys, in any order.
+            beyond_s: Seconds by which a block is longer than its windows, on each side.
+
+        Raises:
+            InputError: The window or a key is invalid, or a key does not exist.
         """
         check_window(window)
         for key in keys:

@@ -28,8 +28,9 @@ def numbered_files(
 ) -> dict[int, Path]:
     """Return the numbered files of a folder, such as ``0000000120.bin``, by ascending number.
 
-    Of files with the same number, the earliest of ``suffixes`` is taken. The first group of
-    ``stem``, which matches a whole name without suffix, is the number.
+    Args:
+        *suffixes: Accepted suffixes. Of files with the same number, the earliest suffix is taken.
+        stem: Pattern of a whole name without suffix; its first group is the number.
     """
     entries = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
     files = [
@@ -121,7 +122,12 @@ def pinhole(
 def chosen_scene(
     reader: str, path: Path, scene: str | None, names: Sequence[str], none: str
 ) -> str:
-    """Return the requested scene, for None the only one; ``none`` is the error without any."""
+    """Return the name of the requested scene; for None, the name of the only scene.
+
+    Args:
+        names: Names of the existing scenes.
+        none: Message of the InputError if there are no scenes.
+    """
     if not names:
         raise InputError(f"{path}: {none}")
     if scene in names or (scene is None and len(names) == 1):

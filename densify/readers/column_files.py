@@ -40,10 +40,14 @@ def read_arrow(
 ) -> dict[str, NDArray[Any]]:
     """Return columns (N,) of a feather or parquet file by name.
 
-    ``columns`` gives the kind of each column: "n" finite numbers, "m" numbers or NaN, "i" integers,
-    "s" strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of arrays or None).
-    ``where`` selects the rows of a parquet file by values of columns. ``data_set``, an extra that
-    installs pyarrow and the recordings' name, is for messages.
+    Args:
+        path: File whose suffix is .feather or .parquet.
+        columns: Name of a column -> its kind: "n" finite numbers, "m" numbers or NaN, "i"
+            integers, "s" strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of
+            arrays or None).
+        data_set: Extra that installs pyarrow, and the name of the recordings for messages.
+        where: Name of a column -> value that the rows to read have there, for a parquet file; None
+            for all rows.
     """
     needed("pyarrow", *data_set)
     is_feather = path.suffix == ".feather"

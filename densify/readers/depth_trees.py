@@ -84,11 +84,16 @@ class _File(NamedTuple):
 def pair_depth_files(
     predicted: Path, truth: Path, mask: Path | None = None, *, filled: bool = False
 ) -> DepthPairs:
-    """Pair estimated PNG depth maps with true ones and masks of moving objects: files or folders.
+    """Pair estimated PNG depth maps with true depth maps and with masks of moving objects.
 
-    Two files are paired whatever their names. In folders the frames must agree, and drive and
-    camera too if all paths name them; files of a known layout exclude others, and copies by
-    `densify export` are left out. ``filled`` pairs densify's filled maps, not the measured ones.
+    Two files are paired whatever their names. In folders the frames must agree; the drive and the
+    camera too if all paths name them.
+
+    Args:
+        predicted: File of an estimated map, or folder that is searched with its subfolders. Files
+            of a known layout exclude others.
+        mask: File or folder of masks, None for none.
+        filled: True to pair densify's filled maps instead of its maps of measured pixels.
     """
     estimated = _of_product(_depth_files(predicted, "PREDICTED"), predicted, filled)
     files = _depth_files(truth, "TRUTH")

@@ -266,8 +266,12 @@ class PointLayout:
     ) -> PointLayout:
         """Find the meaning of the fields from several sweeps of a sensor.
 
-        The user may state ``named`` (quantity -> field), ``intensity_scale`` (0 to find it), and
-        ``times`` (unit, absolute, reference as in `TimeField`). ``stamps_ns`` are the sweeps'.
+        Args:
+            period_ns: Time between consecutive sweeps.
+            stamps_ns: Stamp of each sweep, None without stamps.
+            named: Quantity -> name of its field, where the user states it.
+            intensity_scale: Divisor of intensities that the user states, 0 to find it.
+            **times: unit, absolute or reference that the user states, as in `TimeField`.
         """
         fields = Fields(**(vars(find_fields(sweeps[0])) | dict(named or {})))
         missing = [axis for axis in "xyz" if not getattr(fields, axis)]

@@ -66,8 +66,14 @@ class PoseTrack:
     def as_fired(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
         """Undo ego-motion compensation: return points in the vehicle frame at their firing times.
 
-        ``points`` (N,3), metres, are in the vehicle frame at ``stamp_ns``, padding at 0 0 0 stays;
-        ``offset_ns`` (N,) are the firing times since then.
+        Many data sets store a sweep as if measured at one time, which smears moving objects and
+        bends rings.
+
+        Args:
+            points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``; padding at 0 0 0
+                stays.
+            stamp_ns: Time to which the points are compensated.
+            offset_ns: (N,) firing times since ``stamp_ns``.
         """
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)

@@ -352,7 +352,10 @@ def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
 def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, where: str) -> Camera:
     """Convert a CameraInfo message to a camera, adjusted for binning and region of interest.
 
-    Rectified images use P and R, raw ones K and D; ``T_optical_lidar`` leads to the optical frame.
+    Args:
+        T_optical_lidar: (4,4) pose of the lidar in the message's optical frame.
+        rectified: True for rectified images, which use P and the rotation R; raw images use K and
+            the distortion D.
     """
     matrix = {  # ROS 1 writes K, ROS 2 k
         key: np.asarray(getattr(info, key if hasattr(info, key) else key.upper()), np.float64)

@@ -235,8 +235,12 @@ def in_time(
 ) -> Series:
     """Order files by time and find their stamps; files whose names are times are numbered from 0.
 
-    ``stamps`` is "names", "sweeps" (no stamps), or a stamp file beside the files or below ``root``,
-    "" to search (``shared``: in ``root`` too). ``unit`` is theirs, "" to detect it.
+    Args:
+        paths: Files.
+        stamps: "names" if file names are stamps, "sweeps" for files without stamps, the name of a
+            stamp file beside the files or below ``root``, or "" to search for one.
+        unit: Unit of the stamps, "" to detect it.
+        shared: True to search in ``root`` too.
     """
     by_names = stamps == "names"
     names = [NamedFile.of(path, unit if by_names else "") for path in paths]

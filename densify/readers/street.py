@@ -50,8 +50,10 @@ class Street:
     ) -> None:
         """Set up the street; sweeps and images are rendered on demand.
 
-        ``preset``: "street", "highway", "static" (only the ego vehicle moves), "crossing" (it
-        stands). ``tilt_deg`` is the pitch of the lidar's mount, nose down.
+        Args:
+            preset: "street", "highway", "static" (only the ego vehicle moves) or "crossing" (the
+                ego vehicle stands).
+            tilt_deg: Pitch of the lidar's mount, nose down. Cameras are not tilted.
         """
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)

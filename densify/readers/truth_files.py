@@ -36,7 +36,13 @@ def write_bodies(folder: Path, bodies: Bodies) -> None:
 def write_points(
     folder: Path, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], point: Float
 ) -> None:
-    """Write the truth of N points: body (N,), object (N,) or -1, ``point`` (N,3) m in the body."""
+    """Write the ground truth of a sweep's N raw points, row by row.
+
+    Args:
+        body: (N,) index of the body of each point.
+        instance: (N,) number of its object, -1 for none.
+        point: (N,3) position in metres in the frame of the body.
+    """
     path = folder / "points" / f"{frame:010d}.npz"
     _save(path, body=body, instance=instance, point=point)
 

@@ -87,10 +87,15 @@ def make_map() -> Any:
 
 
 def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> Alignment:
-    """Return the alignment of a source, in its own frame, with a target, from (4,4) initial pose.
+    """Align a source with a target, and return the alignment.
 
-    A `Surface` is aligned with a `Surface` or map (`make_map`) by generalized ICP, other points
-    (`thin`) point to plane, with matches up to ``match_m`` metres.
+    A source `Surface` is aligned by generalized ICP, other points are aligned point to plane.
+
+    Args:
+        target: A `Surface`, or a map (`make_map`) of surfaces.
+        source: A `Surface`, or points without covariances (`thin`), in its own frame.
+        T_target_source: (4,4) initial pose of the source.
+        match_m: Greatest distance in metres between corresponding points.
     """
     is_surface = isinstance(source, Surface)
     points = source.points if is_surface else source

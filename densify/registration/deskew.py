@@ -20,8 +20,11 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
     """Return raw sweeps at their poses, with the lidar's motion within each sweep removed.
 
     Points before the reference time move with the velocity from the previous sweep, points after it
-    with that to the next. A sweep without point times keeps its points. The trajectory has at least
-    these sweeps, ascending in time.
+    with the velocity to the next sweep. A sweep without point times keeps its points.
+
+    Args:
+        sweeps: Raw sweeps, ascending in time.
+        trajectory: Poses of at least these sweeps.
     """
     registered = []
     for sweep in sweeps:
@@ -33,9 +36,13 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
 def deskew_sweep(
     sweep: Sweep, T_world_lidar: Float, twist_before: Float, twist_after: Float
 ) -> RegisteredSweep:
-    """Return the sweep at its (4,4) pose, deskewed by twists (6,) before and after its stamp.
+    """Return a deskewed copy of the sweep with its (4,4) pose at the reference time.
 
-    They are rad/s, m/s, in its lidar frame.
+    Args:
+        sweep: The raw sweep.
+        T_world_lidar: (4,4) its pose.
+        twist_before: (6,) velocity of the lidar before that time, rad/s, m/s, lidar frame.
+        twist_after: (6,) velocity of the lidar after that time.
     """
     points: Float = sweep.points
     if sweep.offset_ns is not None:
@@ -100,9 +107,14 @@ class Rings(NamedTuple):
 def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
     """Return how sharply points are concentrated in rings, as seen from an origin; 1 if not at all.
 
-    ``points`` (N,3), metres, and ``origin_m`` (3,) have z along the spin axis. Sharpness is the
-    chance that two returns of a window of elevations share a cell, ``bins`` times 0.02 degrees
-    high, relative to an even spread. The median over windows keeps flat ground from dominating.
+    Elevations are divided into cells, and cells into windows. Sharpness is the chance that two
+    returns of a window share a cell, relative to an even spread. The median over the windows keeps
+    flat ground, which all falls into one window, from dominating.
+
+    Args:
+        points: (N,3) metres, in axes with z along the spin axis.
+        origin_m: (3,) assumed position of the scanner, in the same axes.
+        bins: Height of a cell, in multiples of 0.02 degrees.
     """
     x, y, z = (points - origin_m).T
     elevation = np.arctan2(z, np.hypot(x, y))
@@ -125,9 +137,12 @@ def rings_by_motion(
 ) -> Rings:
     """Return the sharpness of a sweep's rings, as stored and with the motion undone or compensated.
 
-    ``points`` (N,3), metres, lidar frame, fired ``offset_s`` (N,) after the stamp. ``twist`` (6,)
-    is rad/s, m/s, lidar frame. ``R`` (3,3) leads from there to the scanner's axes, in which the
-    sharpest of its positions ``origins_m`` (3,) counts.
+    Args:
+        points: (N,3) metres, lidar frame, as stored.
+        offset_s: (N,) firing times since the stamp.
+        twist: (6,) velocity of the lidar (rad/s, m/s), lidar frame.
+        R: (3,3) rotation from the lidar axes to the scanner's axes.
+        origins_m: Positions (3,) of the scanner to try, in its axes; the sharpest counts.
     """
 
     def find_sharpest(moved: Float) -> float:
@@ -170,8 +185,12 @@ def turning_s(points: Float, period_s: float) -> Float:
 def find_compensated(sweep: Sweep, twist: Float, period_s: float) -> Rings | None:
     """Return the rings of a raw sweep that is compensated for motion already, else None.
 
-    None also if the vehicle is too slow, by ``twist`` (6,), rad/s, m/s, lidar frame, or no scanner
-    has distinct rings. ``period_s`` is that of one revolution, for sweeps without point times.
+    None is also returned if the vehicle is too slow, or if no scanner has distinct rings.
+
+    Args:
+        sweep: The raw sweep.
+        twist: (6,) velocity of the lidar (rad/s, m/s), lidar frame.
+        period_s: Time of one revolution, used for sweeps without point times.
     """
     if np.linalg.norm(twist[3:]) < LEAST_SPEED_M_S:
         return None

@@ -45,11 +45,18 @@ _DAMPING = np.diag([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
 def register_on_surfaces(
     sweeps: Sequence[Sweep], twists: Float | None = None
 ) -> tuple[Float, list[Float]]:
-    """Return (S,4,4) poses of raw sweeps in the first's frame, and (N,3) deskewed points in it.
+    """Register raw sweeps, each with the sweeps of the preceding 1 s.
 
-    Each is registered with the sweeps of the preceding 1 s, the first with those of the following 1
-    s. ``twists`` (S,6) of `find_odometry` predict, rad/s, m/s, lidar frame, from the preceding
-    sweep; None predicts constant velocity. Each sweep has at most about 15,000 points.
+    The first sweeps are registered with the sweeps of the following 1 s.
+
+    Args:
+        sweeps: S raw sweeps, ascending in time.
+        twists: (S,6) predicted velocities (rad/s, m/s), each from the preceding sweep to this one,
+            in the lidar frame, from `find_odometry`. None predicts constant velocity.
+
+    Returns:
+        The (S,4,4) poses in the frame of the first sweep, and (N,3) deskewed points of each sweep
+            in that frame, at most about 15,000.
     """
     if twists is not None:
         return _SweepSeries(sweeps, _NUM_NEIGHBORS, _MATCH_M).register(twists[0], twists)
@@ -226,8 +233,13 @@ def find_odometry(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
 def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
     """Return the (6,) initial velocity (rad/s, m/s), without rotation, by a grid search.
 
-    It best aligns the points above the ground in the first three sweeps, each (N,3), metres, in its
-    lidar frame. Steps are 1 m, then 0.5 m, shorter for sweeps less than 0.1 s apart.
+    It is the velocity that best aligns the points above the ground in the first three sweeps. The
+    grid moves the second sweep by steps of 1 m, then by 0.5 m around the best position. The steps
+    are shorter for sweeps less than 0.1 s apart.
+
+    Args:
+        stamp_ns: (S,) reference times of the sweeps.
+        points: (N,3) of each sweep, metres, in its own lidar frame.
     """
     step_s = np.diff(stamp_ns[:3]) * 1e-9
     pairs = []

@@ -56,12 +56,18 @@ def follow_road(
 ) -> Iterator[tuple[RegisteredSweep, Surface]]:
     """Register raw sweeps along the road one after another, and yield each with its surface.
 
-    Each is aligned with a map of the sweeps before it, starting at constant velocity. The chain
-    ends at a sweep that cannot be read, is too sparse, does not fit the map, or needs an
-    implausible motion. Surfaces are deskewed, in their sweep's lidar frame. ``frames`` are nearest
-    first, up or down in time, with ``stamp_ns`` (n,); the window's sweep next to them is its last.
-    ``read`` returns a frame's raw sweep. ``reach_m`` and ``step_m`` are distances along the road,
-    to cover and between sweeps that are read.
+    Each sweep is aligned with a map of the sweeps before it, starting at constant velocity. The
+    chain ends at a sweep that cannot be read, is too sparse, does not fit the map, or needs an
+    implausible vehicle motion. Surfaces are deskewed, in their sweep's lidar frame.
+
+    Args:
+        window_sweeps: Registered sweeps of the window, the one next to ``frames`` last.
+        window_surfaces: Surfaces of these sweeps.
+        frames: Frame numbers along the road, ascending or descending in time, nearest first.
+        stamp_ns: (n,) reference times of ``frames``.
+        read: Returns the raw sweep of a frame.
+        reach_m: Distance along the road to cover.
+        step_m: Distance along the road between the sweeps that are read.
     """
     chain = make_map()
     for registered, surface in zip(window_sweeps, window_surfaces, strict=True):
@@ -126,13 +132,18 @@ def num_in_submap(num_points: float) -> int:
 def relax_poses(
     surfaces: Sequence[Surface], T_world_lidar: Float, is_known: Bool, num_sweeps: int
 ) -> Relaxed:
-    """Return poses of n consecutive sweeps, corrected until their surfaces, lidar frame, agree.
+    """Return poses of n consecutive sweeps, corrected until their surfaces agree.
 
-    They start at ``T_world_lidar`` (n,4,4). Poses that are known (n,) stay fixed, at least one,
-    consecutive, and those within a submap of ``num_sweeps``. A pose is reliable if no gap between
-    its submap and the known ones has less than half overlap, or over a quarter of alignments wrong
-    by over 0.1 m (good ones: 0.03 m at most). A slide along a road without landmarks cannot be
-    detected.
+    A pose is reliable if no unreliable gap separates its submap from the known ones. A gap between
+    neighbouring submaps is unreliable if they overlap by less than half, or if more than a quarter
+    of the alignments across the gap are wrong by more than 0.1 m. Good alignments are wrong by at
+    most 0.03 m. A slide along a road without landmarks cannot be detected.
+
+    Args:
+        surfaces: Surface of each sweep, in its lidar frame.
+        T_world_lidar: (n,4,4) approximate poses.
+        is_known: (n,) True for poses that stay fixed; at least one, and consecutive.
+        num_sweeps: Number of sweeps in a submap. Relative poses within a submap stay fixed.
     """
     submap_of_sweep, middle = _group_into_submaps(is_known, num_sweeps)
     T = T_world_lidar[middle]

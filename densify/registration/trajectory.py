@@ -69,8 +69,16 @@ def find_trajectory(
 ) -> Trajectory:
     """Return the poses of raw sweeps: the recorded poses after a check, or registered ones.
 
-    Raises UnfitSweepError if the stamps do not ascend or a sweep has too few points to be
-    registered, and UnplacedSweepError, which names the frame, for an implausible pose.
+    Each sweep is registered with the surfaces of earlier sweeps. KISS-ICP predicts the motion of
+    dense sweeps.
+
+    Args:
+        sweeps: Raw sweeps, ascending in time.
+        recorded: Recorded poses of these sweeps, None to register them.
+
+    Raises:
+        UnfitSweepError: The stamps do not ascend, or a sweep has too few points to be registered.
+        UnplacedSweepError: A pose is implausible. The message names the frame.
     """
     frames = tuple(sweep.frame for sweep in sweeps)
     stamp_ns = np.array([sweep.stamp_ns for sweep in sweeps], np.int64)
@@ -140,7 +148,13 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
 
 
 def find_jump(twist: Float, previous_twist: Float | None, step_s: float) -> str:
-    """Return, in words, why no vehicle can move by twist (6,) in ``step_s``; "" if it can."""
+    """Return, in words, why no vehicle can move as given; "" if it can.
+
+    Args:
+        twist: (6,) velocity of the step (rad/s, m/s).
+        previous_twist: (6,) velocity of the previous step, None if unknown.
+        step_s: Duration of the step.
+    """
     slack_m_s = _POSE_NOISE_M / step_s
     speed_m_s, turn_deg_s = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))
     if not (speed_m_s <= MAX_SPEED_M_S + slack_m_s and turn_deg_s <= _MAX_TURN_RATE_DEG_S):
@@ -164,8 +178,11 @@ def check_overlap(
     """Raise UnplacedSweepError if a sweep overlaps too little with the preceding third of a second.
 
     Odometry can continue at constant velocity over sweeps of another place. One earlier sweep is
-    not enough for a scan pattern that does not repeat. Very sparse sweeps pass. ``points`` of each
-    sweep are (N,3), deskewed, metres, world.
+    not enough for a scan pattern that does not repeat. Very sparse sweeps pass.
+
+    Args:
+        points: (N,3) of each sweep, deskewed, metres, world.
+        trajectory: Poses of these sweeps.
     """
     frames, stamp_ns = trajectory.frames, trajectory.stamp_ns
     points_above = [above_ground(sweep_points) for sweep_points in points]

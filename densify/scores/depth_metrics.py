@@ -63,9 +63,15 @@ def depth_errors(
 ) -> DepthErrors:
     """Return the errors of depths over the pixels with ground truth.
 
-    Depths (H,W) or (N,) are camera z in metres, 0 for none; ``mask`` is True at the pixels that
-    count. A depth z is an outlier if its disparity ``focal_px * baseline_m / z`` differs by more
-    than 3 px *and* by more than 5 % from the true disparity.
+    A depth z is an outlier if its disparity ``focal_px * baseline_m / z`` differs by more than 3 px
+    *and* by more than 5 % from the true disparity.
+
+    Args:
+        predicted_m: (H,W) map or (N,) list of depths, camera z in metres, 0 for none.
+        truth_m: True depths of the same shape.
+        mask: True at the pixels that count, None for all.
+        focal_px: Focal length fx.
+        baseline_m: Stereo baseline.
     """
     has_truth = truth_m > 0 if mask is None else (truth_m > 0) & mask
     is_compared = has_truth & (predicted_m > 0)

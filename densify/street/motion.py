@@ -278,9 +278,13 @@ class Driving:
 def on_ground(
     terrain: Terrain, rear: Float, front: Float, lift_m: Float, upright: bool = False
 ) -> Poses:
-    """Return the N poses of bodies on the ground, or above it.
+    """Return the N poses of bodies that stand on the ground, or above it.
 
-    Points of contact ``rear`` and ``front`` (N,2), world, are ``lift_m`` (N,) above the ground.
+    Args:
+        rear: (N,2) rear points of contact, world.
+        front: (N,2) front points of contact, world.
+        lift_m: (N,) heights of both points above the ground.
+        upright: True to stay vertical on slopes.
     """
     rear_xyz = np.column_stack([rear, terrain.height(rear) + lift_m])
     front_xyz = np.column_stack([front, terrain.height(front) + lift_m])
@@ -300,7 +304,12 @@ class Towed:
     def __init__(
         self, tractor: Driving, kingpin_m: float, wheelbase_m: float, first_s: float, last_s: float
     ) -> None:
-        """Compute the axle's path, ``wheelbase_m`` behind a kingpin on the tractor's x axis."""
+        """Compute the path of the axle.
+
+        Args:
+            kingpin_m: Position of the kingpin on the x axis of the tractor.
+            wheelbase_m: Distance from the kingpin to the axle of the trailer.
+        """
         self._tractor = tractor
         self._kingpin_m = kingpin_m
         times = np.arange(first_s, last_s, _TOW_S)

@@ -184,7 +184,13 @@ class Scenery:
         self._num_parked = 0
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
-        """Place a mesh at ``xy`` (2,), world, heading in rad; traffic avoids ``solid``."""
+        """Place a mesh on the ground.
+
+        Args:
+            xy: (2,) position, world.
+            heading: Rotation about z in rad.
+            solid: Part of the mesh that traffic must not touch; None for all of it.
+        """
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
         self._stand(mesh, upright((*xy, z), heading), solid or mesh)
 
@@ -226,7 +232,14 @@ class Scenery:
     def row(
         self, make: Callable[[float], Mesh], start: Float, end: Float, kerb_gap_m: float
     ) -> None:
-        """Place panels, made by length (m), on the ground from start to end (2,), world."""
+        """Place the panels of a fence, wall or hedge in a line, each on the ground below it.
+
+        Args:
+            make: Function that returns a panel of a given length (m).
+            start: (2,) begin of the line, world.
+            end: (2,) end of the line.
+            kerb_gap_m: Panels nearer to the kerb are left out.
+        """
         length = float(np.linalg.norm(end - start))
         num_panels = max(1, round(length / _TABLES.plots.panel_m))
         heading = float(np.arctan2(*(end - start)[::-1]))
@@ -417,7 +430,12 @@ class Traffic:
     def __init__(
         self, ego: Driving, scenery: Scenery, lanes: Mapping[str, Any], curves: Mapping[str, Curve]
     ) -> None:
-        """Start without actors; ``lanes`` are the rows in scenes.yaml, ``curves`` the roads'."""
+        """Start without actors.
+
+        Args:
+            lanes: Rows of ``lanes`` in scenes.yaml, by name.
+            curves: Curves of the roads, by name.
+        """
         self.actors: list[Actor] = []
         self._ground = scenery.ground
         self._rng = scenery.rng

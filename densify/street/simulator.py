@@ -35,7 +35,12 @@ class Bodies:
     moving: Bool  # (F,B) bool, True if the body's object moves around that time
 
     def place(self, frame: int, body: NDArray[np.int32], points: Float) -> Float:
-        """Return world positions (N,3) of points (N,3), metres, in their ``body`` (N,)."""
+        """Return the (N,3) world positions of points at a frame's reference time.
+
+        Args:
+            body: (N,) index of the body of each point.
+            points: (N,3) metres, each in the frame of its body.
+        """
         T_world_body = self.T_world_body[frame][body]
         placed: Float = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points)
         return placed + T_world_body[:, :3, 3]

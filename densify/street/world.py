@@ -147,7 +147,10 @@ class World:
     def cast(self, rays: Rays, optics: Optics, num_together: int = 1, spread: float = 0.0) -> Hits:
         """Return the first surface at which each ray ends, by the decisions of ``optics``.
 
-        ``num_together`` consecutive rays share origin and time, ``spread`` (rad) apart at most.
+        Args:
+            rays: N rays in the world.
+            num_together: Number of consecutive rays that share origin and time.
+            spread: Greatest angle (rad) between the first of them and another.
         """
         # The static world first; then the moving bodies in front of its surfaces
         every = np.arange(len(rays.time_s))

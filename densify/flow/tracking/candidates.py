@@ -127,7 +127,11 @@ class Batch:
         )
 
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
-        """Concatenate this batch's sweeps of ``columns``, a value per obstacle of each sweep."""
+        """Concatenate the arrays of this batch's sweeps, in the order of ``obstacles``.
+
+        Args:
+            columns: For every sweep of the stretch, an array with a value for each obstacle.
+        """
         return np.concatenate([columns[j] for j in self.sweeps])
 
     def split(self, rows: Int) -> dict[int, Int]:
@@ -173,10 +177,13 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
 def find_candidates(
     stretch: Stretch, space: FreeSpace, ground: HeightMap, among: Sequence[int] | None = None
 ) -> tuple[Candidates, ...]:
-    """Return the points above the ground of each sweep, of ``among`` or all, and which may move.
+    """Return the points above the ground of each sweep, and which of them may move.
 
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
     because usually only a part of a moving object's points is seen through.
+
+    Args:
+        among: Indices of the sweeps to work on, None for all.
     """
 
     def find_in_sweep(i: int) -> Candidates:
@@ -201,8 +208,9 @@ def find_candidates(
 def closer_rings(points: Float, gap_m: Float) -> Float:
     """Return the (N,3) points with heights compressed where rings are too far apart to be linked.
 
-    ``points`` are metres, z up, relative to the scanner: level surfaces stay level. ``gap_m`` (N,)
-    is the distance between neighbouring rings.
+    Args:
+        points: (N,3) metres, z up, relative to the scanner: level surfaces then stay level.
+        gap_m: (N,) distance between neighbouring rings at each point.
     """
     compressed = points.copy()
     compressed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
@@ -218,9 +226,16 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Return the number of clusters of points (N,3) m within 0.4 m of seeds, and labels (N,).
+    """Link seeds and points within 0.4 m of seeds into clusters.
 
-    Seeds with few other seeds around them, as in a hedge, do not count. Label -1 is none.
+    Seeds with few other seeds around them, as in a hedge, do not count.
+
+    Args:
+        points: (N,3) metres.
+        seed: (N,) True for seeds.
+
+    Returns:
+        The number of clusters, and (N,) labels, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
     rows = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, MIN_SEED_SHARE))

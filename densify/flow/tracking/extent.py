@@ -79,9 +79,15 @@ class SweepPoints:
 def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Shape:
     """Return the accumulated shape of a track; shapes of walkers exclude their surroundings.
 
-    Objects up to 2 m/s lose echoes merged with a wall's (only in even or only in odd sweeps),
-    points of a bush (static, or among static points), and points of a wall (hardly ever seen
-    through). The last go only if the rest is shorter than 1.5 m: sides of slow cars are alike.
+    Objects faster than 2 m/s keep all points. Otherwise three kinds of points are dropped:
+
+    - Echoes merged with a wall's. They occur only in even or only in odd sweeps.
+    - Points of a bush. They are static, or lie among static points.
+    - Points of a wall. They are hardly ever seen through. Sides of slow cars are alike, hence these
+      points are dropped only if the rest is shorter than 1.5 m.
+
+    Args:
+        obstacles: Points above the ground of each sweep of the stretch.
     """
     sweeps = sorted(track.claimed)
     clouds = {j: track.in_object(obstacles[j], track.claimed[j]) for j in sweeps}
@@ -143,7 +149,13 @@ def assign_points(
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
 ) -> list[Instance]:
-    """Return, for each sweep of a batch, (N,) the index of each point's object, -1 for none."""
+    """Return, for each sweep of a batch, (N,) the index of each point's object, -1 for none.
+
+    Args:
+        batch: Indices of the batch's sweeps.
+        objects: Confirmed objects.
+        obstacles: Points above the ground of each sweep of the stretch.
+    """
     clouds = [SweepPoints.of(stretch, i, ground, obstacles[i], space.sensors) for i in batch]
     attached = [
         attach(cloud, i, objects, space.clock) for i, cloud in zip(batch, clouds, strict=True)
@@ -193,11 +205,16 @@ def lengthen(
     objects: Sequence[MovingObject],
     space: FreeSpace,
 ) -> None:
-    """Extend vehicles along their heading, as wide and high as they are, in place in ``instance``.
+    """Extend vehicles along their heading, as wide and as high as they are, in ``instance`` (N,).
 
     The middle of a long side that moves along itself is never seen through, and lacks candidates.
-    The extension ends at a hole, or where another sweep sees through the moved points. ``instance``
-    (N,) is each point's object, -1 for none, ``i`` the batch's first sweep.
+    The extension ends at a hole, or where another sweep sees through the moved points.
+
+    Args:
+        instance: (N,) index of each point's object, -1 for none; changed in place.
+        seen: The N points of a batch.
+        i: First sweep of the batch.
+        objects: Confirmed objects.
     """
     batch_s = np.ptp(seen.time_s) if len(seen.time_s) else 0.0
     for k, (track, shape) in enumerate(objects):
@@ -231,9 +248,12 @@ def lengthen(
 
 
 def columns_apart_m(point: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
-    """Return the metres between columns of rays on a side, at a point (3,) along ``ahead`` (2,).
+    """Return the distance (m) along a side between neighbouring columns of rays that hit it.
 
-    Both are in the world frame; ``T_lidar_world`` is (4,4).
+    Args:
+        point: (3,) a point of the side, world.
+        ahead: (2,) unit vector along the side, world.
+        T_lidar_world: (4,4) inverse of the lidar's pose.
     """
     in_lidar = poses.transform(T_lidar_world, point[None])[0, :2]
     x, y = T_lidar_world[:2, :2] @ ahead

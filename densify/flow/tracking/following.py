@@ -112,9 +112,15 @@ class Group:
 def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
     """Return the horizontal velocity (3,) of a cluster, m/s, that the neighbouring sweeps support.
 
-    There the group, of batch n, comes nearest to candidates of other batches, by ``fields`` of each
-    batch's sweeps. A flat side shows its speed only at its ends, which move by less than a voxel in
-    0.1 or 0.2 s. Therefore a coarse search of these is refined by batches up to 0.5 s away.
+    At this velocity the group comes nearest to candidates of other batches. First the batches about
+    0.1 and 0.2 s before and after are compared, in coarse steps of velocity. A flat side shows its
+    speed only at its ends, which move by less than a voxel in this short time. Therefore batches up
+    to 0.5 s away are compared too, in fine steps.
+
+    Args:
+        group: The cluster's points in batch n.
+        fields: For each batch, the distance fields of its sweeps.
+        clock: Times of the batches.
     """
     near_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
     far_s = max(_AROUND_S / 2, near_s)
@@ -237,7 +243,15 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
 def velocities_beside(
     batch: Batch, members: Int, objects: Sequence[MovingObject]
 ) -> Iterator[Float]:
-    """Yield velocities (3,), m/s, of objects within 1 m of a cluster: a trailer has its car's."""
+    """Yield the velocity (3,), m/s, of each object within 1 m of a cluster.
+
+    A trailer has the velocity of the car that tows it. The measurements alone hardly show how fast
+    a long flat side moves along itself.
+
+    Args:
+        members: Rows of the cluster in the batch's obstacles.
+        objects: Confirmed objects.
+    """
     points = batch.obstacles.points[members]
     tree = tree_of(points)
     middle = points.mean(0, keepdims=True)
@@ -270,7 +284,13 @@ class Follower:
     clock: Clock  # times of the batches
 
     def follow(self, members: Int, start: int, velocity: Float) -> Track:
-        """Track a cluster, rows of batch ``start``, both ways, from (3,) m/s, world."""
+        """Track a cluster forwards, then backwards; the model is made of all points found so far.
+
+        Args:
+            members: Rows of the cluster in the obstacles of batch ``start``.
+            start: Batch index of the cluster.
+            velocity: (3,) m/s, world, at which the track starts.
+        """
         batch = self.batches[start]
         rate = np.append(velocity, 0.0)  # of the state, without a turn
         seen_s = float(batch.obstacles.time_s[members].mean())

@@ -110,9 +110,12 @@ def motion_of(
     candidates: Sequence[Candidates],
     velocities_m_s: Sequence[Float] | None = None,
 ) -> GroupMotion:
-    """Find the moving objects among each sweep's candidates.
+    """Find the moving objects among the points of each sweep that may move.
 
-    They start at ``velocities_m_s``, for each sweep (C,3), world; None lets the neighbours vote.
+    Args:
+        candidates: For each sweep, its C points above the ground, and which may move.
+        velocities_m_s: For each sweep, (C,3) approximate velocities of these points, world frame.
+            None estimates them by a vote of neighbouring sweeps.
     """
     stretch, space = scene.stretch, scene.space
     obstacles = [
@@ -209,8 +212,11 @@ def join_pieces(
 ) -> JoinedObjects:
     """Find the object that each of the K tracks belongs to, and the motion of its points.
 
-    An object has the number of its piece with most points, a track without points its own.
-    ``instance`` has for each sweep (N,) int32 the index of each point's track, -1 for static.
+    An object has the number of its piece with most points. A track without points is an object of
+    its own.
+
+    Args:
+        instance: For each sweep, (N,) int32, the index of each point's track, -1 for static points.
     """
     pieces = _pieces(stretch, tracks, instance, space)
     number = np.arange(len(tracks))

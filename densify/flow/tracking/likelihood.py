@@ -122,7 +122,13 @@ def judge(
     objects: Sequence[MovingObject],
     record: RecordEvidence | None = None,
 ) -> Verdict:
-    """Return the log odds that a smoothed track moves, minus infinity below 3 observations."""
+    """Return the log odds that a smoothed track moves, minus infinity below 3 observations.
+
+    Args:
+        obstacles: Points above the ground of each sweep of the stretch.
+        objects: Objects confirmed so far. Their returns do not count against the track.
+        record: Called with the track and its evidence.
+    """
     if len(track.observations) < _NUM_STATES:
         return Verdict(-np.inf, -np.inf)
     violations = count_violations(track, obstacles, space)
@@ -198,8 +204,16 @@ def find_places_left(
 ) -> tuple[Places, Places]:
     """Count what was observed at an object's positions before its arrival, and after it left.
 
-    Positions it left are free if it moved. A static wire fence can imitate this, but there
-    ``obstacles`` return within ``within_m``. Returns of other ``objects`` do not count.
+    Vacated positions are free if the object moved. A static wire fence can imitate this: it is seen
+    through from some directions only. Its vacated positions then hold returns of the fence.
+
+    Args:
+        obstacles: Points above the ground of each sweep of the stretch.
+        objects: Other confirmed objects. Their returns do not count.
+        within_m: Distance up to which a return occupies a position.
+
+    Returns:
+        The counts before the object's arrival, and after it left.
     """
     sweeps = list(track.claimed)
     samples = [

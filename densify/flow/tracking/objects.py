@@ -50,11 +50,16 @@ class Path:
 
     @staticmethod
     def fit(times_s: Float, states: Float, weights: Float) -> Path:
-        """Fit a path to states (m,d), first x and y in metres, at ascending times (m,).
+        """Fit a path to states, as stiff as the states allow.
 
-        A softer path needs a leave-one-out error at least 20 % lower, 8 states and 0.65 s. Fewer
-        than 5 states, or less than 0.35 s, give almost constant velocity. ``weights`` (m,) have any
-        scale.
+        A softer path is taken only if its leave-one-out error, in closed form, is at least 20 %
+        lower. It needs at least 8 states and 0.65 s. Fewer than 5 states, or less than 0.35 s, give
+        a path of almost constant velocity.
+
+        Args:
+            times_s: (m,) ascending times, s.
+            states: (m,d) coordinates at these times, first x and y in metres.
+            weights: (m,) weights of the states, of any scale.
         """
         num_states = len(times_s)
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
@@ -175,7 +180,14 @@ class Track:
     path: Path = field(init=False)
 
     def add(self, n: int, batch: Batch, state: Float, seen_s: float, rows: Int) -> None:
-        """Add the state (4,) observed in batch n by ascending obstacle ``rows`` at ``seen_s``."""
+        """Add the observation in one batch.
+
+        Args:
+            n: Index of the batch.
+            state: (4,) state of the object.
+            seen_s: Mean firing time of the points.
+            rows: Ascending rows of the points in the batch's obstacles.
+        """
         rows_by_sweep = batch.split(rows)
         self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(rows_by_sweep))
         self.claimed |= rows_by_sweep

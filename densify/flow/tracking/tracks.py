@@ -54,9 +54,11 @@ def find_tracks(
 ) -> list[Track]:
     """Return the confirmed tracks of all moving objects in the stretch (consecutive sweeps).
 
-    ``obstacles`` are each sweep's points above the ground. Tracks start at ``velocities_m_s``, for
-    each sweep (C,3), world; None lets neighbours vote. ``record`` gets each tried track and its
-    evidence.
+    Args:
+        obstacles: Points above the ground of each sweep of the stretch.
+        velocities_m_s: For each sweep, (C,3) velocities of its obstacles, world frame, at which
+            tracks start. None lets the neighbouring sweeps vote.
+        record: Called with each track that was tried, and its evidence.
     """
     return _Search(obstacles, space, ground, velocities_m_s, record).find_tracks()
 
