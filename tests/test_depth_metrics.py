@@ -74,6 +74,7 @@ def slow_errors(pixels, fb):
         for n in (1, 2, 3):
             sums[f"delta_{n}"] += max(z / t, t / z) < 1.25**n
         sums["outliers"] += off_px > 3 and off_px > 0.05 * fb / t
+        sums["outliers_1_px"] += off_px > 1
     means = {name: total / len(pixels) for name, total in sums.items()}
     for name in ("rmse_m", "irmse_per_km"):
         means[name] = math.sqrt(means[name])
