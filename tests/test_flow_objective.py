@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from densify.config.errors import InputError
-from densify.flow import objective
+from densify.flow import graph
 from densify.flow.energy import energy
 
 
@@ -49,7 +49,7 @@ def slow_energy(
 def problem(n: int, m: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> tuple[Any, ...]:
     source, target = cloud(n, seed), cloud(m, seed + 1)
     flow = cloud(n, seed + 2, 0.3)
-    matrix = objective.laplacian(objective.knn_graph(source, 5))
+    matrix = graph.laplacian(graph.knn_graph(source, 5))
     return (
         *(torch.from_numpy(x).to(dtype) for x in (flow, source, target)),
         matrix,
@@ -96,18 +96,18 @@ def test_as_a_training_loss_it_reaches_the_parameters_of_a_network() -> None:
 @settings(max_examples=40, deadline=None)
 def test_knn_graph_equals_its_slow_twin(n: int, k: int, seed: int) -> None:
     points = cloud(n, seed)
-    np.testing.assert_allclose(objective.knn_graph(points, k).toarray(), slow_weights(points, k))
+    np.testing.assert_allclose(graph.knn_graph(points, k).toarray(), slow_weights(points, k))
 
 
 def test_graph_of_duplicates_keeps_every_self_weight() -> None:
     points = np.concatenate([np.zeros((30, 3)), cloud(10), np.full((5, 3), 60.0)])
-    weights = objective.knn_graph(points, 4)
+    weights = graph.knn_graph(points, 4)
     dense = weights.toarray()
     np.testing.assert_array_equal(np.diag(dense), 1.0)
     np.testing.assert_array_equal(dense, dense.T)
     assert ((dense[:30, :30] > 0).sum(axis=1) >= 5).all()
     np.testing.assert_allclose(
-        objective.laplacian(weights).toarray(), slow_laplacian(dense), atol=1e-15
+        graph.laplacian(weights).toarray(), slow_laplacian(dense), atol=1e-15
     )
 
 
@@ -116,8 +116,8 @@ def test_graph_of_duplicates_keeps_every_self_weight() -> None:
 def test_laplacian_is_symmetric_positive_and_leaves_its_null_space_alone(
     n: int, k: int, seed: int
 ) -> None:
-    weights = objective.knn_graph(cloud(n, seed), k)
-    matrix = objective.laplacian(weights).toarray()
+    weights = graph.knn_graph(cloud(n, seed), k)
+    matrix = graph.laplacian(weights).toarray()
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-15)
     np.testing.assert_allclose(matrix, slow_laplacian(weights.toarray()), atol=1e-14)
     values = np.linalg.eigvalsh(matrix)
@@ -151,4 +151,4 @@ def test_bad_input_is_one_clear_line() -> None:
 def test_bad_graphs_are_refused() -> None:
     points = cloud(5)
     with pytest.raises(InputError, match="num_neighbors: got 0"):
-        objective.knn_graph(points, 0)
+        graph.knn_graph(points, 0)

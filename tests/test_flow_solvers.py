@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from densify.config.errors import InputError
-from densify.flow import objective
+from densify.flow import graph
 from densify.flow.energy import energy
 from densify.flow.objective import SolverSettings, solve
 
@@ -43,9 +43,9 @@ def street(seed: int, num_points: int = 1000) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reported_equals_recomputed(source, target, settings, solution) -> None:
-    weights = objective.knn_graph(source, settings.num_neighbors)
+    weights = graph.knn_graph(source, settings.num_neighbors)
     clouds = (torch.from_numpy(x) for x in (solution.flow, source, target))
-    value = energy(*clouds, objective.laplacian(weights), settings.alpha)
+    value = energy(*clouds, graph.laplacian(weights), settings.alpha)
     reported = (solution.energy, solution.data, solution.smoothness)
     np.testing.assert_allclose(reported, value, rtol=1e-9)
 

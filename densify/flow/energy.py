@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from densify.config.errors import InputError
-from densify.flow.objective import checked_cloud
+from densify.flow.graph import checked_cloud
 
 
 class Energy(NamedTuple):
@@ -45,7 +45,7 @@ def energy(
         flow: (n,3) metres, F.
         source: (n,3) metres, points p.
         target: (m,3) metres, points q, in the frame of the source.
-        laplacian: (n,n) L of `densify.flow.objective.laplacian`.
+        laplacian: (n,n) L of `densify.flow.graph.laplacian`.
         alpha: Weight of smoothness.
     """
     if flow.shape != source.shape:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import cKDTree
 
@@ -21,67 +21,13 @@ from densify.config import Config, ObjectiveSettings
 from densify.config.errors import InputError
 from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
+from densify.flow.graph import checked_cloud, knn_graph, laplacian
 from densify.flow.pair_groups import MIN_MOTION_M, PairCloud, RigidMotion, judge
 from densify.flow.tracking.candidates import LINK_M
 from densify.free_space.ground import ABOVE_GROUND_M
 from densify.geometry import poses
 from densify.geometry.nearest import link
 from densify.geometry.types import Float, FlowField, Motion
-
-
-def checked_cloud(values: ArrayLike, name: str) -> Float:
-    """Return a copy of a cloud as (n,3) float64 metres."""
-    try:
-        points = np.array(values, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected (n,3) numbers, metres; {error}") from error
-    if points.ndim > 0 and len(points) == 0:
-        raise InputError(f"{name}: got no points, expected at least 1")
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{name}: got shape {points.shape}, expected (n,3) metres")
-    invalid = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if len(invalid):
-        raise InputError(
-            f"{name}: {len(invalid)} of {len(points)} rows are NaN or infinite, the first is row "
-            f"{invalid[0]}; expected finite metres, drop those rows"
-        )
-    return points
-
-
-def knn_graph(points: Float, num_neighbors: int) -> csr_array:
-    """Return the weights W of the undirected k-nearest-neighbour graph of points (n,3), metres.
-
-    W is (n,n) symmetric float64, with ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is
-    among the k nearest of the other, itself excluded, 1 on the diagonal, 0 elsewhere; k is at most
-    n - 1. A larger k couples the flow of points farther apart.
-    """
-    if num_neighbors < 1:
-        raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
-    points = checked_cloud(points, "points")
-    num = len(points)
-    num_nearest = min(num_neighbors, num - 1) + 1  # with the point itself
-    distance_m, neighbour = cKDTree(points).query(points, np.arange(1, num_nearest + 1))
-    row = np.repeat(np.arange(num), num_nearest)
-    column = np.ravel(neighbour)
-    # With more than k duplicates, the point itself may be missing among the nearest.
-    is_edge = column != row
-    weight = np.exp(-(np.ravel(distance_m)[is_edge] ** 2))
-    directed = csr_array((weight, (row[is_edge], column[is_edge])), shape=(num, num))
-    weights = csr_array(directed.maximum(directed.T) + eye_array(num))
-    weights.sort_indices()
-    return weights
-
-
-def laplacian(weights: csr_array) -> csr_array:
-    """Return the (n,n) graph Laplacian ``L = D^-1/2 (D - W) D^-1/2`` of the W of `knn_graph`.
-
-    L is symmetric, positive semi-definite, float64. D holds the row sums of W with ``W_ii = 1``, as
-    in the paper. The null space is ``D^1/2 · 1``: constant flow costs energy where density changes.
-    """
-    degree = weights.sum(axis=1)
-    scale = diags_array(1.0 / np.sqrt(degree))
-    return csr_array(scale @ (diags_array(degree) - weights) @ scale)
-
 
 SOLVERS = ("pcg", "adam")
 _LEARNING_RATE_M = 0.1  # of Adam, as published

@@ -15,7 +15,8 @@ from densify.config import Config, resolve
 from densify.config.errors import InputError
 from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
-from densify.flow.objective import checked_cloud, flow_between
+from densify.flow.graph import checked_cloud
+from densify.flow.objective import flow_between
 from densify.flow.pair_groups import PairCloud, find_movers
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.geometry import poses

@@ -29,7 +29,7 @@ from densify.config import Config, resolve
 from densify.config.errors import ComputationError, InputError
 from densify.flow.energy import energy, on_one_thread
 from densify.flow.engines import Scene, estimate_motion
-from densify.flow.objective import knn_graph, laplacian
+from densify.flow.graph import knn_graph, laplacian
 from densify.free_space.ground import ground
 from densify.geometry.types import Bool, Float32, LidarSequence, Progress
 from densify.learning.network import (
