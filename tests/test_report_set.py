@@ -57,6 +57,7 @@ def test_keys_with_the_most_ghosts_come_first(described: Path) -> None:
     assert "9 done; 2.0 s a key" in page and page.count("<svg") == 3  # ghosts, measured, time
     assert float(rows[0][2]) == 3 and {row[4] for row in rows} == {"50.0"}
     assert len(rows) == len(FRAMES)
+    assert page_of(described) == page  # to the last byte, figures too
 
 
 def test_keys_that_are_not_done_say_why(described: Path) -> None:

@@ -90,7 +90,7 @@ _USUAL = (
         f"""
 {_RECORDING}{_CONFIG}
 --write FILE  write the remedies that are settings to a YAML file, for densify run --config FILE
-""",
+{_OVERWRITE}""",
         "Reads fifteen sweeps and some images from all over the recording. Each check prints a "
         "verdict (fine, unknown, suspicious, wrong), its evidence, and the option or the line that "
         "mends it. The exit code is 2 if something is wrong.",

@@ -68,7 +68,7 @@ def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
     config, spec = config_of(options), recording_of(options)
     sequence = open_sequence(spec)
     if options.write is not None:
-        check_new_file(options.write, False, ".yaml", "--write")
+        check_new_file(options.write, options.overwrite, ".yaml", "--write")
     diagnosis = examine(sequence, config)
     facts = {
         "recording": sequence.name,
@@ -163,8 +163,10 @@ def _make_set(options: argparse.Namespace) -> Iterator[Answer]:
         raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
     recipe, keys, num_keys = _recipe(options), options.keys, 0
     if options.preview is not None:
+        if options.preview < 1:
+            raise InputError(f"--preview {options.preview}: expected 1 key or more")
         num_keys = sum(len(drive.keys) for drive in plan(recordings_of(options), keys, recipe))
-        keys = _spread(keys, math.ceil(num_keys / max(options.preview, 1)))
+        keys = _spread(keys, math.ceil(num_keys / options.preview))
     with progress_on_stderr() as progress:
         summary = make_dataset(
             recordings_of(options),
@@ -181,8 +183,10 @@ def _make_set(options: argparse.Namespace) -> Iterator[Answer]:
     text = _describe_set(summary)
     if options.preview is not None:
         paths = write_report(out, overwrite=True) + paths
-        num_left, pace_s = num_keys - summary.num_keys, summary.seconds / max(summary.num_made, 1)
-        text += f"\nthe other {num_left:,} keys take about {num_left * pace_s / 60:.0f} min"
+        if summary.num_made:
+            num_left = num_keys - summary.num_keys
+            left_s = num_left * summary.seconds / summary.num_made  # keys side by side share work
+            text += f"\nthe other {num_left:,} keys take up to {left_s / 60:.0f} min"
     yield Answer(text, _set_facts(summary), [out], first_of(paths, _FIRST_OF_SET))
     log_warnings((w, r.drive, r.key) for r in summary.records.values() for w in r.warnings)
     if summary.count("failed"):

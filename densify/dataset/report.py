@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import base64
 import html
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -42,10 +44,8 @@ def _percent(name: str) -> Callable[[KeyRecord], float | None]:
     """Return a function of a record: the mean over cameras of one of its scores, in percent."""
 
     def of(record: KeyRecord) -> float | None:
-        score = record.scores.get(name)
-        values = score.values() if isinstance(score, Mapping) else [score]
-        known = [value for value in values if isinstance(value, int | float)]
-        return 100 * float(np.mean(known)) if known else None
+        values = record.values_of(name)
+        return 100 * float(np.mean(values)) if values else None
 
     return of
 
@@ -84,9 +84,8 @@ def _set_page(root: Path) -> bytes:
         ),
     }
     page = (package_files("densify.outputs") / "page" / "set.html").read_text("utf-8")
-    for name, text in parts.items():
-        page = page.replace("{{" + name + "}}", text)
-    return page.encode("utf-8", "backslashreplace")
+    filled = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], page)
+    return filled.encode("utf-8", "backslashreplace")
 
 
 def _badness(records: Sequence[KeyRecord]) -> Callable[[KeyRecord], float]:
@@ -147,7 +146,7 @@ def _card(root: Path, record: KeyRecord) -> str:
                 pictures.append(f"<p>{html.escape(str(error))}</p>")
     pages = [name for name in record.files if name.endswith("report.html")]
     maps = [name for name in record.files if name.endswith(".png")]
-    link = html.escape(next(iter([*pages, *maps]), ""), quote=True)
+    link = quote(next(iter([*pages, *maps]), ""))
     scores = ", ".join(
         f"{score.title.lower()} {_text(value)} {score.unit}"
         for score in _SCORES

@@ -162,7 +162,7 @@ def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K,
 
 
 class TimeField(NamedTuple):
-    """What the user says of a field of point times; the rest is found."""
+    """The user's settings of a field of point times; `find_times` detects those left empty."""
 
     name: str
     unit: str = ""  # one of `UNIT_NS`
