@@ -150,14 +150,47 @@ def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: floa
     if not len(seeds):
         return is_close
     near_rows = np.flatnonzero(is_near(tree_of(seeds), points, within_m))
-    num_points, num_seeds = (
-        tree_of(cloud).query_ball_point(seeds, within_m, return_length=True)
-        for cloud in (points[near_rows], seeds)
-    )
+    num_points, num_seeds = _count_around_seeds(points[near_rows], seed[near_rows], within_m)
     dense_seeds = seeds[num_seeds >= least_share * num_points]
     if len(dense_seeds):
         is_close[near_rows] = is_near(tree_of(dense_seeds), points[near_rows], within_m)
     return is_close
+
+
+def _count_around_seeds(points: Float, seed: Bool, within_m: float) -> tuple[Int, Int]:
+    """Return the (S,) numbers of points (N,3) and of seeds (N,) within a radius of each seed."""
+    # Points are sorted by cells as large as the radius, numbered along z first: the cells around a
+    # seed are nine ranges of points. A border of empty cells keeps columns apart.
+    cell = ((points - points.min(axis=0)) / within_m).astype(np.int64) + 1
+    shape = cell.max(axis=0) + 2
+    number = np.ravel_multi_index(tuple(cell.T), tuple(shape))
+    order = np.argsort(number, kind="stable")
+    columns = shape[2] * np.array([x * shape[1] + y for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    column = number[seed][:, None] + columns
+    begin = np.searchsorted(number[order], column - 1)
+    end = np.searchsorted(number[order], column + 1, side="right")
+    num_points, num_seeds = np.zeros((2, len(column)), np.int64)
+    _count_in_ranges.over_rows(
+        len(column), points[order], seed[order], begin, end, points[seed], within_m**2,
+        num_points, num_seeds,
+    )  # fmt: skip
+    return num_points, num_seeds
+
+
+@Kernel
+def _count_in_ranges(
+    first: int, last: int, points: Float, seed: Bool, begin: Int, end: Int,
+    centre: Float, within_m2: float, num_points: Int, num_seeds: Int,
+) -> None:  # fmt: skip
+    """Count points and seeds within a radius of centres (S,3), in their ranges (S,9) of points."""
+    for i in range(first, last):
+        for j in range(begin.shape[1]):
+            for k in range(begin[i, j], end[i, j]):
+                dx, dy = points[k, 0] - centre[i, 0], points[k, 1] - centre[i, 1]
+                dz = points[k, 2] - centre[i, 2]
+                is_close = dx * dx + dy * dy + dz * dz <= within_m2
+                num_points[i] += is_close
+                num_seeds[i] += is_close & seed[k]
 
 
 @Kernel
