@@ -372,7 +372,7 @@ class Search:
         displacements = displacements[np.hypot(*displacements.T) <= reach_m]
         displacements = np.column_stack([displacements, displacements @ slope])
         nearness = np.zeros((len(displacements), len(group.points)), np.uint8)
-        field.raise_to(nearness, group, displacements)
+        field.raise_nearness(nearness, group, displacements)
         score = nearness.mean(axis=1) / 255 - _PER_M * np.linalg.norm(displacements, axis=1)
         voted = []
         for _ in range(_NUM_STARTS):
