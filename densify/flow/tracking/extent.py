@@ -184,12 +184,6 @@ def attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: C
     """Return (N,) the index in ``objects`` of the nearest object at each point of sweep i, or -1.
 
     A point belongs to an object if it lies near the shape, or inside the outline seen from above.
-
-    Args:
-        cloud: The N points of sweep i.
-        i: Index of the sweep in the stretch.
-        objects: Confirmed objects.
-        clock: Times of the sweeps.
     """
     instance = np.full(len(cloud.points), -1, np.int32)
     least_m = np.full(len(cloud.points), np.inf)

@@ -88,17 +88,10 @@ class Bending:
     softened: Softened  # points of the object in each of these sweeps, and how the points bend
 
     def carry(self, i: int, j: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
-        """Return the points of sweep i at the reference times of sweeps i and j, object's frame.
+        """Return sweep i's N points at the reference times of sweeps i and j: two (N,3) arrays.
 
-        Args:
-            i: Index of a sweep in ``sweeps``.
-            j: Index of any sweep. If the object has no points in it, its shape is that in the
-                nearest sweep of ``sweeps``.
-            clock: Times of all sweeps.
-            seen_s: (N,) firing times of the points.
-
-        Returns:
-            The (N,3) points at the time of sweep i, and at that of sweep j.
+        Both are in the object's frame; ``seen_s`` are the points' firing times. If the object has
+        no points in sweep j, it bends as in the nearest sweep that has some.
         """
         source = self.sweeps.index(i)
         target = self.sweeps.index(clock.nearest(j, self.sweeps))

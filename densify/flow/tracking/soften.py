@@ -213,18 +213,12 @@ class _FlowSolver:
         """Solve for the flow, in place, by conjugate gradients with a Jacobi preconditioner."""
         jacobi = diags_array(1 / (matrix.diagonal() + 1e-9))
         for axis in range(3):
-            start = self._flow[:, axis]
-            residual = right_side[:, axis] - matrix @ start
+            start, wanted = self._flow[:, axis], right_side[:, axis]
+            residual = wanted - matrix @ start
             # Matches are provisional: a full solution is not needed.
             tolerance = _RESIDUAL_DROP * float(np.linalg.norm(residual))
             self._flow[:, axis], _ = cg(
-                matrix,
-                right_side[:, axis],
-                start,
-                rtol=0.0,
-                atol=tolerance,
-                maxiter=_MAX_PRODUCTS,
-                M=jacobi,
+                matrix, wanted, start, rtol=0.0, atol=tolerance, maxiter=_MAX_PRODUCTS, M=jacobi
             )
 
     def fill_targets(self) -> None:
