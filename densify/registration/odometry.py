@@ -70,7 +70,7 @@ def register_on_surfaces(
     num = int(np.searchsorted(series.stamp_ns, end_ns, side="right"))
     first_second = _SweepSeries(sweeps[:num], _NUM_NEIGHBORS_OF_FEW, _MATCH_UNPREDICTED_M)
     T, _ = first_second.register(searched_twist)
-    # Sweeps before _NUM_START are predictions, hence this step is the first between aligned sweeps.
+    # The first step between two sweeps that were both aligned with earlier ones
     first_aligned_step = min(_NUM_START + 1, len(T) - 1)
     return series.register(poses.twist_to(T, series.stamp_ns, first_aligned_step))
 
@@ -144,8 +144,8 @@ class _SweepSeries:
         self, i: int, step_end: int, T_guess: Float, twist: Float, neighbours: range
     ) -> Float:
         """Align sweep i with ``neighbours``, nearest first, and return its velocity (6,)."""
-        # The velocity is that of the step that ends at sweep ``step_end``: the step between sweep i
-        # and the nearest sweep that is aligned already.
+        # The velocity is that of the step that ends at sweep ``step_end``, between sweep i and the
+        # adjacent sweep that has a pose already.
         self._T[i] = T_guess  # without neighbours the sweep keeps its prediction
         if neighbours:
             surface, T_world_surface = self._surface_for(i, neighbours)

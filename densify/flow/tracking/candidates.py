@@ -130,13 +130,10 @@ class Batch:
         )
 
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
-        """Concatenate the arrays of this batch's sweeps, in the order of ``obstacles``.
+        """Concatenate the arrays of this batch's sweeps to one, in the order of ``obstacles``.
 
         Args:
             columns: For every sweep of the stretch, an array with a value for each obstacle.
-
-        Returns:
-            An array with a value for each obstacle of the batch.
         """
         return np.concatenate([columns[j] for j in self.sweeps])
 
@@ -184,16 +181,13 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
 def find_candidates(
     stretch: Stretch, space: FreeSpace, ground: HeightMap, among: Sequence[int] | None = None
 ) -> tuple[Candidates, ...]:
-    """Return the points above the ground of each sweep, and which of them may move.
+    """Return, for each sweep in order, its points above the ground, and which of them may move.
 
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
     because usually only a part of a moving object's points is seen through.
 
     Args:
-        among: Indices of the sweeps to work on, None for all.
-
-    Returns:
-        The candidates of each of these sweeps, in their order.
+        among: Indices of the sweeps to return, None for all.
     """
 
     def find_in_sweep(i: int) -> Candidates:
@@ -216,14 +210,13 @@ def find_candidates(
 
 
 def compress_heights(points: Float, gap_m: Float) -> Float:
-    """Compress the heights of points where rings are too far apart to be linked.
+    """Return the (N,3) points, with heights compressed until rings are at most 0.35 m apart.
+
+    Otherwise the rings of an object would be too far apart to be linked.
 
     Args:
         points: (N,3) metres, z up, relative to the scanner: level surfaces then stay level.
         gap_m: (N,) distance between neighbouring rings at each point.
-
-    Returns:
-        (N,3) points whose rings are at most about 0.35 m apart.
     """
     compressed = points.copy()
     compressed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))

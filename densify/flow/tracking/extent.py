@@ -90,9 +90,6 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
 
     Args:
         obstacles: Points above the ground of each sweep of the stretch.
-
-    Returns:
-        The shape in the object's frame. It has all points if none would be kept.
     """
     sweeps = sorted(track.claimed)
     clouds = {j: track.in_object(obstacles[j], track.claimed[j]) for j in sweeps}
@@ -110,7 +107,7 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
     is_core = is_own & close_to_seeds(points, seed, _REACH * neighbour_m, _MIN_SEED_SHARE)
     if is_core.any() and np.linalg.norm(np.ptp(points[is_core, :2], axis=0)) < _MAX_WALKER_M:
         return Shape.of(points[is_core])
-    return Shape.of(points[is_own] if is_own.any() else points)
+    return Shape.of(points[is_own] if is_own.any() else points)  # a shape needs points
 
 
 def _recurs(points: Float, sweep_number: Int, reach_m: float) -> Bool:
@@ -198,8 +195,8 @@ def attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: C
             continue
         in_object = track.undo(cloud.points[rows], cloud.time_s[rows])
         distance_m, _ = nearest(shape.tree, in_object)
-        # Below `ABOVE_GROUND_M` a point near the shape may be of the road. Below the outline it is
-        # of the object, as the wheels are.
+        # A point near the shape but below `ABOVE_GROUND_M` may be of the road. Inside the outline
+        # it is of the object, such as a wheel.
         belongs = (distance_m < cloud.reach_m[rows]) & (cloud.height_m[rows] >= ABOVE_GROUND_M)
         belongs |= shape.within_outline(in_object)
         if _speed_m_s(track, i, clock) <= _MAX_WALKER_SPEED_M_S:

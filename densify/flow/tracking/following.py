@@ -27,8 +27,7 @@ from densify.geometry.types import Bool, Float, Int
 Bytes = NDArray[np.uint8]
 
 MAX_SPEED_M_S = 38.0
-# Times to the nearest and the farthest batches that vote. Within 0.1 s the scene hardly changes.
-_NEAR_S, _AROUND_S = 0.1, 0.5
+_NEAR_S, _AROUND_S = 0.1, 0.5  # times to the nearest and the farthest batches that vote
 STEP_M = 0.2  # side of a voxel
 _MOST_VOXELS = 1 << 28  # of a sweep, a byte each: 250 m x 250 m x 34 m
 FEW_POINTS, _MANY_POINTS = 60, 600  # points of a cluster in the first vote, and in later votes
@@ -65,13 +64,10 @@ class DistanceField:
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_nearness(self, nearness: Bytes, group: Group, velocities: Float) -> None:
-        """Raise the nearness of a group's points to what it would be in this sweep.
+        """Raise ``nearness`` (V,N), in place, to that of N points moved at V velocities.
 
-        Args:
-            nearness: (V,N) greatest nearness so far of each point at each velocity, 0 to 255;
-                raised in place.
-            group: N points of a cluster.
-            velocities: (V,3) m/s, world, at which the group may move to the time of this sweep.
+        Nearness is from 0 to 255. The points are moved to the time of this sweep, at velocities
+        (V,3), m/s, world.
         """
         if self.tree is None:
             return
@@ -238,15 +234,9 @@ _MAX_MISSED_BATCHES, MAX_MISSED_S = 1, 0.2
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
-    """Return the clusters of candidates that may start a track, the most promising first.
+    """Return the clusters that may start a track: batch index, (K,) rows of the batch's obstacles.
 
-    Args:
-        batches: Obstacles of each batch.
-        clock: Times of the batches.
-
-    Returns:
-        For each cluster its batch index, and the (K,) ascending rows of its points in the batch's
-            obstacles. Large clusters come first, those near the ends of the recording later.
+    Large clusters come first. Those near the ends of the stretch come later.
     """
     starts = []
 

@@ -25,9 +25,7 @@ from densify.geometry.types import Bool, Float
 _NUM_STATES = 3  # fewer states always lie on a line
 NUM_ASKED = 60
 """Greatest number of tested points of a batch."""
-_PRIOR_COUNT = (
-    5.0  # observations added to both counts of a ratio, because few observations are weak evidence
-)
+_PRIOR_COUNT = 5.0  # added to both counts of a ratio, because few observations are weak evidence
 _CLEARLY = 1.0  # difference of the log odds of two motions that exceeds noise
 _MIN_ROUGHNESS = 0.1  # accuracy of a state, as a share of the neighbour distance
 
@@ -151,15 +149,14 @@ def judge(
     )
     # Observations at vacated positions cost most time. So far they are assumed to favour motion.
     # They are skipped if the other terms reject the track even then.
-    if record is not None or evidence.log_odds(fitted_weights()) > 0:
+    weights = fitted_weights()
+    if record is not None or evidence.log_odds(weights) > 0:
         before, after = count_vacated_places(track, obstacles, space, objects, within_m)
         evidence = evidence._replace(before=before, after=after)
     if record is not None:
         record(track, evidence)
     without_violations = evidence._replace(violations=violations._replace(moved=0))
-    return Verdict(
-        evidence.log_odds(fitted_weights()), without_violations.log_odds(fitted_weights())
-    )
+    return Verdict(evidence.log_odds(weights), without_violations.log_odds(weights))
 
 
 def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Violations:
@@ -238,7 +235,7 @@ def count_vacated_places(
     sweep_of_position = np.repeat(sweeps, [len(sample) for sample in samples])
     tree = tree_of(track.points_in(obstacles, sweeps))
     rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
-    # Only positions within the motion of `REACH_S` are compared: later, anything may be there.
+    # Positions that the object left longer than `REACH_S` ago do not count.
     reach_m = LINK_M + REACH_S * float(np.linalg.norm(rate[:2]))
     before = after = Places(0, 0)
     for batch in space.batches:

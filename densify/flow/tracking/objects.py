@@ -27,7 +27,7 @@ from densify.geometry.types import Bool, Float, Int
 _KNOT_S = 0.1
 # (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03 and 10 m/s³.
 _STIFFNESSES = (1e6, 10.0)
-_MAX_ERROR_RATIO = 0.8  # greatest leave-one-out error of a softer path, relative to the stiffer
+_MAX_ERROR_RATIO = 0.8  # greatest leave-one-out error of a softer path, by that of a stiffer one
 # Fewer states, or a shorter time, determine no acceleration, or no jerk.
 MIN_STATES, _JERK_STATES = 5, 8
 MIN_SPAN_S, _JERK_S = (_KNOT_S * (num - 1.5) for num in (MIN_STATES, _JERK_STATES))
@@ -154,11 +154,7 @@ _SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
 
 
 def near_m(gap_m: Float | float) -> Any:
-    """Return the neighbour distance (m): how far apart returns of one surface spot may be measured.
-
-    Args:
-        gap_m: Distance between neighbouring rings there, of any shape, which is also returned.
-    """
+    """Return the neighbour distance: how far apart (m) returns of one spot are, by the ring gap."""
     return np.maximum(_NEAR_M, _NEAR_GAPS * gap_m)
 
 
@@ -233,10 +229,7 @@ class Track:
         return velocity_m_s
 
     def seen_through(self, points: Float, j: int, space: FreeSpace) -> Bool:
-        """Return (N,) True for points (N,3, object's frame) that sweep j sees through.
-
-        The points are moved with the object to the time of the sweep.
-        """
+        """Return (N,) True for points (N,3, object's frame) that, moved, sweep j sees through."""
         at_s = space.clock.time_s[j]
         carried = self.place(points, at_s)
         return space.seen_through(carried, j, self.velocity_m_s(carried, at_s))

@@ -163,10 +163,7 @@ def _mean_squared_m2(points: Float, predicted: Float) -> float:
 
 
 class _FlowSolver:
-    """Solver of the flow from each snapshot to the next and to the previous one.
-
-    Flows are those of the nodes (points thinned to one per voxel), relative to the rigid motion.
-    """
+    """Solver of the flow of nodes (points thinned by voxels) to the next and previous snapshot."""
 
     def __init__(self, snapshots: tuple[Snapshot, ...]) -> None:
         self._snapshots = snapshots
