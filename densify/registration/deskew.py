@@ -59,9 +59,9 @@ def deskew_points(sweep: Sweep, twist: Float) -> Float:
 
 
 def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
-    """Return (6,) velocities (rad/s, m/s) before and after sweep i, lidar frame; or 0."""
+    """Return (6,) velocities (rad/s, m/s) before and after sweep i, lidar frame."""
     last = len(trajectory.frames) - 1
-    if last == 0:
+    if last == 0:  # the velocity of a single sweep is unknown
         return np.zeros(6), np.zeros(6)
     T = trajectory.T_world_lidar
 
