@@ -13,8 +13,7 @@ import numpy as np
 from densify.depth.confidence import confidence_by_age
 from densify.depth.exposure import AT_ONCE, Exposure
 from densify.depth.patches import AGREE_M, HIDDEN_FRACTION, fit_tangents
-from densify.free_space.range_image import RangeImage
-from densify.free_space.seen_through import FREE_MARGIN
+from densify.free_space.range_image import FREE_MARGIN, RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.compiled import num_threads

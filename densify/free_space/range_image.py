@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""Build range images: the measurements of a sweep by direction, and its free space.
+"""Build range images, and find free-space violations: points that other sweeps saw through.
 
-A range image is in the scanner's frame at the firing time of each ray, where the rays form a
-regular grid of rings and azimuth steps (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for
-free space). A scanner that does not fire in order of azimuth (solid state, rosettes) faces a cell
-at several times, whose spread widens the margin. Several images with ever larger cells are used
-where enough of their cells are filled.
+A range image (`RangeImage`) holds the nearest return of a sweep in each direction. It is in the
+scanner's frame at the firing time of each ray, where the rays form a regular grid of rings and
+azimuth steps. The space before a return is free (Thrun et al., "Probabilistic Robotics", 2005, ch.
+9). A scanner that does not fire in order of azimuth (solid state, rosettes) faces a cell at several
+times, whose spread widens the margin. It gets several images with ever larger cells. `FreeSpace`
+holds the images of a window's sweeps, and tests points against them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,9 +32,16 @@ from densify.free_space.rays import (
     move_to_scanner,
     move_to_time,
 )
-from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
+from densify.free_space.sensor import Sensors
+from densify.geometry import poses
+from densify.geometry.clock import Clock
+from densify.geometry.compiled import Kernel, inlined, num_threads
+from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep, Stretch
 
+REACH_S = 1.0
+"""Greatest time between a sweep and the sweeps that are tested against its points."""
+FREE_MARGIN = 0.4, 0.015
+"""Least distance of a return beyond a seen-through point: the larger of metres, share of range."""
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
 _MIN_ROW_RAD = np.deg2rad(0.45)  # least height of a row for near points
 # Rings closer than this always share a row. Other rings have their own rows from the range at
@@ -42,7 +52,7 @@ _LONE_RAD = np.deg2rad(1.0)
 _SETTLED = 0.1  # two estimates of a firing time agree within this share of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
 _DENSEST = 10  # percent of the returns of an unordered scanner that set its finest cells
-MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
+_MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
 # An unordered scanner gets larger cells, of up to `_MAX_SIZES` sizes, until this share of its
 # returns has enough filled cells.
 _VOUCHED, _MAX_SIZES = 0.8, 5
@@ -97,7 +107,7 @@ class RangeImage:
         points: Float,
         margin_m: float,
         margin_fraction: float,
-        min_filled: int = MIN_FILLED,
+        min_filled: int = _MIN_FILLED,
         velocity_m_s: Float | Float32 | None = None,
     ) -> Bool:
         """Return (N,) True where the space at points (N,3) is certainly free.
@@ -152,6 +162,80 @@ class RangeImage:
                 len(points), points32, velocity32, image, margins32, min_filled, image_count
             )
         return num_beyond
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """The free space that each of the W sweeps of a window observed."""
+
+    images: tuple[RangeImage, ...]  # W range images
+    T_lidar_world: tuple[Float, ...]  # W transforms (4,4) at the reference times
+    clock: Clock  # reference times of the sweeps
+    sensors: Sensors  # scanners, with the angles between their rays
+    # Indices of consecutive sweeps that are tested together, see `Clock.batches`
+    batches: tuple[tuple[int, ...], ...]
+
+    @staticmethod
+    def of(stretch: Stretch) -> FreeSpace:
+        """Return the free space of a window of sweeps."""
+        clock = Clock.of(stretch)
+        batches = clock.batches()
+        image = partial(RangeImage.of, num_together=max(map(len, batches)), by_ring=True)
+        with ThreadPoolExecutor(num_threads()) as pool:
+            images = tuple(pool.map(image, stretch.sweeps))
+        T_lidar_world = tuple(
+            poses.inverse(registered.T_world_lidar) for registered in stretch.sweeps
+        )
+        return FreeSpace(images, T_lidar_world, clock, Sensors.of(stretch.sweeps), batches)
+
+    def gap_m(self, position: Float, i: int) -> float:
+        """Return the metres between neighbouring rings of sweep i at a (3,) world position."""
+        position_lidar = poses.transform(self.T_lidar_world[i], position[None])
+        return float(self.sensors.finest_gap_m(position_lidar)[0])
+
+    def others(self, i: int) -> list[int]:
+        """Return the index of a sweep of each other batch within `REACH_S` of sweep i."""
+        return [
+            batch[0]
+            for batch in self.batches
+            if i not in batch and any(self.clock.near(i, j, REACH_S) for j in batch)
+        ]
+
+    @cached_property
+    def _batch_of(self) -> dict[int, tuple[int, ...]]:
+        """Indices of the sweeps in the same batch, by index of the sweep."""
+        return {j: batch for batch in self.batches for j in batch}
+
+    def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
+        """Return (N,) True where the batch of sweep j certainly observed free space.
+
+        Every return near the direction of the point must be clearly farther away, in all sweeps of
+        the batch. Together the sweeps must have enough returns there.
+
+        Args:
+            points: (N,3) positions in the world frame at the reference time of sweep j.
+            velocity_m_s: (N,3) velocities in the world frame, None for static points.
+        """
+        batch = self._batch_of[j]
+        # In a single sweep the image counts only full neighbourhoods; of several, the sum decides.
+        min_filled = _MIN_FILLED if len(batch) == 1 else 1
+        counts = []  # one (S,N) array for each sweep of the batch
+        for k in batch:
+            T_lidar_world = self.T_lidar_world[k]
+            points_k = points
+            velocity_lidar = None
+            if velocity_m_s is not None:
+                velocity_lidar = poses.rotate(T_lidar_world, velocity_m_s)
+                if k != j:
+                    duration_s = self.clock.time_s[k] - self.clock.time_s[j]
+                    points_k = points + duration_s * velocity_m_s
+            points_lidar = poses.transform(T_lidar_world, points_k)
+            image = self.images[k]
+            counts.append(image.count_beyond(points_lidar, FREE_MARGIN, min_filled, velocity_lidar))
+        # A sweep that lacks a scanner has fewer images: its counts cannot be added to the others.
+        addable = [count for count in counts if len(count) == len(counts[0])]
+        is_free: Bool = (np.sum(addable, axis=0) >= _MIN_FILLED).any(axis=0)
+        return is_free
 
 
 class _Cells(NamedTuple):
@@ -269,7 +353,7 @@ def _times_per_cell(cell: Int, offset_s: Float32, shape: tuple[int, ...]) -> _Ti
 def _share_vouched(image: ScannerImage, rays: AimedRays) -> float:
     """Return the share of rays with enough filled cells around them."""
     row, column = _cell_of(rays, image.row_edges_rad, image.num_filled.shape[1])
-    return float((image.num_filled[np.maximum(row, 0), column] >= MIN_FILLED).mean())
+    return float((image.num_filled[np.maximum(row, 0), column] >= _MIN_FILLED).mean())
 
 
 def _choose_cells(rays: AimedRays, num_together: int, by_ring: bool) -> list[_Cells]:
