@@ -27,7 +27,7 @@ from densify.geometry.types import (
     Int,
     Patches,
     RegisteredSweep,
-    StandingWorld,
+    StaticWorld,
     Stretch,
     Sweep,
 )
@@ -118,14 +118,12 @@ def _choose_testers_of(index: int, testers: Sequence[int], travel_m: Float) -> l
     return chosen
 
 
-def static_points(
-    sensors: Sensors, registered: RegisteredSweep, seen_through: Bool
-) -> StandingWorld:
+def static_points(sensors: Sensors, registered: RegisteredSweep, seen_through: Bool) -> StaticWorld:
     """Return the points of a sweep not ``seen_through`` (N,), world frame, with their patches."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     source = np.zeros(len(sweep), np.int32)
     surface = fit_tangents(sweep.points, sweep.lidar, source, sensors, [sensors.origins_m])
-    return StandingWorld(
+    return StaticWorld(
         points=poses.transform(T_world_lidar, sweep.points).astype(np.float32),
         normal=poses.rotate(T_world_lidar, surface.normal.astype(np.float64)).astype(np.float32),
         spacing_m=np.minimum(surface.spacing_m, np.float32(_MOST_SPACING_M)),
@@ -138,22 +136,22 @@ def static_points(
     ).select(~seen_through)
 
 
-def join_worlds(worlds: Sequence[StandingWorld]) -> StandingWorld:
+def join_worlds(worlds: Sequence[StaticWorld]) -> StaticWorld:
     """Return the parts of one static world as a whole, ordered by frame number."""
     # The empty world is there so that something can be concatenated.
     parts = [_EMPTY_WORLD, *sorted(worlds, key=lambda world: world.frames)]
     # ``source`` is an index in ``frames``: those of a part follow those of the parts before it.
     firsts = np.cumsum([0, *(len(part.frames) for part in parts)])
     sources = [part.source + np.int32(first) for part, first in zip(parts, firsts, strict=False)]
-    names = {field.name for field in fields(StandingWorld)} - {"source", "frames", "left_out"}
+    names = {field.name for field in fields(StaticWorld)} - {"source", "frames", "left_out"}
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts]) for name in names
     }
     frames = tuple(frame for part in parts for frame in part.frames)
-    return StandingWorld(**columns, source=np.concatenate(sources), frames=frames)
+    return StaticWorld(**columns, source=np.concatenate(sources), frames=frames)
 
 
-_EMPTY_WORLD = StandingWorld(
+_EMPTY_WORLD = StaticWorld(
     points=np.zeros((0, 3), np.float32),
     normal=np.zeros((0, 3), np.float32),
     spacing_m=np.zeros((0, 2), np.float32),
@@ -195,12 +193,12 @@ def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float)
 
 
 def far_cloud(
-    world: StandingWorld,
+    world: StaticWorld,
     T_key_world: Float,
     stretch: Stretch,
     key: int,
     exposures: Mapping[str, Exposure],
-    standing_only: bool,
+    static_only: bool,
 ) -> tuple[Cloud, Patches]:
     """Return the points beyond the window that a camera observes, and their patches.
 
@@ -212,7 +210,7 @@ def far_cloud(
         stretch: Registered sweeps of the window.
         key: Frame number of the key sweep.
         exposures: Cameras and times of the maps, by name of the map.
-        standing_only: Leave out points that the first or the last sweep of the window saw through.
+        static_only: Leave out points that the first or the last sweep of the window saw through.
     """
     is_beyond = ~np.isin(world.frames, stretch.frames)
     rows = np.flatnonzero(is_beyond[world.source])
@@ -221,7 +219,7 @@ def far_cloud(
         is_needed[_select_needed(world.points, rows, T_key_world, exposure)] = True
     used = world.select(is_needed)
     points = poses.transform(T_key_world, used.points.astype(np.float64))
-    if standing_only:
+    if static_only:
         is_static = ~_seen_through_by_ends(points, stretch, key)
         used, points = used.select(is_static), points[is_static]
     num_points = len(used)

@@ -35,7 +35,7 @@ from densify.geometry.types import (
     Mover,
     Patches,
     Reason,
-    StandingWorld,
+    StaticWorld,
     Stretch,
     Sweep,
     Truth,
@@ -148,11 +148,11 @@ class Views:
         return find_moving_bodies(cloud, self.rays, self.exposures.values())
 
     def see_far(
-        self, world: StandingWorld, T_key_world: Float, stretch: Stretch, standing_only: bool
+        self, world: StaticWorld, T_key_world: Float, stretch: Stretch, static_only: bool
     ) -> SeenCloud:
         """Return the points of sweeps beyond the window as cameras see them, see `far_cloud`."""
         cloud, surface = far_cloud(
-            world, T_key_world, stretch, self.key, self.exposures, standing_only
+            world, T_key_world, stretch, self.key, self.exposures, static_only
         )
         return SeenCloud(cloud, surface, self.points_in_view(cloud))
 

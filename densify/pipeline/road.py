@@ -21,7 +21,7 @@ from densify.geometry.types import (
     Camera,
     Float,
     RegisteredSweep,
-    StandingWorld,
+    StaticWorld,
     Stretch,
     Trajectory,
 )
@@ -86,7 +86,7 @@ class Road:
     window: Stretch  # deskewed sweeps of the window
     views: Sequence[tuple[Camera, Float]]  # cameras with their poses ``T_cam_world`` (4,4)
 
-    def find_static_surfaces(self, with_window: bool) -> StandingWorld:
+    def find_static_surfaces(self, with_window: bool) -> StaticWorld:
         """Return the static surfaces along the road, in the world of the window.
 
         The result has the points that one of the views may see and that no other sweep along the
