@@ -7,7 +7,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -344,11 +344,6 @@ class PointsInImage(NamedTuple):
     frame: np.ndarray  # (K,) frame number of the source sweep
     age_ns: Int  # (K,) time between the source sweep and the key sweep, see `_ages_ns`
     far: Bool  # (K,) True for points of sweeps beyond the window
-
-    def take(self, rows: Int) -> PointsInImage:
-        """Return the points at these indices, in their order."""
-        columns: Any = (column.take(rows, axis=0) for column in self)
-        return PointsInImage(*columns)
 
 
 def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInImage:

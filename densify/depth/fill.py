@@ -309,15 +309,8 @@ def measure_spots(record: MapRecord) -> None:
 def _cover(pixel, uv, radius_px, depth_m, tilt, interpolated_m, source, least_px2):  # type: ignore[no-untyped-def]
     """Fill ``source`` (H,W) with the measured pixel whose spot covers each interpolated pixel.
 
-    Args:
-        pixel: (P,) flat indices of the measured pixels.
-        uv: (P,2) centres of their spots in px.
-        radius_px: (P,) radii of the spots.
-        depth_m: (H,W) depths of the measured pixels.
-        tilt: (H,W,2) slopes of their surfaces, as in `MapRecord`.
-        interpolated_m: (H,W) depths of the interpolated pixels, 0 for other pixels.
-        source: Flat indices, of the spot with the nearest centre; unchanged if no spot covers.
-        least_px2: (H,W) squared distance to that centre, inf to begin with.
+    The spots of the measured pixels, flat indices ``pixel`` (P,), have the centres ``uv`` (P,2) and
+    radii (P,). The nearest centre counts; ``least_px2`` (H,W) is its squared distance, inf before.
     """
     height, width = interpolated_m.shape
     for i in range(len(pixel)):

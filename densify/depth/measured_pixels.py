@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from densify.depth.patches import (
     sorted_by_pixel,
 )
 from densify.depth.rays import MovingBody, Rays
+from densify.geometry.arrays import select_rows
 from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Bool, Camera, Cloud, Float32, Int, Patches, Reason
 
@@ -126,7 +127,7 @@ def measure(inputs: MapInputs) -> MapRecord:
     """
     camera = inputs.camera
     points = points_in_image(inputs.cloud, inputs.view, inputs.patches)
-    in_window = points.take(np.flatnonzero(~points.far)) if points.far.any() else points
+    in_window = select_rows(points, ~points.far) if points.far.any() else points
     # The spacing of rays is that of the window's sweeps, unless none of their points is in view.
     record = _empty_record(inputs, points, spaced=points if points.far.all() else in_window)
     if not inputs.settings.visibility:
@@ -217,11 +218,6 @@ class _Winners(NamedTuple):
     is_nearest: Float32
     edge: Float32  # (P,) distance from a discontinuity, in radii of a laser's spot
 
-    def select(self, keep: Bool) -> _Winners:
-        """Return the pixels where ``keep`` (P,) is True."""
-        columns: Any = (column[keep] for column in self)
-        return _Winners(*columns)
-
 
 def _measure_visible(
     record: MapRecord, points: PointsInImage, camera: Camera, beyond_window: bool = False
@@ -249,7 +245,7 @@ def _measure_visible(
         is_judged = ~points.far
     reasons[winners.point[~is_supported]] = Reason.UNSUPPORTED
     record.reason[points.rows[is_judged]] = reasons[is_judged]
-    _set_pixels(record, points, winners.select(is_used), is_inside[is_used])
+    _set_pixels(record, points, select_rows(winners, is_used), is_inside[is_used])
 
 
 def _find_winners(
@@ -263,7 +259,7 @@ def _find_winners(
     start, order = sorted_by_pixel(points, rank, camera)
     has_depth = record.depth_m > 0
     settled = np.zeros((_NUM_SETTLED, has_depth.size), np.float32)
-    by_pixel = _ByPixel(points.take(order), is_hidden[order], start, has_depth.shape)
+    by_pixel = _ByPixel(select_rows(points, order), is_hidden[order], start, has_depth.shape)
     _settle.over_rows(has_depth.size, by_pixel, has_depth.ravel(), settled)
     pixel = np.flatnonzero(settled[_DEPTH])
     return _Winners(
@@ -326,13 +322,9 @@ def _count(bits):  # type: ignore[no-untyped-def]
 def _compare(by_pixel, i, u0, v0, centre, tolerance, edge_px, moments, extent):  # type: ignore[no-untyped-def]
     """Compare the points around pixel (v0, u0) with the tangent plane of its winner, point i.
 
-    Deviations are inverse depths (1/m). Those of agreeing points are added to ``moments`` (9,).
-
-    Args:
-        centre: Inverse depth of the plane at the pixel's centre.
-        tolerance: Greatest deviation of an agreeing point.
-        edge_px: Half size of the square in which a discontinuity is looked for. ``extent`` (8,) is
-            raised to the extent of the agreeing points in it.
+    The plane has the inverse depth ``centre`` (1/m) at the pixel. A point agrees if it deviates by
+    at most ``tolerance`` (1/m). Its deviation is added to ``moments`` (9,). In a square of half
+    size ``edge_px`` it raises ``extent`` (8,).
 
     Returns:
         sweeps: Bit set of the agreeing sweeps in the window.

@@ -215,12 +215,8 @@ def _show(
 ) -> _Shown:
     """Show a body's surface (h,w), 1/m, in the record, and return where.
 
-    Args:
-        record: The record, cut to the box of the body's front.
-        cloud: The cloud of the record.
-        surface: Inverse depth of the body.
-        allowed_m: (h,w) greatest distance of a return from the surface.
-        share: (h,w) share of the rays that end on the body, 0 outside its hull.
+    Returns of moving objects up to ``allowed_m`` (h,w) behind it stay. ``share`` (h,w) is that of
+    the rays that end on the body, 0 outside its hull.
     """
     inside = share > 0
     surface_m = (1 / surface).astype(np.float32)

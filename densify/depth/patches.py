@@ -182,11 +182,8 @@ def _first_filled(cells, row, column, row_offsets, column_offsets):  # type: ign
 
 @inlined
 def _slope(slope_a, slope_b, step_rad, range_m):  # type: ignore[no-untyped-def]
-    """Return the slope of inverse range per radian from those to both sides, NaN if unknown.
-
-    ``step_rad`` is the angle to the neighbours from which the slopes come.
-    """
-    # The change of range (m) to a neighbour is range² · slope · step.
+    """Return the slope of inverse range per radian from those to both sides, NaN if unknown."""
+    # The change of range (m) to a neighbour, step_rad away, is range² · slope · step.
     metres = step_rad * range_m * range_m
     # The mean on one surface, else the lesser slope, or 0 if that is a step in depth
     if abs(slope_a - slope_b) * metres <= AGREE_M + _BEND * abs(slope_a + slope_b) * metres:
@@ -340,16 +337,10 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
 
 
 def sorted_by_pixel(points: PointsInImage, rank: Int, camera: Camera) -> tuple[Int, Int]:
-    """Return the points by pixel, the first by rank first.
+    """Return ``start`` (H·W+1,) and ``order`` (K,): the K points in the image, by pixel.
 
-    Args:
-        points: K points in the image.
-        rank: (K,) rank of each point; of equal ranks the nearer point is first.
-        camera: Camera of the image.
-
-    Returns:
-        start: (H·W+1,) position in ``order`` of the first point of each pixel, and their end.
-        order: (K,) indices of the points. Pixel p has ``order[start[p]:start[p + 1]]``.
+    Pixel p has the points ``order[start[p]:start[p + 1]]``, ascending by ``rank`` (K,). Of equal
+    ranks the nearer point is first.
     """
     row, column = pixel_of(points.uv)
     start = np.empty(camera.height_px * camera.width_px + 1, np.int64)

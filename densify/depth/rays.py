@@ -20,6 +20,7 @@ from densify.depth.exposure import Exposure
 from densify.depth.patches import AGREE_M, HIDDEN_M
 from densify.free_space.ground import HeightMap
 from densify.geometry import poses
+from densify.geometry.arrays import joined_rows, select_rows
 from densify.geometry.types import Bool, Cloud, Float, Float32, Int, ObjectTrack, Stretch, Sweep
 
 _NEAR_M = 2.5 * AGREE_M  # distance within which a point of a body has other points of it
@@ -135,10 +136,6 @@ class ObjectRays(NamedTuple):
     start: Float  # (K,3) origin of each ray
     to_return: Float  # (K,3) vector from the origin to the return
 
-    def select(self, keep: Bool) -> ObjectRays:
-        """Return the rays where ``keep`` (K,) is True."""
-        return ObjectRays(self.rows[keep], self.start[keep], self.to_return[keep])
-
 
 def rays_toward(
     cloud: Cloud, rays: Rays, rows_of: Mapping[int, Int], corners: Mapping[int, Float]
@@ -157,14 +154,7 @@ def rays_toward(
     for frame in rays.stretch.frames if rows_of else ():
         for instance, object_rays in _sweep_rays(cloud, rays, frame, rows_of, corners).items():
             by_sweep[instance].append(object_rays)
-    return {
-        instance: ObjectRays(
-            np.concatenate([part.rows for part in parts]),
-            np.concatenate([part.start for part in parts]),
-            np.concatenate([part.to_return for part in parts]),
-        )
-        for instance, parts in by_sweep.items()
-    }
+    return {instance: joined_rows(parts) for instance, parts in by_sweep.items()}
 
 
 def _sweep_rays(
@@ -279,10 +269,8 @@ def without_sweep(
     for instance, body in bodies.items():
         corners = _hull_corners(cloud.points[cloud.moving & (cloud.instance == instance)])
         if len(corners):
-            keep = body.frame != frame
-            reduced_bodies[instance] = MovingBody(
-                corners, body.velocity_m_s, body.entries[keep], body.ends[keep], body.frame[keep]
-            )
+            others = select_rows(body, body.frame != frame, ("entries", "ends", "frame"))
+            reduced_bodies[instance] = others._replace(corners=corners)
     return reduced_bodies
 
 
@@ -301,16 +289,16 @@ def _body(
     cloud: Cloud, instance: int, corners: Float, velocity_m_s: Float32, rays: ObjectRays
 ) -> MovingBody:
     """Return the body with this hull (V,3), and those of the ``rays`` that meet the hull."""
-    rays = rays.select(passes_near(corners, rays.start, rays.to_return))
-    enter, leave = find_crossing(half_spaces(corners), rays.start, rays.to_return)
+    near = select_rows(rays, passes_near(corners, rays.start, rays.to_return))
+    enter, leave = find_crossing(half_spaces(corners), near.start, near.to_return)
     meets = (enter > 0) & (enter < np.minimum(leave, 1))  # 0 is the origin, 1 the return
-    rays = rays.select(meets)
+    rows, start, to_return = select_rows(near, meets)
     return MovingBody(
         corners=corners,
         velocity_m_s=velocity_m_s,
-        entries=rays.start + enter[meets, None] * rays.to_return,
-        ends=cloud.moving[rays.rows] & (cloud.instance[rays.rows] == instance),
-        frame=cloud.frame[rays.rows],
+        entries=start + enter[meets, None] * to_return,
+        ends=cloud.moving[rows] & (cloud.instance[rows] == instance),
+        frame=cloud.frame[rows],
     )
 
 

@@ -388,11 +388,7 @@ def _cells_of_unordered(rays: AimedRays, layout: Layout) -> list[_Cells]:
 
 
 def _cells_of_rings(rings: Float, column_rad: float, by_ring: bool) -> list[_Cells]:
-    """Return the cells of a scanner with rings (K,): one image, with ``by_ring`` up to two.
-
-    The rows reach half way to the neighbouring rings. Near points get rows of several rings, which
-    tolerate errors of registration.
-    """
+    """Return the cells of a scanner with rings (K,), of a second image too if ``by_ring``."""
     borders = 0.5 * (rings[1:] + rings[:-1])
     # The first and the last ring are in the middle of their rows.
     outer: Float = 2 * rings[[0, -1]] - borders[[0, -1]]
@@ -426,8 +422,7 @@ def _merge_rows(edges: Float, min_rad: float) -> Float:
     for edge in edges[1:]:
         if edge - merged[-1] >= min_rad:
             merged.append(edge)
-    # The last edge replaces the last one found, unless that is the first edge: the uppermost row
-    # takes what would be too low for a row of its own.
+    # The last edge replaces the last one found, unless that is the first edge.
     return np.array([*merged[: max(1, len(merged) - 1)], edges[-1]])
 
 

@@ -116,12 +116,7 @@ class SensorModel(Layout):
         return in_view & (elevation >= low) & (elevation <= high)
 
     def gap_m(self, points: Float) -> tuple[Float, Bool]:
-        """Return the ray spacing at points (N,3), lidar frame, and where they are in view.
-
-        Returns:
-            gap_m: (N,) metres to the next ring or ray, and the width of a beam.
-            in_view: (N,) True within the field of view.
-        """
+        """Return (N,) metres from points, lidar frame, to the next ring or ray; (N,) in view."""
         azimuth, elevation, range_m = self.directions(points)
         gap_rad = self.table.at(azimuth, elevation)[:, 1]
         return range_m * (gap_rad + _BEAM_RAD), self.sees(azimuth, elevation)
@@ -150,10 +145,7 @@ class Sensors:
         return origins_m
 
     def gap_m(self, points: Float, lidar: NDArray[np.uint8]) -> Float:
-        """Return (N,) metres from points (N,3), lidar frame, to the next ring of their scanner.
-
-        ``lidar`` (N,) are the numbers of the scanners.
-        """
+        """Return (N,) metres from points, lidar frame, to the next ring of their scanner (N,)."""
         gap_m = np.zeros(len(points))
         for number, model in self.models.items():
             rows = np.flatnonzero(lidar == number)

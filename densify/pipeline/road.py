@@ -35,9 +35,9 @@ _STEP_M = 2.0  # usual distance along the road between the sweeps that are used
 _MIN_STEP_M = 0.5 * _STEP_M  # least distance between them: sweeps do not lie at exact steps
 _MAX_S = 15.0  # greatest time on each side; a parked vehicle observes nothing new
 _SAME_VIEW_M = 3.0  # distance between keys up to which they share a view
-# Share of ``far_m`` that is used on a side where no camera looks. Its sweeps measure only what
-# their own rays reach on the other side, so the farther half adds little.
-_UNSEEN_SHARE = 0.5
+_UNSEEN_SHARE = (
+    0.5  # of ``far_m``, used where no camera looks: farther sweeps measure little in view
+)
 # Greatest distance of a camera from its pose in the test of the view. The vehicle moves between the
 # firing of a ray, the reference time of the sweep and the exposure: 0.1 s at 40 m/s.
 _SLACK_M = 4.0
@@ -293,14 +293,9 @@ class Road:
 def choose_views(
     cameras: Collection[Camera], window: Stretch, keys: Sequence[int]
 ) -> list[tuple[Camera, Float]]:
-    """Return the views of some keys: each camera with its pose ``T_cam_world`` (4,4).
+    """Return the views of ascending keys: each camera with its pose ``T_cam_world`` (4,4).
 
     A key at most 3 m from the last key with a view of its own shares that view.
-
-    Args:
-        cameras: The cameras of the recording.
-        window: Deskewed sweeps, among them those of the keys.
-        keys: Frame numbers of the keys, ascending.
     """
     key_poses: list[Float] = []
     for T_world_lidar in (window[key].T_world_lidar for key in keys):
