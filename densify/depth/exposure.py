@@ -282,8 +282,7 @@ def _neighbour_exposures(
         exposed_ns = stamps_ns[neighbour_number]
         frame = stretch.frames[int(np.argmin(np.abs(sweeps_ns - exposed_ns)))]
         begin_ns, end_ns = _own_time_ns(sequence, frame)
-        # The pose is extrapolated from the nearest sweep. If that is outside the window, the image
-        # is too far from the sweeps inside.
+        # An image nearer to a sweep outside the window is too far for the pose of one inside.
         if begin_ns < exposed_ns <= end_ns:
             at_sweep = settings.project.at == "sweep"
             shown_ns = stretch[frame].sweep.stamp_ns if at_sweep else exposed_ns
@@ -316,7 +315,7 @@ def _exposure(
         camera=camera,
         T_cam_key=T_cam_lidar @ stretch.T_target_source(frame, key),
         late_s=float(shot.stamp_ns - stretch[key].sweep.stamp_ns) * 1e-9,
-        twist=poses.carried(camera.T_cam_lidar, twist),
+        twist=poses.transform_twist(camera.T_cam_lidar, twist),
         number=shot.number,
         measure=camera.measure if measure == "auto" else measure,
     )
@@ -377,10 +376,7 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInIma
 def _pinhole_scale(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> _Scale:
-    """Return the scale of points (K,3), camera frame, for z depth in a rectified image.
-
-    ``normal`` (K,3) are those of the patches in the camera frame, ``spacing_m`` (K,2) the spacing.
-    """
+    """Return the scale of points (K,3), normals (K,3) and spacings (K,2): a rectified image, z."""
     focal_px = exposure.camera.K[[0, 1], [0, 1]]
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
     distance = np.einsum("ij,ij->i", normal, points_cam)  # d

@@ -224,8 +224,7 @@ def _measure_visible(
 ) -> None:
     """Measure pixels without a depth by visible points, and set the reason of each point.
 
-    With ``beyond_window`` the points are those of all sweeps, else those of the window. Reasons are
-    set only for the sweeps in question: the first call has judged the points of the window.
+    The points are those of the window, or with ``beyond_window`` all, of which the window's stay.
     """
     is_hidden = is_occluded(points, camera)
     winners = _find_winners(record, points, is_hidden, camera)
@@ -252,8 +251,7 @@ def _find_winners(
     record: MapRecord, points: PointsInImage, is_hidden: Bool, camera: Camera
 ) -> _Winners:
     """Return the winners of the pixels without a depth; occluded points (K,) win no pixel."""
-    # Occluded points rank behind the oldest visible one, so a pixel's first point is its winner,
-    # unless all its points are occluded.
+    # Occluded points rank behind the oldest visible one, so a pixel's first point is its winner.
     hidden_rank = int(points.age_ns.max(initial=0)) + 1
     rank = np.where(is_hidden, hidden_rank, points.age_ns)
     start, order = sorted_by_pixel(points, rank, camera)
@@ -396,7 +394,4 @@ def _settle(first, last, by_pixel, has_depth, settled):  # type: ignore[no-untyp
         # The discontinuity is where the surface ends first.
         settled[_EDGE, p] = ALL_ROUND
         if has_background and spot_px > 0:
-            least_px = extent[0]
-            for extent_px in extent[1:]:
-                least_px = min(least_px, extent_px)
-            settled[_EDGE, p] = least_px / spot_px
+            settled[_EDGE, p] = extent.min() / spot_px

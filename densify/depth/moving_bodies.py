@@ -2,8 +2,7 @@
 """Close the surfaces of moving objects, so that no background shows through them.
 
 Dark paint and glass give few returns, and other sweeps measured the background there. A body
-(`MovingBody`) is closed where rays end on it, open where they pass. Its front is the nearest
-surface of its hull in each pixel.
+(`MovingBody`) is closed where rays end on it, open where they pass.
 """
 
 from __future__ import annotations
@@ -27,9 +26,7 @@ from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.types import Cloud
 
 _PRIOR = 0.05  # number of rays that end on the body, assumed everywhere
-# Closed share of the front from which a body counts as compact, as a car is, and not as a person
-# with gaps between the limbs. It is then closed everywhere.
-_COMPACT = 0.8
+_COMPACT = 0.8  # closed share of the front from which all of a body is closed, as a car is
 # Least share of rays that end on a compact body, and on the closed part of another one. At glass it
 # is a third.
 _LEAST_OF_COMPACT, _LEAST_OF_OTHER = 0.2, 0.5

@@ -316,9 +316,8 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
     """Raise ``canvas`` (H,W) float32 in place to the greatest inverse depth of the patches there.
 
     A patch covers the pixel centres within ``half_px`` (K,2) of uv (K,2). There its inverse depth
-    is ``inverse + slope · offset``, limited to half of ``inverse`` and to ``inverse``: a patch is
-    never nearer than its point, so that errors of the slope do not occlude neighbours. ``inverse``
-    (K,) is in 1/m, ``slope`` (K,2) in 1/m per px.
+    is ``inverse + slope · offset``, between half of ``inverse`` and all of it: a patch is never
+    nearer than its point. ``inverse`` (K,) is in 1/m, ``slope`` (K,2) in 1/m per px.
     """
     height, width = canvas.shape
     for i in range(len(inverse)):
@@ -419,9 +418,8 @@ def add_moments(moments, weight, u, v, w):  # type: ignore[no-untyped-def]
 
 @inlined
 def plane(moments, ridge):  # type: ignore[no-untyped-def]
-    """Fit a plane to the pixels of `add_moments` by weighted least squares.
+    """Return inverse depth (1/m) at offset 0, and slopes, of the plane through `add_moments`' sums.
 
-    Returns the inverse depth (1/m) at offset 0 and the slopes right and down (1/m per px).
     ``ridge``, a variance (px²), keeps pixels on one line from tilting the plane across the line.
     """
     sum_weights = moments[0]

@@ -219,11 +219,7 @@ def _cells_beside(position: Float, num_cells: int) -> list[tuple[Int, Float]]:
 def _correction(
     filled_m: Float32, log_depth: Float, guide: Float32, steepness: Float32, usable: Bool
 ) -> tuple[Float, Float]:
-    """Return (H,W) the correction of the prior's log depth, and (H,W) its remaining error.
-
-    All arguments are (H,W): the known depths, the prior's log depth, smoothed too (``guide``), its
-    step around each pixel, and the pixels with a usable value.
-    """
+    """Return (H,W) the correction of the prior's log depth, and (H,W) its remaining error."""
     cells = _Cells.over(guide)
     area, num_cells = cells.size**2, cells.guide.size
     # Known pixels pull their cell, unless they are on another surface than its centre.

@@ -23,7 +23,7 @@ from densify.depth.rays import MovingBody, Rays, find_moving_bodies, without_swe
 from densify.depth.votes import to_lab
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
-from densify.geometry.cameras import converted
+from densify.geometry.cameras import convert_depth
 from densify.geometry.types import (
     Bool,
     CameraView,
@@ -235,7 +235,7 @@ class Views:
             if exposure.number is not None:
                 camera = exposure.camera
                 depth_m = truth.depth_m(camera.name, exposure.number)
-                depth_m = converted(camera, depth_m, camera.measure, exposure.measure)
+                depth_m = convert_depth(camera, depth_m, camera.measure, exposure.measure)
                 true_maps[name] = (depth_m, truth.moving_mask(camera.name, exposure.number))
         return true_maps
 

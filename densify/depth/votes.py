@@ -61,10 +61,7 @@ from the right. Each step goes to one of the eight neighbours."""
 
 
 def steps_to_known(known: Bool) -> NDArray[np.uint8]:
-    """Return the (16,H,W) number of steps to the first known pixel in each of `DIRECTIONS`.
-
-    It is 0 at ``known`` (H,W) pixels, and `NONE` without a known pixel within 254 steps.
-    """
+    """Return (16,H,W) steps to the first known pixel in `DIRECTIONS`, 0 if known, or `NONE`."""
     # Two steps reach at most two pixels beyond the image: there is a border of two on each side.
     padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
     steps = padded[:, 2:-2, 2:-2]
@@ -177,11 +174,7 @@ def _steps_to_other(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 @inlined
 def _cast_votes(voters, v, u, depth_m, gap_px, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill in the 16 votes on a depth of the pixel in row v, column u.
-
-    ``steps`` (16,) are those to the voters, 0 without one, and ``agrees`` (16,) their votes.
-    Returns the numbers of votes for and against.
-    """
+    """Fill in ``steps`` (16,) to the voters (0: none) and ``agrees`` (16,); count for, against."""
     tolerance_m = HIDDEN_M + HIDDEN_FRACTION * depth_m
     num_for, num_against = 0, 0
     for d in range(len(steps)):

@@ -196,14 +196,10 @@ class Layout:
 def measure_layout(sweeps: Sequence[AimedRays]) -> Layout:
     """Return the layout of one scanner, measured in its rays of a few sweeps.
 
-    There are three outcomes:
-
-    - Rings: most returns have one of a few elevations.
-    - Lines: lasers that do not share an origin, as in KITTI's HDL-64E, mix their rings at close
-      range, but their returns follow at even steps along the azimuth.
-    - Unordered: neither rings nor lines.
-
-    Fewer than 200 returns give the default, lines with the spacing of a 64-beam scanner.
+    Most returns of rings have one of a few elevations. Lasers that do not share an origin, as in
+    KITTI's HDL-64E, mix their rings at close range, but their returns follow at even steps along
+    the azimuth: lines. Scanners with neither are unordered. Fewer than 200 returns give the
+    default, lines with the spacing of a 64-beam scanner.
     """
     if sum(len(rays.azimuth) for rays in sweeps) < FEW_POINTS:
         return _default_layout()
@@ -231,11 +227,7 @@ def _default_layout() -> Layout:
 
 
 def find_rings(elevation: Float32) -> Float | None:
-    """Return the (K,) ascending elevations of the rings, None if the returns are not on rings.
-
-    Returns are on rings if at least 80 % of the N ``elevation`` are close to a peak of their
-    histogram, and if the rings have at least 24 returns on average.
-    """
+    """Return the (K,) ascending elevations of the rings, None if the returns are not on rings."""
     # The last bin but one holds the zenith; one more is spare for rounding.
     num_bins = int(np.pi / _RING_BIN_RAD) + 2
     bin_of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)

@@ -106,7 +106,7 @@ def depth_along(points_cam: Float, measure: str) -> Float:
     return points_cam[:, 2] if measure == "z" else np.linalg.norm(points_cam, axis=1)
 
 
-def converted(camera: Camera, depth_m: Float32, from_measure: str, to_measure: str) -> Float32:
+def convert_depth(camera: Camera, depth_m: Float32, from_measure: str, to_measure: str) -> Float32:
     """Return a depth map of a camera converted from one measure of depth to another.
 
     Pixels whose ray has z <= 0 become 0. If the measures are the same, the map is returned

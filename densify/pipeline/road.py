@@ -38,8 +38,8 @@ _SAME_VIEW_M = 3.0  # distance between keys up to which they share a view
 _UNSEEN_SHARE = (
     0.5  # of ``far_m``, used where no camera looks: farther sweeps measure little in view
 )
-# Greatest distance of a camera from its pose in the test of the view. The vehicle moves between the
-# firing of a ray, the reference time of the sweep and the exposure: 0.1 s at 40 m/s.
+# Greatest distance of a camera from its pose in the test of the view: the motion of a fast vehicle
+# within a sweep and until the exposure
 _SLACK_M = 4.0
 
 
@@ -48,8 +48,7 @@ class _RoadSweep(NamedTuple):
 
     # Returns in view of a camera, with the pose; deskewed if ``in_window``, else raw
     registered: RegisteredSweep
-    # Surface of all returns, deskewed, in the lidar frame, for the pose graph of `relax_poses`;
-    # None with recorded poses
+    # Surface of all returns, deskewed, in the lidar frame; None with recorded poses
     surface: Surface | None
     travel_m: float  # distance along the road from the window's first sweep, negative before it
     in_window: bool  # true if the sweep is in the window, whose poses are fixed
@@ -263,16 +262,10 @@ class Road:
         corrected = list(road_sweeps)
         for i, road_sweep in enumerate(road_sweeps):
             if not road_sweep.in_window:
-                sweep = road_sweep.registered.sweep
-                registered = RegisteredSweep(
-                    sweep, relaxed.T_world_lidar[i], *twists(trajectory, i)
-                )
+                sweep, T_world_lidar = road_sweep.registered.sweep, relaxed.T_world_lidar[i]
+                registered = RegisteredSweep(sweep, T_world_lidar, *twists(trajectory, i))
                 corrected[i] = road_sweep._replace(registered=registered)
-        unreliable = [
-            frame
-            for frame, is_reliable in zip(frames, relaxed.is_reliable, strict=True)
-            if not is_reliable
-        ]
+        unreliable = np.array(frames)[~relaxed.is_reliable].tolist()
         return _RelaxedRoad(corrected, frozenset(unreliable))
 
     def _select_in_view(self, registered: RegisteredSweep) -> RegisteredSweep:
